@@ -1,0 +1,56 @@
+//! The command line: one file per subcommand.
+
+use std::process::ExitCode;
+
+mod bench;
+mod demo;
+mod import;
+mod inspect;
+mod render;
+mod replay;
+mod serve;
+mod verify;
+
+use clap::{Parser, Subcommand};
+
+/// A closed-loop driving simulator server for city twins.
+#[derive(Debug, Parser)]
+#[command(version, about, arg_required_else_help = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(demo::Demo),
+    Serve(serve::Serve),
+    Import(import::Import),
+    Inspect(inspect::Inspect),
+    Verify(verify::Verify),
+    Render(render::Render),
+    Replay(replay::Replay),
+    Bench(bench::Bench),
+}
+
+/// Parses the command line, runs, and tells how it went: 0 done, 1 failed, 2 not understood.
+pub fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let result = match arguments.command {
+        Command::Demo(command) => command.run(),
+        Command::Serve(command) => command.run(),
+        Command::Import(command) => command.run(),
+        Command::Inspect(command) => command.run(),
+        Command::Verify(command) => command.run(),
+        Command::Render(command) => command.run(),
+        Command::Replay(command) => command.run(),
+        Command::Bench(command) => command.run(),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! The pinhole: `u = fx x/z + cx`, `v = fy y/z + cy`.
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use super::CameraError;
+
+/// Pinhole intrinsics, in pixels from the image's top-left corner.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pinhole {
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Principal point, x.
+    pub cx: f64,
+    /// Principal point, y.
+    pub cy: f64,
+}
+
+impl Pinhole {
+    /// Focal lengths and principal points beyond this are mistakes, and would leave f32's comfort.
+    const MAX_PX: f64 = 1e6;
+
+    /// # Errors
+    /// Names the first intrinsic that is not finite, not positive, or absurd.
+    pub fn check(&self) -> Result<(), CameraError> {
+        for (field, value) in [("fx", self.fx), ("fy", self.fy)] {
+            let usable = value.is_finite() && (1e-3..=Self::MAX_PX).contains(&value);
+            if !usable {
+                let must = "a focal length is from 0.001 to 1e6 px";
+                return Err(CameraError::Intrinsic { field, value, must });
+            }
+        }
+        for (field, value) in [("cx", self.cx), ("cy", self.cy)] {
+            let usable = value.is_finite() && value.abs() <= Self::MAX_PX;
+            if !usable {
+                let must = "a principal point is within 1e6 px of the image's corner";
+                return Err(CameraError::Intrinsic { field, value, must });
+            }
+        }
+        Ok(())
+    }
+
+    /// Where a camera-space point lands, in pixels; meaningless unless `z > 0`.
+    pub fn project(&self, point_m: DVec3) -> DVec2 {
+        DVec2::new(
+            self.fx * point_m.x / point_m.z + self.cx,
+            self.fy * point_m.y / point_m.z + self.cy,
+        )
+    }
+
+    /// The camera-space direction, with z = 1, of a pixel position.
+    pub fn unproject(&self, pixel: DVec2) -> DVec3 {
+        DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unproject_inverts_project() {
+        let pinhole = Pinhole { fx: 1800.0, fy: 1750.0, cx: 721.5, cy: 462.25 };
+        let point = DVec3::new(-1.25, 0.75, 8.0);
+        let ray = pinhole.unproject(pinhole.project(point));
+        assert!((ray * point.z - point).length() < 1e-12);
+    }
+
+    #[test]
+    fn absurd_intrinsics_are_named() {
+        let good = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 50.0 };
+        assert_eq!(good.check(), Ok(()));
+        for (bad, field) in [
+            (Pinhole { fx: 0.0, ..good }, "fx"),
+            (Pinhole { fy: f64::NAN, ..good }, "fy"),
+            (Pinhole { cx: f64::INFINITY, ..good }, "cx"),
+            (Pinhole { cy: -1e7, ..good }, "cy"),
+        ] {
+            assert_eq!(bad.check().unwrap_err().field(), field);
+        }
+    }
+}

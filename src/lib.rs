@@ -1,0 +1,50 @@
+//! A closed-loop driving simulator server for city twins made of 3D Gaussians.
+//!
+//! # Layout
+//!
+//! | room | what it is | may name |
+//! |---|---|---|
+//! | [`config`] | every default and every limit, checked once | nothing |
+//! | [`geometry`] | poses, cameras, boxes | nothing |
+//! | [`scene`] | what a city twin is | geometry |
+//! | [`generate`] | the procedural demo twin | geometry, scene |
+//! | [`ingest`] | one file per outside format | scene |
+//! | [`store`] | twins on disk, versioned, content-addressed | geometry, scene, ingest |
+//! | [`residency`] | what is in memory now | geometry, scene, store |
+//! | [`render`] | six images per step: `cpu`, `reference` | geometry, scene |
+//! | [`session`] | episodes: reset, step, observe, record, replay | all above |
+//! | [`protocol`] | the wire, and only the wire | nothing |
+//! | [`server`] | WebSocket and HTTP | protocol, store, session |
+//! | [`client`] | the Rust client of the protocol | protocol |
+//! | [`cli`] | one file per subcommand | everything |
+//!
+//! Data goes one way: file, ingest, store, residency, render, session, server, agent; an agent's
+//! pose goes server, session. Nothing downstream calls upstream.
+//!
+//! # Invariants
+//!
+//! 1. `protocol` is a leaf; only `server` and `client` name it, `server` in `convert.rs`.
+//! 2. Only `store/objects.rs` opens files of a twin; only `server` names axum.
+//! 3. `render` and `scene` are pure: the same input, the same bytes, whatever the thread count.
+//! 4. Scene data is checked once, at import. Poses and cameras are checked once, at the wire.
+//! 5. An image is a function of (scene version, render profile, poses, cameras).
+//! 6. Every observation names the scene version and the render profile it was made with.
+//! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative.
+//! 8. Every queue, message, buffer and count has a maximum, all in [`config`].
+//! 9. A scene pays only for what it has: no SH, no depth wanted, no work for it.
+//!
+//! `tests/tidy` holds this table against the source.
+
+pub mod cli;
+pub mod client;
+pub mod config;
+pub mod generate;
+pub mod geometry;
+pub mod ingest;
+pub mod protocol;
+pub mod render;
+pub mod residency;
+pub mod scene;
+pub mod server;
+pub mod session;
+pub mod store;

@@ -1,0 +1,141 @@
+//! The renderer: six images of one step, by one of several backends that compute the same thing.
+//!
+//! The stages project, sort, bin, rasterize, resolve bear one name in every backend. An image is a
+//! function of (scene, profile, views): no clock, no cache, no thread count.
+
+pub mod cpu;
+pub mod reference;
+
+use crate::geometry::{Camera, Pose};
+use crate::scene::{RenderProfile, Scene};
+
+/// A camera somewhere in the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// Size and intrinsics.
+    pub camera: Camera,
+    /// Where the camera stands.
+    pub world_from_camera: Pose,
+}
+
+/// One chain of stages: all views of one step.
+#[derive(Clone, Copy, Debug)]
+pub struct Frame<'a> {
+    /// What is drawn.
+    pub scene: &'a Scene,
+    /// How it must be drawn.
+    pub profile: &'a RenderProfile,
+    /// From where: 1 to [`MAX_VIEWS`].
+    pub views: &'a [View],
+}
+
+/// Most views of one frame: the depth sort's key keeps 4 bits for the camera.
+pub const MAX_VIEWS: usize = 16;
+
+/// Where the pixels of one view go, row by row from the top; what is `None` is not computed.
+#[derive(Debug, Default)]
+pub struct Target<'a> {
+    /// `[height, width, 4]`: linear premultiplied red, green, blue on black, and opacity.
+    pub rgba: Option<&'a mut [f32]>,
+    /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
+    pub rgb8: Option<&'a mut [u8]>,
+    /// `[height, width]`: expected camera z in metres, 0 where opacity is 0.
+    pub depth_m: Option<&'a mut [f32]>,
+    /// `[height, width]`: accumulated opacity, the validity of the depth.
+    pub opacity: Option<&'a mut [f32]>,
+}
+
+/// Called once per view, as soon as its pixels are final, from a worker thread: the place to
+/// encode one image while others are still drawn.
+pub type Finished<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
+
+/// What a frame cost.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct FrameStats {
+    /// Wall time per stage, in milliseconds, in the order of the chain.
+    pub stages_ms: Vec<(&'static str, f64)>,
+    /// (Gaussian, view) pairs that survived culling.
+    pub visible_pairs: u64,
+    /// (Gaussian, tile) pairs after binning.
+    pub instances: u64,
+    /// Gaussian-pixel evaluations of the rasterizer, idle lanes included.
+    pub evaluations: u64,
+}
+
+/// Why a frame was not rendered. Nothing was written then.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RenderError {
+    /// No view, or more than the sort key can tell apart.
+    #[error("a frame has 1 to {MAX_VIEWS} views, not {count}")]
+    Views {
+        /// How many were given.
+        count: usize,
+    },
+    /// A target's buffer is not of its view's size.
+    #[error(
+        "view {view}: buffer {buffer} holds {given} values; the camera's size asks for {wanted}"
+    )]
+    TargetSize {
+        /// Which view.
+        view: usize,
+        /// Which buffer of [`Target`].
+        buffer: &'static str,
+        /// Its length.
+        given: usize,
+        /// The length that the camera asks for.
+        wanted: usize,
+    },
+    /// More (Gaussian, tile) pairs than a frame may hold.
+    #[error("the frame needs {needed} {what}; at most {limit} fit")]
+    TooMany {
+        /// What there is too much of.
+        what: &'static str,
+        /// How many.
+        needed: u64,
+        /// How many fit.
+        limit: u64,
+    },
+}
+
+/// Something that renders frames.
+pub trait Backend: Send + Sync {
+    /// The name, as `--backend` and observations spell it.
+    fn name(&self) -> &'static str;
+
+    /// Renders all views into their targets, `targets[i]` for `views[i]`.
+    ///
+    /// # Errors
+    /// See [`RenderError`]; the same frame fails or succeeds the same way every time.
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError>;
+}
+
+impl Frame<'_> {
+    /// # Errors
+    /// Names the first view whose target does not fit.
+    pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
+        let count = self.views.len();
+        if !(1..=MAX_VIEWS).contains(&count) || targets.len() != count {
+            return Err(RenderError::Views { count });
+        }
+        for (view, (target, View { camera, .. })) in targets.iter().zip(self.views).enumerate() {
+            let pixels = camera.pixels();
+            let lengths = [
+                ("rgba", target.rgba.as_ref().map(|b| b.len()), 4 * pixels),
+                ("rgb8", target.rgb8.as_ref().map(|b| b.len()), 3 * pixels),
+                ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
+                ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
+            ];
+            for (buffer, given, wanted) in lengths {
+                if let Some(given) = given.filter(|&given| given != wanted) {
+                    return Err(RenderError::TargetSize { view, buffer, given, wanted });
+                }
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,360 @@
+//! Chunks: the Gaussians of one 64 m cell, activated and laid out for the renderer.
+//!
+//! A chunk keeps 16 Gaussians side by side ("a block"), one column of 16 floats per parameter, so
+//! that a vector instruction treats 16 at once and a culled block costs three columns of reads.
+//! 256 Gaussians in Morton order form a cluster with a box, which is culled as one.
+
+use std::sync::Arc;
+
+use bytemuck::{Pod, Zeroable};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+use super::{Gaussians, sh};
+
+/// Edge of a cell, in metres.
+pub const CELL_M: f64 = 64.0;
+/// Gaussians in a block: one AVX-512 register of f32, two of AVX2, four of SSE.
+pub const LANES: usize = 16;
+/// Gaussians in a cluster, the unit of frustum culling.
+pub const CLUSTER: usize = 256;
+
+/// One parameter of the 16 Gaussians of a block.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C, align(64))]
+pub struct Lanes(pub [f32; LANES]);
+
+/// Columns of a block, in order. SH follows: coefficient-major, then red, green, blue.
+pub mod column {
+    /// Centre relative to the chunk's origin, in metres: x, y, z.
+    pub const MEAN: usize = 0;
+    /// Standard deviation along each own axis, in metres: three columns.
+    pub const SCALE: usize = 3;
+    /// Unit quaternion (w, x, y, z), world from own axes: four columns.
+    pub const QUAT: usize = 6;
+    /// Peak opacity, in [0, 1].
+    pub const OPACITY: usize = 10;
+    /// First colour coefficient.
+    pub const SH: usize = 11;
+}
+
+/// Floats of one Gaussian of an SH degree: 11 and three per coefficient (23, 92 B, at degree 1).
+pub const fn columns(sh_degree: u8) -> usize {
+    column::SH + 3 * sh::coefficients(sh_degree)
+}
+
+/// One raw Gaussian relative to its chunk's origin: what an F32 record holds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RawRecord<'a> {
+    /// Centre relative to the chunk's origin, in metres.
+    pub mean_m: [f32; 3],
+    /// Rotation (w, x, y, z), of any length but zero.
+    pub quat_wxyz: [f32; 4],
+    /// Natural logarithm of the standard deviations, of metres.
+    pub ln_scale: [f32; 3],
+    /// Opacity before the sigmoid.
+    pub logit_opacity: f32,
+    /// `[(sh_degree + 1)², 3]`.
+    pub sh: &'a [f32],
+}
+
+/// What bounds the Gaussians of a cluster.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cluster {
+    /// Smallest centre, relative to the chunk's origin, in metres.
+    pub min_m: Vec3,
+    /// Largest centre, relative to the chunk's origin, in metres.
+    pub max_m: Vec3,
+    /// Largest standard deviation along any axis, in metres.
+    pub sigma_m: f32,
+}
+
+/// The Gaussians of one cell, ready to be rendered.
+#[derive(Clone, Debug)]
+pub struct Chunk {
+    cell: [i32; 2],
+    origin_m: DVec3,
+    sh_degree: u8,
+    count: usize,
+    lanes: Vec<Lanes>,
+    clusters: Vec<Cluster>,
+}
+
+impl Chunk {
+    /// An empty chunk with room for `capacity` Gaussians, to be filled with [`Chunk::push`].
+    pub fn new(cell: [i32; 2], origin_m: DVec3, sh_degree: u8, capacity: usize) -> Self {
+        let lanes = Vec::with_capacity(capacity.div_ceil(LANES) * columns(sh_degree));
+        let clusters = Vec::with_capacity(capacity.div_ceil(CLUSTER));
+        Self { cell, origin_m, sh_degree, count: 0, lanes, clusters }
+    }
+
+    /// Activates one Gaussian and appends it.
+    ///
+    /// # Panics
+    /// If the record's colour is not of the chunk's degree.
+    pub fn push(&mut self, record: &RawRecord<'_>) {
+        let width = columns(self.sh_degree);
+        assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
+        let (slot, lane) = (self.count / LANES * width, self.count % LANES);
+        if lane == 0 {
+            // Lanes without a Gaussian are never drawn: their opacity is zero.
+            self.lanes.resize(slot + width, Lanes([0.0; LANES]));
+        }
+        let scale = record.ln_scale.map(|ln| f64::from(ln).exp() as f32);
+        let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
+        let block = &mut self.lanes[slot..slot + width];
+        let mut set = |first: usize, values: &[f32]| {
+            for (column, &value) in block[first..].iter_mut().zip(values) {
+                column.0[lane] = value;
+            }
+        };
+        set(column::MEAN, &record.mean_m);
+        set(column::SCALE, &scale);
+        set(column::QUAT, &record.quat_wxyz.map(|q| (f64::from(q) / length) as f32));
+        set(column::OPACITY, &[sigmoid(record.logit_opacity)]);
+        set(column::SH, record.sh);
+
+        let mean = Vec3::from_array(record.mean_m);
+        let sigma_m = scale[0].max(scale[1]).max(scale[2]);
+        if self.count.is_multiple_of(CLUSTER) {
+            self.clusters.push(Cluster { min_m: mean, max_m: mean, sigma_m });
+        } else if let Some(cluster) = self.clusters.last_mut() {
+            cluster.min_m = cluster.min_m.min(mean);
+            cluster.max_m = cluster.max_m.max(mean);
+            cluster.sigma_m = cluster.sigma_m.max(sigma_m);
+        }
+        self.count += 1;
+    }
+
+    /// Grid cell (x, y).
+    pub fn cell(&self) -> [i32; 2] {
+        self.cell
+    }
+
+    /// Where the chunk's zero lies in the world, in metres.
+    pub fn origin_m(&self) -> DVec3 {
+        self.origin_m
+    }
+
+    /// Spherical-harmonic degree of the colours.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// How many Gaussians.
+    pub fn len(&self) -> usize {
+        self.count
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// The clusters, in order; cluster `k` holds Gaussians `256 k` to `256 k + 255`.
+    pub fn clusters(&self) -> &[Cluster] {
+        &self.clusters
+    }
+
+    /// The columns of block `k`, which holds Gaussians `16 k` to `16 k + 15`.
+    pub fn block(&self, block: usize) -> &[Lanes] {
+        let width = columns(self.sh_degree);
+        &self.lanes[block * width..(block + 1) * width]
+    }
+
+    /// One parameter of one Gaussian, by its column.
+    pub fn value(&self, index: usize, column: usize) -> f32 {
+        self.block(index / LANES)[column].0[index % LANES]
+    }
+
+    /// Memory held, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()
+    }
+}
+
+/// `1 / (1 + exp(-x))`, for any x but NaN without overflow.
+fn sigmoid(logit: f32) -> f32 {
+    (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
+}
+
+/// Where each Gaussian of a file goes: its cell, and its place in Morton order within.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Partition {
+    /// Cells in order of (y, x).
+    pub cells: Vec<CellRun>,
+    /// Indices of the Gaussians, cell after cell.
+    pub order: Vec<u32>,
+}
+
+/// One cell of a [`Partition`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct CellRun {
+    /// Grid cell (x, y); its square is centred on (64 x, 64 y) m.
+    pub cell: [i32; 2],
+    /// The chunk's zero in the world, in metres: the cell's centre, at a height that is a multiple
+    /// of 64 m. Subtracting it from an f32 mean near the world's origin is exact.
+    pub origin_m: DVec3,
+    /// Its part of [`Partition::order`].
+    pub run: std::ops::Range<usize>,
+}
+
+impl Partition {
+    /// Sorts centres, in metres, into cells. Ties keep the order of the file.
+    pub fn new(means_m: &[[f64; 3]]) -> Self {
+        let mut keys: Vec<([i32; 2], u64, u32)> = means_m
+            .par_iter()
+            .enumerate()
+            .map(|(index, mean)| {
+                let cell = [cell_of(mean[1]), cell_of(mean[0])];
+                (cell, morton(mean), index as u32)
+            })
+            .collect();
+        keys.par_sort_unstable();
+        let mut cells = Vec::new();
+        let mut start = 0;
+        for run in keys.chunk_by(|a, b| a.0 == b.0) {
+            let [y, x] = run[0].0;
+            let heights = run.iter().map(|&(_, _, index)| means_m[index as usize][2]);
+            let (low, high) =
+                heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), z| (l.min(z), h.max(z)));
+            let level = (0.5 * (low + high) / CELL_M).round();
+            let origin_m = CELL_M * DVec3::new(f64::from(x), f64::from(y), level);
+            cells.push(CellRun { cell: [x, y], origin_m, run: start..start + run.len() });
+            start += run.len();
+        }
+        Self { cells, order: keys.into_iter().map(|(_, _, index)| index).collect() }
+    }
+}
+
+impl CellRun {
+    /// Reads one Gaussian relative to this cell's origin.
+    pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawRecord<'a> {
+        let mean = DVec3::from_array(gaussians.means_m[index]) - self.origin_m;
+        RawRecord {
+            mean_m: mean.as_vec3().to_array(),
+            quat_wxyz: gaussians.quats_wxyz[index],
+            ln_scale: gaussians.ln_scales[index],
+            logit_opacity: gaussians.logit_opacities[index],
+            sh: gaussians.sh_of(index),
+        }
+    }
+}
+
+/// The cell index along one axis; the gate keeps coordinates below 1e8 m, far inside i32.
+fn cell_of(coordinate_m: f64) -> i32 {
+    (coordinate_m / CELL_M).round() as i32
+}
+
+/// Interleaves the bits of a position at 1/1024 of a cell, modulo 128 km.
+fn morton(mean_m: &[f64; 3]) -> u64 {
+    mean_m.iter().enumerate().fold(0, |code, (axis, &m)| {
+        let steps = (m * (1024.0 / CELL_M)).floor() as i64 as u64 & 0x1F_FFFF;
+        code | spread(steps) << axis
+    })
+}
+
+/// Moves bit `i` of a 21-bit number to bit `3 i`.
+fn spread(x: u64) -> u64 {
+    let x = (x | x << 32) & 0x001F_0000_0000_FFFF;
+    let x = (x | x << 16) & 0x001F_0000_FF00_00FF;
+    let x = (x | x << 8) & 0x100F_00F0_0F00_F00F;
+    let x = (x | x << 4) & 0x10C3_0C30_C30C_30C3;
+    (x | x << 2) & 0x1249_2492_4924_9249
+}
+
+/// The chunks that a frame draws. Global ids count through them in order.
+#[derive(Clone, Debug, Default)]
+pub struct Scene {
+    /// Chunks of one SH degree, in order of (cell y, cell x).
+    pub chunks: Vec<Arc<Chunk>>,
+}
+
+impl Scene {
+    /// Activates a whole file in memory.
+    pub fn from_gaussians(gaussians: &Gaussians) -> Self {
+        let partition = Partition::new(&gaussians.means_m);
+        let chunk = |cell: &CellRun| {
+            let count = cell.run.len();
+            let mut chunk = Chunk::new(cell.cell, cell.origin_m, gaussians.sh_degree, count);
+            for &index in &partition.order[cell.run.clone()] {
+                chunk.push(&cell.record(gaussians, index as usize));
+            }
+            Arc::new(chunk)
+        };
+        Self { chunks: partition.cells.par_iter().map(chunk).collect() }
+    }
+
+    /// Gaussians in all chunks.
+    pub fn gaussians(&self) -> usize {
+        self.chunks.iter().map(|chunk| chunk.len()).sum()
+    }
+
+    /// Spherical-harmonic degree; 0 for an empty scene.
+    pub fn sh_degree(&self) -> u8 {
+        self.chunks.first().map_or(0, |chunk| chunk.sh_degree())
+    }
+
+    /// Memory held by the chunks, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.chunks.iter().map(|chunk| chunk.bytes()).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn three() -> Gaussians {
+        Gaussians {
+            sh_degree: 0,
+            means_m: vec![[40.0, 0.0, 100.0], [0.25, -1.0, 130.0], [0.5, 40.0, 4.5]],
+            quats_wxyz: vec![[2.0, 0.0, 0.0, 0.0]; 3],
+            ln_scales: vec![[0.0, -1.0, 1.0]; 3],
+            logit_opacities: vec![0.0, 100.0, -100.0],
+            sh: vec![0.5; 9],
+        }
+    }
+
+    #[test]
+    fn gaussians_go_to_the_cell_around_them() {
+        let scene = Scene::from_gaussians(&three());
+        let cells: Vec<_> = scene.chunks.iter().map(|chunk| chunk.cell()).collect();
+        assert_eq!(cells, [[0, 0], [1, 0], [0, 1]]);
+        let first = &scene.chunks[0];
+        assert_eq!(first.origin_m(), DVec3::new(0.0, 0.0, 128.0));
+        assert_eq!([0, 1, 2].map(|c| first.value(0, c)), [0.25, -1.0, 2.0]);
+        assert_eq!(scene.gaussians(), 3);
+    }
+
+    #[test]
+    fn activation_is_exp_sigmoid_and_normalise() {
+        let scene = Scene::from_gaussians(&three());
+        let value = |chunk: usize, column| scene.chunks[chunk].value(0, column);
+        assert_eq!(value(0, column::SCALE + 2), std::f32::consts::E);
+        assert_eq!(value(0, column::QUAT), 1.0);
+        assert_eq!(
+            [value(1, column::OPACITY), value(0, column::OPACITY)],
+            [0.5, 1.0],
+            "sigmoid of 0 and of 100"
+        );
+        assert!(value(2, column::OPACITY) < 1e-43, "sigmoid of -100");
+        assert_eq!(scene.chunks[0].block(0)[column::OPACITY].0[1..], [0.0; LANES - 1]);
+    }
+
+    #[test]
+    fn neighbours_in_morton_order_are_near_each_other() {
+        let means: Vec<_> = (0..4096)
+            .map(|i: i32| [i % 16, i / 16 % 16, i / 256].map(|x| 2.0 * f64::from(x) - 15.0))
+            .collect();
+        let order = Partition::new(&means).order;
+        // 256 consecutive points of a 16 x 16 x 16 grid fill a box of 8 x 8 x 4 points.
+        for cluster in order.chunks(CLUSTER) {
+            let mut bounds = crate::geometry::Bounds::EMPTY;
+            for &i in cluster {
+                bounds.add(DVec3::from_array(means[i as usize]), DVec3::ZERO);
+            }
+            assert!(bounds.size_m().max_element() <= 16.0, "{bounds:?}");
+        }
+    }
+}

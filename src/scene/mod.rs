@@ -1,0 +1,16 @@
+//! What a city twin is made of: Gaussians in chunks, a rig, recorded trajectories, a manifest.
+
+pub mod chunk;
+pub mod gaussian;
+pub mod manifest;
+pub mod profile;
+pub mod rig;
+pub mod sh;
+pub mod trajectory;
+
+pub use chunk::{Chunk, Scene};
+pub use gaussian::Gaussians;
+pub use manifest::Manifest;
+pub use profile::RenderProfile;
+pub use rig::Rig;
+pub use trajectory::Trajectory;

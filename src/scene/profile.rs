@@ -1,0 +1,152 @@
+//! The render profile: how the twin's trainer rendered, which every backend must repeat.
+
+use serde::{Deserialize, Serialize};
+
+/// Constants of the image formation that differ between trainers (gsplat, INRIA, brush, ...).
+///
+/// The defaults are gsplat 1.6's "classic" mode. Sources per field: rendering semantics of gsplat
+/// and of Kerbl et al. 2023's reference code.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RenderProfile {
+    /// Nearest camera-space z of a centre that is drawn, in metres. INRIA: 0.2.
+    pub near: f64,
+    /// Farthest camera-space z of a centre that is drawn, in metres.
+    pub far: f64,
+    /// Variance added to both axes of the screen covariance, in px². Mip-splatting: 0.1.
+    pub blur: f64,
+    /// Whether opacity is scaled by `sqrt(max(0.005², det before blur / det after))`.
+    pub antialiased: bool,
+    /// Largest alpha of one Gaussian at one pixel. gsplat before 2026-02 and brush: 0.999.
+    pub alpha_cap: f64,
+    /// Smallest alpha that is blended; below it a Gaussian does not touch the pixel.
+    pub alpha_cut: f64,
+    /// A Gaussian that would bring the transmittance to this or below ends its pixel, unblended.
+    pub stop: f64,
+}
+
+impl Default for RenderProfile {
+    fn default() -> Self {
+        Self {
+            near: 0.01,
+            far: 1e10,
+            blur: 0.3,
+            antialiased: false,
+            alpha_cap: 0.99,
+            alpha_cut: 1.0 / 255.0,
+            stop: 1e-4,
+        }
+    }
+}
+
+/// Why a profile was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ProfileError {
+    /// A field is outside what the stages can compute with.
+    #[error("profile field {field} is {value}; {must}")]
+    Value {
+        /// The field.
+        field: &'static str,
+        /// The refused value.
+        value: f64,
+        /// What must hold instead.
+        must: &'static str,
+    },
+    /// `key=value` did not parse.
+    #[error("cannot read profile setting {setting:?}: {reason}; the keys are {}", RenderProfile::KEYS.join(", "))]
+    Setting {
+        /// The text given.
+        setting: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+impl RenderProfile {
+    /// Names of the fields, as `--profile` and manifests spell them.
+    pub const KEYS: [&'static str; 7] =
+        ["near", "far", "blur", "antialiased", "alpha_cap", "alpha_cut", "stop"];
+
+    /// # Errors
+    /// Names the first field out of range. The bounds keep every stage's f32 arithmetic finite.
+    pub fn check(&self) -> Result<(), ProfileError> {
+        let holds = [
+            ("near", self.near, (1e-4..=1e3).contains(&self.near), "near is from 1e-4 to 1e3 m"),
+            (
+                "far",
+                self.far,
+                self.far > self.near && self.far <= 1e12,
+                "far is beyond near, up to 1e12 m",
+            ),
+            ("blur", self.blur, (1e-3..=1e2).contains(&self.blur), "blur is from 1e-3 to 1e2 px²"),
+            (
+                "alpha_cap",
+                self.alpha_cap,
+                (0.5..=0.9999).contains(&self.alpha_cap),
+                "alpha_cap is from 0.5 to 0.9999",
+            ),
+            (
+                "alpha_cut",
+                self.alpha_cut,
+                (1e-5..=0.1).contains(&self.alpha_cut),
+                "alpha_cut is from 1e-5 to 0.1",
+            ),
+            ("stop", self.stop, (1e-8..=0.1).contains(&self.stop), "stop is from 1e-8 to 0.1"),
+        ];
+        match holds.into_iter().find(|(_, _, holds, _)| !holds) {
+            Some((field, value, _, must)) => Err(ProfileError::Value { field, value, must }),
+            None => Ok(()),
+        }
+    }
+
+    /// Applies one `key=value` of the command line.
+    ///
+    /// # Errors
+    /// The key is unknown, the value does not parse, or the result is out of range.
+    pub fn set(&mut self, setting: &str) -> Result<(), ProfileError> {
+        let bad = |reason: String| ProfileError::Setting { setting: setting.to_owned(), reason };
+        let (key, value) =
+            setting.split_once('=').ok_or_else(|| bad("expected key=value".into()))?;
+        let number = || value.parse::<f64>().map_err(|e| bad(e.to_string()));
+        match key {
+            "near" => self.near = number()?,
+            "far" => self.far = number()?,
+            "blur" => self.blur = number()?,
+            "antialiased" => {
+                self.antialiased =
+                    value.parse().map_err(|_| bad("expected true or false".into()))?;
+            }
+            "alpha_cap" => self.alpha_cap = number()?,
+            "alpha_cut" => self.alpha_cut = number()?,
+            "stop" => self.stop = number()?,
+            _ => return Err(bad(format!("there is no field {key:?}"))),
+        }
+        self.check()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_change_one_field_and_are_checked() {
+        let mut profile = RenderProfile::default();
+        profile.set("near=0.2").unwrap();
+        profile.set("antialiased=true").unwrap();
+        assert_eq!(profile, RenderProfile { near: 0.2, antialiased: true, ..Default::default() });
+        for bad in ["near", "near=x", "nearr=1", "alpha_cap=1", "blur=-1", "far=0.1", "near=NaN"] {
+            assert!(profile.clone().set(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn the_keys_are_the_fields() {
+        let json = serde_json::to_value(RenderProfile::default()).unwrap();
+        let mut fields: Vec<_> = json.as_object().unwrap().keys().map(String::as_str).collect();
+        let mut keys = RenderProfile::KEYS.to_vec();
+        fields.sort_unstable();
+        keys.sort_unstable();
+        assert_eq!(fields, keys);
+    }
+}

@@ -1,0 +1,136 @@
+//! Rigs: the cameras of a vehicle.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::{Camera, CameraError, Pose};
+
+/// A camera on the vehicle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RigCamera {
+    /// Name within the rig, `[a-z0-9._-]+`.
+    pub name: String,
+    /// Size and intrinsics.
+    pub camera: Camera,
+    /// Where the camera stands on the rig (`camera_to_rig` on the wire).
+    pub rig_from_camera: Pose,
+}
+
+/// The cameras of one vehicle, in the order in which images are answered.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rig {
+    /// Name, `[a-z0-9._-]+`.
+    pub name: String,
+    /// At least one camera.
+    pub cameras: Vec<RigCamera>,
+}
+
+/// Why a rig was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RigError {
+    /// No cameras, or more than a step can render.
+    #[error("rig {rig:?} has {count} cameras; 1 to {limit} are accepted")]
+    Count {
+        /// The rig.
+        rig: String,
+        /// How many it has.
+        count: usize,
+        /// How many are accepted.
+        limit: usize,
+    },
+    /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
+    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are")]
+    Name {
+        /// The refused name.
+        name: String,
+    },
+    /// Two cameras share a name.
+    #[error("camera {name:?} occurs twice")]
+    Duplicate {
+        /// The name.
+        name: String,
+    },
+    /// A camera cannot be used.
+    #[error("camera {name:?}: {source}")]
+    Camera {
+        /// The camera.
+        name: String,
+        /// What is wrong with it.
+        source: CameraError,
+    },
+}
+
+impl Rig {
+    /// Most cameras of a rig: the depth sort's key keeps 4 bits for the camera.
+    pub const MAX_CAMERAS: usize = 16;
+
+    /// # Errors
+    /// Names the first camera that cannot be used.
+    pub fn check(&self) -> Result<(), RigError> {
+        let count = self.cameras.len();
+        if !(1..=Self::MAX_CAMERAS).contains(&count) {
+            let rig = self.name.clone();
+            return Err(RigError::Count { rig, count, limit: Self::MAX_CAMERAS });
+        }
+        let mut names = BTreeSet::new();
+        for RigCamera { name, camera, .. } in &self.cameras {
+            if !is_name(name) {
+                return Err(RigError::Name { name: name.clone() });
+            }
+            if !names.insert(name) {
+                return Err(RigError::Duplicate { name: name.clone() });
+            }
+            Camera::checked(camera.width_px.into(), camera.height_px.into(), camera.pinhole)
+                .map_err(|source| RigError::Camera { name: name.clone(), source })?;
+        }
+        Ok(())
+    }
+}
+
+/// Whether a text may name a twin, a rig, a camera, a trajectory or a session.
+///
+/// 1 to 64 of `a-z 0-9 . _ -`, not starting with a dot: safe as a file name, never a path.
+pub fn is_name(text: &str) -> bool {
+    let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"._-".contains(&b);
+    (1..=64).contains(&text.len()) && !text.starts_with('.') && text.bytes().all(allowed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Pinhole;
+
+    fn camera(name: &str) -> RigCamera {
+        let pinhole = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 40.0 };
+        RigCamera {
+            name: name.into(),
+            camera: Camera { width_px: 100, height_px: 80, pinhole },
+            rig_from_camera: Pose::IDENTITY,
+        }
+    }
+
+    #[test]
+    fn a_rig_is_checked() {
+        let rig = |cameras| Rig { name: "test".into(), cameras };
+        assert_eq!(rig(vec![camera("front"), camera("rear")]).check(), Ok(()));
+        assert!(matches!(rig(vec![]).check(), Err(RigError::Count { count: 0, .. })));
+        let twice = rig(vec![camera("front"), camera("front")]);
+        assert!(matches!(twice.check(), Err(RigError::Duplicate { .. })));
+        let mut flat = camera("front");
+        flat.camera.height_px = 0;
+        assert!(matches!(rig(vec![flat]).check(), Err(RigError::Camera { .. })));
+    }
+
+    #[test]
+    fn names_are_never_paths() {
+        for name in ["front", "a.b-c_9", &"x".repeat(64)] {
+            assert!(is_name(name), "{name}");
+        }
+        for name in ["", ".", "..", ".a", "a/b", "A", "a b", "é", &"x".repeat(65)] {
+            assert!(!is_name(name), "{name}");
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! Recorded trajectories: the log's poses at their times.
+
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::Pose;
+
+/// One recorded pose of the rig.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Keyframe {
+    /// Time since the trajectory's start, in microseconds.
+    pub time_us: i64,
+    /// Where the rig was.
+    pub world_from_rig: Pose,
+}
+
+/// A recorded drive: keyframes in order of time.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Trajectory {
+    /// Name within the twin, `[a-z0-9._-]+`.
+    pub name: String,
+    /// Poses in strictly increasing time; at least one.
+    pub keyframes: Vec<Keyframe>,
+}
+
+/// Why a trajectory was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum TrajectoryError {
+    /// There is nothing to drive along.
+    #[error("trajectory {name:?} has no keyframes")]
+    Empty {
+        /// The trajectory.
+        name: String,
+    },
+    /// Times must increase strictly.
+    #[error("keyframes[{index}].time_us is {time_us}, not after the one before it ({before_us})")]
+    Time {
+        /// Which keyframe.
+        index: usize,
+        /// Its time, in microseconds.
+        time_us: i64,
+        /// The time before it, in microseconds.
+        before_us: i64,
+    },
+}
+
+impl Trajectory {
+    /// # Errors
+    /// Names the first keyframe that breaks the order of time.
+    pub fn check(&self) -> Result<(), TrajectoryError> {
+        if self.keyframes.is_empty() {
+            return Err(TrajectoryError::Empty { name: self.name.clone() });
+        }
+        for (before, pair) in self.keyframes.windows(2).enumerate() {
+            if pair[1].time_us <= pair[0].time_us {
+                return Err(TrajectoryError::Time {
+                    index: before + 1,
+                    time_us: pair[1].time_us,
+                    before_us: pair[0].time_us,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Length along the keyframes, in metres.
+    pub fn length_m(&self) -> f64 {
+        self.keyframes.windows(2).map(|pair| segment_m(&pair[0], &pair[1])).sum()
+    }
+
+    /// The pose at a distance along the route, clamped to its ends, in metres from the start.
+    pub fn at_station(&self, station_m: f64) -> Pose {
+        let mut start_m = 0.0;
+        for pair in self.keyframes.windows(2) {
+            let length_m = segment_m(&pair[0], &pair[1]);
+            if length_m > 0.0 && station_m <= start_m + length_m {
+                let t = ((station_m - start_m) / length_m).max(0.0);
+                return pair[0].world_from_rig.interpolate(&pair[1].world_from_rig, t);
+            }
+            start_m += length_m;
+        }
+        self.keyframes[self.keyframes.len() - 1].world_from_rig
+    }
+}
+
+fn segment_m(from: &Keyframe, to: &Keyframe) -> f64 {
+    from.world_from_rig.position_m.distance(to.world_from_rig.position_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+
+    fn straight() -> Trajectory {
+        let keyframe = |i: i64| Keyframe {
+            time_us: 100_000 * i,
+            world_from_rig: Pose {
+                position_m: DVec3::new(0.5 * i as f64, 0.0, 0.0),
+                rotation: DQuat::IDENTITY,
+            },
+        };
+        Trajectory { name: "log".into(), keyframes: (0..5).map(keyframe).collect() }
+    }
+
+    #[test]
+    fn stations_interpolate_and_clamp() {
+        let log = straight();
+        assert_eq!(log.length_m(), 2.0);
+        assert_eq!(log.at_station(0.75).position_m, DVec3::new(0.75, 0.0, 0.0));
+        assert_eq!(log.at_station(-3.0).position_m, DVec3::ZERO);
+        assert_eq!(log.at_station(9.0).position_m, DVec3::new(2.0, 0.0, 0.0));
+    }
+
+    #[test]
+    fn time_must_increase() {
+        let mut log = straight();
+        assert_eq!(log.check(), Ok(()));
+        log.keyframes[3].time_us = 200_000;
+        assert!(matches!(log.check(), Err(TrajectoryError::Time { index: 3, .. })));
+        log.keyframes.clear();
+        assert!(matches!(log.check(), Err(TrajectoryError::Empty { .. })));
+    }
+}
