@@ -38,7 +38,7 @@ pub struct Observation {
     pub profile_hash: String,
     /// Name of the backend.
     pub backend: String,
-    /// BLAKE3 of all images' raw pixel bytes (u8 red, green, blue, before encoding) in order.
+    /// BLAKE3 of the images' hashes (32 bytes each, in order), in hex.
     pub frame_hash: String,
     /// The ego at this time.
     pub ego: Ego,
@@ -91,7 +91,7 @@ pub struct Image {
     pub shutter_start_us: i64,
     /// End of the exposure, in simulated microseconds: the image's time.
     pub shutter_end_us: i64,
-    /// BLAKE3 of the image's raw pixel bytes, before encoding, in hex.
+    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
     pub hash: String,
 }
 
