@@ -4,6 +4,8 @@
 //! Harmonics Tricks" (2008), with the Condon-Shortley phase. The constants are written out in f64
 //! so that every backend rounds the same number.
 
+use glam::DVec3;
+
 /// Largest supported degree.
 pub const MAX_DEGREE: u8 = 3;
 
@@ -34,4 +36,28 @@ pub const C3: [f64; 7] = [
 /// Coefficients per colour channel of a degree: `(degree + 1)²`.
 pub const fn coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
+}
+
+/// The 16 basis functions up to degree 3 at a unit direction, in coefficient order.
+pub fn basis(direction: DVec3) -> [f64; 16] {
+    let DVec3 { x, y, z } = direction;
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        C0,
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        C2[1] * y * z,
+        C2[2] * (2.0 * zz - xx - yy),
+        C2[3] * x * z,
+        C2[4] * (xx - yy),
+        C3[0] * y * (3.0 * xx - yy),
+        C3[1] * x * y * z,
+        C3[2] * y * (4.0 * zz - xx - yy),
+        C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        C3[4] * x * (4.0 * zz - xx - yy),
+        C3[5] * z * (xx - yy),
+        C3[6] * x * (xx - 3.0 * yy),
+    ]
 }
