@@ -24,8 +24,6 @@ pub struct EngineSettings {
     pub episodes: PathBuf,
     /// What renders.
     pub backend: Arc<dyn Backend>,
-    /// Threads that render; one per core if absent.
-    pub threads: Option<usize>,
     /// How long one step may take, waiting included.
     pub step_timeout: Duration,
 }
@@ -62,27 +60,22 @@ pub(super) struct Hold {
 }
 
 impl Engine {
-    /// Starts the render threads. They end when the engine is dropped.
+    /// Starts the render thread. It ends when the engine is dropped.
     ///
     /// # Errors
-    /// Threads cannot be started.
+    /// The thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { catalog, episodes, backend, threads, step_timeout } = settings;
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.unwrap_or(0))
-            .thread_name(|index| format!("render-{index}"))
-            .build()
-            .map_err(|error| SessionError::Threads { reason: error.to_string() })?;
+        let EngineSettings { catalog, episodes, backend, step_timeout } = settings;
         let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
         std::thread::Builder::new()
             .name("render".to_owned())
             .spawn(move || {
                 let mut scratch = Scratch::new();
                 while let Some(job) = queue.blocking_recv() {
-                    pool.install(|| job(&mut scratch));
+                    job(&mut scratch);
                 }
             })
-            .map_err(|error| SessionError::Threads { reason: error.to_string() })?;
+            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         let cache = Cache::new(catalog.clone());
         let answers = Answers::default();
         Ok(Arc::new(Self { catalog, cache, episodes, backend, step_timeout, jobs, answers }))
@@ -124,7 +117,7 @@ impl Engine {
         Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
 
-    /// Does some work on the render threads when its turn comes, and tells how long it waited.
+    /// Does some work on the render thread when its turn comes, and tells how long it waited.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if too much is queued, [`SessionError::DeadlineExceeded`] if the

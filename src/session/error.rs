@@ -94,9 +94,9 @@ pub enum SessionError {
     /// A defect of the program.
     #[error("the renderer crashed; the server's log says where")]
     Crashed,
-    /// A thread could not be started.
+    /// The render thread could not be started.
     #[error("cannot start the render thread: {reason}")]
-    Threads {
+    Thread {
         /// What the operating system says.
         reason: String,
     },
