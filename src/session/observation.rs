@@ -257,14 +257,7 @@ impl Assembly {
         scratch: &mut Scratch,
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
-        let views: Vec<View> = layout
-            .cameras
-            .iter()
-            .map(|RigCamera { camera, rig_from_camera, .. }| View {
-                camera: *camera,
-                world_from_camera: world_from_rig * *rig_from_camera,
-            })
-            .collect();
+        let views = views(&layout.cameras, world_from_rig);
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
         let mut targets = self.targets(scratch);
@@ -377,6 +370,15 @@ impl Assembly {
     }
 }
 
+/// The cameras of a rig that stands somewhere.
+pub(super) fn views(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
+    let view = |camera: &RigCamera| View {
+        camera: camera.camera,
+        world_from_camera: world_from_rig * camera.rig_from_camera,
+    };
+    cameras.iter().map(view).collect()
+}
+
 /// The hash of a frame: of its images' hashes, in order.
 pub(super) fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
     let mut hasher = blake3::Hasher::new();
@@ -425,7 +427,8 @@ struct Tensors {
 impl Tensors {
     fn push(&mut self, kind: TensorKind, dtype: DType, shape: Vec<usize>) {
         let bytes = shape.iter().product::<usize>() * dtype.bytes();
-        let start = mem::replace(&mut self.end, self.end + bytes);
+        let start = self.end;
+        self.end += bytes;
         self.list.push(Tensor { kind, dtype, shape, bytes: start..self.end });
     }
 }
