@@ -36,15 +36,10 @@ pub(super) fn rasterize(
             let grid = Grid::new(view);
             let mut bands = resolve::bands(target, view);
             bands.par_iter_mut().enumerate().with_max_len(1).for_each(|(row, band)| {
-                let mut lists = Lists::default();
-                let count = (0..grid.columns as usize).map(|column| {
-                    let tile = bins.tile(index, row * grid.columns as usize + column);
-                    let at = [column as u32 * TILE_PX, row as u32 * TILE_PX];
-                    dispatch!(level, simd => {
-                        rasterize_tile(simd, bins, tile, at, cutoffs, &mut lists, band)
-                    })
+                let count = dispatch!(level, simd => {
+                    rasterize_band(simd, bins, index, row, grid.columns, cutoffs, band)
                 });
-                evaluations.fetch_add(count.sum(), Relaxed);
+                evaluations.fetch_add(count, Relaxed);
             });
             drop(bands);
             finished(index, target);
@@ -72,6 +67,7 @@ struct Matched {
 
 /// A batch, and which of it touches each block.
 struct Lists {
+    splats: [Splat; BATCH],
     batch: [Matched; BATCH],
     touching: [[u8; BATCH]; BLOCKS],
     counts: [usize; BLOCKS],
@@ -80,11 +76,32 @@ struct Lists {
 impl Default for Lists {
     fn default() -> Self {
         Self {
+            splats: [Splat::default(); BATCH],
             batch: [Matched::default(); BATCH],
             touching: [[0; BATCH]; BLOCKS],
             counts: [0; BLOCKS],
         }
     }
+}
+
+#[inline(always)]
+fn rasterize_band<S: Simd>(
+    simd: S,
+    bins: &Bins,
+    view: usize,
+    row: usize,
+    columns: u32,
+    cutoffs: &Cutoffs,
+    band: &mut Band<'_>,
+) -> u64 {
+    let mut lists = Lists::default();
+    let mut evaluations = 0;
+    for column in 0..columns {
+        let tile = bins.tile(view, row * columns as usize + column as usize);
+        let at = [column * TILE_PX, row as u32 * TILE_PX];
+        evaluations += rasterize_tile(simd, bins, tile, at, cutoffs, &mut lists, band);
+    }
+    evaluations
 }
 
 #[inline(always)]
@@ -143,10 +160,14 @@ fn match_batch<S: Simd>(
     let block_y = (lane_y + splat(half_px)) * splat(BLOCK_PX as f32);
     let [tile_x, tile_y] = at_px.map(|px| px as f32 + 0.5 + half_px);
 
+    // All reads first: side by side, the cache misses of a batch cost little more than one.
+    for (splat, index) in lists.splats.iter_mut().zip(batch) {
+        *splat = *bins.splat(index);
+    }
     lists.counts = [0; BLOCKS];
-    for (k, index) in batch.iter().enumerate() {
+    for k in 0..batch.len().min(BATCH) {
         let Splat { mean_px, factor: [l0, l1, l2], log2_opacity, rgb, depth_m, extent_px } =
-            bins.splat(index);
+            &lists.splats[k];
         let dx = block_x - splat(mean_px[0] - tile_x);
         let dy = block_y - splat(mean_px[1] - tile_y);
         let u = dx.mul_add(splat(*l0), dy * splat(*l1));
@@ -168,8 +189,9 @@ fn match_batch<S: Simd>(
         while blocks != 0 {
             let block = blocks.trailing_zeros() as usize;
             blocks &= blocks - 1;
-            lists.touching[block][lists.counts[block]] = k as u8;
-            lists.counts[block] += 1;
+            let count = &mut lists.counts[block];
+            lists.touching[block][*count % BATCH] = k as u8;
+            *count += 1;
         }
     }
 }
@@ -194,7 +216,8 @@ fn blend<S: Simd, const DEPTH: bool>(
         (splat(cutoffs.alpha_cap), splat(cutoffs.log2_alpha_cut), splat(cutoffs.stop));
     // Far below any stop, and far above what slows a multiplication down.
     let floor = splat(1e-20);
-    let mut rgb = [0, 1, 2].map(|channel| load(&sums.rgb[channel][block]));
+    let [mut r, mut g, mut b] =
+        [load(&sums.rgb[0][block]), load(&sums.rgb[1][block]), load(&sums.rgb[2][block])];
     let mut depth = load(&sums.depth_m[block]);
     let mut transmittance = load(&sums.transmittance[block]);
     let mut running = load(&sums.running[block]);
@@ -212,9 +235,9 @@ fn blend<S: Simd, const DEPTH: bool>(
         let counts = after.simd_gt(stop);
         let weight = counts.select(alpha * running, splat(0.0));
         running = after.max(floor);
-        for (sum, &color) in rgb.iter_mut().zip(&matched.rgb) {
-            *sum = weight.mul_add(splat(color), *sum);
-        }
+        r = weight.mul_add(splat(matched.rgb[0]), r);
+        g = weight.mul_add(splat(matched.rgb[1]), g);
+        b = weight.mul_add(splat(matched.rgb[2]), b);
         if DEPTH {
             depth = weight.mul_add(splat(matched.depth_m), depth);
         }
@@ -224,9 +247,9 @@ fn blend<S: Simd, const DEPTH: bool>(
             break;
         }
     }
-    for (channel, sum) in rgb.into_iter().enumerate() {
-        sum.store_array(&mut sums.rgb[channel][block]);
-    }
+    r.store_array(&mut sums.rgb[0][block]);
+    g.store_array(&mut sums.rgb[1][block]);
+    b.store_array(&mut sums.rgb[2][block]);
     depth.store_array(&mut sums.depth_m[block]);
     transmittance.store_array(&mut sums.transmittance[block]);
     running.store_array(&mut sums.running[block]);
