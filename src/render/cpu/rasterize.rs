@@ -6,7 +6,7 @@
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*, u16x32};
 use rayon::prelude::*;
 
 use super::bin::{Bins, Grid};
@@ -69,8 +69,10 @@ struct Matched {
 struct Lists {
     splats: [Splat; BATCH],
     batch: [Matched; BATCH],
-    touching: [[u8; BATCH]; BLOCKS],
-    counts: [usize; BLOCKS],
+    /// Per splat, a bit for each block that it touches.
+    blocks: [u16; BATCH],
+    /// Per block, a bit for each splat that touches it.
+    touching: [u64; BLOCKS],
 }
 
 impl Default for Lists {
@@ -78,8 +80,8 @@ impl Default for Lists {
         Self {
             splats: [Splat::default(); BATCH],
             batch: [Matched::default(); BATCH],
-            touching: [[0; BATCH]; BLOCKS],
-            counts: [0; BLOCKS],
+            blocks: [0; BATCH],
+            touching: [0; BLOCKS],
         }
     }
 }
@@ -118,9 +120,12 @@ fn rasterize_tile<S: Simd>(
     let mut live = u16::MAX;
     let mut evaluations = 0;
     for batch in tile.chunks(BATCH) {
-        match_batch(simd, bins, batch, at_px, cutoffs, live, lists);
+        match_batch(simd, bins, batch, at_px, cutoffs, lists);
         for block in 0..BLOCKS {
-            let touching = &lists.touching[block][..lists.counts[block]];
+            let touching = lists.touching[block];
+            if touching == 0 || live >> block & 1 == 0 {
+                continue;
+            }
             let (done, count) = if band.wants_depth() {
                 blend::<S, true>(simd, &lists.batch, touching, block, cutoffs, &mut sums)
             } else {
@@ -137,7 +142,7 @@ fn rasterize_tile<S: Simd>(
     evaluations
 }
 
-/// Fills the batch and the lists of the blocks that are still live.
+/// Fills the batch, and finds which of it touches each block.
 ///
 /// A splat's ellipse lies within `|dx| <= extent_x`, `|dy| <= extent_y` and `|u| <= √power`: three
 /// slabs, tight for needles at any angle. Each is widened by half a block.
@@ -148,7 +153,6 @@ fn match_batch<S: Simd>(
     batch: &[AtomicU32],
     at_px: [u32; 2],
     cutoffs: &Cutoffs,
-    live: u16,
     lists: &mut Lists,
 ) {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -164,7 +168,6 @@ fn match_batch<S: Simd>(
     for (splat, index) in lists.splats.iter_mut().zip(batch) {
         *splat = *bins.splat(index);
     }
-    lists.counts = [0; BLOCKS];
     for k in 0..batch.len().min(BATCH) {
         let Splat { mean_px, factor: [l0, l1, l2], log2_opacity, rgb, depth_m, extent_px } =
             &lists.splats[k];
@@ -185,14 +188,17 @@ fn match_batch<S: Simd>(
         (lane_y * splat(*l2)).store_array(&mut matched.lane_v);
         (matched.log2_opacity, matched.rgb, matched.depth_m) = (*log2_opacity, *rgb, *depth_m);
 
-        let mut blocks = touches.to_bitmask() as u16 & live;
-        while blocks != 0 {
-            let block = blocks.trailing_zeros() as usize;
-            blocks &= blocks - 1;
-            let count = &mut lists.counts[block];
-            lists.touching[block][*count % BATCH] = k as u8;
-            *count += 1;
-        }
+        lists.blocks[k] = touches.to_bitmask() as u16;
+    }
+
+    // Transpose: bit k of `touching[block]` is bit `block` of `blocks[k]`.
+    lists.blocks[batch.len().min(BATCH)..].fill(0);
+    let (low, high) = lists.blocks.split_at(BATCH / 2);
+    let (low, high) = (u16x32::from_slice(simd, low), u16x32::from_slice(simd, high));
+    for (block, touching) in lists.touching.iter_mut().enumerate() {
+        let bit = u16x32::splat(simd, 1 << block);
+        let [low, high] = [(low & bit).simd_eq(bit), (high & bit).simd_eq(bit)];
+        *touching = low.to_bitmask() | high.to_bitmask() << (BATCH / 2);
     }
 }
 
@@ -205,7 +211,7 @@ fn match_batch<S: Simd>(
 fn blend<S: Simd, const DEPTH: bool>(
     simd: S,
     batch: &[Matched; BATCH],
-    touching: &[u8],
+    mut touching: u64,
     block: usize,
     cutoffs: &Cutoffs,
     sums: &mut TileSums,
@@ -223,9 +229,10 @@ fn blend<S: Simd, const DEPTH: bool>(
     let mut running = load(&sums.running[block]);
     let mut count = 0;
     let mut done = false;
-    for &k in touching {
+    while touching != 0 {
         count += 1;
-        let matched = &batch[k as usize % BATCH];
+        let matched = &batch[touching.trailing_zeros() as usize % BATCH];
+        touching &= touching - 1;
         let u = load(&matched.lane_u) + splat(matched.u[block]);
         let v = load(&matched.lane_v) + splat(matched.v[block]);
         let exponent = (-v).mul_add(v, (-u).mul_add(u, splat(matched.log2_opacity)));
