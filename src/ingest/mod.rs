@@ -116,6 +116,25 @@ pub fn read(path: &Path, progress: Progress<'_>) -> Result<Gaussians, IngestErro
     }
 }
 
+/// BLAKE3 of a file, 64 lower-case hex digits: which source a twin was made of.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn digest(path: &Path, progress: Progress<'_>) -> Result<String, IngestError> {
+    let mut file = File::open(path)?;
+    let file_bytes = file.metadata()?.len();
+    let mut hasher = blake3::Hasher::new();
+    let mut buffer = vec![0; BUFFER_BYTES];
+    loop {
+        let read = file.read(&mut buffer)?;
+        if read == 0 {
+            return Ok(hasher.finalize().to_hex().to_string());
+        }
+        hasher.update(&buffer[..read]);
+        progress(hasher.count(), file_bytes);
+    }
+}
+
 /// Bytes read at once.
 const BUFFER_BYTES: usize = 256 << 10;
 

@@ -69,7 +69,7 @@ fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u6
     let metadata: Metadata =
         serde_json::from_slice(&header).map_err(|e| bad("JSON", e.to_string()))?;
     let promised = metadata.data_len() as u128;
-    let held = u128::from(file_bytes) - u128::from(8 + length);
+    let held = u128::from(file_bytes.saturating_sub(8 + length));
     if promised != held {
         let content = format!("{} tensors", metadata.offset_keys().len());
         return Err(IngestError::Size { format: "safetensors", promised, held, content });
@@ -127,7 +127,8 @@ impl<'a> Plan<'a> {
             }
             colours
         };
-        let coefficients = colours.iter().map(|c| c.shape[1]).sum::<usize>();
+        // Saturating: a shape with a zero may have any other length.
+        let coefficients = colours.iter().fold(0, |sum: usize, c| sum.saturating_add(c.shape[1]));
         let sh_degree = (0..=sh::MAX_DEGREE).find(|&d| sh::coefficients(d) == coefficients);
         let sh_degree = sh_degree.ok_or_else(|| {
             let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };

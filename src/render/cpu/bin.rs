@@ -6,6 +6,7 @@
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 use super::project::Projected;
@@ -16,6 +17,9 @@ use crate::render::{RenderError, View};
 
 /// Splats of a parallel block: enough to outweigh its histogram of a view's tiles.
 const BLOCK: usize = 1 << 14;
+
+/// Splats copied at a time.
+const GATHER: usize = 64;
 
 /// The splats of a frame by tile.
 #[derive(Debug, Default)]
@@ -66,6 +70,7 @@ impl Bins {
     /// More than [`MAX_INSTANCES`] pairs.
     pub(super) fn bin(
         &mut self,
+        level: Level,
         projected: &Projected,
         sorted: &Sorted,
         views: &[View],
@@ -92,10 +97,7 @@ impl Bins {
             |((_, grid, keys, splats), counts)| {
                 counts.clear();
                 counts.resize(grid.tiles(), 0);
-                for (splat, &key) in splats.iter_mut().zip(*keys) {
-                    *splat = *projected.splat(key);
-                    for_each_tile(splat, grid, log2_cut, |tile| counts[tile] += 1);
-                }
+                dispatch!(level, _ => count(projected, keys, splats, grid, log2_cut, counts));
             },
         );
 
@@ -139,12 +141,9 @@ impl Bins {
             })
             .collect();
         blocks.par_iter().zip(&mut self.cursors).for_each(|((grid, range), cursors)| {
-            for (splat, index) in self.splats[range.clone()].iter().zip(range.start as u32..) {
-                for_each_tile(splat, grid, log2_cut, |tile| {
-                    self.instances[cursors[tile] as usize].store(index, Relaxed);
-                    cursors[tile] += 1;
-                });
-            }
+            let splats = &self.splats[range.clone()];
+            let first = range.start as u32;
+            dispatch!(level, _ => emit(splats, first, grid, log2_cut, cursors, &self.instances));
         });
         Ok(())
     }
@@ -167,6 +166,57 @@ impl Bins {
     }
 }
 
+/// Puts a block's splats in order, and counts their instances per tile.
+#[inline(always)]
+fn count(
+    projected: &Projected,
+    keys: &[u64],
+    splats: &mut [Splat],
+    grid: &Grid,
+    log2_cut: f32,
+    counts: &mut [u32],
+) {
+    // Copy a few, then walk them: side by side, their cache misses cost little more than one.
+    for (splats, keys) in splats.chunks_mut(GATHER).zip(keys.chunks(GATHER)) {
+        for (splat, &key) in splats.iter_mut().zip(keys) {
+            *splat = *projected.splat(key);
+        }
+        for splat in splats {
+            for_each_tile(
+                splat,
+                grid,
+                log2_cut,
+                #[inline(always)]
+                |tile| counts[tile] += 1,
+            );
+        }
+    }
+}
+
+/// Writes a block's instances where its cursors say.
+#[inline(always)]
+fn emit(
+    splats: &[Splat],
+    first: u32,
+    grid: &Grid,
+    log2_cut: f32,
+    cursors: &mut [u32],
+    instances: &[AtomicU32],
+) {
+    for (splat, index) in splats.iter().zip(first..) {
+        for_each_tile(
+            splat,
+            grid,
+            log2_cut,
+            #[inline(always)]
+            |tile| {
+                instances[cursors[tile] as usize].store(index, Relaxed);
+                cursors[tile] += 1;
+            },
+        );
+    }
+}
+
 /// Calls `visit` for every tile that the ellipse `u² + v² <= power` touches, row by row.
 ///
 /// Within a band of rows the ellipse's right edge `x(dy) = s dy + √(power - (l2 dy)²)/l0`, with
@@ -177,11 +227,6 @@ impl Bins {
 fn for_each_tile(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMut(usize)) {
     let ([x, y], [extent_x, extent_y]) = (splat.mean_px, splat.extent_px);
     let last = grid.size_px.map(|size| size as i32 - 1);
-    // Pixel centres lie at +0.5. Float to int saturates, so the largest splat is no exception.
-    let pixels = |center: f32, low: f32, high: f32, last: i32| {
-        let first = ((center + low - 0.5).ceil() as i32).max(0);
-        (first, ((center + high - 0.5).floor() as i32).min(last))
-    };
     let (left, right) = pixels(x, -extent_x, extent_x, last[0]);
     let (top, bottom) = pixels(y, -extent_y, extent_y, last[1]);
     if left > right || top > bottom {
@@ -190,19 +235,22 @@ fn for_each_tile(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
     let tile = TILE_PX as i32;
     let (first_column, last_column) = (left / tile, right / tile);
     let (first_row, last_row) = (top / tile, bottom / tile);
-    let place = |row: i32, column: i32| row as usize * grid.columns as usize + column as usize;
+    let columns = grid.columns as usize;
     if first_column == last_column || first_row == last_row {
         for row in first_row..=last_row {
-            (first_column..=last_column).for_each(|column| visit(place(row, column)));
+            for column in first_column..=last_column {
+                visit(row as usize * columns + column as usize);
+            }
         }
         return;
     }
 
     let [l0, l1, l2] = splat.factor;
     let power = splat.log2_opacity - log2_cut;
-    let skew = -l1 / l0;
+    let inverse_l0 = 1.0 / l0;
+    let skew = -l1 * inverse_l0;
     let widest_dy = skew * power / (l2 * l2 * extent_x);
-    let half_width = |dy: f32| (power - (l2 * dy) * (l2 * dy)).max(0.0).sqrt() / l0;
+    let half_width = |dy: f32| (power - (l2 * dy) * (l2 * dy)).max(0.0).sqrt() * inverse_l0;
     for row in first_row..=last_row {
         let band_top = ((row * tile) as f32 + 0.5 - y).max(-extent_y);
         let band_bottom = ((row * tile + tile - 1) as f32 + 0.5 - y).min(extent_y);
@@ -212,7 +260,18 @@ fn for_each_tile(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
         let low = skew * left_dy - half_width(left_dy) - EXTENT_SLACK_PX;
         let (left, right) = pixels(x, low, high, last[0]);
         if left <= right {
-            (left / tile..=right / tile).for_each(|column| visit(place(row, column)));
+            for column in left / tile..=right / tile {
+                visit(row as usize * columns + column as usize);
+            }
         }
     }
+}
+
+/// First and last pixel with its centre, at +0.5, between `center + low` and `center + high`.
+///
+/// Float to int saturates, so the largest splat is no exception.
+#[inline(always)]
+fn pixels(center: f32, low: f32, high: f32, last: i32) -> (i32, i32) {
+    let first = ((center + low - 0.5).ceil() as i32).max(0);
+    (first, ((center + high - 0.5).floor() as i32).min(last))
 }

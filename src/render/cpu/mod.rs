@@ -4,6 +4,7 @@
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
 mod bin;
+mod lanes;
 mod project;
 mod rasterize;
 mod resolve;
@@ -107,7 +108,7 @@ impl Backend for Cpu {
             clock.stage("project");
             sorted.sort(projected);
             clock.stage("sort");
-            bins.bin(projected, sorted, frame.views, &cutoffs)?;
+            bins.bin(level, projected, sorted, frame.views, &cutoffs)?;
             clock.stage("bin");
             let evaluations =
                 rasterize::rasterize(level, bins, frame.views, targets, &cutoffs, finished);

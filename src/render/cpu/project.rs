@@ -3,8 +3,10 @@
 //! Work is cut into units of (view, 16 clusters of one chunk), whose results keep the order
 //! (view, global id) wherever they were computed.
 
-use fearless_simd::{Level, dispatch, f32x16, mask32x16, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
 use rayon::prelude::*;
+
+use super::lanes::Vec3x16;
 
 use crate::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
@@ -164,16 +166,17 @@ fn project_block<S: Simd>(
     view: &ChunkView,
     cutoffs: &Cutoffs,
 ) -> Option<SplatLanes> {
-    let load = |column: usize| f32x16::load_array_ref(simd, &columns[column].0);
     let splat = |value: f32| f32x16::splat(simd, value);
-    let mean = [load(column::MEAN), load(column::MEAN + 1), load(column::MEAN + 2)];
+    let mean = Vec3x16::load(simd, columns, column::MEAN);
 
     // Camera space: in range?
-    let [x, y, z] = [0, 1, 2].map(|i| {
-        let [rx, ry, rz] = view.rotation[i].map(splat);
-        rx.mul_add(mean[0], ry.mul_add(mean[1], rz.mul_add(mean[2], splat(view.translation_m[i]))))
-    });
-    let mut log2_opacity = load(column::LOG2_OPACITY);
+    let camera = |i: usize| {
+        let [rx, ry, rz] = view.rotation[i];
+        let z = splat(rz).mul_add(mean.z, splat(view.translation_m[i]));
+        splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
+    };
+    let (x, y, z) = (camera(0), camera(1), camera(2));
+    let mut log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let in_range = z.simd_ge(splat(cutoffs.near_m))
         & z.simd_le(splat(cutoffs.far_m))
         & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
@@ -181,34 +184,31 @@ fn project_block<S: Simd>(
         return None;
     }
 
-    // Rows of J W at the clamped slope.
+    // V = J W R S, with J at the clamped slope, and no wider than f32 can square twice.
     let inverse_z = splat(1.0) / z;
-    let slope = [x * inverse_z, y * inverse_z];
-    let mean_px =
-        [0, 1].map(|i| slope[i].mul_add(splat(view.focal_px[i]), splat(view.center_px[i])));
-    let jw = [0, 1].map(|i| {
-        let clamped = slope[i].max(splat(view.slope_min[i])).min(splat(view.slope_max[i]));
-        let scale = inverse_z * splat(view.focal_px[i]);
-        [0, 1, 2].map(|k| {
-            scale * (-clamped).mul_add(splat(view.rotation[2][k]), splat(view.rotation[i][k]))
-        })
-    });
-
-    // V = J W R S, no wider than f32 can square twice.
-    let rotation = rotation_matrix([0, 1, 2, 3].map(|i| load(column::QUAT + i)), splat(1.0));
-    let scale = [0, 1, 2].map(|i| load(column::SCALE + i));
-    let v = [0, 1].map(|i| {
-        [0, 1, 2].map(|k| scale[k] * dot(jw[i], [rotation[0][k], rotation[1][k], rotation[2][k]]))
-    });
-    let widest = v.iter().flatten().fold(splat(0.0), |widest, entry| widest.max(entry.abs()));
-    let shrink = (splat(MAX_SIGMA_PX) / widest.max(splat(1e-30))).min(splat(1.0));
-    let v = v.map(|row| row.map(|entry| entry * shrink));
+    let (slope_x, slope_y) = (x * inverse_z, y * inverse_z);
+    let mean_x = slope_x.mul_add(splat(view.focal_px[0]), splat(view.center_px[0]));
+    let mean_y = slope_y.mul_add(splat(view.focal_px[1]), splat(view.center_px[1]));
+    let own = rotation_columns(simd, columns);
+    let scale = Vec3x16::load(simd, columns, column::SCALE);
+    let row = |i: usize, slope: f32x16<S>| {
+        let clamped = slope.max(splat(view.slope_min[i])).min(splat(view.slope_max[i]));
+        let forward = Vec3x16::splat(simd, view.rotation[2]);
+        let jw = forward
+            .mul_add(-clamped, Vec3x16::splat(simd, view.rotation[i]))
+            .scale(inverse_z * splat(view.focal_px[i]));
+        Vec3x16 { x: jw.dot(own[0]), y: jw.dot(own[1]), z: jw.dot(own[2]) }.times(scale)
+    };
+    let (v0, v1) = (row(0, slope_x), row(1, slope_y));
+    let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
+    let shrink = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
+    let (v0, v1) = (v0.scale(shrink), v1.scale(shrink));
 
     // The covariance, its determinant, and the factor of its inverse.
     let blur = splat(cutoffs.blur_px2);
-    let minors = [(0, 1), (0, 2), (1, 2)].map(|(i, j)| v[0][i] * v[1][j] - v[0][j] * v[1][i]);
-    let (xx, yy, b) = (dot(v[0], v[0]), dot(v[1], v[1]), dot(v[0], v[1]));
-    let det_before = dot(minors, minors);
+    let (xx, yy, b) = (v0.dot(v0), v1.dot(v1), v0.dot(v1));
+    let minors = v0.cross(v1);
+    let det_before = minors.dot(minors);
     let det = blur.mul_add(xx + yy + blur, det_before);
     let (a, c) = (xx + blur, yy + blur);
     if cutoffs.antialiased {
@@ -228,81 +228,66 @@ fn project_block<S: Simd>(
     let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
     let reach = power.max(splat(0.0)).sqrt() / unit;
     let slack = splat(EXTENT_SLACK_PX);
-    let extent = [reach.mul_add(a.sqrt(), slack), reach.mul_add(root_c, slack)];
-    let on_image = |i: usize| {
-        (mean_px[i] + extent[i]).simd_ge(splat(0.5))
-            & (mean_px[i] - extent[i]).simd_le(splat(view.size_px[i] - 0.5))
+    let extent_x = reach.mul_add(a.sqrt(), slack);
+    let extent_y = reach.mul_add(root_c, slack);
+    let on_image = |mean: f32x16<S>, extent: f32x16<S>, size_px: f32| {
+        (mean + extent).simd_ge(splat(0.5)) & (mean - extent).simd_le(splat(size_px - 0.5))
     };
-    let visible = in_range & power.simd_ge(splat(0.0)) & on_image(0) & on_image(1);
+    let visible = in_range
+        & power.simd_ge(splat(0.0))
+        & on_image(mean_x, extent_x, view.size_px[0])
+        & on_image(mean_y, extent_y, view.size_px[1]);
     if visible.all_false() {
         return None;
     }
 
-    let toward = [0, 1, 2].map(|i| mean[i] - splat(view.camera_m[i]));
+    let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     let rgb = color(simd, columns, sh_degree, toward);
-    let columns = [
-        mean_px[0],
-        mean_px[1],
-        l0,
-        l1,
-        l2,
-        log2_opacity,
-        rgb[0],
-        rgb[1],
-        rgb[2],
-        z,
-        extent[0],
-        extent[1],
-    ];
-    Some(SplatLanes { visible: bits(visible), columns: columns.map(|column| column.to_array()) })
+    let mut lanes = SplatLanes { visible: visible.to_bitmask(), columns: [[0.0; LANES]; 12] };
+    mean_x.store_array(&mut lanes.columns[0]);
+    mean_y.store_array(&mut lanes.columns[1]);
+    l0.store_array(&mut lanes.columns[2]);
+    l1.store_array(&mut lanes.columns[3]);
+    l2.store_array(&mut lanes.columns[4]);
+    log2_opacity.store_array(&mut lanes.columns[5]);
+    rgb.x.store_array(&mut lanes.columns[6]);
+    rgb.y.store_array(&mut lanes.columns[7]);
+    rgb.z.store_array(&mut lanes.columns[8]);
+    z.store_array(&mut lanes.columns[9]);
+    extent_x.store_array(&mut lanes.columns[10]);
+    extent_y.store_array(&mut lanes.columns[11]);
+    Some(lanes)
 }
 
+/// Columns of the rotation matrices of a block's unit quaternions: the own axes in the world.
 #[inline(always)]
-fn bits<S: Simd>(mask: mask32x16<S>) -> u64 {
-    mask.to_bitmask()
-}
-
-#[inline(always)]
-fn dot<S: Simd>(a: [f32x16<S>; 3], b: [f32x16<S>; 3]) -> f32x16<S> {
-    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
-}
-
-/// Rows of the rotation matrix of unit quaternions (w, x, y, z).
-#[inline(always)]
-fn rotation_matrix<S: Simd>(q: [f32x16<S>; 4], one: f32x16<S>) -> [[f32x16<S>; 3]; 3] {
-    let [w, x, y, z] = q;
+fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+    let one = f32x16::splat(simd, 1.0);
+    let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
     let (x2, y2, z2) = (x + x, y + y, z + z);
     let (xx, yy, zz) = (x * x2, y * y2, z * z2);
     let (xy, xz, yz) = (x * y2, x * z2, y * z2);
     let (wx, wy, wz) = (w * x2, w * y2, w * z2);
     [
-        [one - yy - zz, xy - wz, xz + wy],
-        [xy + wz, one - xx - zz, yz - wx],
-        [xz - wy, yz + wx, one - xx - yy],
+        Vec3x16 { x: one - yy - zz, y: xy + wz, z: xz - wy },
+        Vec3x16 { x: xy - wz, y: one - xx - zz, z: yz + wx },
+        Vec3x16 { x: xz + wy, y: yz - wx, z: one - xx - yy },
     ]
 }
 
 /// `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
 #[inline(always)]
-fn color<S: Simd>(
-    simd: S,
-    columns: &[Lanes],
-    degree: u8,
-    toward: [f32x16<S>; 3],
-) -> [f32x16<S>; 3] {
+fn color<S: Simd>(simd: S, columns: &[Lanes], degree: u8, toward: Vec3x16<S>) -> Vec3x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let coefficient = |k: usize, channel: usize| {
-        f32x16::load_array_ref(simd, &columns[column::SH + 3 * k + channel].0)
-    };
-    let mut rgb = [0, 1, 2].map(|c| splat(sh::C0).mul_add(coefficient(0, c), splat(0.5)));
+    let half = Vec3x16 { x: splat(0.5), y: splat(0.5), z: splat(0.5) };
+    let mut rgb = Vec3x16::load(simd, columns, column::SH).mul_add(splat(sh::C0), half);
     let mut add = |k: usize, basis: f32x16<S>| {
-        for (c, channel) in rgb.iter_mut().enumerate() {
-            *channel = basis.mul_add(coefficient(k, c), *channel);
-        }
+        rgb = Vec3x16::load(simd, columns, column::SH + 3 * k).mul_add(basis, rgb);
     };
     if degree > 0 {
-        let inverse_length = splat(1.0) / dot(toward, toward).max(splat(1e-30)).sqrt();
-        let [x, y, z] = toward.map(|t| t * inverse_length);
+        let length = toward.dot(toward).max(splat(1e-30)).sqrt();
+        let Vec3x16 { x, y, z } = toward.scale(splat(1.0) / length);
         add(1, splat(-sh::C1) * y);
         add(2, splat(sh::C1) * z);
         add(3, splat(-sh::C1) * x);
@@ -326,7 +311,7 @@ fn color<S: Simd>(
             }
         }
     }
-    rgb.map(|channel| channel.max(splat(0.0)))
+    rgb.max(splat(0.0))
 }
 
 /// Base-2 logarithm of positive normal numbers, within 2e-7: the exponent, and the series of
@@ -334,7 +319,7 @@ fn color<S: Simd>(
 #[inline(always)]
 fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let bits: fearless_simd::i32x16<S> = x.bitcast();
+    let bits: i32x16<S> = x.bitcast();
     // The bits of √½, so that the exponent rounds at √2.
     let shifted = bits - 0x3F35_04F3_i32;
     let exponent = shifted >> 23;

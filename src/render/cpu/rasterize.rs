@@ -6,7 +6,7 @@
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*, u16x32};
 use rayon::prelude::*;
 
 use super::bin::{Bins, Grid};
@@ -36,15 +36,10 @@ pub(super) fn rasterize(
             let grid = Grid::new(view);
             let mut bands = resolve::bands(target, view);
             bands.par_iter_mut().enumerate().with_max_len(1).for_each(|(row, band)| {
-                let mut lists = Lists::default();
-                let count = (0..grid.columns as usize).map(|column| {
-                    let tile = bins.tile(index, row * grid.columns as usize + column);
-                    let at = [column as u32 * TILE_PX, row as u32 * TILE_PX];
-                    dispatch!(level, simd => {
-                        rasterize_tile(simd, bins, tile, at, cutoffs, &mut lists, band)
-                    })
+                let count = dispatch!(level, simd => {
+                    rasterize_band(simd, bins, index, row, grid.columns, cutoffs, band)
                 });
-                evaluations.fetch_add(count.sum(), Relaxed);
+                evaluations.fetch_add(count, Relaxed);
             });
             drop(bands);
             finished(index, target);
@@ -72,19 +67,43 @@ struct Matched {
 
 /// A batch, and which of it touches each block.
 struct Lists {
+    splats: [Splat; BATCH],
     batch: [Matched; BATCH],
-    touching: [[u8; BATCH]; BLOCKS],
-    counts: [usize; BLOCKS],
+    /// Per splat, a bit for each block that it touches.
+    blocks: [u16; BATCH],
+    /// Per block, a bit for each splat that touches it.
+    touching: [u64; BLOCKS],
 }
 
 impl Default for Lists {
     fn default() -> Self {
         Self {
+            splats: [Splat::default(); BATCH],
             batch: [Matched::default(); BATCH],
-            touching: [[0; BATCH]; BLOCKS],
-            counts: [0; BLOCKS],
+            blocks: [0; BATCH],
+            touching: [0; BLOCKS],
         }
     }
+}
+
+#[inline(always)]
+fn rasterize_band<S: Simd>(
+    simd: S,
+    bins: &Bins,
+    view: usize,
+    row: usize,
+    columns: u32,
+    cutoffs: &Cutoffs,
+    band: &mut Band<'_>,
+) -> u64 {
+    let mut lists = Lists::default();
+    let mut evaluations = 0;
+    for column in 0..columns {
+        let tile = bins.tile(view, row * columns as usize + column as usize);
+        let at = [column * TILE_PX, row as u32 * TILE_PX];
+        evaluations += rasterize_tile(simd, bins, tile, at, cutoffs, &mut lists, band);
+    }
+    evaluations
 }
 
 #[inline(always)]
@@ -101,9 +120,12 @@ fn rasterize_tile<S: Simd>(
     let mut live = u16::MAX;
     let mut evaluations = 0;
     for batch in tile.chunks(BATCH) {
-        match_batch(simd, bins, batch, at_px, cutoffs, live, lists);
+        match_batch(simd, bins, batch, at_px, cutoffs, lists);
         for block in 0..BLOCKS {
-            let touching = &lists.touching[block][..lists.counts[block]];
+            let touching = lists.touching[block];
+            if touching == 0 || live >> block & 1 == 0 {
+                continue;
+            }
             let (done, count) = if band.wants_depth() {
                 blend::<S, true>(simd, &lists.batch, touching, block, cutoffs, &mut sums)
             } else {
@@ -120,7 +142,7 @@ fn rasterize_tile<S: Simd>(
     evaluations
 }
 
-/// Fills the batch and the lists of the blocks that are still live.
+/// Fills the batch, and finds which of it touches each block.
 ///
 /// A splat's ellipse lies within `|dx| <= extent_x`, `|dy| <= extent_y` and `|u| <= √power`: three
 /// slabs, tight for needles at any angle. Each is widened by half a block.
@@ -131,7 +153,6 @@ fn match_batch<S: Simd>(
     batch: &[AtomicU32],
     at_px: [u32; 2],
     cutoffs: &Cutoffs,
-    live: u16,
     lists: &mut Lists,
 ) {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -143,10 +164,13 @@ fn match_batch<S: Simd>(
     let block_y = (lane_y + splat(half_px)) * splat(BLOCK_PX as f32);
     let [tile_x, tile_y] = at_px.map(|px| px as f32 + 0.5 + half_px);
 
-    lists.counts = [0; BLOCKS];
-    for (k, index) in batch.iter().enumerate() {
+    // All reads first: side by side, the cache misses of a batch cost little more than one.
+    for (splat, index) in lists.splats.iter_mut().zip(batch) {
+        *splat = *bins.splat(index);
+    }
+    for k in 0..batch.len().min(BATCH) {
         let Splat { mean_px, factor: [l0, l1, l2], log2_opacity, rgb, depth_m, extent_px } =
-            bins.splat(index);
+            &lists.splats[k];
         let dx = block_x - splat(mean_px[0] - tile_x);
         let dy = block_y - splat(mean_px[1] - tile_y);
         let u = dx.mul_add(splat(*l0), dy * splat(*l1));
@@ -164,13 +188,17 @@ fn match_batch<S: Simd>(
         (lane_y * splat(*l2)).store_array(&mut matched.lane_v);
         (matched.log2_opacity, matched.rgb, matched.depth_m) = (*log2_opacity, *rgb, *depth_m);
 
-        let mut blocks = touches.to_bitmask() as u16 & live;
-        while blocks != 0 {
-            let block = blocks.trailing_zeros() as usize;
-            blocks &= blocks - 1;
-            lists.touching[block][lists.counts[block]] = k as u8;
-            lists.counts[block] += 1;
-        }
+        lists.blocks[k] = touches.to_bitmask() as u16;
+    }
+
+    // Transpose: bit k of `touching[block]` is bit `block` of `blocks[k]`.
+    lists.blocks[batch.len().min(BATCH)..].fill(0);
+    let (low, high) = lists.blocks.split_at(BATCH / 2);
+    let (low, high) = (u16x32::from_slice(simd, low), u16x32::from_slice(simd, high));
+    for (block, touching) in lists.touching.iter_mut().enumerate() {
+        let bit = u16x32::splat(simd, 1 << block);
+        let [low, high] = [(low & bit).simd_eq(bit), (high & bit).simd_eq(bit)];
+        *touching = low.to_bitmask() | high.to_bitmask() << (BATCH / 2);
     }
 }
 
@@ -183,7 +211,7 @@ fn match_batch<S: Simd>(
 fn blend<S: Simd, const DEPTH: bool>(
     simd: S,
     batch: &[Matched; BATCH],
-    touching: &[u8],
+    mut touching: u64,
     block: usize,
     cutoffs: &Cutoffs,
     sums: &mut TileSums,
@@ -194,15 +222,17 @@ fn blend<S: Simd, const DEPTH: bool>(
         (splat(cutoffs.alpha_cap), splat(cutoffs.log2_alpha_cut), splat(cutoffs.stop));
     // Far below any stop, and far above what slows a multiplication down.
     let floor = splat(1e-20);
-    let mut rgb = [0, 1, 2].map(|channel| load(&sums.rgb[channel][block]));
+    let [mut r, mut g, mut b] =
+        [load(&sums.rgb[0][block]), load(&sums.rgb[1][block]), load(&sums.rgb[2][block])];
     let mut depth = load(&sums.depth_m[block]);
     let mut transmittance = load(&sums.transmittance[block]);
     let mut running = load(&sums.running[block]);
     let mut count = 0;
     let mut done = false;
-    for &k in touching {
+    while touching != 0 {
         count += 1;
-        let matched = &batch[k as usize % BATCH];
+        let matched = &batch[touching.trailing_zeros() as usize % BATCH];
+        touching &= touching - 1;
         let u = load(&matched.lane_u) + splat(matched.u[block]);
         let v = load(&matched.lane_v) + splat(matched.v[block]);
         let exponent = (-v).mul_add(v, (-u).mul_add(u, splat(matched.log2_opacity)));
@@ -212,9 +242,9 @@ fn blend<S: Simd, const DEPTH: bool>(
         let counts = after.simd_gt(stop);
         let weight = counts.select(alpha * running, splat(0.0));
         running = after.max(floor);
-        for (sum, &color) in rgb.iter_mut().zip(&matched.rgb) {
-            *sum = weight.mul_add(splat(color), *sum);
-        }
+        r = weight.mul_add(splat(matched.rgb[0]), r);
+        g = weight.mul_add(splat(matched.rgb[1]), g);
+        b = weight.mul_add(splat(matched.rgb[2]), b);
         if DEPTH {
             depth = weight.mul_add(splat(matched.depth_m), depth);
         }
@@ -224,9 +254,9 @@ fn blend<S: Simd, const DEPTH: bool>(
             break;
         }
     }
-    for (channel, sum) in rgb.into_iter().enumerate() {
-        sum.store_array(&mut sums.rgb[channel][block]);
-    }
+    r.store_array(&mut sums.rgb[0][block]);
+    g.store_array(&mut sums.rgb[1][block]);
+    b.store_array(&mut sums.rgb[2][block]);
     depth.store_array(&mut sums.depth_m[block]);
     transmittance.store_array(&mut sums.transmittance[block]);
     running.store_array(&mut sums.running[block]);

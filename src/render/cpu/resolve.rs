@@ -101,10 +101,12 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
         });
     }
     if let Some(rgb8) = &mut band.rgb8 {
-        let bytes = [0, 1, 2].map(|channel| to_8_bit(simd, &sums.rgb[channel][block]));
+        let r = to_8_bit(simd, &sums.rgb[0][block]);
+        let g = to_8_bit(simd, &sums.rgb[1][block]);
+        let b = to_8_bit(simd, &sums.rgb[2][block]);
         each(&mut |pixel, lane| {
-            let [r, g, b] = [0, 1, 2].map(|channel| bytes[channel][lane] as u8);
-            rgb8[3 * pixel..3 * pixel + 3].copy_from_slice(&[r, g, b]);
+            let bytes = [r[lane] as u8, g[lane] as u8, b[lane] as u8];
+            rgb8[3 * pixel..3 * pixel + 3].copy_from_slice(&bytes);
         });
     }
     if let Some(depth_m) = &mut band.depth_m {
