@@ -175,7 +175,9 @@ async fn one_that_does_not_read(server: &TestServer, name: &str) -> Agent {
         format!("ws://{}/v1/session", server.address()).into_client_request().unwrap();
     request.headers_mut().insert("Sec-WebSocket-Protocol", "wildcity.v1".parse().unwrap());
     let stream = tokio_tungstenite::MaybeTlsStream::Plain(stream);
-    let (socket, _) = tokio_tungstenite::client_async(request, stream).await.unwrap();
+    let limits = support::client_limits();
+    let connected = tokio_tungstenite::client_async_with_config(request, stream, limits).await;
+    let (socket, _) = connected.unwrap();
     let mut agent = Agent { socket, seq: 0 };
     agent.hello().await;
     let camera = json!({

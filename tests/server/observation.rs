@@ -165,9 +165,7 @@ async fn time_motion_and_history_advance_with_steps() {
     let rotation = floats(tensors.tensor("ego.history_rot").unwrap().data());
     assert_eq!(rotation[135..], [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
 
-    let over = agent
-        .look(json!({ "type": "step", "pose": pose(6.0), "terminate": true }))
-        .await;
+    let over = agent.look(json!({ "type": "step", "pose": pose(6.0), "terminate": true })).await;
     assert_eq!(over.meta["terminated"], true);
     let refused = agent.ask(json!({ "type": "step", "pose": pose(7.0) })).await;
     crate::support::refused(&refused, "session_state");
@@ -244,10 +242,13 @@ async fn the_longest_header_fits() {
     let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true });
     let rig = json!({ "name": "r", "cameras": cameras });
     agent
-        .open(json!({ "rig": rig, "outputs": outputs, "session": "s".repeat(64), "seed": u64::MAX }))
+        .open(
+            json!({ "rig": rig, "outputs": outputs, "session": "s".repeat(64), "seed": u64::MAX }),
+        )
         .await;
-    let poses: Vec<_> =
-        (0..16).map(|_| json!({ "xyz": [ugly, ugly, ugly], "q": [1.0, ugly, ugly, ugly] })).collect();
+    let poses: Vec<_> = (0..16)
+        .map(|_| json!({ "xyz": [ugly, ugly, ugly], "q": [1.0, ugly, ugly, ugly] }))
+        .collect();
     let seen = agent.look(json!({ "type": "observe", "poses": poses })).await;
     assert_eq!(seen.meta["images"].as_array().unwrap().len(), 256);
     assert_eq!(seen.tensors().len(), 2 + 3 * 256);

@@ -33,7 +33,10 @@ async fn what_is_not_a_request() {
         ("{\"type\":\"close\"}", "invalid_request"),
         ("{\"type\":\"close\",\"seq\":-1}", "invalid_request"),
         ("{\"type\":\"close\",\"seq\":2,\"now\":true}", "invalid_request"),
-        ("{\"type\":\"step\",\"seq\":2,\"pose\":{\"xyz\":[0,0],\"q\":[1,0,0,0]}}", "invalid_request"),
+        (
+            "{\"type\":\"step\",\"seq\":2,\"pose\":{\"xyz\":[0,0],\"q\":[1,0,0,0]}}",
+            "invalid_request",
+        ),
         ("{\"type\":\"observe\",\"seq\":2,\"poses\":7}", "invalid_request"),
     ] {
         agent.send_text(text).await;
@@ -134,13 +137,29 @@ async fn sessions_that_cannot_be_opened() {
         (json!({ "deadline_ms": 0 }), "out_of_range", "deadline_ms"),
         (json!({ "deadline_ms": 1_000_000_000 }), "out_of_range", "deadline_ms"),
         (json!({ "rig": "vehicle7" }), "unknown_rig", "rig"),
-        (json!({ "outputs": { "cameras": ["front", "top"] } }), "unknown_camera", "outputs.cameras[1]"),
-        (json!({ "outputs": { "cameras": ["rear", "rear"] } }), "out_of_range", "outputs.cameras[1]"),
+        (
+            json!({ "outputs": { "cameras": ["front", "top"] } }),
+            "unknown_camera",
+            "outputs.cameras[1]",
+        ),
+        (
+            json!({ "outputs": { "cameras": ["rear", "rear"] } }),
+            "out_of_range",
+            "outputs.cameras[1]",
+        ),
         (json!({ "outputs": { "cameras": [] } }), "out_of_range", "outputs.cameras"),
         (json!({ "outputs": { "quality": 0 } }), "out_of_range", "outputs.quality"),
         (json!({ "start": { "trajectory": "x" } }), "unknown_trajectory", "start.trajectory"),
-        (json!({ "start": { "trajectory": "log", "station_m": 9.1 } }), "out_of_range", "start.station_m"),
-        (json!({ "start": { "pose": { "xyz": [0, 0, 0], "q": [0, 0, 0, 0] } } }), "pose_invalid", "start.pose.q"),
+        (
+            json!({ "start": { "trajectory": "log", "station_m": 9.1 } }),
+            "out_of_range",
+            "start.station_m",
+        ),
+        (
+            json!({ "start": { "pose": { "xyz": [0, 0, 0], "q": [0, 0, 0, 0] } } }),
+            "pose_invalid",
+            "start.pose.q",
+        ),
         (one(json!({ "width": 0 })), "camera_invalid", "rig.cameras[1].width"),
         (one(json!({ "height": 1_000_000_000 })), "camera_invalid", "rig.cameras[1].height"),
         (one(json!({ "fx": -1.0 })), "camera_invalid", "rig.cameras[1].fx"),
@@ -206,7 +225,7 @@ async fn bytes_that_are_not_websocket() {
         vec![0x81, 0x01, b'x'],
         vec![0x83, 0x80, 0, 0, 0, 0],
         vec![0x81, 0x82, 0, 0, 0, 0, 0xC3, 0x28],
-        vec![0x89, 0x80 | 126, 0, 126],
+        [&[0x89, 0x80 | 126, 0, 126, 0, 0, 0, 0][..], &[0; 126]].concat(),
     ] {
         let mut agent = server.agent().await;
         agent.tcp().write_all(&bytes).await.unwrap();
@@ -221,8 +240,7 @@ async fn bytes_that_are_not_websocket() {
 #[tokio::test]
 async fn silence_ends_a_connection() {
     let short = Duration::from_millis(200);
-    let limits =
-        Limits { hello: short, idle: short, resume_grace: short, ..Limits::default() };
+    let limits = Limits { hello: short, idle: short, resume_grace: short, ..Limits::default() };
     let server = TestServer::with(limits).await;
     // Never says hello; never says anything but hello; goes silent within a session.
     let mut silent = Agent::connect(server.address()).await;

@@ -34,7 +34,8 @@ async fn running_steps_are_answered_and_waiting_clients_told() {
     told(&mut waiting).await;
     tokio::time::timeout(Duration::from_secs(8), stopping).await.expect("stopped").unwrap();
     for name in ["waiting", "running", "parked"] {
-        let text = std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
+        let text =
+            std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
         assert!(text.lines().last().unwrap().contains("server_error"), "{name}: {text}");
     }
 }

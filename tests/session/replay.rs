@@ -107,10 +107,7 @@ async fn damaged_files_are_named_by_line() {
     assert!(line == 1 && reason.contains('7'), "{reason}");
     let (line, reason) = damaged(&format!("{}\n\"{}\"\n", lines[0], "x".repeat(2 << 20)));
     assert!(line == 2 && reason.contains("longer"), "{reason}");
-    assert!(matches!(
-        Recording::read(Path::new("/nowhere.jsonl")),
-        Err(ReplayError::Read { .. })
-    ));
+    assert!(matches!(Recording::read(Path::new("/nowhere.jsonl")), Err(ReplayError::Read { .. })));
     // Without its last line, the episode of a killed server can still be replayed.
     std::fs::write(&path, lines[..lines.len() - 1].join("\n") + "\n").unwrap();
     assert_eq!(replay(&server, &path, &Painter::default()).unwrap().difference, None);

@@ -243,17 +243,20 @@ pub struct Seen {
     pub bytes: Bytes,
 }
 
+/// Room for every observation.
+pub fn client_limits() -> Option<WebSocketConfig> {
+    let bytes = Some(wildcity::config::OBSERVATION_BYTES);
+    Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
+}
+
 impl Agent {
     pub async fn connect(address: SocketAddr) -> Self {
         let mut request =
             format!("ws://{address}/v1/session").into_client_request().expect("a request");
         let subprotocol = "wildcity.v1".parse().expect("a header");
         request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
-        let limits = WebSocketConfig::default()
-            .max_message_size(Some(1 << 30))
-            .max_frame_size(Some(1 << 30));
-        let connected =
-            tokio_tungstenite::connect_async_with_config(request, Some(limits), true).await;
+        let limits = client_limits();
+        let connected = tokio_tungstenite::connect_async_with_config(request, limits, true).await;
         Self { socket: connected.expect("a connection").0, seq: 0 }
     }
 

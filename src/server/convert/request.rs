@@ -81,11 +81,16 @@ pub(in crate::server) fn parse(text: &str) -> Parsed {
     if let Some((seq, field)) = not_finite(text) {
         return Parsed { seq, command: Err(Fault::NotFinite { field }) };
     }
-    match error.classify() {
-        Category::Data => {
+    // An error of the data stops the parser: the rest may still not be JSON.
+    let rest = serde_json::from_str::<serde::de::IgnoredAny>(text).err();
+    match (error.classify(), rest) {
+        (Category::Data, None) => {
             Parsed { seq: seq_of(text), command: Err(Fault::InvalidRequest(error.to_string())) }
         }
-        _ => Parsed { seq: None, command: Err(Fault::MalformedJson(error.to_string())) },
+        (_, rest) => {
+            let reason = rest.unwrap_or(error).to_string();
+            Parsed { seq: None, command: Err(Fault::MalformedJson(reason)) }
+        }
     }
 }
 
@@ -101,8 +106,7 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
         }
         Request::Open(open) => (open.seq, open_command(*open)),
         Request::Step { seq, pose, terminate } => {
-            let command =
-                pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
+            let command = pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
             (seq, command)
         }
         Request::Observe { seq, poses } => {
@@ -121,8 +125,8 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
         }
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
-            let command = name_of("session", session)
-                .map(|session| Command::Resume { session, last_seq });
+            let command =
+                name_of("session", session).map(|session| Command::Resume { session, last_seq });
             (seq, command)
         }
     }
@@ -217,9 +221,9 @@ fn not_finite(text: &str) -> Option<(Option<u64>, String)> {
             Some(format!("{name}.{part}[{index}]"))
         })
     };
-    let single = ["/pose", "/start/pose"].into_iter().find_map(|pointer| {
-        in_pose(&pointer[1..].replace('/', "."), value.pointer(pointer)?)
-    });
+    let single = ["/pose", "/start/pose"]
+        .into_iter()
+        .find_map(|pointer| in_pose(&pointer[1..].replace('/', "."), value.pointer(pointer)?));
     let of_list = |pointer: &str, name: &str, inner: &str| {
         let list = value.pointer(pointer)?.as_array()?;
         list.iter().enumerate().find_map(|(index, entry)| {
