@@ -128,11 +128,8 @@ impl Building {
         for side in 0..2 {
             let (wall, top_m) = (walls[side], self.style.height_m());
             if self.open_sides[side] {
-                let style = Style {
-                    balconies: false,
-                    ground_floor: GroundFloor::Flats,
-                    ..self.style
-                };
+                let style =
+                    Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };
                 painter.coarser(1.25, |painter| facade::paint(painter, &wall, &style, random));
             } else if self.neighbours_m[side] < top_m {
                 let us = painter.even(0.0, DEPTH_M, 0.8);
@@ -158,7 +155,8 @@ impl Building {
         let (run_m, rise_m) = (5.0, random.range(2.4, 3.6));
         let us = painter.even(-0.1, wall.width_m + 0.1, 0.50);
         let vs = painter.even(0.0, 1.0, 0.07);
-        let place = |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
+        let place =
+            |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
         let courses = |u_m: f64, t: f64| 0.07 * noise(11, 2.0 * u_m, (t * 24.0).floor());
         painter.sheet(&us, &vs, place, |u_m, t| Some(tiles.times(1.0 + courses(u_m, t))));
 
@@ -177,9 +175,12 @@ impl Building {
             for side in 0..4 {
                 let face = Wall::between(corners[side], corners[(side + 1) % 4]);
                 let us = painter.even(0.0, face.width_m, 0.38);
-                painter.sheet(&us, &vs, |u_m, v_m| face.at(u_m, v_m, 0.0), |_, v_m| {
-                    Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick })
-                });
+                painter.sheet(
+                    &us,
+                    &vs,
+                    |u_m, v_m| face.at(u_m, v_m, 0.0),
+                    |_, v_m| Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick }),
+                );
             }
         }
     }

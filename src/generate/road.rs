@@ -208,7 +208,9 @@ impl Ground<'_> {
         let crossing = self.route.at(self.cross_s_m);
         // In the side street's own axes: x away from the main street, y to the left of that.
         let place = |x_m: f64, y_m: f64, z_m: f64| {
-            crossing.point_m + side * (x_m * crossing.left - y_m * crossing.forward) + z_m * DVec3::Z
+            crossing.point_m
+                + side * (x_m * crossing.left - y_m * crossing.forward)
+                + z_m * DVec3::Z
         };
         let mut stretch = |from_m: f64, to_m: f64, factor: f64| {
             painter.coarser(factor, |painter| {
