@@ -176,9 +176,7 @@ impl Staging {
 
     /// Makes the staged objects and then the log record visible.
     pub(super) fn publish(mut self, number: u64, record: &[u8]) -> Result<(), StoreError> {
-        for hash in std::mem::take(&mut self.staged) {
-            self.place(&hash)?;
-        }
+        self.place_all()?;
         let staged = self.dir.join("record");
         let failed = || StoreError::io("write", &staged);
         let mut file = File::create(&staged).map_err(failed())?;
@@ -192,6 +190,14 @@ impl Staging {
         })?;
         self.placed.clear();
         sync_parent(&path)
+    }
+
+    /// Puts the staged objects in the place of those of a version that is there already, which
+    /// heals damaged and lost ones.
+    pub(super) fn restore(mut self) -> Result<(), StoreError> {
+        self.place_all()?;
+        self.placed.clear();
+        Ok(())
     }
 
     /// Removes objects that no version names: what a killed commit had already placed.
@@ -208,16 +214,19 @@ impl Staging {
         Ok(())
     }
 
-    /// Moves a staged object to its place. Over an older copy, too: that heals a damaged one.
-    fn place(&mut self, hash: &str) -> Result<(), StoreError> {
-        let path = self.objects.path(&self.name, hash);
-        create_parent(&path)?;
-        if !path.exists() {
-            self.placed.push(path.clone());
+    /// Moves the staged objects to their places, over older copies, too.
+    fn place_all(&mut self) -> Result<(), StoreError> {
+        for hash in std::mem::take(&mut self.staged) {
+            let path = self.objects.path(&self.name, &hash);
+            create_parent(&path)?;
+            if !path.exists() {
+                self.placed.push(path.clone());
+            }
+            let staged = self.dir.join(&hash);
+            fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
+            sync_parent(&path)?;
         }
-        let staged = self.dir.join(hash);
-        fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
-        sync_parent(&path)
+        Ok(())
     }
 }
 
