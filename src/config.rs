@@ -53,3 +53,24 @@ pub const HISTORY_POSES: usize = 16;
 
 /// Spacing of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
+
+/// Longest PLY header. INRIA's with degree 3 is 1.5 KB.
+pub const PLY_HEADER_BYTES: usize = 64 << 10;
+
+/// Longest safetensors header. A gsplat checkpoint's is under 1 KB.
+pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
+
+/// Most Gaussians of one import: their order within the twin is kept as u32.
+pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
+
+/// Largest manifest: a log's 20,000 chunks are 6 MB, its 170,000 keyframes 30 MB.
+pub const MANIFEST_BYTES: u64 = 64 << 20;
+
+/// Largest record of a twin's log. One is about 150 bytes.
+pub const LOG_RECORD_BYTES: u64 = 4 << 10;
+
+/// Largest rig or trajectory file: what fits a manifest.
+pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
+
+/// Largest camera list: 300 B per camera, so 50,000 cameras.
+pub const CAMERA_LIST_BYTES: u64 = 16 << 20;

@@ -6,8 +6,11 @@ mod bench;
 mod demo;
 mod import;
 mod inspect;
+mod places;
+mod progress;
 mod render;
 mod replay;
+mod scene_source;
 mod serve;
 mod verify;
 

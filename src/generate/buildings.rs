@@ -130,11 +130,8 @@ impl Building {
         for side in 0..2 {
             let (wall, top_m) = (walls[side], self.style.height_m());
             if self.open_sides[side] {
-                let style = Style {
-                    balconies: false,
-                    ground_floor: GroundFloor::Flats,
-                    ..self.style
-                };
+                let style =
+                    Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };
                 painter.coarser(1.25, |painter| facade::paint(painter, &wall, &style, random));
                 self.back(painter, &wall);
             } else if self.neighbours_m[side] < top_m {
@@ -177,7 +174,8 @@ impl Building {
         let (run_m, rise_m) = (0.5 * DEPTH_M, random.range(2.8, 4.0));
         let us = painter.graded(-0.1, wall.width_m + 0.1, 0.3, 0.9);
         let vs = painter.even(0.0, 1.0, 0.12);
-        let place = |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
+        let place =
+            |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
         let courses = |u_m: f64, t: f64| 0.07 * noise(11, 2.0 * u_m, (t * 24.0).floor());
         painter.sheet(&us, &vs, place, |u_m, t| Some(tiles.times(1.0 + courses(u_m, t))));
 
@@ -185,7 +183,8 @@ impl Building {
         let depths = [painter.even(-DEPTH_M, 0.0, 0.9), painter.even(0.0, DEPTH_M, 0.9)];
         for (u_m, depths, sign) in [(0.0, &depths[0], 1.0), (wall.width_m, &depths[1], -1.0)] {
             let top_m = |depth_m: f64| rise_m * (1.0 - (depth_m / run_m + 1.0).abs());
-            let place = |d_m: f64, t: f64| wall.at(u_m, eaves_m + t * top_m(sign * d_m), sign * d_m);
+            let place =
+                |d_m: f64, t: f64| wall.at(u_m, eaves_m + t * top_m(sign * d_m), sign * d_m);
             painter.sheet(depths, &[0.0, 0.35, 0.65, 0.85, 0.96, 1.0], place, |_, _| Some(gable));
         }
 
@@ -204,9 +203,12 @@ impl Building {
             for side in 0..4 {
                 let face = Wall::between(corners[side], corners[(side + 1) % 4]);
                 let us = painter.even(0.0, face.width_m, 0.38);
-                painter.sheet(&us, &vs, |u_m, v_m| face.at(u_m, v_m, 0.0), |_, v_m| {
-                    Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick })
-                });
+                painter.sheet(
+                    &us,
+                    &vs,
+                    |u_m, v_m| face.at(u_m, v_m, 0.0),
+                    |_, v_m| Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick }),
+                );
             }
         }
     }

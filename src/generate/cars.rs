@@ -253,9 +253,11 @@ impl Car {
                 if arch {
                     return None;
                 }
-                let seam = self.kind.side_glass.iter().any(|glass| {
-                    (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36
-                });
+                let seam = self
+                    .kind
+                    .side_glass
+                    .iter()
+                    .any(|glass| (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36);
                 let sill = if z_m < 0.34 { 0.45 } else { 1.0 };
                 let shade = if seam { 0.72 } else { 1.0 };
                 let open = 0.62 + 0.38 * smooth((z_m - 0.1) / 0.6);
@@ -302,8 +304,8 @@ impl Car {
                 let side_glass = (0.12..0.86).contains(&v)
                     && cabin_m > 0.14
                     && self.kind.side_glass.iter().any(|&glass| within(x, glass));
-                let screen = v > 1.0
-                    && (within(x, self.kind.windscreen) || within(x, self.kind.rear_glass));
+                let screen =
+                    v > 1.0 && (within(x, self.kind.windscreen) || within(x, self.kind.rear_glass));
                 Some(if side_glass || screen { glass() } else { self.paint })
             },
         );
@@ -327,18 +329,20 @@ impl Car {
             let lamp = aside_m > half_m - 0.30 && (0.62..0.98).contains(&height);
             let plate = aside_m < 0.26 && (0.30..0.55).contains(&height);
             let grille = nose && aside_m < half_m - 0.36 && (0.62..0.95).contains(&height);
-            Some(if lamp && nose {
-                Paint::matt(0.93, 0.94, 0.96).gloss(0.2)
-            } else if lamp {
-                Paint::matt(0.74, 0.09, 0.08).gloss(0.1)
-            } else if plate {
-                Paint::matt(0.90, 0.90, 0.87)
-            } else if grille || height < 0.22 {
-                Paint::matt(0.12, 0.12, 0.13).gloss(0.05)
-            } else {
-                self.paint
-            }
-            .open(0.65 + 0.35 * smooth(height / 0.6)))
+            Some(
+                if lamp && nose {
+                    Paint::matt(0.93, 0.94, 0.96).gloss(0.2)
+                } else if lamp {
+                    Paint::matt(0.74, 0.09, 0.08).gloss(0.1)
+                } else if plate {
+                    Paint::matt(0.90, 0.90, 0.87)
+                } else if grille || height < 0.22 {
+                    Paint::matt(0.12, 0.12, 0.13).gloss(0.05)
+                } else {
+                    self.paint
+                }
+                .open(0.65 + 0.35 * smooth(height / 0.6)),
+            )
         });
     }
 
@@ -401,9 +405,8 @@ impl Car {
                 Some(if sign < 0.0 { glass() } else { self.paint.times(0.85) })
             });
         }
-        let outer = |u_m: f64, v_m: f64| {
-            self.place(x_m - side * u_m, side * (inner_m + 0.18), z_m + v_m)
-        };
+        let outer =
+            |u_m: f64, v_m: f64| self.place(x_m - side * u_m, side * (inner_m + 0.18), z_m + v_m);
         painter.sheet(&[-0.05, 0.05], &zs, outer, |_, _| Some(self.paint.times(0.85)));
     }
 
@@ -412,10 +415,15 @@ impl Car {
         let (half_m, length_m) = (0.5 * self.kind.width_m, self.kind.length_m);
         let xs = painter.even(0.02, length_m - 0.02, 0.26);
         let ys = painter.even(-half_m + 0.02, half_m - 0.02, 0.26);
-        painter.sheet(&xs, &ys, |x_m, y_m| self.place(x_m, y_m, 0.02), |x_m, y_m| {
-            let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
-            Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
-        });
+        painter.sheet(
+            &xs,
+            &ys,
+            |x_m, y_m| self.place(x_m, y_m, 0.02),
+            |x_m, y_m| {
+                let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
+                Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
+            },
+        );
     }
 }
 

@@ -270,8 +270,8 @@ impl Facade<'_, '_, '_> {
         self.rect(&us, &vs, -RECESS_M, |at_m, v_m| {
             let panel = |x: f64, from: f64, to: f64| (from..to).contains(&x);
             let aside_m = (at_m - middle_m).abs() / half_m;
-            let inset = panel(aside_m, 0.15, 0.8)
-                && (panel(v_m, 0.25, 0.95) || panel(v_m, 1.15, 2.1));
+            let inset =
+                panel(aside_m, 0.15, 0.8) && (panel(v_m, 0.25, 0.95) || panel(v_m, 1.15, 2.1));
             wood.times(if inset { 0.78 } else { 1.0 }).gloss(0.06)
         });
         let vs = self.painter.graded(door_m, light_m, 0.08, 0.25);
@@ -302,7 +302,9 @@ impl Facade<'_, '_, '_> {
         self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
         self.plain(u, [sign_m, GROUND_FLOOR_M]);
         let us = self.painter.graded(u[0], u[1], 0.08, 0.3);
-        self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| accent.times(0.7).open(0.7 + 0.5 * v_m));
+        self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| {
+            accent.times(0.7).open(0.7 + 0.5 * v_m)
+        });
         // Goods: blurred shelves of colours behind the glass.
         let seed = random.below(1 << 30) as u64;
         let panes = self.painter.graded(plinth_m, head_m, 0.08, 0.22);

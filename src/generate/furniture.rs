@@ -107,9 +107,12 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
         let width_m = from_m.distance(to_m);
         let right = (to_m - from_m) / width_m;
         let us = painter.graded(0.0, width_m, 0.10, 0.24);
-        painter.sheet(&us, &vs, |u_m, v_m| from_m + u_m * right + v_m * DVec3::Z, |_, v_m| {
-            Some(paint.open(0.75 + 0.25 * (v_m / size_m.z)))
-        });
+        painter.sheet(
+            &us,
+            &vs,
+            |u_m, v_m| from_m + u_m * right + v_m * DVec3::Z,
+            |_, v_m| Some(paint.open(0.75 + 0.25 * (v_m / size_m.z))),
+        );
     }
     let (us, vs) = ([-1.0, -0.4, 0.4, 1.0], [-1.0, 0.0, 1.0]);
     let lid = |i: f64, j: f64| corner(i, j) + size_m.z * DVec3::Z;

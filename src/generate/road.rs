@@ -132,7 +132,13 @@ impl Ground<'_> {
         painter.sheet(&around, &rings, place, |angle_rad, radius_m| {
             let rib = (angle_rad * 14.0 / std::f64::consts::TAU + radius_m / 0.09) as i64 % 2 == 0;
             let ring = radius_m > 0.27;
-            let tone = if ring { 0.46 } else if rib { 0.24 } else { 0.33 };
+            let tone = if ring {
+                0.46
+            } else if rib {
+                0.24
+            } else {
+                0.33
+            };
             Some(Paint::matt(tone, 0.98 * tone, 0.95 * tone).gloss(0.08))
         });
     }
@@ -243,7 +249,9 @@ impl Ground<'_> {
         let crossing = self.route.at(self.cross_s_m);
         // In the side street's own axes: x away from the main street, y to the left of that.
         let place = |x_m: f64, y_m: f64, z_m: f64| {
-            crossing.point_m + side * (x_m * crossing.left - y_m * crossing.forward) + z_m * DVec3::Z
+            crossing.point_m
+                + side * (x_m * crossing.left - y_m * crossing.forward)
+                + z_m * DVec3::Z
         };
         let mut stretch = |from_m: f64, to_m: f64, factor: f64| {
             painter.coarser(factor, |painter| {

@@ -169,8 +169,7 @@ impl<'a> Painter<'a> {
         let apart = (0.5 * (xx - yy)).hypot(xy);
         let (major, minor) = (0.5 * (xx + yy) + apart, (0.5 * (xx + yy) - apart).max(1e-6));
         let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
-        let axes =
-            DMat3::from_cols(cos * along + sin * across, cos * across - sin * along, normal);
+        let axes = DMat3::from_cols(cos * along + sin * across, cos * across - sin * along, normal);
         let rotation = DQuat::from_mat3(&axes);
         let sigmas_m = DVec3::new(OVERLAP * major.sqrt(), OVERLAP * minor.sqrt(), THICKNESS_M);
         // Seen at 60° from the normal, d·n = -0.5, the mirror adds nothing.

@@ -1,1 +1,12 @@
-//! The wire, and only the wire.
+//! `wildcity.v1`: the wire, and only the wire.
+//!
+//! Text frames are JSON, [`message::Request`] one way and [`message::Answer`] the other, matched by
+//! `seq`. Binary frames are [`observation`]s. The prose is `protocol/README.md`; the JSON schemas
+//! beside it are generated from these types.
+
+pub mod error;
+pub mod message;
+pub mod observation;
+
+/// The WebSocket subprotocol, and the only protocol version there is so far.
+pub const PROTOCOL: &str = "wildcity.v1";

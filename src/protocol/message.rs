@@ -1,0 +1,405 @@
+//! Control messages: JSON text frames.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::error::Code;
+
+/// A rigid transform: position in metres, unit quaternion (w, x, y, z).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Pose {
+    /// Position, in metres.
+    pub xyz: [f64; 3],
+    /// Unit quaternion (w, x, y, z).
+    pub q: [f64; 4],
+}
+
+/// What a client sends. Every request gets exactly one answer with the same `seq`.
+///
+/// `seq` counts the requests of a session from 0 without gaps, through `resume` as well.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Request {
+    /// First of a connection. Answer: `welcome`.
+    Hello {
+        /// Number of this request.
+        seq: u64,
+        /// Who is calling, for the server's log.
+        client: ClientInfo,
+        /// Protocol versions that the client speaks.
+        protocols: Vec<String>,
+    },
+    /// Opens a session on a twin. Answer: `opened`.
+    Open(Box<Open>),
+    /// Moves the ego to its next pose, lets `dt_us` pass and renders. Answer: an observation.
+    Step {
+        /// Number of this request.
+        seq: u64,
+        /// `world_from_rig` at the end of the step.
+        pose: Pose,
+        /// Whether the episode ends with this step.
+        #[serde(default)]
+        terminate: bool,
+    },
+    /// Renders poses without moving. Answer: one observation with all of them.
+    Observe {
+        /// Number of this request.
+        seq: u64,
+        /// `world_from_rig` each; 1 to `limits.observe_poses`.
+        poses: Vec<Pose>,
+    },
+    /// Starts a new episode in the same session. Answer: an observation.
+    Reset {
+        /// Number of this request.
+        seq: u64,
+        /// Seed of the episode.
+        #[serde(default)]
+        seed: u64,
+        /// Where to start; the session's start if absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        start: Option<Start>,
+    },
+    /// Ends the session. Answer: `closed`.
+    Close {
+        /// Number of this request.
+        seq: u64,
+    },
+    /// Continues a session after a lost connection, in place of `open`. Answer: `resumed`.
+    Resume {
+        /// Number of this request on the new connection.
+        seq: u64,
+        /// Name of the session.
+        session: String,
+        /// Last `seq` whose answer arrived.
+        last_seq: u64,
+    },
+}
+
+/// Who is calling.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ClientInfo {
+    /// Program or library.
+    pub name: String,
+    /// Its version.
+    pub version: String,
+}
+
+/// Opens a session on a twin.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Open {
+    /// Number of this request.
+    pub seq: u64,
+    /// Name of the twin.
+    pub twin: String,
+    /// Its version; the latest if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub version: Option<u64>,
+    /// Name for the session; chosen by the server if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub session: Option<String>,
+    /// Seed of the first episode.
+    #[serde(default)]
+    pub seed: u64,
+    /// Where to start; the start of the twin's first trajectory, or its origin, if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<Start>,
+    /// Cameras; the twin's rig, or the preset `vehicle6`, if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rig: Option<RigChoice>,
+    /// What each observation holds.
+    #[serde(default)]
+    pub outputs: Outputs,
+    /// Simulated time of a step, in microseconds; the server's default if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dt_us: Option<i64>,
+    /// How long an answer may take, in milliseconds; the server's limit if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deadline_ms: Option<u64>,
+}
+
+/// Where an episode starts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged, deny_unknown_fields)]
+pub enum Start {
+    /// At a pose.
+    Pose {
+        /// `world_from_rig`.
+        pose: Pose,
+    },
+    /// Somewhere along a recorded trajectory.
+    Station {
+        /// Name of the trajectory.
+        trajectory: String,
+        /// Distance along it, in metres.
+        #[serde(default)]
+        station_m: f64,
+    },
+}
+
+/// Which cameras.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum RigChoice {
+    /// A preset, by name.
+    Preset(String),
+    /// All of them, written out.
+    Full(Rig),
+}
+
+/// The cameras of a vehicle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Rig {
+    /// Name.
+    pub name: String,
+    /// Cameras, in the order in which images are answered.
+    pub cameras: Vec<RigCamera>,
+}
+
+/// A pinhole camera on the vehicle; all intrinsics in pixels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RigCamera {
+    /// Name.
+    pub name: String,
+    /// Image width.
+    pub width: u64,
+    /// Image height.
+    pub height: u64,
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Principal point, x, from the image's left edge.
+    pub cx: f64,
+    /// Principal point, y, from the image's top edge.
+    pub cy: f64,
+    /// `rig_from_camera`: camera axes are x right, y down, z forward.
+    pub camera_to_rig: Pose,
+}
+
+/// What each observation holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Outputs {
+    /// Names of the cameras to render, in the order wanted; all if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cameras: Option<Vec<String>>,
+    /// How colour images travel.
+    pub encoding: Encoding,
+    /// JPEG quality, 1 to 100; ignored by the other encodings.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quality: Option<u8>,
+    /// Whether to add `depth`, f32 `[height, width]`: expected camera z in metres.
+    pub depth: bool,
+    /// Whether to add `opacity`, f32 `[height, width]`: the validity of depth and colour.
+    pub opacity: bool,
+}
+
+impl Default for Outputs {
+    fn default() -> Self {
+        Self {
+            cameras: None,
+            encoding: Encoding::Jpeg,
+            quality: None,
+            depth: false,
+            opacity: false,
+        }
+    }
+}
+
+/// How colour images travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Encoding {
+    /// A JPEG file, u8 `[n]`.
+    Jpeg,
+    /// A PNG file, u8 `[n]`.
+    Png,
+    /// Pixels, u8 `[height, width, 3]`.
+    Raw,
+}
+
+/// What the server sends as text.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum Answer {
+    /// To `hello`.
+    Welcome {
+        /// Number of the request.
+        seq: u64,
+        /// The protocol version chosen.
+        protocol: String,
+        /// Name, version and build of the server.
+        server: ServerInfo,
+        /// What the server accepts.
+        limits: Limits,
+        /// Name of the backend that renders.
+        backend: String,
+        /// Twins that can be opened.
+        twins: Vec<TwinInfo>,
+    },
+    /// To `open`: everything resolved, nothing implicit.
+    Opened(Box<Opened>),
+    /// To `resume`.
+    Resumed {
+        /// Number of the request.
+        seq: u64,
+        /// Name of the session.
+        session: String,
+        /// Last request that the session carried out: repeat it to get its answer again, or go on
+        /// with the number after it.
+        last_seq: u64,
+        /// Steps done in the episode.
+        step: u64,
+        /// Simulated time, in microseconds.
+        time_us: i64,
+    },
+    /// To `close`.
+    Closed {
+        /// Number of the request.
+        seq: u64,
+        /// What happened.
+        summary: Summary,
+    },
+    /// To any request that was refused. A refused request changes nothing and can be sent again.
+    Error {
+        /// Number of the request; absent if it could not be read.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        seq: Option<u64>,
+        /// What went wrong.
+        code: Code,
+        /// For people: what, and how to fix it.
+        message: String,
+        /// The field at fault, as `pose.q[2]`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        field: Option<String>,
+        /// Whether the connection ends with this message.
+        fatal: bool,
+    },
+}
+
+/// Name, version and build of the server.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ServerInfo {
+    /// `wildcity`.
+    pub name: String,
+    /// Version of the package.
+    pub version: String,
+}
+
+/// What the server accepts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Limits {
+    /// Largest message to the server, in bytes.
+    pub message_bytes: u64,
+    /// Poses of one `observe`.
+    pub observe_poses: u64,
+    /// Cameras of a rig.
+    pub cameras: u64,
+    /// Longest image side, in pixels.
+    pub side_px: u64,
+    /// Pixels of one answer.
+    pub answer_pixels: u64,
+    /// Longest silence before the connection is closed, in milliseconds.
+    pub idle_ms: u64,
+    /// How long a session can be resumed, in milliseconds.
+    pub resume_ms: u64,
+}
+
+/// A twin that can be opened.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct TwinInfo {
+    /// Name.
+    pub name: String,
+    /// Latest version.
+    pub version: u64,
+    /// BLAKE3 of that version's manifest, in hex.
+    pub version_hash: String,
+    /// Gaussians in it.
+    pub gaussians: u64,
+    /// Spherical-harmonic degree.
+    pub sh_degree: u8,
+    /// Recorded trajectories.
+    pub trajectories: Vec<TrajectoryInfo>,
+}
+
+/// A recorded trajectory.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct TrajectoryInfo {
+    /// Name.
+    pub name: String,
+    /// Length, in metres.
+    pub length_m: f64,
+    /// Keyframes.
+    pub keyframes: u64,
+}
+
+/// An open session.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Opened {
+    /// Number of the request.
+    pub seq: u64,
+    /// Name of the session.
+    pub session: String,
+    /// The twin.
+    pub twin: String,
+    /// Its version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of the render profile's JSON, in hex.
+    pub profile_hash: String,
+    /// The render profile: numbers and switches by name.
+    pub profile: serde_json::Map<String, serde_json::Value>,
+    /// Name of the backend.
+    pub backend: String,
+    /// Seed of the first episode.
+    pub seed: u64,
+    /// `world_from_rig` at time zero.
+    pub start: Pose,
+    /// Simulated time of a step, in microseconds.
+    pub dt_us: i64,
+    /// How long an answer may take, in milliseconds.
+    pub deadline_ms: u64,
+    /// Cameras in the order of the images, with intrinsics as sent.
+    pub cameras: Vec<RigCamera>,
+    /// What each observation holds.
+    pub outputs: Outputs,
+    /// The twin's recorded trajectories.
+    pub trajectories: Vec<TrajectoryInfo>,
+    /// Memory that the twin holds in the server, in bytes, shared by all its sessions.
+    pub resident_bytes: u64,
+}
+
+/// How an episode went.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Summary {
+    /// Why it ended.
+    pub outcome: Outcome,
+    /// Steps done.
+    pub steps: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Distance driven, in metres.
+    pub distance_m: f64,
+}
+
+/// Why an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The agent closed it, or ended it with `terminate`.
+    Completed,
+    /// The agent broke the protocol beyond repair.
+    AgentError,
+    /// The agent was silent for too long.
+    AgentTimeout,
+    /// The connection was lost and not resumed in time.
+    AgentLost,
+    /// A fault of the server.
+    ServerError,
+}

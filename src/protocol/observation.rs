@@ -1,0 +1,118 @@
+//! The observation: one binary frame in safetensors layout.
+//!
+//! 8 bytes little-endian header length, a JSON header (space-padded), raw tensor bytes. The
+//! header's `__metadata__` is `{"observation": "<JSON of Observation>"}`: safetensors allows only
+//! strings there.
+//!
+//! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
+//! then per image `camera/<name>/rgb` u8, `camera/<name>/depth` f32 and `camera/<name>/opacity`
+//! f32 where asked for. With several poses (`observe`) image names start with `pose/<k>/`.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::message::{Encoding, Pose};
+
+/// What an observation says beside its tensors.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Observation {
+    /// Number of the request.
+    pub seq: u64,
+    /// Steps done in the episode; 0 after `reset`.
+    pub step: u64,
+    /// Simulated time since the episode's start, in microseconds.
+    pub time_us: i64,
+    /// Name of the session.
+    pub session: String,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Whether the episode has ended.
+    pub terminated: bool,
+    /// The twin.
+    pub twin: String,
+    /// Its version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of the render profile's JSON, in hex.
+    pub profile_hash: String,
+    /// Name of the backend.
+    pub backend: String,
+    /// BLAKE3 of the images' hashes (32 bytes each, in order), in hex.
+    pub frame_hash: String,
+    /// The ego at this time.
+    pub ego: Ego,
+    /// The images, in order.
+    pub images: Vec<Image>,
+    /// What it cost.
+    pub timings: Timings,
+}
+
+/// The ego vehicle at one time.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Ego {
+    /// `world_from_rig`.
+    pub pose: Pose,
+    /// Velocity in world axes over the last step, in m/s; zero at step 0.
+    pub velocity: [f64; 3],
+    /// How many poses of the history, counted from its end, were driven; the earlier ones repeat
+    /// the start.
+    pub history_count: u64,
+}
+
+/// One image.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Image {
+    /// Name of the camera.
+    pub camera: String,
+    /// Its index in `opened.cameras`.
+    pub index: u64,
+    /// Which of the request's poses: 0 but for `observe`.
+    pub pose: u64,
+    /// Name of the colour tensor; `depth` and `opacity` replace `rgb` at its end.
+    pub tensor: String,
+    /// How the colour image travels.
+    pub encoding: Encoding,
+    /// Width, in pixels.
+    pub width: u64,
+    /// Height, in pixels.
+    pub height: u64,
+    /// Focal length along x, in pixels, of the image as sent.
+    pub fx: f64,
+    /// Focal length along y, in pixels.
+    pub fy: f64,
+    /// Principal point, x, in pixels.
+    pub cx: f64,
+    /// Principal point, y, in pixels.
+    pub cy: f64,
+    /// `rig_from_camera`.
+    pub camera_to_rig: Pose,
+    /// Start of the exposure, in simulated microseconds; equal to the end: a global shutter.
+    pub shutter_start_us: i64,
+    /// End of the exposure, in simulated microseconds: the image's time.
+    pub shutter_end_us: i64,
+    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
+    pub hash: String,
+}
+
+/// What an observation cost, in milliseconds of wall time.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Timings {
+    /// Waiting for other sessions' frames.
+    pub queue_ms: f64,
+    /// Rendering, with the encoding that ran beside it.
+    pub render_ms: f64,
+    /// CPU time of encoding and hashing, most of it beside rendering.
+    pub encode_ms: f64,
+    /// Wall time of each render stage.
+    pub stages_ms: Vec<Stage>,
+}
+
+/// Wall time of a render stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Stage {
+    /// Name of the stage.
+    pub name: String,
+    /// Its time, in milliseconds.
+    pub ms: f64,
+}
