@@ -86,8 +86,8 @@ pub(super) fn planter(
 fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
     let axis = (ends_m[1] - ends_m[0]).normalize();
     let (side, front) = axis.any_orthonormal_pair();
-    let around = painter.even(0.0, std::f64::consts::TAU, 0.9);
-    let step_m = (4.0 * radius_m).clamp(0.12, 0.30);
+    let around = painter.even(0.0, std::f64::consts::TAU, 1.05);
+    let step_m = (5.0 * radius_m).clamp(0.15, 0.40);
     let along = painter.even(0.0, ends_m[0].distance(ends_m[1]), step_m);
     let place = |angle_rad: f64, z_m: f64| {
         let (sin, cos) = angle_rad.sin_cos();
