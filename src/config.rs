@@ -60,3 +60,54 @@ pub const HISTORY_POSES: usize = 16;
 
 /// Spacing of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
+
+/// Shortest simulated time of a step, in microseconds: at 1 kHz the ego history needs 1,500 poses.
+pub const DT_MIN_US: i64 = 1_000;
+
+/// Longest simulated time of a step, in microseconds.
+pub const DT_MAX_US: i64 = 10_000_000;
+
+/// Connections beside [`CONNECTIONS`] that no WebSocket can take, so that health checks and
+/// refusals get through when all of those are taken.
+pub const SPARE_CONNECTIONS: usize = 64;
+
+/// Frames that may wait for the renderer. A session waits for one at a time; one whose deadline
+/// passed can leave a dead one behind, hence twice.
+pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
+
+/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`: 100 sessions with
+/// six raw 1440x928 images, depth and opacity (88 MB each), or every session with JPEGs.
+pub const ANSWERS_BYTES: u64 = 9 << 30;
+
+/// How long a refused client's last bytes are read and thrown away, so that it can read why.
+pub const LINGER: Duration = Duration::from_secs(2);
+
+/// Silence after which TCP asks whether the other side still exists, and how often it asks again;
+/// three unanswered probes end the connection: 20 + 3 x 5 = 35 s. The peer's kernel answers, so an
+/// agent that thinks for minutes without reading its socket stays connected.
+pub const KEEPALIVE: (Duration, Duration, u32) =
+    (Duration::from_secs(20), Duration::from_secs(5), 3);
+
+/// Longest line of an episode file: 256 image hashes of `observe` take 17 kB.
+pub const EPISODE_LINE_BYTES: usize = 1 << 20;
+
+/// The rig of a session on a twin that has none, unless the session says otherwise.
+pub const RIG: &str = "vehicle6";
+
+/// Longest PLY header. INRIA's with degree 3 is 1.5 KB.
+pub const PLY_HEADER_BYTES: usize = 64 << 10;
+
+/// Longest safetensors header. A gsplat checkpoint's is under 1 KB.
+pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
+
+/// Most Gaussians of one import: their order within the twin is kept as u32.
+pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
+
+/// Largest manifest: a log's 20,000 chunks are 6 MB, its 170,000 keyframes 30 MB.
+pub const MANIFEST_BYTES: u64 = 64 << 20;
+
+/// Largest record of a twin's log. One is about 150 bytes.
+pub const LOG_RECORD_BYTES: u64 = 4 << 10;
+
+/// Largest rig or trajectory file: what fits a manifest.
+pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;

@@ -1,11 +1,138 @@
 //! `wildcity import`.
 
-/// Make a twin of a trained scene.
+use std::fs::File;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use serde::de::DeserializeOwned;
+
+use crate::config;
+use crate::ingest::{self, Axes};
+use crate::scene::manifest::Provenance;
+use crate::scene::{RenderProfile, Rig, Trajectory};
+use crate::store::{Catalog, NewVersion};
+
+use super::places::Twins;
+use super::progress;
+
+/// Make a twin of a trained scene, or a new version of one.
+///
+/// SRC is a PLY of 3D Gaussian splatting (INRIA's columns in any order, SH degree 0 to 3, or
+/// PlayCanvas' compressed kind) or safetensors with gsplat's names. Every Gaussian is checked first;
+/// an import that fails leaves nothing behind.
 #[derive(Debug, clap::Args)]
-pub(super) struct Import {}
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Import {
+    /// The scene file.
+    #[arg(value_name = "SRC")]
+    source: PathBuf,
+
+    /// Name of the twin, of a-z 0-9 . _ -; an existing one gets a new version.
+    #[arg(long, value_name = "NAME")]
+    twin: String,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// Which way the file's axes point; no format says. A preset, or the 9 numbers of the matrix
+    /// that takes the file's axes to the twin's (x east, y north, z up), row by row.
+    ///
+    /// identity: z is up already.
+    /// y-down-z-forward: OpenCV, COLMAP; most captures.
+    /// y-up-z-back: OpenGL, glTF.
+    /// y-up-z-forward: Unity, left-handed.
+    #[arg(long, default_value = "identity", allow_hyphen_values = true, verbatim_doc_comment)]
+    axes: String,
+
+    /// Metres per unit of the file, applied after --axes.
+    #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
+    scale: f64,
+
+    /// JSON file of the vehicle's cameras, kept as the twin's default rig.
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+
+    /// JSON file of a recorded drive, in the twin's axes and metres; may be given again.
+    #[arg(long, value_name = "FILE")]
+    trajectory: Vec<PathBuf>,
+
+    /// How the scene's trainer rendered, where it differs from gsplat; may be given again. Keys:
+    /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop.
+    #[arg(long, value_name = "KEY=VALUE")]
+    profile: Vec<String>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity import skull.ply --twin skull --axes y-down-z-forward --profile near=0.2
+  wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
+  wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01";
 
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!("not built yet")
+        // Everything that is quick to check, before the long part.
+        let axes: Axes = self.axes.parse()?;
+        let mut profile = RenderProfile::default();
+        for setting in &self.profile {
+            profile.set(setting)?;
+        }
+        let rig = self.rig.as_deref().map(read_json::<Rig>).transpose()?;
+        let trajectories = self.trajectory.iter().map(|path| read_json::<Trajectory>(path));
+        let trajectories = trajectories.collect::<anyhow::Result<_>>()?;
+        let catalog = Catalog::open(&self.twins.dir()?)?;
+
+        let cannot = || format!("cannot import {}", self.source.display());
+        let bar = progress::bytes("hashing");
+        let source = ingest::digest(&self.source, &mut progress::show(&bar));
+        let source = source.with_context(cannot)?;
+        let bar = progress::bytes("reading");
+        let gaussians = ingest::read(&self.source, &mut progress::show(&bar));
+        let mut gaussians = gaussians.with_context(cannot)?;
+        axes.apply(&mut gaussians, self.scale)?;
+        bar.finish_and_clear();
+
+        let bar = progress::count("writing");
+        let new = NewVersion {
+            name: &self.twin,
+            gaussians: &gaussians,
+            profile,
+            rig,
+            trajectories,
+            provenance: Provenance {
+                source: format!("blake3:{source}"),
+                builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
+                options: vec![format!("axes={}", self.axes), format!("scale={}", self.scale)],
+            },
+        };
+        let version = catalog.commit(new, &mut progress::show(&bar)).with_context(cannot)?;
+        bar.finish_and_clear();
+
+        let manifest = &version.manifest;
+        let stored_bytes: u64 = manifest.chunks.iter().map(|chunk| chunk.bytes).sum();
+        writeln!(
+            std::io::stdout().lock(),
+            "twin {} version {}: {} Gaussians of SH degree {} in {} chunks, {:.1} MB\n\
+             {}\nblake3 {}",
+            self.twin,
+            version.number,
+            manifest.gaussians(),
+            manifest.sh_degree,
+            manifest.chunks.len(),
+            stored_bytes as f64 / 1e6,
+            catalog.dir().join(&self.twin).display(),
+            version.hash,
+        )?;
+        Ok(())
     }
+}
+
+fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+    let cannot = || format!("cannot read {}", path.display());
+    let file = File::open(path).with_context(cannot)?;
+    let mut text = Vec::new();
+    file.take(config::SETTINGS_FILE_BYTES + 1).read_to_end(&mut text).with_context(cannot)?;
+    let limit = config::SETTINGS_FILE_BYTES;
+    anyhow::ensure!(text.len() as u64 <= limit, "{} is above {limit} bytes", path.display());
+    serde_json::from_slice(&text).with_context(cannot)
 }

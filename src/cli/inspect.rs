@@ -1,11 +1,111 @@
 //! `wildcity inspect`.
 
-/// Show what a twin consists of.
+use std::io::{self, Write};
+
+use crate::geometry::Bounds;
+use crate::scene::Manifest;
+use crate::store::{Catalog, Version};
+
+use super::places::{TwinVersion, Twins};
+
+/// Show what a twin consists of: counts, bounds, hashes, and its chunks.
 #[derive(Debug, clap::Args)]
-pub(super) struct Inspect {}
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Inspect {
+    /// The twin, or NAME@NUMBER for an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// Print the version and its whole manifest as one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity inspect street
+  wildcity inspect street@2 --json | jq .manifest.provenance";
 
 impl Inspect {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!("not built yet")
+        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let version = catalog.version(&self.twin.name, self.twin.number)?;
+        let mut out = io::stdout().lock();
+        if self.json {
+            let Version { number, hash, created_us, manifest } = &version;
+            let json = serde_json::json!({
+                "number": number,
+                "hash": hash,
+                "created_us": created_us,
+                "gaussians": manifest.gaussians(),
+                "manifest": manifest,
+            });
+            writeln!(out, "{json:#}")?;
+        } else {
+            summary(&mut out, &version)?;
+            table(&mut out, &version.manifest)?;
+        }
+        Ok(())
     }
+}
+
+fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
+    let Version { number, hash, created_us, manifest } = version;
+    let stored_bytes: u64 = manifest.chunks.iter().map(|chunk| chunk.bytes).sum();
+    writeln!(out, "twin        {} version {number}", manifest.twin)?;
+    writeln!(out, "manifest    {hash}")?;
+    writeln!(out, "created     {} s since 1970", created_us / 1_000_000)?;
+    writeln!(out, "gaussians   {}, SH degree {}", manifest.gaussians(), manifest.sh_degree)?;
+    writeln!(out, "objects     {} chunks, {stored_bytes} bytes", manifest.chunks.len())?;
+    if !manifest.chunks.is_empty() {
+        writeln!(out, "bounds      {}", metres(&manifest.bounds()))?;
+    }
+    let profile = &manifest.profile;
+    writeln!(
+        out,
+        "profile     near={} far={} blur={} antialiased={} alpha_cap={} alpha_cut={} stop={}",
+        profile.near,
+        profile.far,
+        profile.blur,
+        profile.antialiased,
+        profile.alpha_cap,
+        profile.alpha_cut,
+        profile.stop,
+    )?;
+    if let Some(rig) = &manifest.rig {
+        let names: Vec<_> = rig.cameras.iter().map(|camera| camera.name.as_str()).collect();
+        writeln!(out, "rig         {}: {}", rig.name, names.join(", "))?;
+    }
+    for trajectory in &manifest.trajectories {
+        let (keyframes, length_m) = (trajectory.keyframes.len(), trajectory.length_m());
+        writeln!(out, "trajectory  {}: {keyframes} keyframes, {length_m:.1} m", trajectory.name)?;
+    }
+    let provenance = &manifest.provenance;
+    writeln!(out, "source      {}", provenance.source)?;
+    writeln!(out, "builder     {} {}", provenance.builder, provenance.options.join(" "))
+}
+
+fn table(out: &mut impl Write, manifest: &Manifest) -> io::Result<()> {
+    writeln!(
+        out,
+        "\n{:>12} {:>10} {:>12}  object            3-sigma box",
+        "cell", "count", "bytes"
+    )?;
+    for chunk in &manifest.chunks {
+        let cell = format!("{},{}", chunk.cell[0], chunk.cell[1]);
+        let (count, bytes, bounds) = (chunk.count, chunk.bytes, metres(&chunk.bounds));
+        writeln!(out, "{cell:>12} {count:>10} {bytes:>12}  {}  {bounds}", &chunk.object[..16])?;
+    }
+    Ok(())
+}
+
+/// A box as `x -1.50..2.25  y ...  m`.
+fn metres(bounds: &Bounds) -> String {
+    let (low, high) = (bounds.min_m, bounds.max_m);
+    let axis = |name, low, high| format!("{name} {low:.2}..{high:.2}");
+    let axes = [axis("x", low.x, high.x), axis("y", low.y, high.y), axis("z", low.z, high.z)];
+    format!("{} m", axes.join("  "))
 }

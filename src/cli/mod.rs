@@ -6,6 +6,8 @@ mod bench;
 mod demo;
 mod import;
 mod inspect;
+mod places;
+mod progress;
 mod render;
 mod replay;
 mod serve;

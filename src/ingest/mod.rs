@@ -1,1 +1,147 @@
-//! Outside formats.
+//! Outside formats: one file each, picked by what a file starts with, never by its name.
+//!
+//! Everything is streamed through small buffers into [`Gaussians`], which take about what the file
+//! takes, and every Gaussian is checked before anyone sees one.
+
+pub mod axes;
+mod ply;
+mod safetensors;
+pub mod validate;
+
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek};
+use std::path::Path;
+
+use crate::config;
+use crate::scene::Gaussians;
+
+pub use axes::Axes;
+
+/// Told about bytes done and bytes in all.
+pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
+
+/// Why a file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum IngestError {
+    /// The operating system refused.
+    #[error("cannot read: {0}")]
+    Io(#[from] io::Error),
+    /// Neither of the formats.
+    #[error(
+        "the file starts with {start:?}: neither PLY (\"ply\") nor safetensors (header length, \
+         \"{{\"); convert it to one of them"
+    )]
+    UnknownFormat {
+        /// Its first bytes, as text.
+        start: String,
+    },
+    /// A header cannot be understood or is not that of a Gaussian scene.
+    #[error("{format} header, {place}: {reason}")]
+    Header {
+        /// The format.
+        format: &'static str,
+        /// Where in the header, as `line 3` or `tensor means`.
+        place: String,
+        /// What is wrong and what must hold instead.
+        reason: String,
+    },
+    /// The header promises another file size.
+    #[error(
+        "{format} body: the header promises {promised} bytes ({content}), the file holds {held}; \
+         it is {}: write or copy it again",
+        if held < promised { "truncated" } else { "oversized" }
+    )]
+    Size {
+        /// The format.
+        format: &'static str,
+        /// Bytes that must follow the header.
+        promised: u128,
+        /// Bytes that do.
+        held: u128,
+        /// The count and size that led to the promise.
+        content: String,
+    },
+    /// More than a twin can order.
+    #[error(
+        "{count} Gaussians; at most {} fit one import: split the scene",
+        config::IMPORT_GAUSSIANS
+    )]
+    TooMany {
+        /// How many.
+        count: u64,
+    },
+    /// A Gaussian that no renderer can draw.
+    #[error("Gaussian {index}: {field} is {value}; {must}")]
+    Value {
+        /// Which one, from 0.
+        index: usize,
+        /// The field, as the file calls it.
+        field: String,
+        /// The refused value.
+        value: String,
+        /// What must hold instead.
+        must: &'static str,
+    },
+    /// `--axes` or `--scale` cannot be used.
+    #[error("{option} {given:?}: {reason}")]
+    Frame {
+        /// The option.
+        option: &'static str,
+        /// What was given.
+        given: String,
+        /// What is wrong and what must hold instead.
+        reason: String,
+    },
+}
+
+/// Reads a scene file: INRIA PLY, PlayCanvas compressed PLY, or safetensors with gsplat's names.
+///
+/// Axes and unit stay the file's; [`Axes::apply`] changes them.
+///
+/// # Errors
+/// The file is of no known format, damaged, or holds a Gaussian outside [`validate`]'s bounds.
+pub fn read(path: &Path, progress: Progress<'_>) -> Result<Gaussians, IngestError> {
+    let mut file = File::open(path)?;
+    let file_bytes = file.metadata()?.len();
+    let mut start = Vec::new();
+    (&mut file).take(9).read_to_end(&mut start)?;
+    file.rewind()?;
+    if start.starts_with(b"ply\n") || start.starts_with(b"ply\r\n") {
+        ply::read(BufReader::with_capacity(BUFFER_BYTES, file), file_bytes, progress)
+    } else if start.get(8) == Some(&b'{') {
+        safetensors::read(file, file_bytes, progress)
+    } else {
+        let start = String::from_utf8_lossy(&start).into_owned();
+        Err(IngestError::UnknownFormat { start })
+    }
+}
+
+/// BLAKE3 of a file, 64 lower-case hex digits: which source a twin was made of.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn digest(path: &Path, progress: Progress<'_>) -> Result<String, IngestError> {
+    let mut file = File::open(path)?;
+    let file_bytes = file.metadata()?.len();
+    let mut hasher = blake3::Hasher::new();
+    let mut buffer = vec![0; BUFFER_BYTES];
+    loop {
+        let read = file.read(&mut buffer)?;
+        if read == 0 {
+            return Ok(hasher.finalize().to_hex().to_string());
+        }
+        hasher.update(&buffer[..read]);
+        progress(hasher.count(), file_bytes);
+    }
+}
+
+/// Bytes read at once.
+const BUFFER_BYTES: usize = 256 << 10;
+
+/// Refuses counts that a twin could not order.
+fn check_count(count: u64) -> Result<usize, IngestError> {
+    match usize::try_from(count) {
+        Ok(fits) if count <= config::IMPORT_GAUSSIANS => Ok(fits),
+        _ => Err(IngestError::TooMany { count }),
+    }
+}

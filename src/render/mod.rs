@@ -3,7 +3,9 @@
 //! The stages project, sort, bin, rasterize, resolve bear one name in every backend. An image is a
 //! function of (scene, profile, views): no clock, no cache, no thread count.
 
+pub mod constants;
 pub mod cpu;
+pub mod layout;
 pub mod reference;
 
 use crate::geometry::{Camera, Pose};

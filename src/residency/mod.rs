@@ -1,1 +1,5 @@
 //! What is in memory now.
+
+mod cache;
+
+pub use cache::{Cache, Resident};

@@ -32,8 +32,8 @@ pub mod column {
     pub const SCALE: usize = 3;
     /// Unit quaternion (w, x, y, z), world from own axes: four columns.
     pub const QUAT: usize = 6;
-    /// Peak opacity, in [0, 1].
-    pub const OPACITY: usize = 10;
+    /// Base-2 logarithm of the peak opacity, at most 0; minus infinity in lanes without a Gaussian.
+    pub const LOG2_OPACITY: usize = 10;
     /// First colour coefficient.
     pub const SH: usize = 11;
 }
@@ -99,6 +99,7 @@ impl Chunk {
         if lane == 0 {
             // Lanes without a Gaussian are never drawn: their opacity is zero.
             self.lanes.resize(slot + width, Lanes([0.0; LANES]));
+            self.lanes[slot + column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
         }
         let scale = record.ln_scale.map(|ln| f64::from(ln).exp() as f32);
         let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
@@ -111,7 +112,7 @@ impl Chunk {
         set(column::MEAN, &record.mean_m);
         set(column::SCALE, &scale);
         set(column::QUAT, &record.quat_wxyz.map(|q| (f64::from(q) / length) as f32));
-        set(column::OPACITY, &[sigmoid(record.logit_opacity)]);
+        set(column::LOG2_OPACITY, &[log2_sigmoid(record.logit_opacity)]);
         set(column::SH, record.sh);
 
         let mean = Vec3::from_array(record.mean_m);
@@ -173,9 +174,10 @@ impl Chunk {
     }
 }
 
-/// `1 / (1 + exp(-x))`, for any x but NaN without overflow.
-fn sigmoid(logit: f32) -> f32 {
-    (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
+/// `log2(1 / (1 + exp(-x)))`, for any x but NaN without overflow or cancellation.
+fn log2_sigmoid(logit: f32) -> f32 {
+    let x = f64::from(logit);
+    ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
 }
 
 /// Where each Gaussian of a file goes: its cell, and its place in Morton order within.
@@ -334,12 +336,14 @@ mod tests {
         assert_eq!(value(0, column::SCALE + 2), std::f32::consts::E);
         assert_eq!(value(0, column::QUAT), 1.0);
         assert_eq!(
-            [value(1, column::OPACITY), value(0, column::OPACITY)],
-            [0.5, 1.0],
-            "sigmoid of 0 and of 100"
+            [value(1, column::LOG2_OPACITY), value(0, column::LOG2_OPACITY)],
+            [-1.0, 0.0],
+            "opacity one half, and one"
         );
-        assert!(value(2, column::OPACITY) < 1e-43, "sigmoid of -100");
-        assert_eq!(scene.chunks[0].block(0)[column::OPACITY].0[1..], [0.0; LANES - 1]);
+        // sigmoid(-100) = exp(-100) to 43 digits.
+        assert!((value(2, column::LOG2_OPACITY) + 100.0 * std::f32::consts::LOG2_E).abs() < 1e-5);
+        let unused = &scene.chunks[0].block(0)[column::LOG2_OPACITY].0[1..];
+        assert_eq!(unused, [f32::NEG_INFINITY; LANES - 1]);
     }
 
     #[test]

@@ -63,7 +63,23 @@ pub enum RigError {
     },
 }
 
+/// Rigs that come with the program, by name: the JSON of `scenes/rigs`.
+const PRESETS: [(&str, &str); 1] =
+    [("vehicle6", include_str!("../../scenes/rigs/vehicle6.json"))];
+
 impl Rig {
+    /// Names of the rigs that come with the program, for [`Rig::preset`].
+    pub fn preset_names() -> impl Iterator<Item = &'static str> {
+        PRESETS.into_iter().map(|(name, _)| name)
+    }
+
+    /// A rig that comes with the program; `None` if there is none of this name.
+    pub fn preset(name: &str) -> Option<Self> {
+        let (_, json) = PRESETS.into_iter().find(|(preset, _)| *preset == name)?;
+        // A test parses every preset, so `ok` never turns a broken file into "no such rig".
+        serde_json::from_str(json).ok()
+    }
+
     /// Most cameras of a rig: the depth sort's key keeps 4 bits for the camera.
     pub const MAX_CAMERAS: usize = 16;
 
@@ -102,6 +118,7 @@ pub fn is_name(text: &str) -> bool {
 mod tests {
     use super::*;
     use crate::geometry::camera::Pinhole;
+    use glam::DVec3;
 
     fn camera(name: &str) -> RigCamera {
         let pinhole = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 40.0 };
@@ -122,6 +139,40 @@ mod tests {
         let mut flat = camera("front");
         flat.camera.height_px = 0;
         assert!(matches!(rig(vec![flat]).check(), Err(RigError::Camera { .. })));
+    }
+
+    #[test]
+    fn every_preset_parses_and_checks() {
+        for name in Rig::preset_names() {
+            let rig = Rig::preset(name).expect(name);
+            assert_eq!(rig.name, name);
+            assert_eq!(rig.check(), Ok(()));
+        }
+        assert_eq!(Rig::preset("vehicle7"), None);
+    }
+
+    #[test]
+    fn the_vehicle_looks_where_its_cameras_are_named() {
+        let rig = Rig::preset("vehicle6").unwrap();
+        let (sin, cos) = 35_f64.to_radians().sin_cos();
+        let looks = [
+            ("front", DVec3::X),
+            ("front_left", DVec3::new(cos, sin, 0.0)),
+            ("front_right", DVec3::new(cos, -sin, 0.0)),
+            ("left", DVec3::Y),
+            ("right", DVec3::NEG_Y),
+            ("rear", DVec3::NEG_X),
+        ];
+        assert_eq!(rig.cameras.len(), looks.len());
+        for (RigCamera { name, rig_from_camera, .. }, (named, forward)) in
+            rig.cameras.iter().zip(looks)
+        {
+            assert_eq!(name, named);
+            let axes = rig_from_camera.rotation_matrix();
+            assert!((axes.z_axis - forward).length() < 1e-12, "{name} looks along {}", axes.z_axis);
+            assert!((axes.y_axis + DVec3::Z).length() < 1e-12, "{name}: down is {}", axes.y_axis);
+            assert!((1.5..=2.0).contains(&rig_from_camera.position_m.z), "{name}");
+        }
     }
 
     #[test]

@@ -4,6 +4,10 @@
 //! Harmonics Tricks" (2008), with the Condon-Shortley phase. The constants are written out in f64
 //! so that every backend rounds the same number.
 
+use std::f64::consts::FRAC_PI_4;
+
+use glam::{DMat3, DVec3};
+
 /// Largest supported degree.
 pub const MAX_DEGREE: u8 = 3;
 
@@ -34,4 +38,128 @@ pub const C3: [f64; 7] = [
 /// Coefficients per colour channel of a degree: `(degree + 1)²`.
 pub const fn coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
+}
+
+/// The 16 basis functions up to degree 3 at a unit direction, in coefficient order.
+pub fn basis(direction: DVec3) -> [f64; 16] {
+    let DVec3 { x, y, z } = direction;
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        C0,
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        C2[1] * y * z,
+        C2[2] * (2.0 * zz - xx - yy),
+        C2[3] * x * z,
+        C2[4] * (xx - yy),
+        C3[0] * y * (3.0 * xx - yy),
+        C3[1] * x * y * z,
+        C3[2] * y * (4.0 * zz - xx - yy),
+        C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        C3[4] * x * (4.0 * zz - xx - yy),
+        C3[5] * z * (xx - yy),
+        C3[6] * x * (xx - 3.0 * yy),
+    ]
+}
+
+/// Turns colours with the scene: what was seen from `d` is seen from `M d`.
+///
+/// The basis Y is orthonormal, so `Y(M d) = B Y(d)` with `B_jk = ∫ Y_j(M d) Y_k(d) dω`, and the
+/// coefficients turn with the same B, which mixes no degrees and is orthogonal. The integrand is a
+/// polynomial of degree 6 at most; 4 Gauss-Legendre heights by 8 azimuths integrate degree 7
+/// exactly, so B has the accuracy of f64.
+#[derive(Clone, Debug)]
+pub struct Turn {
+    /// `B`, of which the first `coefficients(degree)` rows and columns are used.
+    matrix: [[f64; 16]; 16],
+    count: usize,
+}
+
+impl Turn {
+    /// For an orthogonal matrix, mirrors included, and colours of a degree.
+    pub fn new(turned_from_plain: DMat3, degree: u8) -> Self {
+        // Abscissae and weights of the 4-point rule on [-1, 1] (Abramowitz & Stegun, table 25.4).
+        const HEIGHTS: [(f64, f64); 2] = [
+            (0.339_981_043_584_856_3, 0.652_145_154_862_546_1),
+            (0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
+        ];
+        let mut matrix = [[0.0; 16]; 16];
+        for (height, weight) in HEIGHTS.into_iter().flat_map(|(z, w)| [(z, w), (-z, w)]) {
+            for step in 0..8 {
+                let (sin, cos) = (f64::from(step) * FRAC_PI_4).sin_cos();
+                let radius = (1.0 - height * height).sqrt();
+                let direction = DVec3::new(radius * cos, radius * sin, height);
+                let (plain, turned) = (basis(direction), basis(turned_from_plain * direction));
+                for (row, turned) in matrix.iter_mut().zip(turned) {
+                    for (entry, plain) in row.iter_mut().zip(plain) {
+                        *entry += weight * FRAC_PI_4 * turned * plain;
+                    }
+                }
+            }
+        }
+        Self { matrix, count: coefficients(degree) }
+    }
+
+    /// Turns the colour of one Gaussian in place, `[(degree + 1)², 3]`.
+    pub fn apply(&self, colour: &mut [f32]) {
+        let mut plain = [[0.0; 3]; 16];
+        for (plain, colour) in plain.iter_mut().zip(colour.chunks_exact(3)) {
+            *plain = [colour[0], colour[1], colour[2]].map(f64::from);
+        }
+        for (row, turned) in self.matrix.iter().zip(colour.chunks_exact_mut(3)) {
+            for (channel, value) in turned.iter_mut().enumerate() {
+                let terms = row[..self.count].iter().zip(&plain);
+                *value = terms.map(|(b, plain)| b * plain[channel]).sum::<f64>() as f32;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+
+    /// The constants and signs once more, by another road: the basis must be orthonormal.
+    #[test]
+    fn the_basis_is_orthonormal() {
+        let matrix = Turn::new(DMat3::IDENTITY, 3).matrix;
+        for (j, row) in matrix.iter().enumerate() {
+            for (k, entry) in row.iter().enumerate() {
+                let wanted = if j == k { 1.0 } else { 0.0 };
+                assert!((entry - wanted).abs() < 1e-14, "B[{j}][{k}] = {entry}");
+            }
+        }
+    }
+
+    #[test]
+    fn turned_colours_are_seen_from_turned_directions() {
+        let rotation = DMat3::from_quat(DQuat::from_xyzw(0.3, -0.5, 0.7, 0.2).normalize());
+        let mirror = DMat3::from_diagonal(DVec3::new(1.0, -1.0, 1.0)) * rotation;
+        for matrix in [rotation, mirror] {
+            for degree in 0..=MAX_DEGREE {
+                let count = coefficients(degree);
+                let plain: Vec<f32> = (0..3 * count).map(|i| (i as f32 * 0.7).sin()).collect();
+                let mut turned = plain.clone();
+                Turn::new(matrix, degree).apply(&mut turned);
+                for step in 0..50 {
+                    let t = f64::from(step);
+                    let d = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());
+                    let d = d.normalize();
+                    let (seen, wanted) = (colour(&turned, matrix * d), colour(&plain, d));
+                    let error = (seen - wanted).abs().max_element();
+                    assert!(error < 1e-6, "degree {degree}, from {d}: {seen}, not {wanted}");
+                }
+            }
+        }
+    }
+
+    fn colour(coefficients: &[f32], direction: DVec3) -> DVec3 {
+        let basis = basis(direction);
+        coefficients.chunks_exact(3).zip(basis).fold(DVec3::ZERO, |sum, (rgb, b)| {
+            sum + b * DVec3::new(rgb[0].into(), rgb[1].into(), rgb[2].into())
+        })
+    }
 }

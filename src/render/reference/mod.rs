@@ -1,1 +1,77 @@
-//! x
+//! The f64 oracle: the image by definition. No tiles, no SIMD, no clever bounds: slow and obvious.
+//!
+//! It differentiates the camera numerically and inverts the covariance plainly, so that a slip in
+//! the other backends' hand-derived formulas has nowhere to hide.
+
+mod blend;
+mod project;
+
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+
+/// The f64 backend.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Reference;
+
+impl Backend for Reference {
+    fn name(&self) -> &'static str {
+        "reference"
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        frame.check(targets)?;
+        let (mut project_ms, mut blend_ms) = (0.0, 0.0);
+        let mut stats = FrameStats::default();
+        for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
+            let start = Instant::now();
+            let splats = project::project(frame.scene, frame.profile, view);
+            project_ms += start.elapsed().as_secs_f64() * 1e3;
+            stats.visible_pairs += splats.len() as u64;
+
+            let start = Instant::now();
+            let width = view.camera.width_px as usize;
+            let pixels: Vec<blend::Pixel> = (0..view.camera.height_px)
+                .into_par_iter()
+                .flat_map_iter(|row| blend::row(&splats, row, width, frame.profile))
+                .collect();
+            blend_ms += start.elapsed().as_secs_f64() * 1e3;
+            stats.evaluations += pixels.len() as u64 * splats.len() as u64;
+            write(&pixels, target);
+            finished(index, target);
+        }
+        stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];
+        Ok(stats)
+    }
+}
+
+/// Stage resolve: f64 pixels to what was asked for.
+fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
+    for (i, pixel) in pixels.iter().enumerate() {
+        let opacity = 1.0 - pixel.transmittance;
+        if let Some(rgba) = &mut target.rgba {
+            let [r, g, b] = pixel.rgb.to_array();
+            for (value, to) in [r, g, b, opacity].into_iter().zip(&mut rgba[4 * i..]) {
+                *to = value as f32;
+            }
+        }
+        if let Some(rgb8) = &mut target.rgb8 {
+            for (value, to) in pixel.rgb.to_array().into_iter().zip(&mut rgb8[3 * i..]) {
+                *to = (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+            }
+        }
+        if let Some(depth_m) = &mut target.depth_m {
+            depth_m[i] = if opacity > 0.0 { (pixel.depth_m / opacity) as f32 } else { 0.0 };
+        }
+        if let Some(to) = &mut target.opacity {
+            to[i] = opacity as f32;
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! Where twins lie unless told otherwise.
+
+use std::env;
+use std::path::PathBuf;
+
+/// `--twins`, for every command that has it.
+#[derive(Debug, clap::Args)]
+pub(super) struct Twins {
+    /// Directory of the twins [default: $XDG_DATA_HOME/wildcity/twins, or
+    /// ~/.local/share/wildcity/twins]
+    #[arg(long, value_name = "DIR")]
+    twins: Option<PathBuf>,
+}
+
+impl Twins {
+    /// The directory given, or the user's own.
+    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+        if let Some(dir) = &self.twins {
+            return Ok(dir.clone());
+        }
+        let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+        let data = set("XDG_DATA_HOME").or_else(|| set("HOME").map(|h| h.join(".local/share")));
+        match data {
+            Some(data) => Ok(data.join("wildcity/twins")),
+            None => anyhow::bail!("neither HOME nor XDG_DATA_HOME is set: give --twins DIR"),
+        }
+    }
+}
+
+/// A twin and perhaps one of its versions, as `street` or `street@3`.
+#[derive(Clone, Debug)]
+pub(super) struct TwinVersion {
+    pub(super) name: String,
+    /// None for the latest.
+    pub(super) number: Option<u64>,
+}
+
+impl std::str::FromStr for TwinVersion {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some((name, number)) = text.split_once('@') else {
+            return Ok(Self { name: text.to_owned(), number: None });
+        };
+        let number = number.parse().map_err(|e| format!("version {number:?}: {e}"))?;
+        Ok(Self { name: name.to_owned(), number: Some(number) })
+    }
+}

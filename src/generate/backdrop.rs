@@ -1,0 +1,124 @@
+//! What closes the view: sky, clouds, distant roofs, and the land around.
+//!
+//! The renderer has no sky, and a pixel without Gaussians is black: so the sky is a dome of large,
+//! overlapping Gaussians.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::random::{Random, noise, smooth};
+use super::route::Route;
+use super::surface::{Paint, Painter};
+
+/// Radius of the dome, in metres: 260 m of driving grow its face ahead by half.
+const DOME_M: f64 = 560.0;
+/// Angle between neighbours on the lower dome, in radians: 1.5°, 47 px in the front camera, which
+/// is what clouds may be made of.
+const LOW_RAD: f64 = 0.026;
+/// The same above 38°, where no camera of a level car looks.
+const HIGH_RAD: f64 = 0.09;
+/// Where the spacing changes, in radians above the horizon.
+const CHANGE_RAD: f64 = 0.66;
+/// The dome begins below the horizon, in radians: -3°.
+const FOOT_RAD: f64 = -0.05;
+
+/// Land nearer to the centre line than this is painted by others, in metres.
+const LAND_FROM_M: f64 = 27.0;
+
+/// Paints all of it around the middle of the street.
+pub(super) fn paint(painter: &mut Painter, route: &Route, seed: u64) {
+    let middle_m = route.at(0.5 * route.length_m).point_m;
+    sky(painter, middle_m, seed);
+    skyline(painter, middle_m, seed);
+    land(painter, route, middle_m, seed);
+}
+
+fn sky(painter: &mut Painter, middle_m: DVec3, seed: u64) {
+    let mut elevation_rad = FOOT_RAD;
+    while elevation_rad < std::f64::consts::FRAC_PI_2 {
+        let step_rad = if elevation_rad < CHANGE_RAD { LOW_RAD } else { HIGH_RAD };
+        let (rise, run) = elevation_rad.sin_cos();
+        let around = (std::f64::consts::TAU * run / step_rad).ceil().max(1.0);
+        for i in 0..around as usize {
+            // Every second ring is turned by half a step.
+            let half = if (elevation_rad / step_rad) as i64 % 2 == 0 { 0.5 } else { 0.0 };
+            let azimuth_rad = std::f64::consts::TAU * (i as f64 + half) / around;
+            let (sin, cos) = azimuth_rad.sin_cos();
+            let away = DVec3::new(run * cos, run * sin, rise);
+            let along = DVec3::new(-sin, cos, 0.0);
+            let rotation = DQuat::from_mat3(&DMat3::from_cols(along, away.cross(along), away));
+            // Wider than surfels: 0.75 of the spacing leaves no hole and no pattern.
+            let sigma_m = 0.75 * step_rad * DOME_M;
+            let sigmas_m = DVec3::new(sigma_m, sigma_m, 1.0);
+            let mean_m = middle_m + DOME_M * away;
+            painter.gaussian(mean_m, rotation, sigmas_m, 0.99, sky_rgb(away, seed), DVec3::ZERO);
+        }
+        elevation_rad += step_rad;
+    }
+}
+
+/// Haze on the horizon, blue above, and fair-weather clouds.
+fn sky_rgb(away: DVec3, seed: u64) -> DVec3 {
+    let (haze, zenith) = (DVec3::new(0.86, 0.89, 0.92), DVec3::new(0.30, 0.52, 0.82));
+    let clear = haze.lerp(zenith, smooth((away.z + 0.02) / 0.75).sqrt());
+    // A flat layer of clouds, seen from below.
+    let layer = away.truncate() / (away.z + 0.16);
+    let octave = |scale: f64, seed: u64| noise(seed, scale * layer.x, scale * layer.y);
+    let cover = octave(1.1, seed + 20) + 0.55 * octave(2.6, seed + 21) + 0.3 * octave(6.0, seed + 22);
+    let cloud = smooth((cover - 0.12) / 0.65) * smooth((away.z - 0.02) / 0.12);
+    let lit = DVec3::splat(0.97) - 0.10 * smooth((cover - 0.6) / 0.6) * DVec3::new(1.0, 0.9, 0.75);
+    clear.lerp(lit, 0.88 * cloud)
+}
+
+/// Roofs and towers in the haze, nearer than the dome.
+fn skyline(painter: &mut Painter, middle_m: DVec3, seed: u64) {
+    let mut random = Random::new(seed, "skyline", 0);
+    let mut azimuth_rad = 0.0;
+    while azimuth_rad < std::f64::consts::TAU {
+        let width_rad = random.range(0.03, 0.08);
+        let away_m = random.range(300.0, 440.0);
+        let height_m = random.range(12.0, 26.0) + if random.chance(0.1) { 22.0 } else { 0.0 };
+        let haze = smooth((away_m - 220.0) / 420.0);
+        let tone = random.range(0.90, 1.06);
+        let wall = DVec3::new(0.60, 0.58, 0.57).lerp(DVec3::new(0.80, 0.84, 0.88), haze) * tone;
+        let (sin, cos) = (azimuth_rad + 0.5 * width_rad).sin_cos();
+        let (right, inwards) = (DVec3::new(sin, -cos, 0.0), DVec3::new(-cos, -sin, 0.0));
+        let foot_m = middle_m - away_m * inwards - 3.0 * DVec3::Z;
+        let half_m = 0.5 * width_rad * away_m;
+        let us = painter.even(-half_m, half_m, 4.5);
+        let vs = painter.even(0.0, height_m, 4.5);
+        painter.sheet(&us, &vs, |u_m, v_m| foot_m + u_m * right + v_m * DVec3::Z, |u_m, v_m| {
+            let rgb = wall * (1.0 + 0.05 * noise(seed + 23, 0.3 * u_m, 0.3 * v_m));
+            Some(Paint::glowing(rgb.x, rgb.y, rgb.z))
+        });
+        azimuth_rad += 0.9 * width_rad;
+    }
+}
+
+/// Grass and yards beyond the houses, coarser with the distance, fading into the haze.
+fn land(painter: &mut Painter, route: &Route, middle_m: DVec3, seed: u64) {
+    let turn = std::f64::consts::TAU / 96.0;
+    let mut radius_m = 12.0;
+    while radius_m < DOME_M {
+        let step_m = (0.065 * radius_m).max(5.0);
+        for i in 0..96 {
+            let (sin, cos) = (turn * f64::from(i)).sin_cos();
+            let away = DVec3::new(cos, sin, 0.0);
+            let center_m = middle_m + (radius_m + 0.5 * step_m) * away - 0.35 * DVec3::Z;
+            let edge_m = step_m.max(turn * radius_m);
+            let (s_m, t_m) = route.project(center_m);
+            let on_street = (-130.0..route.length_m + 130.0).contains(&s_m);
+            if on_street && t_m.abs() < LAND_FROM_M + 1.5 * edge_m {
+                continue;
+            }
+            let haze = smooth((radius_m - 150.0) / 420.0);
+            let tone = 1.0 + 0.12 * noise(seed + 24, 0.05 * center_m.x, 0.05 * center_m.y);
+            let grass = DVec3::new(0.42, 0.50, 0.30) * tone;
+            let rgb = grass.lerp(DVec3::new(0.78, 0.82, 0.85), haze);
+            let left = DVec3::new(-sin, cos, 0.0);
+            let rotation = DQuat::from_mat3(&DMat3::from_cols(away, left, DVec3::Z));
+            let sigmas_m = DVec3::new(0.7 * step_m, 0.7 * turn * (radius_m + step_m), 0.02);
+            painter.gaussian(center_m, rotation, sigmas_m, 0.98, rgb, DVec3::ZERO);
+        }
+        radius_m += step_m;
+    }
+}

@@ -1,0 +1,409 @@
+//! Parked cars: one body, lofted through outlines that each kind gives as a table.
+
+use glam::DVec3;
+
+use super::light::Occluder;
+use super::random::{Random, smooth};
+use super::surface::{Paint, Painter, Patch};
+
+/// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
+///
+/// Every knot is (x, belt, top): where along the car, the height of the body's side and the height
+/// of the middle line, in metres. Between knots both run straight.
+#[derive(Clone, Copy, Debug)]
+struct Kind {
+    length_m: f64,
+    width_m: f64,
+    knots: &'static [(f64, f64, f64)],
+    /// Glass of the sides, from tail to nose in parts of the length: between them stand pillars.
+    side_glass: &'static [[f64; 2]],
+    /// Rear window and windscreen, as [low end, high end] along the car.
+    rear_glass: [f64; 2],
+    windscreen: [f64; 2],
+}
+
+const HATCHBACK: Kind = Kind {
+    length_m: 4.1,
+    width_m: 1.76,
+    knots: &[
+        (0.00, 0.72, 0.74),
+        (0.03, 0.94, 0.98),
+        (0.14, 0.96, 1.42),
+        (0.45, 0.94, 1.50),
+        (0.56, 0.93, 1.44),
+        (0.75, 0.90, 0.97),
+        (0.94, 0.74, 0.80),
+        (1.00, 0.58, 0.60),
+    ],
+    side_glass: &[[0.12, 0.22], [0.25, 0.44], [0.465, 0.67]],
+    rear_glass: [0.04, 0.135],
+    windscreen: [0.57, 0.735],
+};
+
+const SEDAN: Kind = Kind {
+    length_m: 4.7,
+    width_m: 1.82,
+    knots: &[
+        (0.00, 0.70, 0.72),
+        (0.02, 0.90, 0.98),
+        (0.15, 0.94, 1.03),
+        (0.30, 0.94, 1.37),
+        (0.48, 0.93, 1.45),
+        (0.57, 0.92, 1.40),
+        (0.74, 0.89, 0.96),
+        (0.95, 0.74, 0.78),
+        (1.00, 0.56, 0.58),
+    ],
+    side_glass: &[[0.21, 0.31], [0.325, 0.465], [0.485, 0.66]],
+    rear_glass: [0.165, 0.29],
+    windscreen: [0.58, 0.725],
+};
+
+const WAGON: Kind = Kind {
+    length_m: 4.5,
+    width_m: 1.86,
+    knots: &[
+        (0.00, 0.80, 0.82),
+        (0.02, 1.04, 1.10),
+        (0.09, 1.06, 1.56),
+        (0.30, 1.05, 1.66),
+        (0.54, 1.03, 1.60),
+        (0.72, 1.00, 1.10),
+        (0.95, 0.86, 0.93),
+        (1.00, 0.66, 0.68),
+    ],
+    side_glass: &[[0.09, 0.24], [0.265, 0.43], [0.45, 0.64]],
+    rear_glass: [0.025, 0.085],
+    windscreen: [0.55, 0.705],
+};
+
+const VAN: Kind = Kind {
+    length_m: 5.1,
+    width_m: 1.94,
+    knots: &[
+        (0.00, 1.02, 1.04),
+        (0.01, 1.18, 1.80),
+        (0.04, 1.20, 1.96),
+        (0.60, 1.18, 1.98),
+        (0.68, 1.16, 1.90),
+        (0.85, 1.10, 1.20),
+        (0.97, 0.92, 0.98),
+        (1.00, 0.70, 0.72),
+    ],
+    side_glass: &[[0.58, 0.78]],
+    rear_glass: [0.012, 0.035],
+    windscreen: [0.69, 0.84],
+};
+
+/// Height of the sills, in metres.
+const SILL_M: f64 = 0.24;
+/// Radius of a tyre, in metres.
+const TYRE_M: f64 = 0.325;
+/// Middle of the wheels along the car, as parts of its length.
+const WHEELS: [f64; 2] = [0.19, 0.80];
+
+/// A parked car, not yet painted.
+#[derive(Clone, Debug)]
+pub(super) struct Car {
+    kind: &'static Kind,
+    /// Middle of the tail on the ground, in metres.
+    tail_m: DVec3,
+    forward: DVec3,
+    left: DVec3,
+    paint: Paint,
+}
+
+impl Car {
+    /// A car with its middle on `middle_m` that looks along `forward`.
+    pub(super) fn new(middle_m: DVec3, forward: DVec3, mut random: Random) -> Self {
+        let kind = random.pick(&[&HATCHBACK, &HATCHBACK, &SEDAN, &SEDAN, &WAGON, &WAGON, &VAN]);
+        let paint = random.pick(&[
+            Paint::matt(0.86, 0.87, 0.88),
+            Paint::matt(0.62, 0.64, 0.66),
+            Paint::matt(0.36, 0.38, 0.41),
+            Paint::matt(0.16, 0.17, 0.19),
+            Paint::matt(0.62, 0.13, 0.12),
+            Paint::matt(0.15, 0.26, 0.50),
+            Paint::matt(0.24, 0.36, 0.33),
+            Paint::matt(0.74, 0.70, 0.60),
+        ]);
+        let left = DVec3::Z.cross(forward);
+        let tail_m = middle_m - 0.5 * kind.length_m * forward;
+        Self { kind, tail_m, forward, left, paint: paint.gloss(0.14) }
+    }
+
+    /// What stands in the sun's way: the body and the cabin, a little smaller than painted.
+    pub(super) fn occluders(&self) -> [Occluder; 2] {
+        let Kind { length_m, width_m, .. } = *self.kind;
+        let block = |from: f64, to: f64, low_m: f64, high_m: f64, half_width_m: f64| {
+            let middle_m = 0.5 * (from + to) * length_m;
+            let half_m = 0.5 * (to - from) * length_m;
+            Occluder::Block {
+                base_m: self.tail_m + middle_m * self.forward + low_m * DVec3::Z,
+                along: self.forward,
+                size_m: DVec3::new(half_m, half_width_m, high_m - low_m),
+            }
+        };
+        let top_m = self.middle_line_m(0.45);
+        [
+            block(0.02, 0.97, 0.10, 0.60, 0.5 * width_m - 0.06),
+            block(0.16, 0.62, 0.60, top_m - 0.12, 0.5 * width_m - 0.22),
+        ]
+    }
+
+    /// Paints body, glass, lamps and wheels.
+    pub(super) fn paint(&self, painter: &mut Painter) {
+        let xs = self.lengthwise(painter);
+        for side in [-1.0, 1.0] {
+            self.flank(painter, &xs, side);
+            self.upper(painter, &xs, side);
+            for wheel in WHEELS {
+                self.wheel(painter, wheel, side);
+            }
+            self.mirror(painter, side);
+        }
+        self.end(painter, 1.0);
+        self.end(painter, 0.0);
+        self.shade_below(painter);
+    }
+
+    /// Break points along the car, in metres from the tail: at every feature, and evenly between.
+    fn lengthwise(&self, painter: &Painter) -> Vec<f64> {
+        let kind = self.kind;
+        let mut features: Vec<f64> = kind.knots.iter().map(|knot| knot.0).collect();
+        features.extend(kind.side_glass.iter().flatten());
+        features.extend(kind.rear_glass);
+        features.extend(kind.windscreen);
+        features.sort_by(f64::total_cmp);
+        features.dedup_by(|b, a| *b - *a < 0.012);
+        let mut xs = vec![0.0];
+        for pair in features.windows(2) {
+            let steps = painter.even(pair[0] * kind.length_m, pair[1] * kind.length_m, 0.12);
+            xs.extend(&steps[1..]);
+        }
+        xs
+    }
+
+    /// Half width of the body at its belt: it narrows towards both ends.
+    fn half_width_m(&self, x: f64) -> f64 {
+        let taper = |from_end: f64| 1.0 - smooth(from_end / 0.16);
+        0.5 * self.kind.width_m * (1.0 - 0.10 * taper(1.0 - x) - 0.07 * taper(x))
+    }
+
+    /// Height of the body's shoulder at a part of the length, in metres.
+    fn belt_m(&self, x: f64) -> f64 {
+        knotted(self.kind.knots, x, |knot| knot.1)
+    }
+
+    /// Height of bonnet, glass and roof on the middle line, in metres.
+    fn middle_line_m(&self, x: f64) -> f64 {
+        knotted(self.kind.knots, x, |knot| knot.2)
+    }
+
+    fn place(&self, x_m: f64, y_m: f64, z_m: f64) -> DVec3 {
+        self.tail_m + x_m * self.forward + y_m * self.left + z_m * DVec3::Z
+    }
+
+    /// The side from sill to shoulder, slightly bellied, with the wheel arches cut out.
+    fn flank(&self, painter: &mut Painter, xs: &[f64], side: f64) {
+        let length_m = self.kind.length_m;
+        let vs = painter.even(0.0, 1.0, 0.14);
+        let place = |x_m: f64, v: f64| {
+            let x = x_m / length_m;
+            let belly = 1.0 - 0.10 * (1.0 - v) * (1.0 - v) - 0.03 * v * v;
+            let z_m = SILL_M + v * (self.belt_m(x) - SILL_M);
+            self.place(x_m, side * belly * self.half_width_m(x), z_m)
+        };
+        // Outwards is left × ... : on the left side u runs to the tail.
+        let us = facing(xs, -side);
+        let body = self.paint;
+        painter.sheet(
+            &us,
+            &vs,
+            |u, v| place(-side * u, v),
+            |u, v| {
+                let x_m = -side * u;
+                let z_m = SILL_M + v * (self.belt_m(x_m / length_m) - SILL_M);
+                let arch = WHEELS.iter().any(|wheel| {
+                    let dx_m = x_m - wheel * length_m;
+                    dx_m * dx_m + (z_m - TYRE_M).powi(2) < (TYRE_M + 0.07).powi(2)
+                });
+                if arch {
+                    return None;
+                }
+                let seam = self.kind.side_glass.iter().any(|glass| {
+                    (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36
+                });
+                let sill = if z_m < 0.34 { 0.45 } else { 1.0 };
+                let shade = if seam { 0.72 } else { 1.0 };
+                let open = 0.62 + 0.38 * smooth((z_m - 0.1) / 0.6);
+                Some(body.times(sill * shade).open(open))
+            },
+        );
+    }
+
+    /// From the shoulder over the side windows to the middle line.
+    fn upper(&self, painter: &mut Painter, xs: &[f64], side: f64) {
+        let length_m = self.kind.length_m;
+        // v from 0 at the shoulder to 1 at the roof's edge, on to 2 on the middle line.
+        let mut vs = vec![0.0, 0.12];
+        vs.extend(painter.even(0.12, 0.86, 0.25).into_iter().skip(1));
+        vs.push(1.0);
+        vs.extend(painter.even(1.0, 2.0, 0.24).into_iter().skip(1));
+        let section = |x_m: f64, v: f64| {
+            let x = x_m / length_m;
+            let (belt_m, top_m) = (self.belt_m(x), self.middle_line_m(x));
+            let half_m = 0.97 * self.half_width_m(x);
+            // The cabin leans in by a quarter of its height above the shoulder; the roof's crown
+            // is 6 cm above its edge.
+            let cabin_m = (top_m - belt_m).max(0.0);
+            let edge_m = half_m - 0.10 - 0.38 * (cabin_m - 0.06).max(0.0);
+            let edge_z_m = belt_m + 0.88 * cabin_m;
+            let (y_m, z_m) = if v < 1.0 {
+                (half_m + v * (edge_m - half_m), belt_m + v * (edge_z_m - belt_m))
+            } else {
+                let inwards = v - 1.0;
+                let rise = 1.0 - (1.0 - inwards) * (1.0 - inwards);
+                (edge_m * (1.0 - inwards), edge_z_m + rise * (top_m - edge_z_m))
+            };
+            self.place(x_m, side * y_m, z_m)
+        };
+        let us = facing(xs, -side);
+        let within = |x: f64, [from, to]: [f64; 2]| (from..to).contains(&x);
+        painter.sheet(
+            &us,
+            &vs,
+            |u, v| section(-side * u, v),
+            |u, v| {
+                let x = -side * u / length_m;
+                let cabin_m = self.middle_line_m(x) - self.belt_m(x);
+                let side_glass = (0.12..0.86).contains(&v)
+                    && cabin_m > 0.14
+                    && self.kind.side_glass.iter().any(|&glass| within(x, glass));
+                let screen = v > 1.0
+                    && (within(x, self.kind.windscreen) || within(x, self.kind.rear_glass));
+                Some(if side_glass || screen { glass() } else { self.paint })
+            },
+        );
+    }
+
+    /// Nose (`x` = 1) or tail (`x` = 0): bumper, grille or boot lid, lamps, number plate.
+    fn end(&self, painter: &mut Painter, x: f64) {
+        let nose = x > 0.5;
+        let outwards = if nose { 1.0 } else { -1.0 };
+        let (half_m, top_m) = (0.97 * self.half_width_m(x), self.belt_m(x) + 0.01);
+        // As seen from outside, u runs to the right: the car's left when one looks at its nose.
+        let ys = painter.graded(-half_m, half_m, 0.10, 0.14);
+        let zs = painter.even(SILL_M - 0.02, top_m, 0.075);
+        let bulge = |y_m: f64| 0.05 * (1.0 - (y_m / half_m).powi(2));
+        let place = |u_m: f64, z_m: f64| {
+            let x_m = x * self.kind.length_m + outwards * bulge(u_m);
+            self.place(x_m, outwards * u_m, z_m)
+        };
+        painter.sheet(&ys, &zs, place, |u_m, z_m| {
+            let (aside_m, height) = (u_m.abs(), (z_m - SILL_M) / (top_m - SILL_M));
+            let lamp = aside_m > half_m - 0.30 && (0.62..0.98).contains(&height);
+            let plate = aside_m < 0.26 && (0.30..0.55).contains(&height);
+            let grille = nose && aside_m < half_m - 0.36 && (0.62..0.95).contains(&height);
+            Some(if lamp && nose {
+                Paint::matt(0.93, 0.94, 0.96).gloss(0.2)
+            } else if lamp {
+                Paint::matt(0.74, 0.09, 0.08).gloss(0.1)
+            } else if plate {
+                Paint::matt(0.90, 0.90, 0.87)
+            } else if grille || height < 0.22 {
+                Paint::matt(0.12, 0.12, 0.13).gloss(0.05)
+            } else {
+                self.paint
+            }
+            .open(0.65 + 0.35 * smooth(height / 0.6)))
+        });
+    }
+
+    /// Tyre, rim, and the dark of the arch behind them.
+    fn wheel(&self, painter: &mut Painter, wheel: f64, side: f64) {
+        let x_m = wheel * self.kind.length_m;
+        let half_m = self.half_width_m(wheel);
+        let disc = |radius_m: f64, y_m: f64| {
+            move |angle_rad: f64, r: f64| {
+                let (sin, cos) = angle_rad.sin_cos();
+                self.place(x_m + radius_m * r * cos, side * y_m, TYRE_M + radius_m * r * sin)
+            }
+        };
+        let around = |count: usize| -> Vec<f64> {
+            let step_rad = std::f64::consts::TAU / count as f64;
+            // Outwards for either side: with r as v, u × v points to -left when u turns left.
+            (0..=count).map(|i| side * i as f64 * step_rad).collect()
+        };
+        let arch = disc(TYRE_M + 0.09, half_m - 0.16);
+        painter.sheet(&around(10), &[0.1, 0.55, 1.0], arch, |_, _| {
+            Some(Paint::matt(0.07, 0.07, 0.08).open(0.5))
+        });
+        let rings = [0.0, 0.22, 0.48, 0.68, 0.82, 1.0];
+        let rim = Paint::matt(0.66, 0.67, 0.70).gloss(0.1);
+        painter.sheet(&around(15), &rings, disc(TYRE_M, half_m - 0.035), |angle_rad, r| {
+            let spoke = (angle_rad.abs() * 5.0 / std::f64::consts::TAU).fract() < 0.55;
+            Some(if r > 0.68 {
+                Paint::matt(0.14, 0.14, 0.15)
+            } else if spoke || r < 0.22 || r > 0.6 {
+                rim
+            } else {
+                Paint::matt(0.16, 0.16, 0.17)
+            })
+        });
+        // The tread, as seen from ahead and behind.
+        let tread = move |angle_rad: f64, t: f64| {
+            let (sin, cos) = angle_rad.sin_cos();
+            let y_m = side * (half_m - 0.035 - 0.20 * t);
+            self.place(x_m + TYRE_M * cos, y_m, TYRE_M + TYRE_M * sin)
+        };
+        painter.sheet(&around(14), &[0.0, 0.5, 1.0], tread, |_, _| {
+            Some(Paint::matt(0.12, 0.12, 0.13))
+        });
+    }
+
+    /// A door mirror: one blob.
+    fn mirror(&self, painter: &mut Painter, side: f64) {
+        let x = self.kind.windscreen[1] - 0.055;
+        let center_m = self.place(
+            x * self.kind.length_m,
+            side * (self.half_width_m(x) + 0.06),
+            self.belt_m(x) + 0.09,
+        );
+        for (edge_u_m, edge_v_m) in [
+            (0.20 * side * self.left, 0.14 * DVec3::Z),
+            (-0.20 * side * self.left, 0.14 * DVec3::Z),
+            (-0.12 * side * self.forward, 0.14 * DVec3::Z),
+        ] {
+            painter.patch(&Patch { center_m, edge_u_m, edge_v_m }, self.paint.times(0.9));
+        }
+    }
+
+    /// The dark between the wheels, 2 cm above the road.
+    fn shade_below(&self, painter: &mut Painter) {
+        let (half_m, length_m) = (0.5 * self.kind.width_m, self.kind.length_m);
+        let xs = painter.even(0.02, length_m - 0.02, 0.26);
+        let ys = painter.even(-half_m + 0.02, half_m - 0.02, 0.26);
+        painter.sheet(&xs, &ys, |x_m, y_m| self.place(x_m, y_m, 0.02), |x_m, y_m| {
+            let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
+            Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
+        });
+    }
+}
+
+/// A column of the knots at `x`, straight between them.
+fn knotted(knots: &[(f64, f64, f64)], x: f64, column: fn(&(f64, f64, f64)) -> f64) -> f64 {
+    let after = knots.iter().position(|knot| knot.0 >= x).unwrap_or(knots.len() - 1).max(1);
+    let (low, high) = (&knots[after - 1], &knots[after]);
+    let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);
+    column(low) + t * (column(high) - column(low))
+}
+
+/// Break points run forwards for `sign` 1; for -1 mirrored, so that they still increase.
+fn facing(xs: &[f64], sign: f64) -> Vec<f64> {
+    if sign > 0.0 { xs.to_vec() } else { xs.iter().rev().map(|x_m| -x_m).collect() }
+}
+
+fn glass() -> Paint {
+    Paint::matt(0.13, 0.16, 0.19).gloss(0.36)
+}

@@ -1,0 +1,390 @@
+//! One wall of a house: windows, doors, shops, balconies, cornice.
+
+use glam::DVec3;
+
+use super::random::{Random, noise, smooth};
+use super::surface::{Paint, Painter, Patch};
+
+/// A vertical plane: u runs to the right as seen from outside, v up, depth outwards.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Wall {
+    /// Left lower corner as seen from outside, in metres.
+    pub(super) corner_m: DVec3,
+    /// Unit, to the right.
+    pub(super) right: DVec3,
+    /// Unit, outwards.
+    pub(super) out: DVec3,
+    /// Width, in metres.
+    pub(super) width_m: f64,
+}
+
+impl Wall {
+    /// The wall between two ground points, `left_m` and `right_m` as seen from outside.
+    pub(super) fn between(left_m: DVec3, right_m: DVec3) -> Self {
+        let right = (right_m - left_m).normalize();
+        let out = right.cross(DVec3::Z);
+        Self { corner_m: left_m, right, out, width_m: left_m.distance(right_m) }
+    }
+
+    /// The point at `u_m` to the right, `v_m` up and `depth_m` out of the wall.
+    pub(super) fn at(&self, u_m: f64, v_m: f64, depth_m: f64) -> DVec3 {
+        self.corner_m + u_m * self.right + v_m * DVec3::Z + depth_m * self.out
+    }
+}
+
+/// What fills the ground floor.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum GroundFloor {
+    /// Windows, and a door in one bay.
+    Flats,
+    /// Shop windows with a sign and awnings.
+    Shop,
+    /// Nothing but the wall: towards a neighbour or a yard.
+    Blind,
+}
+
+/// How a house looks from outside.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Style {
+    /// The plaster or brick.
+    pub(super) wall: Paint,
+    /// Cornices, window surrounds, sills.
+    pub(super) trim: Paint,
+    /// Window frames and balcony railings.
+    pub(super) frame: Paint,
+    /// Shop sign and awnings.
+    pub(super) accent: Paint,
+    /// Floors above the ground floor.
+    pub(super) upper_floors: usize,
+    /// Width of a window bay, about, in metres.
+    pub(super) bay_m: f64,
+    /// Height of a window, in metres.
+    pub(super) window_m: f64,
+    /// Brick courses instead of plaster.
+    pub(super) brick: bool,
+    /// Balconies in every second bay.
+    pub(super) balconies: bool,
+    /// What fills the ground floor.
+    pub(super) ground_floor: GroundFloor,
+}
+
+/// Height of a ground floor, in metres.
+pub(super) const GROUND_FLOOR_M: f64 = 3.8;
+/// Height of every other floor, in metres.
+pub(super) const FLOOR_M: f64 = 3.1;
+/// Height of the cornice above the last floor, in metres.
+const CORNICE_M: f64 = 0.45;
+
+impl Style {
+    /// Height of the wall up to the eaves, in metres.
+    pub(super) fn height_m(&self) -> f64 {
+        GROUND_FLOOR_M + FLOOR_M * self.upper_floors as f64 + CORNICE_M
+    }
+}
+
+/// Paints a wall with everything in it.
+pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &mut Random) {
+    let count = (wall.width_m / style.bay_m).round().max(1.0) as usize;
+    let mut facade = Facade { painter, wall, style, bay_m: wall.width_m / count as f64 };
+    let door = random.below(count);
+    for bay in 0..count {
+        let u_m = bay as f64 * facade.bay_m;
+        match style.ground_floor {
+            GroundFloor::Blind => facade.plain([u_m, u_m + facade.bay_m], [0.0, GROUND_FLOOR_M]),
+            _ if bay == door => facade.door_bay(u_m),
+            GroundFloor::Shop => facade.shop_bay(u_m, random),
+            GroundFloor::Flats => facade.window_bay(u_m, [0.0, GROUND_FLOOR_M], 1.25, random),
+        }
+    }
+    for floor in 0..style.upper_floors {
+        let from_m = GROUND_FLOOR_M + FLOOR_M * floor as f64;
+        // What is higher is farther from every camera.
+        facade.painter.coarser(1.0 + 0.22 * floor as f64, |painter| {
+            let mut facade = Facade { painter, ..facade };
+            for bay in 0..count {
+                let u_m = bay as f64 * facade.bay_m;
+                facade.window_bay(u_m, [from_m, from_m + FLOOR_M], 0.85, random);
+                let centred = bay % 2 == count / 2 % 2;
+                if style.balconies && centred {
+                    facade.balcony(u_m + 0.5 * facade.bay_m, from_m);
+                }
+            }
+        });
+    }
+    facade.bands();
+}
+
+struct Facade<'p, 'a, 'w> {
+    painter: &'p mut Painter<'a>,
+    wall: &'w Wall,
+    style: &'w Style,
+    bay_m: f64,
+}
+
+/// Spacing at edges of colour, in metres.
+const EDGE_M: f64 = 0.07;
+/// Spacing on plain wall, in metres.
+const PLAIN_M: f64 = 0.38;
+/// How deep window panes lie in the wall, in metres.
+const RECESS_M: f64 = 0.14;
+
+impl Facade<'_, '_, '_> {
+    /// One bay of one floor: wall around a window whose sill is `sill_m` above the floor.
+    fn window_bay(&mut self, u_m: f64, v_m: [f64; 2], sill_m: f64, random: &mut Random) {
+        let half_m = 0.5 * (0.42 * self.bay_m).clamp(0.9, 1.5);
+        let middle_m = u_m + 0.5 * self.bay_m;
+        let u = [middle_m - half_m, middle_m + half_m];
+        let v = [v_m[0] + sill_m, (v_m[0] + sill_m + self.style.window_m).min(v_m[1] - 0.35)];
+        self.plain([u_m, u[0]], v_m);
+        self.plain([u[1], u_m + self.bay_m], v_m);
+        self.plain(u, [v_m[0], v[0]]);
+        self.plain(u, [v[1], v_m[1]]);
+        self.surround(u, v);
+        self.window(u, v, random);
+    }
+
+    /// Wall without anything in it, fine at its sides.
+    fn plain(&mut self, u: [f64; 2], v: [f64; 2]) {
+        let us = self.painter.graded(u[0], u[1], EDGE_M, PLAIN_M);
+        let vs = self.painter.graded(v[0], v[1], EDGE_M, PLAIN_M);
+        let style = *self.style;
+        let at_m = self.wall.corner_m;
+        self.rect(&us, &vs, 0.0, |u_m, v_m| {
+            // Stains run down, splashes from the pavement darken the foot.
+            let seed = (at_m.x * 16.0) as i64 as u64;
+            let stain = 0.030 * noise(seed, 1.3 * u_m, 0.25 * v_m)
+                + 0.025 * noise(seed + 1, 0.3 * u_m, 0.3 * v_m);
+            let grain = if style.brick {
+                0.06 * noise(seed + 2, 3.1 * u_m + (v_m * 8.0).floor() * 0.5, (v_m * 8.0).floor())
+            } else {
+                0.012 * noise(seed + 2, 5.0 * u_m, 5.0 * v_m)
+            };
+            let foot = 0.72 + 0.28 * smooth(v_m / 1.2);
+            let eaves = 0.75 + 0.25 * smooth((style.height_m() - v_m) / 1.2);
+            style.wall.times(1.0 + stain + grain).open(foot * eaves)
+        });
+    }
+
+    /// The stone frame around an opening, with its sill and the reveals to the panes.
+    fn surround(&mut self, u: [f64; 2], v: [f64; 2]) {
+        let trim = self.style.trim;
+        let (wide_m, out_m) = (0.13, 0.035);
+        for [u0, u1] in [[u[0] - wide_m, u[0]], [u[1], u[1] + wide_m]] {
+            let vs = self.painter.even(v[0], v[1], 0.32);
+            self.rect(&[u0, u1], &vs, out_m, |_, _| trim);
+        }
+        let us = self.painter.even(u[0] - wide_m, u[1] + wide_m, 0.30);
+        self.rect(&us, &[v[1], v[1] + wide_m + 0.03], out_m, |_, _| trim);
+        // The sill stands out: its top, its face, and the shade below it.
+        self.rect(&us, &[v[0] - 0.09, v[0]], 0.10, |_, _| trim.times(1.04));
+        self.rect(&us, &[v[0] - 0.19, v[0] - 0.10], 0.01, |_, _| trim.times(0.72));
+        // Reveals: the wall's thickness beside and above the panes.
+        let shade = self.style.wall.open(0.6);
+        let vs = self.painter.even(v[0], v[1], 0.40);
+        for (at_m, outwards) in [(u[0], true), (u[1], false)] {
+            let wall = *self.wall;
+            // Seen from inside the opening: to the right goes inwards on its left side.
+            let (from_m, to_m) = if outwards { (0.0, -RECESS_M) } else { (-RECESS_M, 0.0) };
+            let place = move |d_m: f64, v_m: f64| wall.at(at_m, v_m, d_m);
+            self.painter.sheet(&[from_m, to_m], &vs, place, |_, _| Some(shade));
+        }
+    }
+
+    /// Frame and panes in an opening.
+    fn window(&mut self, u: [f64; 2], v: [f64; 2], random: &mut Random) {
+        let frame = self.style.frame;
+        let (rim_m, depth_m) = (0.065, -RECESS_M);
+        let middle_m = 0.5 * (u[0] + u[1]);
+        let transom_m = v[1] - 0.30 * (v[1] - v[0]);
+        let verticals = [u[0] + 0.5 * rim_m, middle_m, u[1] - 0.5 * rim_m];
+        for at_m in verticals {
+            let vs = self.painter.even(v[0], v[1], 0.34);
+            let us = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
+            self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
+        }
+        for at_m in [v[0] + 0.5 * rim_m, transom_m, v[1] - 0.5 * rim_m] {
+            let us = self.painter.even(u[0], u[1], 0.30);
+            let vs = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
+            self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
+        }
+        // Some rooms are lit, some have curtains; the rest is dark with the sky in it.
+        let curtain = random.chance(0.45);
+        let drawn = random.range(0.1, 0.34);
+        let tone = random.range(0.8, 1.25);
+        let cloth = random.pick(&[
+            Paint::matt(0.66, 0.63, 0.56),
+            Paint::matt(0.60, 0.62, 0.64),
+            Paint::matt(0.58, 0.47, 0.40),
+        ]);
+        for [u0, u1] in [[u[0] + rim_m, middle_m], [middle_m, u[1] - rim_m]] {
+            let us = self.painter.graded(u0, u1, 0.09, 0.26);
+            for [v0, v1] in [[v[0] + rim_m, transom_m], [transom_m, v[1] - rim_m]] {
+                let vs = self.painter.graded(v0, v1, 0.10, 0.34);
+                let [left_m, right_m] = u;
+                let [low_m, high_m] = v;
+                self.rect(&us, &vs, depth_m, |u_m, v_m| {
+                    let aside = (u_m - left_m).min(right_m - u_m) / (right_m - left_m);
+                    let height = (v_m - low_m) / (high_m - low_m);
+                    // The lintel shades the upper part of the panes.
+                    let open = 0.75 + 0.25 * smooth((high_m - v_m) / 0.4);
+                    if curtain && aside < drawn {
+                        cloth.times(0.72).gloss(0.16).open(open)
+                    } else {
+                        glass().times(tone * (0.85 + 0.4 * height)).open(open)
+                    }
+                });
+            }
+        }
+    }
+
+    /// A bay with the house's door, two steps and a lamp.
+    fn door_bay(&mut self, u_m: f64) {
+        let half_m = 0.65_f64.min(0.3 * self.bay_m);
+        let middle_m = u_m + 0.5 * self.bay_m;
+        let u = [middle_m - half_m, middle_m + half_m];
+        let (door_m, light_m) = (2.35, 3.0);
+        self.plain([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
+        self.plain([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
+        self.plain(u, [light_m, GROUND_FLOOR_M]);
+        self.surround(u, [0.30, light_m]);
+        let wood = self.style.accent.times(0.75);
+        let us = self.painter.graded(u[0], u[1], 0.06, 0.16);
+        let vs = self.painter.graded(0.0, door_m, 0.06, 0.22);
+        self.rect(&us, &vs, -RECESS_M, |at_m, v_m| {
+            let panel = |x: f64, from: f64, to: f64| (from..to).contains(&x);
+            let aside_m = (at_m - middle_m).abs() / half_m;
+            let inset = panel(aside_m, 0.15, 0.8)
+                && (panel(v_m, 0.25, 0.95) || panel(v_m, 1.15, 2.1));
+            wood.times(if inset { 0.78 } else { 1.0 }).gloss(0.06)
+        });
+        let vs = self.painter.graded(door_m, light_m, 0.08, 0.25);
+        self.rect(&us, &vs, -RECESS_M, |_, v_m| {
+            if v_m < door_m + 0.1 { self_frame() } else { glass() }
+        });
+        let step = Paint::matt(0.62, 0.61, 0.59);
+        let wall = *self.wall;
+        let us = self.painter.even(u[0] - 0.15, u[1] + 0.15, 0.3);
+        let top = move |at_m: f64, d_m: f64| wall.at(at_m, 0.15, -d_m);
+        self.painter.sheet(&us, &[-0.45, -0.2, 0.1], top, |_, _| Some(step));
+        self.rect(&us, &[0.0, 0.15], 0.45, |_, _| step.times(0.9).open(0.7));
+        let lamp = Patch {
+            center_m: wall.at(u[1] + 0.32, 2.35, 0.12),
+            edge_u_m: 0.16 * wall.right,
+            edge_v_m: 0.26 * DVec3::Z,
+        };
+        self.painter.patch(&lamp, Paint::glowing(0.98, 0.92, 0.75));
+    }
+
+    /// A bay of shop window: plinth, glass with goods behind it, sign, awning.
+    fn shop_bay(&mut self, u_m: f64, random: &mut Random) {
+        let (accent, frame) = (self.style.accent, self.style.frame);
+        let pier_m = 0.22;
+        let u = [u_m + pier_m, u_m + self.bay_m - pier_m];
+        let (plinth_m, head_m, sign_m) = (0.45, 2.75, 3.45);
+        self.plain([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
+        self.plain([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
+        self.plain(u, [sign_m, GROUND_FLOOR_M]);
+        let us = self.painter.graded(u[0], u[1], 0.08, 0.3);
+        self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| accent.times(0.7).open(0.7 + 0.5 * v_m));
+        // Goods: blurred shelves of colours behind the glass.
+        let seed = random.below(1 << 30) as u64;
+        let panes = self.painter.graded(plinth_m, head_m, 0.08, 0.22);
+        self.rect(&us, &panes, -0.10, |at_m, v_m| {
+            let mullion = ((at_m - u[0]) / (u[1] - u[0]) - 0.5).abs() < 0.02;
+            if mullion || v_m > head_m - 0.09 || v_m < plinth_m + 0.08 {
+                return frame;
+            }
+            let shelf = (v_m / 0.42).floor();
+            let goods = |channel: u64| noise(seed + channel, 3.2 * at_m, 1.7 * shelf);
+            let warm = 0.5 + 0.5 * smooth((v_m - 1.2) / 1.4);
+            let mut paint = Paint::matt(0.42, 0.37, 0.31).times(0.75 + 0.5 * warm).gloss(0.22);
+            paint.rgb += 0.16 * DVec3::new(goods(0), goods(1), goods(2));
+            paint
+        });
+        // The sign, with blocks that pass for letters.
+        let signs = self.painter.graded(head_m, sign_m, 0.09, 0.12);
+        let letters = self.painter.even(u[0], u[1], 0.13);
+        let lettering = if accent.rgb.element_sum() > 1.5 { 0.25 } else { 0.93 };
+        self.rect(&letters, &signs, 0.06, |at_m, v_m| {
+            let inside = (v_m - 0.5 * (head_m + sign_m)).abs() < 0.17
+                && (at_m - 0.5 * (u[0] + u[1])).abs() < 0.36 * (u[1] - u[0]);
+            let ink = noise(seed + 5, 7.0 * at_m, 3.0 * v_m) > -0.05;
+            let letter = Paint::matt(lettering, lettering, 0.95 * lettering);
+            if inside && ink { letter } else { accent }
+        });
+        if seed % 3 != 0 {
+            self.awning(u, head_m + 0.05, accent);
+        }
+    }
+
+    /// A striped cloth on a slope, 1.1 m out.
+    fn awning(&mut self, u: [f64; 2], v_m: f64, accent: Paint) {
+        let wall = *self.wall;
+        let us = self.painter.even(u[0] - 0.1, u[1] + 0.1, 0.16);
+        // From the outer edge up to the wall, so that the normal points out and up.
+        let out = self.painter.even(0.0, 1.0, 0.2);
+        let slope = move |at_m: f64, t: f64| wall.at(at_m, v_m - 0.40 + 0.40 * t, 1.1 * (1.0 - t));
+        let first_m = us[0];
+        let cloth = |at_m: f64| {
+            let light = ((at_m - first_m) / 0.32) as i64 % 2 == 0;
+            if light { Paint::matt(0.88, 0.86, 0.82) } else { accent.times(1.1) }
+        };
+        self.painter.sheet(&us, &out, slope, |at_m, _| Some(cloth(at_m)));
+        self.rect(&us, &[v_m - 0.58, v_m - 0.40], 1.1, |at_m, _| cloth(at_m).times(0.95));
+    }
+
+    /// A balcony in front of a window: slab, rails, and plants in a box.
+    fn balcony(&mut self, middle_m: f64, floor_m: f64) {
+        let (half_m, deep_m) = ((0.42 * self.bay_m).min(1.3), 0.95);
+        let u = [middle_m - half_m, middle_m + half_m];
+        let stone = self.style.trim;
+        let us = self.painter.even(u[0], u[1], 0.3);
+        self.rect(&us, &[floor_m - 0.12, floor_m + 0.06], deep_m, |_, _| stone);
+        let wall = *self.wall;
+        let below = move |at_m: f64, d_m: f64| wall.at(at_m, floor_m - 0.12, d_m);
+        self.painter.sheet(&us, &[0.0, 0.3, 0.6, deep_m], below, |_, _| Some(stone.open(0.8)));
+        let rail = self.style.frame.times(0.45);
+        self.rect(&us, &[floor_m + 0.98, floor_m + 1.05], deep_m, |_, _| rail);
+        let bars = self.painter.even(u[0], u[1], 0.14);
+        for at_m in bars {
+            let bar = [at_m - 0.015, at_m + 0.015];
+            self.rect(&bar, &[floor_m + 0.06, floor_m + 0.52, floor_m + 0.98], deep_m, |_, _| rail);
+        }
+        for (at_m, side) in [(u[0], -1.0), (u[1], 1.0)] {
+            let ds = if side < 0.0 { [0.0, 0.5, deep_m] } else { [deep_m, 0.5, 0.0] };
+            let place = move |d_m: f64, v_m: f64| wall.at(at_m, v_m, d_m);
+            self.painter.sheet(&ds, &[floor_m - 0.12, floor_m + 0.06], place, |_, _| Some(stone));
+            self.painter.sheet(&ds, &[floor_m + 0.98, floor_m + 1.05], place, |_, _| Some(rail));
+        }
+    }
+
+    /// Bands across the whole wall: plinth line above the ground floor, cornice below the eaves.
+    fn bands(&mut self) {
+        let (width_m, top_m) = (self.wall.width_m, self.style.height_m());
+        let trim = self.style.trim;
+        let us = self.painter.even(0.0, width_m, 0.45);
+        let band = [GROUND_FLOOR_M - 0.16, GROUND_FLOOR_M - 0.03, GROUND_FLOOR_M + 0.10];
+        self.rect(&us, &band, 0.09, |_, v_m| trim.times(0.8 + 0.2 * smooth((v_m - band[0]) / 0.1)));
+        let base_m = top_m - CORNICE_M;
+        let (mould, lip) = ([base_m, base_m + 0.12, base_m + 0.24], [base_m + 0.24, top_m]);
+        self.rect(&us, &mould, 0.10, |_, _| trim.times(0.86));
+        self.rect(&us, &lip, 0.34, |_, _| trim);
+        let wall = *self.wall;
+        let below = move |u_m: f64, d_m: f64| wall.at(u_m, base_m + 0.24, d_m);
+        self.painter.sheet(&us, &[0.0, 0.17, 0.34], below, |_, _| Some(trim.open(0.8)));
+    }
+
+    fn rect(&mut self, us: &[f64], vs: &[f64], depth_m: f64, paint: impl Fn(f64, f64) -> Paint) {
+        let wall = *self.wall;
+        let place = move |u_m: f64, v_m: f64| wall.at(u_m, v_m, depth_m);
+        self.painter.sheet(us, vs, place, |u_m, v_m| Some(paint(u_m, v_m)));
+    }
+}
+
+fn glass() -> Paint {
+    Paint::matt(0.26, 0.31, 0.36).gloss(0.34)
+}
+
+fn self_frame() -> Paint {
+    Paint::matt(0.80, 0.79, 0.76)
+}

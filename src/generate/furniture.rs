@@ -1,0 +1,136 @@
+//! Lamp poles, traffic lights, signs, bins, planters and bollards.
+
+use glam::DVec3;
+
+use super::plants;
+use super::random::Random;
+use super::surface::{Paint, Painter, Patch};
+
+const STEEL: Paint = Paint::matt(0.36, 0.38, 0.39);
+
+/// A street lamp with an arm: `towards_road` is unit and horizontal.
+pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
+    let top_m = foot_m + 6.8 * DVec3::Z;
+    pole(painter, [foot_m, foot_m + 1.1 * DVec3::Z], 0.10, STEEL.times(0.9));
+    pole(painter, [foot_m + 1.1 * DVec3::Z, top_m], 0.06, STEEL);
+    let head_m = top_m + 1.3 * towards_road + 0.25 * DVec3::Z;
+    pole(painter, [top_m, head_m], 0.035, STEEL);
+    let along = towards_road.cross(DVec3::Z);
+    block(painter, head_m + 0.30 * towards_road, along, DVec3::new(0.13, 0.34, 0.09), STEEL);
+    let glow = Patch {
+        center_m: head_m + 0.30 * towards_road - 0.012 * DVec3::Z,
+        edge_u_m: 0.5 * towards_road,
+        edge_v_m: 0.2 * along,
+    };
+    painter.patch(&glow, Paint::glowing(0.97, 0.95, 0.86));
+}
+
+/// A traffic light on a pole; its lamps look along `facing`. `green` or red is on.
+pub(super) fn traffic_light(painter: &mut Painter, foot_m: DVec3, facing: DVec3, green: bool) {
+    pole(painter, [foot_m, foot_m + 3.5 * DVec3::Z], 0.065, STEEL);
+    let right = DVec3::Z.cross(facing);
+    let dark = Paint::matt(0.11, 0.12, 0.12);
+    let base_m = foot_m + 2.45 * DVec3::Z + 0.17 * facing;
+    block(painter, base_m, right, DVec3::new(0.16, 0.13, 0.98), dark);
+    let lamps = [
+        (0.80, if green { Paint::matt(0.25, 0.06, 0.06) } else { Paint::glowing(1.0, 0.16, 0.10) }),
+        (0.49, Paint::matt(0.30, 0.22, 0.05)),
+        (0.18, if green { Paint::glowing(0.20, 1.0, 0.55) } else { Paint::matt(0.04, 0.22, 0.12) }),
+    ];
+    for (height_m, paint) in lamps {
+        let center_m = base_m + height_m * DVec3::Z + 0.15 * facing;
+        disc(painter, center_m, facing, 0.105, |_| paint);
+    }
+}
+
+/// A round sign on a pole: white in a red ring.
+pub(super) fn sign(painter: &mut Painter, foot_m: DVec3, facing: DVec3) {
+    pole(painter, [foot_m, foot_m + 2.75 * DVec3::Z], 0.035, STEEL.times(1.3));
+    let center_m = foot_m + 2.5 * DVec3::Z;
+    disc(painter, center_m + 0.05 * facing, facing, 0.31, |r| {
+        if r > 0.72 { Paint::matt(0.80, 0.10, 0.11) } else { Paint::matt(0.93, 0.93, 0.92) }
+    });
+    disc(painter, center_m - 0.05 * facing, -facing, 0.31, |_| Paint::matt(0.55, 0.56, 0.57));
+}
+
+/// A litter bin.
+pub(super) fn bin(painter: &mut Painter, foot_m: DVec3) {
+    let green = Paint::matt(0.17, 0.30, 0.24);
+    pole(painter, [foot_m, foot_m + 0.85 * DVec3::Z], 0.21, green);
+    pole(painter, [foot_m + 0.85 * DVec3::Z, foot_m + 0.95 * DVec3::Z], 0.23, green.times(0.6));
+}
+
+/// A short post that keeps cars off the pavement.
+pub(super) fn bollard(painter: &mut Painter, foot_m: DVec3) {
+    let dark = Paint::matt(0.22, 0.22, 0.23);
+    pole(painter, [foot_m, foot_m + 0.72 * DVec3::Z], 0.06, dark);
+    pole(painter, [foot_m + 0.72 * DVec3::Z, foot_m + 0.90 * DVec3::Z], 0.062, dark.times(3.6));
+    pole(painter, [foot_m + 0.90 * DVec3::Z, foot_m + 0.98 * DVec3::Z], 0.06, dark);
+}
+
+/// A box of concrete with a hedge in it, `half_m` long to either side.
+pub(super) fn planter(
+    painter: &mut Painter,
+    base_m: DVec3,
+    along: DVec3,
+    half_m: f64,
+    random: &mut Random,
+) {
+    let concrete = Paint::matt(0.62, 0.61, 0.58);
+    block(painter, base_m, along, DVec3::new(half_m, 0.32, 0.5), concrete);
+    let size_m = DVec3::new(half_m - 0.05, 0.30, 0.75);
+    plants::hedge(painter, base_m + 0.42 * DVec3::Z, along, size_m, random);
+}
+
+/// A round pole from end to end.
+fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
+    let axis = (ends_m[1] - ends_m[0]).normalize();
+    let (side, front) = axis.any_orthonormal_pair();
+    let around = painter.even(0.0, std::f64::consts::TAU, 0.9);
+    let step_m = (4.0 * radius_m).clamp(0.12, 0.30);
+    let along = painter.even(0.0, ends_m[0].distance(ends_m[1]), step_m);
+    let place = |angle_rad: f64, z_m: f64| {
+        let (sin, cos) = angle_rad.sin_cos();
+        ends_m[0] + z_m * axis + radius_m * (cos * side + sin * front)
+    };
+    painter.sheet(&around, &along, place, |_, _| Some(paint));
+}
+
+/// Four sides and a lid: `size_m` is half length, half depth and height.
+fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, paint: Paint) {
+    let across = DVec3::Z.cross(along);
+    let corner = |i: f64, j: f64| base_m + i * size_m.x * along + j * size_m.y * across;
+    let corners = [corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
+    let vs = painter.graded(0.0, size_m.z, 0.10, 0.22);
+    for side in 0..4 {
+        let (from_m, to_m) = (corners[side], corners[(side + 1) % 4]);
+        let width_m = from_m.distance(to_m);
+        let right = (to_m - from_m) / width_m;
+        let us = painter.graded(0.0, width_m, 0.10, 0.24);
+        painter.sheet(&us, &vs, |u_m, v_m| from_m + u_m * right + v_m * DVec3::Z, |_, v_m| {
+            Some(paint.open(0.75 + 0.25 * (v_m / size_m.z)))
+        });
+    }
+    let (us, vs) = ([-1.0, -0.4, 0.4, 1.0], [-1.0, 0.0, 1.0]);
+    let lid = |i: f64, j: f64| corner(i, j) + size_m.z * DVec3::Z;
+    painter.sheet(&us, &vs, lid, |_, _| Some(paint));
+}
+
+/// A round plate that looks along `facing`; `paint` is asked by the part of the radius.
+fn disc(
+    painter: &mut Painter,
+    center_m: DVec3,
+    facing: DVec3,
+    radius_m: f64,
+    paint: impl Fn(f64) -> Paint,
+) {
+    let right = DVec3::Z.cross(facing);
+    let around: Vec<_> = (0..=12).map(|i| f64::from(i) * std::f64::consts::TAU / 12.0).collect();
+    let rings = [0.0, 0.38, 0.72, 1.0];
+    let place = |angle_rad: f64, r: f64| {
+        let (sin, cos) = angle_rad.sin_cos();
+        // Turning from up to the right and outwards: u × v looks along `facing`.
+        center_m + r * radius_m * (cos * DVec3::Z + sin * right)
+    };
+    painter.sheet(&around, &rings, place, |_, r| Some(paint(r)));
+}

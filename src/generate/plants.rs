@@ -1,0 +1,150 @@
+//! Trees and hedges.
+
+use glam::{DQuat, DVec3};
+
+use super::light::Occluder;
+use super::random::{Random, noise};
+use super::surface::{Paint, Painter};
+
+/// A street tree, not yet painted.
+#[derive(Clone, Debug)]
+pub(super) struct Tree {
+    foot_m: DVec3,
+    trunk_m: f64,
+    crown_m: f64,
+    random: Random,
+}
+
+impl Tree {
+    /// A tree whose trunk stands at `foot_m`.
+    pub(super) fn new(foot_m: DVec3, mut random: Random) -> Self {
+        let trunk_m = random.range(2.9, 3.5);
+        let crown_m = random.range(1.55, 2.05);
+        Self { foot_m, trunk_m, crown_m, random }
+    }
+
+    /// What stands in the sun's way.
+    pub(super) fn occluder(&self) -> Occluder {
+        Occluder::Crown { center_m: self.middle_m(), radius_m: 1.05 * self.crown_m }
+    }
+
+    fn middle_m(&self) -> DVec3 {
+        self.foot_m + (self.trunk_m + 0.80 * self.crown_m) * DVec3::Z
+    }
+
+    /// Paints trunk, branches and leaves.
+    pub(super) fn paint(&self, painter: &mut Painter) {
+        let mut random = self.random.clone();
+        let bark = Paint::matt(0.40, 0.34, 0.28).times(random.range(0.85, 1.2));
+        let top_m = self.foot_m + self.trunk_m * DVec3::Z;
+        stem(painter, [self.foot_m, top_m], [0.17, 0.11], bark);
+        let turn_rad = random.range(0.0, std::f64::consts::TAU);
+        for branch in 0..4 {
+            let (sin, cos) = (turn_rad + 1.57 * f64::from(branch)).sin_cos();
+            let tip_m = 0.55 * self.crown_m * DVec3::new(cos, sin, 1.6);
+            stem(painter, [top_m - 0.3 * DVec3::Z, top_m + tip_m], [0.08, 0.03], bark);
+        }
+        self.pit(painter);
+
+        let green = random.pick(&[
+            Paint::matt(0.44, 0.56, 0.24),
+            Paint::matt(0.38, 0.52, 0.25),
+            Paint::matt(0.50, 0.57, 0.25),
+            Paint::matt(0.34, 0.48, 0.27),
+        ]);
+        for _ in 0..11 {
+            let away = ball(&mut random) * DVec3::new(0.62, 0.62, 0.72);
+            let middle_m = self.middle_m() + self.crown_m * away;
+            let radius_m = self.crown_m * random.range(0.40, 0.56);
+            let tone = random.range(0.88, 1.12);
+            clump(painter, &mut random, middle_m, DVec3::splat(radius_m), 95, green.times(tone));
+        }
+    }
+
+    /// The square of earth that the trunk stands in.
+    fn pit(&self, painter: &mut Painter) {
+        let foot_m = self.foot_m;
+        let steps_m = painter.even(-0.55, 0.55, 0.16);
+        let place = |x: f64, y: f64| foot_m + DVec3::new(x, y, 0.012);
+        painter.sheet(&steps_m, &steps_m, place, |x, y| {
+            let tone = noise(3, 6.0 * (foot_m.x + x), 6.0 * (foot_m.y + y));
+            Some(Paint::matt(0.34, 0.28, 0.21).times(1.0 + 0.15 * tone))
+        });
+    }
+}
+
+/// A clipped hedge in a box: `size_m` is half length, half depth and height.
+pub(super) fn hedge(
+    painter: &mut Painter,
+    base_m: DVec3,
+    along: DVec3,
+    size_m: DVec3,
+    random: &mut Random,
+) {
+    let green = Paint::matt(0.34, 0.46, 0.22);
+    let count = (size_m.x / 0.22).ceil() as usize;
+    for i in 0..count {
+        let x_m = (2.0 * (i as f64 + 0.5) / count as f64 - 1.0) * size_m.x;
+        let middle_m = base_m + x_m * along + 0.55 * size_m.z * DVec3::Z;
+        let radii_m = DVec3::new(0.30, size_m.y, 0.5 * size_m.z);
+        clump(painter, random, middle_m, radii_m, 70, green.times(random.clone().range(0.9, 1.1)));
+    }
+}
+
+/// Leaves on an ellipsoid of these radii around an opaque, dark core.
+fn clump(
+    painter: &mut Painter,
+    random: &mut Random,
+    middle_m: DVec3,
+    radii_m: DVec3,
+    leaves: usize,
+    green: Paint,
+) {
+    let core = painter.shade(middle_m, DVec3::Z, &green.times(0.45).open(0.8));
+    painter.gaussian(middle_m, DQuat::IDENTITY, 0.38 * radii_m, 0.9, core, DVec3::ZERO);
+    for _ in 0..leaves {
+        let away = ball(random).normalize_or_zero();
+        let depth = random.range(0.72, 1.05);
+        let mean_m = middle_m + depth * away * radii_m;
+        // Leaves face anywhere, on the whole outwards and up.
+        let normal = (away + 0.9 * ball(random) + 0.4 * DVec3::Z).normalize_or(DVec3::Z);
+        let tone = random.range(0.78, 1.2) * (0.55 + 0.45 * depth);
+        let mut paint = green.times(tone);
+        paint.rgb.x *= random.range(0.85, 1.15);
+        // What points down or lies deep in the crown sees little of the sky.
+        let rgb = painter.shade(mean_m, normal, &paint.open(0.72 + 0.28 * away.z));
+        let size_m = random.range(0.055, 0.10);
+        let sigmas_m = DVec3::new(1.5 * size_m, size_m, 0.012);
+        let rotation = DQuat::from_rotation_arc(DVec3::Z, normal)
+            * DQuat::from_rotation_z(random.range(0.0, 3.14));
+        painter.gaussian(mean_m, rotation, sigmas_m, 0.93, rgb, DVec3::ZERO);
+    }
+}
+
+/// A round stem from end to end, thinner towards the second.
+fn stem(painter: &mut Painter, ends_m: [DVec3; 2], radii_m: [f64; 2], bark: Paint) {
+    let axis = (ends_m[1] - ends_m[0]).normalize();
+    let (side, front) = axis.any_orthonormal_pair();
+    let around = painter.even(0.0, std::f64::consts::TAU, 0.9);
+    let along = painter.even(0.0, 1.0, 0.28 / ends_m[0].distance(ends_m[1]));
+    let place = |angle_rad: f64, t: f64| {
+        let (sin, cos) = angle_rad.sin_cos();
+        let radius_m = radii_m[0] + t * (radii_m[1] - radii_m[0]);
+        ends_m[0].lerp(ends_m[1], t) + radius_m * (cos * side + sin * front)
+    };
+    painter.sheet(&around, &along, place, |angle_rad, t| {
+        let tone = noise(9, 3.0 * angle_rad, 4.0 * t);
+        Some(bark.times(1.0 + 0.15 * tone))
+    });
+}
+
+/// Uniform in the unit ball.
+fn ball(random: &mut Random) -> DVec3 {
+    loop {
+        let mut axis = || random.range(-1.0, 1.0);
+        let point = DVec3::new(axis(), axis(), axis());
+        if point.length_squared() <= 1.0 {
+            return point;
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! The painter: surfaces become flat Gaussians.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::scene::{Gaussians, sh};
+
+use super::light::Light;
+
+/// Standard deviation of a surfel as a part of its cell's edge. At 0.62 four neighbours of opacity
+/// 0.96 cover their common corner, 0.5 / 0.62 = 0.81 sigma from each along both axes, to
+/// `1 - (1 - 0.96 exp(-0.81²))⁴` = 94 %, and the next ring closes most of the rest.
+const OVERLAP: f64 = 0.62;
+
+/// Half thickness of a surfel, in metres.
+const THICKNESS_M: f64 = 0.004;
+
+/// Cells grow from an edge inwards by this factor: fine where colours meet, coarse between.
+const GROWTH: f64 = 1.9;
+
+/// How a surface looks.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Paint {
+    /// Display colour of the material in white light, 0 to 1.
+    pub(super) rgb: DVec3,
+    /// How much sky it mirrors: 0 matt, 0.08 asphalt, 0.3 glass.
+    pub(super) gloss: f64,
+    /// Part of the light that reaches it past its surroundings: 1 open, 0.5 a deep corner.
+    pub(super) open: f64,
+    /// Whether it shines by itself: the colour is taken as it is.
+    pub(super) glows: bool,
+}
+
+impl Paint {
+    /// A matt surface in the open.
+    pub(super) const fn matt(r: f64, g: f64, b: f64) -> Self {
+        Self { rgb: DVec3::new(r, g, b), gloss: 0.0, open: 1.0, glows: false }
+    }
+
+    /// The same, mirroring the sky.
+    pub(super) const fn gloss(self, gloss: f64) -> Self {
+        Self { gloss, ..self }
+    }
+
+    /// The same, brighter or darker.
+    pub(super) fn times(self, factor: f64) -> Self {
+        Self { rgb: self.rgb * factor, ..self }
+    }
+
+    /// The same, where surroundings take some of the light.
+    pub(super) fn open(self, open: f64) -> Self {
+        Self { open: self.open * open, ..self }
+    }
+
+    /// A light source.
+    pub(super) const fn glowing(r: f64, g: f64, b: f64) -> Self {
+        Self { glows: true, ..Self::matt(r, g, b) }
+    }
+}
+
+/// A flat patch: a parallelogram with its outward normal `edge_u x edge_v`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patch {
+    /// Middle, in metres.
+    pub(super) center_m: DVec3,
+    /// The whole edge along u, in metres.
+    pub(super) edge_u_m: DVec3,
+    /// The whole edge along v, in metres.
+    pub(super) edge_v_m: DVec3,
+}
+
+/// Collects the street's Gaussians.
+#[derive(Debug)]
+pub(super) struct Painter<'a> {
+    /// What was painted so far; SH degree 1.
+    pub(super) gaussians: Gaussians,
+    light: &'a Light,
+    /// Spacing of everything, as a factor: above 1 is coarser.
+    spacing: f64,
+}
+
+impl<'a> Painter<'a> {
+    /// An empty canvas. `density` is Gaussians per Gaussian of the default street.
+    pub(super) fn new(light: &'a Light, density: f64) -> Self {
+        Self {
+            gaussians: Gaussians { sh_degree: 1, ..Gaussians::default() },
+            light,
+            spacing: 1.0 / density.sqrt(),
+        }
+    }
+
+    /// Paints what `draw` paints, with all spacings `factor` times as wide: for what is far away.
+    pub(super) fn coarser(&mut self, factor: f64, draw: impl FnOnce(&mut Self)) {
+        let spacing = self.spacing;
+        self.spacing *= factor;
+        draw(self);
+        self.spacing = spacing;
+    }
+
+    /// `from` to `to` in steps of about `step_m`, as break points.
+    pub(super) fn even(&self, from_m: f64, to_m: f64, step_m: f64) -> Vec<f64> {
+        let count = ((to_m - from_m) / (step_m * self.spacing)).round().max(1.0);
+        (0..=count as usize).map(|i| from_m + (to_m - from_m) * i as f64 / count).collect()
+    }
+
+    /// `from` to `to`, in steps of `edge_m` at both ends that grow to `most_m` between.
+    pub(super) fn graded(&self, from_m: f64, to_m: f64, edge_m: f64, most_m: f64) -> Vec<f64> {
+        let (edge_m, most_m) = (edge_m * self.spacing, most_m * self.spacing);
+        let half_m = 0.5 * (to_m - from_m);
+        if half_m < 0.8 * edge_m {
+            return vec![from_m, to_m];
+        }
+        let (mut reached_m, mut step_m) = (0.0, edge_m);
+        let mut ends_m = vec![0.0];
+        while reached_m < half_m - 0.3 * step_m {
+            reached_m += step_m;
+            ends_m.push(reached_m);
+            step_m = (GROWTH * step_m).min(most_m);
+        }
+        let fit = half_m / reached_m;
+        let first = ends_m.iter().map(|end_m| from_m + fit * end_m);
+        let second = ends_m.iter().rev().skip(1).map(|end_m| to_m - fit * end_m);
+        first.chain(second).collect()
+    }
+
+    /// Covers a curved sheet: one surfel per cell between the break points `us` and `vs`.
+    ///
+    /// `place` maps (u, v) to the world, with the outward normal along `∂u x ∂v`; `paint` says how
+    /// the middle of a cell looks, or leaves a hole.
+    pub(super) fn sheet(
+        &mut self,
+        us: &[f64],
+        vs: &[f64],
+        place: impl Fn(f64, f64) -> DVec3,
+        mut paint: impl FnMut(f64, f64) -> Option<Paint>,
+    ) {
+        for v in vs.windows(2) {
+            let middle_v = 0.5 * (v[0] + v[1]);
+            for u in us.windows(2) {
+                let middle_u = 0.5 * (u[0] + u[1]);
+                if let Some(paint) = paint(middle_u, middle_v) {
+                    let patch = Patch {
+                        center_m: place(middle_u, middle_v),
+                        edge_u_m: place(u[1], middle_v) - place(u[0], middle_v),
+                        edge_v_m: place(middle_u, v[1]) - place(middle_u, v[0]),
+                    };
+                    self.patch(&patch, paint);
+                }
+            }
+        }
+    }
+
+    /// One lit surfel. A patch without area paints nothing.
+    pub(super) fn patch(&mut self, patch: &Patch, paint: Paint) {
+        let Patch { center_m, edge_u_m, edge_v_m } = *patch;
+        let normal = edge_u_m.cross(edge_v_m).normalize_or_zero();
+        let (along, length_u_m) = (edge_u_m.normalize_or_zero(), edge_u_m.length());
+        let across = normal.cross(along);
+        let length_v_m = edge_v_m.dot(across);
+        let has_area = length_u_m > 2e-3 && length_v_m > 2e-3;
+        if !has_area {
+            return;
+        }
+        let sigmas_m = DVec3::new(OVERLAP * length_u_m, OVERLAP * length_v_m, THICKNESS_M);
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(along, across, normal));
+        // Seen at 60° from the normal, d·n = -0.5, the mirror adds nothing.
+        let rgb = self.lit(center_m, normal, &paint) + 0.3 * paint.gloss * MIRRORED_SKY;
+        self.gaussian(center_m, rotation, sigmas_m, 0.96, rgb, mirror(normal, paint.gloss));
+    }
+
+    /// Display colour of a surface in this light.
+    fn lit(&self, point_m: DVec3, normal: DVec3, paint: &Paint) -> DVec3 {
+        if paint.glows {
+            return paint.rgb;
+        }
+        // Display values are taken as square roots of light (a gamma of 2), so that shading is
+        // linear and `sqrt` is exact everywhere.
+        let light = self.light.on(point_m, normal) * paint.open * paint.rgb * paint.rgb;
+        light.min(DVec3::splat(1.1)).max(DVec3::ZERO).map(f64::sqrt)
+    }
+
+    /// One Gaussian, as it is: display colour `rgb`, plus `slope · direction` of sky, where the
+    /// direction points from the camera to the Gaussian.
+    pub(super) fn gaussian(
+        &mut self,
+        mean_m: DVec3,
+        rotation: DQuat,
+        sigmas_m: DVec3,
+        opacity: f64,
+        rgb: DVec3,
+        slope: DVec3,
+    ) {
+        let dc = (rgb - 0.5) / sh::C0;
+        let out = &mut self.gaussians;
+        out.means_m.push(mean_m.to_array());
+        let DQuat { x, y, z, w } = rotation;
+        out.quats_wxyz.push([w, x, y, z].map(|c| c as f32));
+        out.ln_scales.push(sigmas_m.to_array().map(|sigma_m| sigma_m.ln() as f32));
+        out.logit_opacities.push((opacity / (1.0 - opacity)).ln() as f32);
+        // The basis of degree 1 is C1 (-y, z, -x).
+        for coefficient in [
+            dc,
+            MIRRORED_SKY * (-slope.y / sh::C1),
+            MIRRORED_SKY * (slope.z / sh::C1),
+            MIRRORED_SKY * (-slope.x / sh::C1),
+        ] {
+            out.sh.extend(coefficient.to_array().map(|c| c as f32));
+        }
+    }
+
+    /// A light bath for what has no normal, like leaves: the display colour of a point.
+    pub(super) fn shade(&self, point_m: DVec3, normal: DVec3, paint: &Paint) -> DVec3 {
+        self.lit(point_m, normal, paint)
+    }
+}
+
+/// Colour of the mirrored sky.
+const MIRRORED_SKY: DVec3 = DVec3::new(0.80, 0.90, 1.0);
+
+/// How the mirrored sky changes with the viewing direction `d`, as a vector to dot it with.
+///
+/// A surface with normal n mirrors more at grazing angles, where d·n rises from -1 to 0; and the
+/// higher one looks up along it, the higher and brighter the mirrored sky.
+fn mirror(normal: DVec3, gloss: f64) -> DVec3 {
+    gloss * (0.6 * normal + 0.5 * (DVec3::Z - normal.z * normal))
+}

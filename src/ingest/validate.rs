@@ -1,0 +1,118 @@
+//! The gate: what every Gaussian must satisfy before anything is written or drawn.
+//!
+//! The bounds are wide. They keep every stage's f32 arithmetic finite, and catch what is a mistake
+//! rather than a scene: a diverged training, swapped columns, logarithms taken twice.
+
+use rayon::prelude::*;
+
+use crate::geometry::Pose;
+use crate::scene::Gaussians;
+
+use super::IngestError;
+
+/// Largest distance from the origin along an axis, in metres: that of poses.
+pub const MAX_COORDINATE_M: f64 = Pose::MAX_COORDINATE_M;
+/// Shortest and longest quaternion. Trainers leave them between 0.1 and 10.
+pub const QUAT_LENGTH: [f64; 2] = [1e-6, 1e6];
+/// Smallest and largest ln of a standard deviation: 1e-13 m and 22 km.
+pub const LN_SCALE: [f32; 2] = [-30.0, 10.0];
+/// Largest opacity before the sigmoid, either way; f32's sigmoid is 1 from 17 on.
+pub const MAX_LOGIT: f32 = 1e4;
+/// Largest colour coefficient, either way: colours are about 1.
+pub const MAX_SH: f32 = 1e3;
+
+/// One number of a Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Field {
+    /// Centre along an axis.
+    Mean(usize),
+    /// Component of the quaternion: w, x, y, z.
+    Quat(usize),
+    /// Length of the quaternion.
+    QuatLength,
+    /// Natural logarithm of the standard deviation along an own axis.
+    Scale(usize),
+    /// Opacity before the sigmoid.
+    Opacity,
+    /// Colour: coefficient, channel.
+    Sh(usize, usize),
+}
+
+impl Field {
+    /// The field of a Gaussian that comes from no file.
+    pub fn twin_name(self) -> String {
+        match self {
+            Self::Mean(axis) => format!("means_m[{axis}]"),
+            Self::Quat(i) => format!("quats_wxyz[{i}]"),
+            Self::QuatLength => "length of quats_wxyz".into(),
+            Self::Scale(axis) => format!("ln_scales[{axis}]"),
+            Self::Opacity => "logit_opacities".into(),
+            Self::Sh(k, channel) => format!("sh[{k}][{channel}]"),
+        }
+    }
+}
+
+/// Checks all Gaussians; `name` says what the file calls a field.
+///
+/// # Errors
+/// [`IngestError::Value`] for the first Gaussian that is out of bounds.
+pub fn check(
+    gaussians: &Gaussians,
+    name: &(dyn Fn(Field) -> String + Sync),
+) -> Result<(), IngestError> {
+    let bad = (0..gaussians.len())
+        .into_par_iter()
+        .by_uniform_blocks(4096)
+        .find_map_first(|index| first_fault(gaussians, index).map(|fault| (index, fault)));
+    match bad {
+        Some((index, (field, value, must))) => {
+            Err(IngestError::Value { index, field: name(field), value, must })
+        }
+        None => Ok(()),
+    }
+}
+
+type Fault = (Field, String, &'static str);
+
+/// Every test is phrased as what must hold, so that NaN fails it.
+fn first_fault(gaussians: &Gaussians, index: usize) -> Option<Fault> {
+    for (axis, &m) in gaussians.means_m[index].iter().enumerate() {
+        let near = m.abs() <= MAX_COORDINATE_M;
+        if !near {
+            return Some((
+                Field::Mean(axis),
+                m.to_string(),
+                "a centre is within 1e8 of the origin",
+            ));
+        }
+    }
+    let quat = gaussians.quats_wxyz[index];
+    if let Some(i) = quat.iter().position(|q| !q.is_finite()) {
+        return Some((Field::Quat(i), quat[i].to_string(), "a quaternion is finite"));
+    }
+    let length = quat.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
+    if !(QUAT_LENGTH[0]..=QUAT_LENGTH[1]).contains(&length) {
+        let must = "a quaternion's length is from 1e-6 to 1e6";
+        return Some((Field::QuatLength, length.to_string(), must));
+    }
+    for (axis, ln) in gaussians.ln_scales[index].iter().enumerate() {
+        if !(LN_SCALE[0]..=LN_SCALE[1]).contains(ln) {
+            let must = "a scale is the natural logarithm of metres, from -30 to 10";
+            return Some((Field::Scale(axis), ln.to_string(), must));
+        }
+    }
+    let logit = gaussians.logit_opacities[index];
+    let bounded = logit.abs() <= MAX_LOGIT;
+    if !bounded {
+        let must = "an opacity is a logit (before the sigmoid), within 1e4 of 0";
+        return Some((Field::Opacity, logit.to_string(), must));
+    }
+    for (i, c) in gaussians.sh_of(index).iter().enumerate() {
+        let bounded = c.abs() <= MAX_SH;
+        if !bounded {
+            let must = "a colour coefficient is within 1000 of 0";
+            return Some((Field::Sh(i / 3, i % 3), c.to_string(), must));
+        }
+    }
+    None
+}

@@ -1,0 +1,88 @@
+//! Three-vectors of 16 lanes.
+//!
+//! Everything here is forced inline: a closure or an iterator adapter that stays a call of its own
+//! is compiled without the instruction set that its caller was dispatched to.
+
+use fearless_simd::{f32x16, prelude::*};
+
+use crate::scene::chunk::Lanes;
+
+/// Sixteen three-vectors.
+#[derive(Clone, Copy)]
+pub(super) struct Vec3x16<S: Simd> {
+    pub(super) x: f32x16<S>,
+    pub(super) y: f32x16<S>,
+    pub(super) z: f32x16<S>,
+}
+
+impl<S: Simd> Vec3x16<S> {
+    /// The same vector in every lane.
+    #[inline(always)]
+    pub(super) fn splat(simd: S, v: [f32; 3]) -> Self {
+        let [x, y, z] = v;
+        Self { x: f32x16::splat(simd, x), y: f32x16::splat(simd, y), z: f32x16::splat(simd, z) }
+    }
+
+    /// Three columns of a block, from the first.
+    #[inline(always)]
+    pub(super) fn load(simd: S, columns: &[Lanes], first: usize) -> Self {
+        Self {
+            x: f32x16::load_array_ref(simd, &columns[first].0),
+            y: f32x16::load_array_ref(simd, &columns[first + 1].0),
+            z: f32x16::load_array_ref(simd, &columns[first + 2].0),
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn dot(self, other: Self) -> f32x16<S> {
+        self.x.mul_add(other.x, self.y.mul_add(other.y, self.z * other.z))
+    }
+
+    #[inline(always)]
+    pub(super) fn cross(self, other: Self) -> Self {
+        Self {
+            x: self.y * other.z - self.z * other.y,
+            y: self.z * other.x - self.x * other.z,
+            z: self.x * other.y - self.y * other.x,
+        }
+    }
+
+    /// Each component times one factor.
+    #[inline(always)]
+    pub(super) fn scale(self, by: f32x16<S>) -> Self {
+        Self { x: self.x * by, y: self.y * by, z: self.z * by }
+    }
+
+    /// Component times component.
+    #[inline(always)]
+    pub(super) fn times(self, other: Self) -> Self {
+        Self { x: self.x * other.x, y: self.y * other.y, z: self.z * other.z }
+    }
+
+    /// `self * by + plus`.
+    #[inline(always)]
+    pub(super) fn mul_add(self, by: f32x16<S>, plus: Self) -> Self {
+        Self {
+            x: self.x.mul_add(by, plus.x),
+            y: self.y.mul_add(by, plus.y),
+            z: self.z.mul_add(by, plus.z),
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn minus(self, other: Self) -> Self {
+        Self { x: self.x - other.x, y: self.y - other.y, z: self.z - other.z }
+    }
+
+    /// The larger of each component and one number.
+    #[inline(always)]
+    pub(super) fn max(self, least: f32x16<S>) -> Self {
+        Self { x: self.x.max(least), y: self.y.max(least), z: self.z.max(least) }
+    }
+
+    /// The largest magnitude of a component.
+    #[inline(always)]
+    pub(super) fn max_abs(self) -> f32x16<S> {
+        self.x.abs().max(self.y.abs()).max(self.z.abs())
+    }
+}

@@ -1,0 +1,336 @@
+//! Stage project: 3D Gaussians become splats on the screens of all views, 16 at a time.
+//!
+//! Work is cut into units of (view, 16 clusters of one chunk), whose results keep the order
+//! (view, global id) wherever they were computed.
+
+use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
+use rayon::prelude::*;
+
+use super::lanes::Vec3x16;
+
+use crate::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, MAX_SIGMA_PX};
+use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
+use crate::render::{Frame, View};
+use crate::scene::chunk::{CLUSTER, LANES, Lanes, column};
+use crate::scene::{Chunk, RenderProfile, sh};
+
+/// Clusters of a unit: 4096 Gaussians, so that 12 bits name a splat within its unit.
+const UNIT_CLUSTERS: usize = 16;
+const UNIT_BITS: u32 = (UNIT_CLUSTERS * CLUSTER).ilog2();
+
+/// All splats of a frame.
+#[derive(Debug, Default)]
+pub(super) struct Projected {
+    units: Vec<Unit>,
+    used: usize,
+}
+
+/// The splats of one view and 4096 Gaussians.
+#[derive(Debug, Default)]
+pub(super) struct Unit {
+    /// In order of global ids.
+    splats: Vec<Splat>,
+    /// Sort keys of the splats.
+    pub(super) keys: Vec<u64>,
+}
+
+struct Job<'a> {
+    view: usize,
+    chunk: &'a Chunk,
+    clusters: std::ops::Range<usize>,
+    chunk_view: ChunkView,
+    frustum: Frustum,
+}
+
+impl Projected {
+    /// Projects every Gaussian of the scene into every view.
+    pub(super) fn project(&mut self, level: Level, frame: &Frame<'_>, cutoffs: &Cutoffs) {
+        let jobs: Vec<Job<'_>> = jobs(frame);
+        if self.units.len() < jobs.len() {
+            self.units.resize_with(jobs.len(), Unit::default);
+        }
+        self.used = jobs.len();
+        let units = self.units[..self.used].par_iter_mut().zip(&jobs).enumerate();
+        units.for_each(|(place, (unit, job))| {
+            unit.splats.clear();
+            unit.keys.clear();
+            let base = (job.view as u64) << (DEPTH_BITS + 32) | (place as u64) << UNIT_BITS;
+            dispatch!(level, simd => project_unit(simd, job, cutoffs, base, unit));
+        });
+    }
+
+    /// The units in order of (view, global id).
+    pub(super) fn units(&self) -> &[Unit] {
+        &self.units[..self.used]
+    }
+
+    /// The splat of a sort key.
+    pub(super) fn splat(&self, key: u64) -> &Splat {
+        let place = key as u32;
+        &self.units[(place >> UNIT_BITS) as usize].splats[(place & ((1 << UNIT_BITS) - 1)) as usize]
+    }
+}
+
+/// The units of a frame: chunks that a view cannot see cost one test.
+fn jobs<'a>(frame: &Frame<'a>) -> Vec<Job<'a>> {
+    let mut jobs = Vec::new();
+    for (index, view) in frame.views.iter().enumerate() {
+        for chunk in &frame.scene.chunks {
+            jobs_of(index, view, chunk, frame.profile, &mut jobs);
+        }
+    }
+    jobs
+}
+
+fn jobs_of<'a>(
+    index: usize,
+    view: &View,
+    chunk: &'a Chunk,
+    profile: &RenderProfile,
+    jobs: &mut Vec<Job<'a>>,
+) {
+    let frustum = Frustum::new(view, chunk, profile);
+    let visible = |clusters: &std::ops::Range<usize>| {
+        let mut clusters = chunk.clusters()[clusters.clone()].iter();
+        clusters.any(|cluster| frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m))
+    };
+    let chunk_view = ChunkView::new(view, chunk);
+    let count = chunk.clusters().len();
+    let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
+    jobs.extend(ranges.filter(visible).map(|clusters| Job {
+        view: index,
+        chunk,
+        clusters,
+        chunk_view,
+        frustum,
+    }));
+}
+
+#[inline(always)]
+fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, base: u64, unit: &mut Unit) {
+    let blocks = job.chunk.len().div_ceil(LANES);
+    for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
+        if !job.frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m) {
+            continue;
+        }
+        let first = k * CLUSTER / LANES;
+        for block in first..(first + CLUSTER / LANES).min(blocks) {
+            let columns = job.chunk.block(block);
+            let degree = job.chunk.sh_degree();
+            if let Some(splats) = project_block(simd, columns, degree, &job.chunk_view, cutoffs) {
+                splats.append(cutoffs.near_m, base, unit);
+            }
+        }
+    }
+}
+
+/// Sixteen splats as columns, and which of them are visible.
+struct SplatLanes {
+    visible: u64,
+    columns: [[f32; LANES]; 12],
+}
+
+impl SplatLanes {
+    #[inline(always)]
+    fn append(&self, near_m: f32, base: u64, unit: &mut Unit) {
+        let mut visible = self.visible;
+        while visible != 0 {
+            let lane = visible.trailing_zeros() as usize;
+            visible &= visible - 1;
+            let c = |column: usize| self.columns[column][lane];
+            let depth = c(9).to_bits() - near_m.to_bits();
+            let depth = u64::from(depth.min((1 << DEPTH_BITS) - 1));
+            unit.keys.push(base | depth << 32 | unit.splats.len() as u64);
+            unit.splats.push(Splat {
+                mean_px: [c(0), c(1)],
+                factor: [c(2), c(3), c(4)],
+                log2_opacity: c(5),
+                rgb: [c(6), c(7), c(8)],
+                depth_m: c(9),
+                extent_px: [c(10), c(11)],
+            });
+        }
+    }
+}
+
+/// Projects one block, or returns `None` if nothing of it can be seen.
+///
+/// `Σ′ = J W Σ Wᵀ Jᵀ + blur I` (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5) through its square
+/// root `V = J W R S` (2x3). With the minors `m_ij` of `V`, `det Σ′ = Σ m_ij² + blur |V|² + blur²`
+/// is a sum of positives: exact to rounding for needles whose `ac - b²` cancels to nothing.
+#[inline(always)]
+fn project_block<S: Simd>(
+    simd: S,
+    columns: &[Lanes],
+    sh_degree: u8,
+    view: &ChunkView,
+    cutoffs: &Cutoffs,
+) -> Option<SplatLanes> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let mean = Vec3x16::load(simd, columns, column::MEAN);
+
+    // Camera space: in range?
+    let camera = |i: usize| {
+        let [rx, ry, rz] = view.rotation[i];
+        let z = splat(rz).mul_add(mean.z, splat(view.translation_m[i]));
+        splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
+    };
+    let (x, y, z) = (camera(0), camera(1), camera(2));
+    let mut log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+    let in_range = z.simd_ge(splat(cutoffs.near_m))
+        & z.simd_le(splat(cutoffs.far_m))
+        & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
+    if in_range.all_false() {
+        return None;
+    }
+
+    // V = J W R S, with J at the clamped slope, and no wider than f32 can square twice.
+    let inverse_z = splat(1.0) / z;
+    let (slope_x, slope_y) = (x * inverse_z, y * inverse_z);
+    let mean_x = slope_x.mul_add(splat(view.focal_px[0]), splat(view.center_px[0]));
+    let mean_y = slope_y.mul_add(splat(view.focal_px[1]), splat(view.center_px[1]));
+    let own = rotation_columns(simd, columns);
+    let scale = Vec3x16::load(simd, columns, column::SCALE);
+    let row = |i: usize, slope: f32x16<S>| {
+        let clamped = slope.max(splat(view.slope_min[i])).min(splat(view.slope_max[i]));
+        let forward = Vec3x16::splat(simd, view.rotation[2]);
+        let jw = forward
+            .mul_add(-clamped, Vec3x16::splat(simd, view.rotation[i]))
+            .scale(inverse_z * splat(view.focal_px[i]));
+        Vec3x16 { x: jw.dot(own[0]), y: jw.dot(own[1]), z: jw.dot(own[2]) }.times(scale)
+    };
+    let (v0, v1) = (row(0, slope_x), row(1, slope_y));
+    let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
+    let shrink = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
+    let (v0, v1) = (v0.scale(shrink), v1.scale(shrink));
+
+    // The covariance, its determinant, and the factor of its inverse.
+    let blur = splat(cutoffs.blur_px2);
+    let (xx, yy, b) = (v0.dot(v0), v1.dot(v1), v0.dot(v1));
+    let minors = v0.cross(v1);
+    let det_before = minors.dot(minors);
+    let det = blur.mul_add(xx + yy + blur, det_before);
+    let (a, c) = (xx + blur, yy + blur);
+    if cutoffs.antialiased {
+        // Yu et al. 2024 (Mip-Splatting): sqrt(det_before / det), with gsplat's floor 0.005.
+        let ratio = (det_before / det).max(splat(0.005 * 0.005));
+        log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
+    }
+    // q(dx, dy) = (c dx - b dy)²/(c det) + dy²/c; times log2(e)/2 it is a power of two.
+    let unit = splat((0.5 * std::f64::consts::LOG2_E).sqrt() as f32);
+    let root_c = c.sqrt();
+    let l2 = unit / root_c;
+    let root_det = det.sqrt();
+    let l0 = unit * root_c / root_det;
+    let l1 = -(b * l2) / root_det;
+
+    // The box where alpha reaches the cut, against the image's pixel centres.
+    let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
+    let reach = power.max(splat(0.0)).sqrt() / unit;
+    let slack = splat(EXTENT_SLACK_PX);
+    let extent_x = reach.mul_add(a.sqrt(), slack);
+    let extent_y = reach.mul_add(root_c, slack);
+    let on_image = |mean: f32x16<S>, extent: f32x16<S>, size_px: f32| {
+        (mean + extent).simd_ge(splat(0.5)) & (mean - extent).simd_le(splat(size_px - 0.5))
+    };
+    let visible = in_range
+        & power.simd_ge(splat(0.0))
+        & on_image(mean_x, extent_x, view.size_px[0])
+        & on_image(mean_y, extent_y, view.size_px[1]);
+    if visible.all_false() {
+        return None;
+    }
+
+    let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
+    let rgb = color(simd, columns, sh_degree, toward);
+    let mut lanes = SplatLanes { visible: visible.to_bitmask(), columns: [[0.0; LANES]; 12] };
+    mean_x.store_array(&mut lanes.columns[0]);
+    mean_y.store_array(&mut lanes.columns[1]);
+    l0.store_array(&mut lanes.columns[2]);
+    l1.store_array(&mut lanes.columns[3]);
+    l2.store_array(&mut lanes.columns[4]);
+    log2_opacity.store_array(&mut lanes.columns[5]);
+    rgb.x.store_array(&mut lanes.columns[6]);
+    rgb.y.store_array(&mut lanes.columns[7]);
+    rgb.z.store_array(&mut lanes.columns[8]);
+    z.store_array(&mut lanes.columns[9]);
+    extent_x.store_array(&mut lanes.columns[10]);
+    extent_y.store_array(&mut lanes.columns[11]);
+    Some(lanes)
+}
+
+/// Columns of the rotation matrices of a block's unit quaternions: the own axes in the world.
+#[inline(always)]
+fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+    let one = f32x16::splat(simd, 1.0);
+    let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
+    let (x2, y2, z2) = (x + x, y + y, z + z);
+    let (xx, yy, zz) = (x * x2, y * y2, z * z2);
+    let (xy, xz, yz) = (x * y2, x * z2, y * z2);
+    let (wx, wy, wz) = (w * x2, w * y2, w * z2);
+    [
+        Vec3x16 { x: one - yy - zz, y: xy + wz, z: xz - wy },
+        Vec3x16 { x: xy - wz, y: one - xx - zz, z: yz + wx },
+        Vec3x16 { x: xz + wy, y: yz - wx, z: one - xx - yy },
+    ]
+}
+
+/// `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
+#[inline(always)]
+fn color<S: Simd>(simd: S, columns: &[Lanes], degree: u8, toward: Vec3x16<S>) -> Vec3x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let half = Vec3x16 { x: splat(0.5), y: splat(0.5), z: splat(0.5) };
+    let mut rgb = Vec3x16::load(simd, columns, column::SH).mul_add(splat(sh::C0), half);
+    let mut add = |k: usize, basis: f32x16<S>| {
+        rgb = Vec3x16::load(simd, columns, column::SH + 3 * k).mul_add(basis, rgb);
+    };
+    if degree > 0 {
+        let length = toward.dot(toward).max(splat(1e-30)).sqrt();
+        let Vec3x16 { x, y, z } = toward.scale(splat(1.0) / length);
+        add(1, splat(-sh::C1) * y);
+        add(2, splat(sh::C1) * z);
+        add(3, splat(-sh::C1) * x);
+        if degree > 1 {
+            let (xx, yy, zz) = (x * x, y * y, z * z);
+            let (xy, yz, xz) = (x * y, y * z, x * z);
+            add(4, splat(sh::C2[0]) * xy);
+            add(5, splat(sh::C2[1]) * yz);
+            add(6, splat(sh::C2[2]) * (zz + zz - xx - yy));
+            add(7, splat(sh::C2[3]) * xz);
+            add(8, splat(sh::C2[4]) * (xx - yy));
+            if degree > 2 {
+                let (three, four) = (splat(3.0), splat(4.0));
+                add(9, splat(sh::C3[0]) * y * (three * xx - yy));
+                add(10, splat(sh::C3[1]) * xy * z);
+                add(11, splat(sh::C3[2]) * y * (four * zz - xx - yy));
+                add(12, splat(sh::C3[3]) * z * (zz + zz - three * (xx + yy)));
+                add(13, splat(sh::C3[4]) * x * (four * zz - xx - yy));
+                add(14, splat(sh::C3[5]) * z * (xx - yy));
+                add(15, splat(sh::C3[6]) * x * (xx - three * yy));
+            }
+        }
+    }
+    rgb.max(splat(0.0))
+}
+
+/// Base-2 logarithm of positive normal numbers, within 2e-7: the exponent, and the series of
+/// `2 atanh(t) log2(e)` for the mantissa in [√½, √2), where `|t| <= 0.172`.
+#[inline(always)]
+fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let bits: i32x16<S> = x.bitcast();
+    // The bits of √½, so that the exponent rounds at √2.
+    let shifted = bits - 0x3F35_04F3_i32;
+    let exponent = shifted >> 23;
+    let mantissa: f32x16<S> = (bits - (exponent << 23)).bitcast();
+    let t = (mantissa - splat(1.0)) / (mantissa + splat(1.0));
+    let tt = t * t;
+    let series = tt
+        .mul_add(splat(2.0 / 9.0), splat(2.0 / 7.0))
+        .mul_add(tt, splat(2.0 / 5.0))
+        .mul_add(tt, splat(2.0 / 3.0))
+        .mul_add(tt, splat(2.0));
+    let exponent: f32x16<S> = exponent.to_float();
+    (t * series).mul_add(splat(std::f64::consts::LOG2_E), exponent)
+}

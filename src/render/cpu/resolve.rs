@@ -1,0 +1,131 @@
+//! Stage resolve: a tile's sums become the pixels that were asked for.
+
+use fearless_simd::{f32x16, prelude::*, u32x16};
+
+use crate::render::constants::{BLOCK_PX, TILE_PX};
+use crate::render::{Target, View};
+use crate::scene::chunk::LANES;
+
+const BLOCKS: usize = 16;
+
+/// What the 256 pixels of a tile have gathered, block by block.
+#[derive(Debug)]
+#[repr(C, align(64))]
+pub(super) struct TileSums {
+    /// Linear premultiplied red, green, blue.
+    pub(super) rgb: [[[f32; LANES]; BLOCKS]; 3],
+    /// Depth weighted by contribution, in metres; zero unless wanted.
+    pub(super) depth_m: [[f32; LANES]; BLOCKS],
+    /// Share of the background that is seen.
+    pub(super) transmittance: [[f32; LANES]; BLOCKS],
+    /// Transmittance that runs on where a pixel has stopped.
+    pub(super) running: [[f32; LANES]; BLOCKS],
+}
+
+impl Default for TileSums {
+    fn default() -> Self {
+        let (zero, one) = ([[0.0; LANES]; BLOCKS], [[1.0; LANES]; BLOCKS]);
+        Self { rgb: [zero; 3], depth_m: zero, transmittance: one, running: one }
+    }
+}
+
+/// The rows of a target under one row of tiles.
+#[derive(Debug, Default)]
+pub(super) struct Band<'a> {
+    width: usize,
+    rows: usize,
+    rgba: Option<&'a mut [f32]>,
+    rgb8: Option<&'a mut [u8]>,
+    depth_m: Option<&'a mut [f32]>,
+    opacity: Option<&'a mut [f32]>,
+}
+
+impl Band<'_> {
+    /// Whether depth has to be gathered.
+    pub(super) fn wants_depth(&self) -> bool {
+        self.depth_m.is_some()
+    }
+}
+
+/// Cuts a target into the bands of its view's rows of tiles.
+pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>> {
+    let (width, height) = (view.camera.width_px as usize, view.camera.height_px as usize);
+    let pixels = width * TILE_PX as usize;
+    let mut rgba = target.rgba.as_mut().map(|b| b.chunks_mut(4 * pixels));
+    let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
+    let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
+    let mut opacity = target.opacity.as_mut().map(|b| b.chunks_mut(pixels));
+    (0..height)
+        .step_by(TILE_PX as usize)
+        .map(|top| Band {
+            width,
+            rows: (height - top).min(TILE_PX as usize),
+            rgba: rgba.as_mut().and_then(Iterator::next),
+            rgb8: rgb8.as_mut().and_then(Iterator::next),
+            depth_m: depth_m.as_mut().and_then(Iterator::next),
+            opacity: opacity.as_mut().and_then(Iterator::next),
+        })
+        .collect()
+}
+
+/// Writes one tile whose left edge is at column `left`.
+#[inline(always)]
+pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, left: u32, band: &mut Band<'_>) {
+    for block in 0..BLOCKS {
+        resolve_block(simd, sums, block, left, band);
+    }
+}
+
+#[inline(always)]
+fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, band: &mut Band<'_>) {
+    let edge = BLOCK_PX as usize;
+    let (column, row) = (left as usize + block % edge * edge, block / edge * edge);
+    // Images need not be multiples of 16 px: nothing is written beyond their edges.
+    let columns = edge.min(band.width.saturating_sub(column));
+    let rows = edge.min(band.rows.saturating_sub(row));
+    let each = |write: &mut dyn FnMut(usize, usize)| {
+        for y in 0..rows {
+            for x in 0..columns {
+                write((row + y) * band.width + column + x, y * edge + x);
+            }
+        }
+    };
+
+    let one = f32x16::splat(simd, 1.0);
+    let transmittance = f32x16::load_array_ref(simd, &sums.transmittance[block]);
+    let opacity = (one - transmittance).to_array();
+    if let Some(rgba) = &mut band.rgba {
+        each(&mut |pixel, lane| {
+            let [r, g, b] = [0, 1, 2].map(|channel| sums.rgb[channel][block][lane]);
+            rgba[4 * pixel..4 * pixel + 4].copy_from_slice(&[r, g, b, opacity[lane]]);
+        });
+    }
+    if let Some(rgb8) = &mut band.rgb8 {
+        let r = to_8_bit(simd, &sums.rgb[0][block]);
+        let g = to_8_bit(simd, &sums.rgb[1][block]);
+        let b = to_8_bit(simd, &sums.rgb[2][block]);
+        each(&mut |pixel, lane| {
+            let bytes = [r[lane] as u8, g[lane] as u8, b[lane] as u8];
+            rgb8[3 * pixel..3 * pixel + 3].copy_from_slice(&bytes);
+        });
+    }
+    if let Some(depth_m) = &mut band.depth_m {
+        let sum = &sums.depth_m[block];
+        each(&mut |pixel, lane| {
+            let covered = opacity[lane] > 0.0;
+            depth_m[pixel] = if covered { sum[lane] / opacity[lane] } else { 0.0 };
+        });
+    }
+    if let Some(to) = &mut band.opacity {
+        each(&mut |pixel, lane| to[pixel] = opacity[lane]);
+    }
+}
+
+/// Clamps to [0, 1] and rounds to the nearest of 0 to 255.
+#[inline(always)]
+fn to_8_bit<S: Simd>(simd: S, linear: &[f32; LANES]) -> [u32; LANES] {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let clamped = f32x16::load_array_ref(simd, linear).max(splat(0.0)).min(splat(1.0));
+    let rounded: u32x16<S> = clamped.mul_add(splat(255.0), splat(0.5)).to_int();
+    rounded.to_array()
+}

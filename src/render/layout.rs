@@ -1,0 +1,180 @@
+//! From f64 scene and views to the camera-relative f32 that the fast backends compute with.
+
+use glam::{DVec3, Vec3};
+
+use super::View;
+use super::constants::SLOPE_SLACK;
+use crate::scene::{Chunk, RenderProfile};
+
+/// A splat: a Gaussian on the screen of one view (48 bytes).
+///
+/// Its alpha at pixel offset `(dx, dy)` from the mean is `2^(log2_opacity - u² - v²)` with
+/// `u = l0 dx + l1 dy`, `v = l2 dy`: the Cholesky factor of half the inverse covariance times
+/// log2(e). Sums of squares cannot turn negative, however thin the needle.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Splat {
+    /// Centre, in pixels from the image's top-left corner.
+    pub mean_px: [f32; 2],
+    /// Factor `(l0, l1, l2)`, in 1/px.
+    pub factor: [f32; 3],
+    /// Base-2 logarithm of the peak opacity.
+    pub log2_opacity: f32,
+    /// Linear colour towards this view, at least 0.
+    pub rgb: [f32; 3],
+    /// Camera-space z of the centre, in metres.
+    pub depth_m: f32,
+    /// Half-size of the box that alpha_cut reaches, in pixels, [`EXTENT_SLACK_PX`] included.
+    ///
+    /// [`EXTENT_SLACK_PX`]: super::constants::EXTENT_SLACK_PX
+    pub extent_px: [f32; 2],
+}
+
+/// The numbers of the profile in the form that the kernels compare with.
+#[derive(Clone, Copy, Debug)]
+pub struct Cutoffs {
+    /// Nearest z, in metres.
+    pub near_m: f32,
+    /// Farthest z, in metres.
+    pub far_m: f32,
+    /// Added to the diagonal of the screen covariance, in px².
+    pub blur_px2: f32,
+    /// Whether opacity is scaled for the blur.
+    pub antialiased: bool,
+    /// Largest alpha.
+    pub alpha_cap: f32,
+    /// Base-2 logarithm of the smallest alpha.
+    pub log2_alpha_cut: f32,
+    /// Transmittance that ends a pixel.
+    pub stop: f32,
+}
+
+impl Cutoffs {
+    /// Rounds a profile to f32.
+    pub fn new(profile: &RenderProfile) -> Self {
+        Self {
+            near_m: profile.near as f32,
+            far_m: profile.far as f32,
+            blur_px2: profile.blur as f32,
+            antialiased: profile.antialiased,
+            alpha_cap: profile.alpha_cap as f32,
+            log2_alpha_cut: profile.alpha_cut.log2() as f32,
+            stop: profile.stop as f32,
+        }
+    }
+
+    /// Largest extent of any splat, in standard deviations: 3.33 for 1/255.
+    pub fn max_sigmas(&self) -> f32 {
+        (2.0 * std::f32::consts::LN_2 * -self.log2_alpha_cut).sqrt()
+    }
+}
+
+/// A pinhole view relative to one chunk.
+#[derive(Clone, Copy, Debug)]
+pub struct ChunkView {
+    /// Rows of the rotation camera_from_world.
+    pub rotation: [[f32; 3]; 3],
+    /// The chunk's origin in camera space, in metres.
+    pub translation_m: [f32; 3],
+    /// The camera's centre relative to the chunk's origin, in world axes, in metres.
+    pub camera_m: [f32; 3],
+    /// Focal lengths, in pixels.
+    pub focal_px: [f32; 2],
+    /// Principal point, in pixels.
+    pub center_px: [f32; 2],
+    /// Image size, in pixels.
+    pub size_px: [f32; 2],
+    /// Smallest slope x/z and y/z at which the projection is linearised.
+    pub slope_min: [f32; 2],
+    /// Largest slope.
+    pub slope_max: [f32; 2],
+}
+
+impl ChunkView {
+    /// Subtracts in f64, so that a twin 4,500 km from its origin loses nothing.
+    pub fn new(view: &View, chunk: &Chunk) -> Self {
+        let camera_from_world = view.world_from_camera.inverse();
+        let rotation = camera_from_world.rotation_matrix().transpose();
+        let camera_m = view.world_from_camera.position_m - chunk.origin_m();
+        let p = &view.camera.pinhole;
+        let axis = |size: u32, f: f64, c: f64| {
+            let slack = SLOPE_SLACK * 0.5 * f64::from(size) / f;
+            [(-c / f - slack) as f32, ((f64::from(size) - c) / f + slack) as f32]
+        };
+        let x = axis(view.camera.width_px, p.fx, p.cx);
+        let y = axis(view.camera.height_px, p.fy, p.cy);
+        Self {
+            rotation: rotation.to_cols_array_2d().map(|row| row.map(|r| r as f32)),
+            translation_m: (camera_from_world.rotation * -camera_m).as_vec3().to_array(),
+            camera_m: camera_m.as_vec3().to_array(),
+            focal_px: [p.fx as f32, p.fy as f32],
+            center_px: [p.cx as f32, p.cy as f32],
+            size_px: [view.camera.width_px as f32, view.camera.height_px as f32],
+            slope_min: [x[0], y[0]],
+            slope_max: [x[1], y[1]],
+        }
+    }
+}
+
+/// Half-spaces in which every Gaussian misses the image, for whole clusters at once.
+///
+/// A splat misses the left edge when `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s`
+/// is its largest standard deviation, `t` its clamped slope and `k` the extent in standard
+/// deviations: `√cov_xx` is at most `(fx/z) √(1 + t²) s + √blur`. Times `z/fx` that is linear in
+/// the centre: `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. Likewise the other edges; near and
+/// far have no width, since centres decide.
+#[derive(Clone, Copy, Debug)]
+pub struct Frustum {
+    planes: [Plane; 6],
+}
+
+/// `normal · mean + offset + spread * sigma < 0` culls.
+#[derive(Clone, Copy, Debug)]
+struct Plane {
+    normal: Vec3,
+    offset_m: f32,
+    spread: f32,
+}
+
+impl Frustum {
+    /// The frustum of a view relative to one chunk's origin.
+    pub fn new(view: &View, chunk: &Chunk, profile: &RenderProfile) -> Self {
+        let p = &view.camera.pinhole;
+        let (width, height) = (f64::from(view.camera.width_px), f64::from(view.camera.height_px));
+        let sigmas = f64::from(Cutoffs::new(profile).max_sigmas()) + 1e-3;
+        let margin_px = sigmas * profile.blur.sqrt() + 1.0;
+        let slope = |size: f64, f: f64, c: f64| {
+            let slack = SLOPE_SLACK * 0.5 * size / f;
+            (c / f + slack).abs().max(((size - c) / f + slack).abs())
+        };
+        let spread_x = sigmas * (1.0 + slope(width, p.fx, p.cx).powi(2)).sqrt();
+        let spread_y = sigmas * (1.0 + slope(height, p.fy, p.cy).powi(2)).sqrt();
+        let camera_planes = [
+            (DVec3::new(1.0, 0.0, (p.cx + margin_px) / p.fx), 0.0, spread_x),
+            (DVec3::new(-1.0, 0.0, (width - p.cx + margin_px) / p.fx), 0.0, spread_x),
+            (DVec3::new(0.0, 1.0, (p.cy + margin_px) / p.fy), 0.0, spread_y),
+            (DVec3::new(0.0, -1.0, (height - p.cy + margin_px) / p.fy), 0.0, spread_y),
+            (DVec3::Z, -profile.near * (1.0 - 1e-6), 0.0),
+            (DVec3::NEG_Z, profile.far * (1.0 + 1e-6), 0.0),
+        ];
+        let camera_from_world = view.world_from_camera.inverse();
+        let origin = camera_from_world.transform_point(chunk.origin_m());
+        let plane = |(normal, offset_m, spread): (DVec3, f64, f64)| Plane {
+            normal: (view.world_from_camera.rotation * normal).as_vec3(),
+            offset_m: (normal.dot(origin) + offset_m) as f32,
+            spread: spread as f32,
+        };
+        Self { planes: camera_planes.map(plane) }
+    }
+
+    /// Whether anything of a box of centres, relative to the chunk's origin, can touch the image.
+    ///
+    /// 1e-5 of the terms' size is granted to f32.
+    pub fn may_see(&self, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
+        let (center, half) = (0.5 * (min_m + max_m), 0.5 * (max_m - min_m));
+        self.planes.iter().all(|plane| {
+            let nearest = plane.normal.dot(center) + plane.normal.abs().dot(half);
+            let distance = nearest + plane.offset_m + plane.spread * sigma_m;
+            distance >= -1e-5 * (plane.normal.length() * center.length() + plane.offset_m.abs())
+        })
+    }
+}

@@ -1,0 +1,80 @@
+//! One copy in memory of every twin version in use.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+
+use rayon::prelude::*;
+
+use crate::scene::Scene;
+use crate::store::{Catalog, Listing, StoreError, Version};
+
+/// A version of a twin, ready to be rendered.
+#[derive(Debug)]
+pub struct Resident {
+    /// What was loaded.
+    pub version: Version,
+    /// Its chunks, in the manifest's order.
+    pub scene: Scene,
+}
+
+/// Loads twin versions and shares them between sessions for as long as one holds them.
+#[derive(Debug)]
+pub struct Cache {
+    catalog: Catalog,
+    /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is held while loading, so that others wait for the result
+    /// rather than load again; a failed load leaves an empty slot, and the next one tries.
+    slots: Mutex<BTreeMap<(String, u64), Slot>>,
+}
+
+type Slot = Arc<Mutex<Weak<Resident>>>;
+
+impl Cache {
+    /// Nothing in memory yet.
+    pub fn new(catalog: Catalog) -> Self {
+        Self { catalog, slots: Mutex::default() }
+    }
+
+    /// The twins that can be opened.
+    ///
+    /// # Errors
+    /// As [`Catalog::twins`].
+    pub fn twins(&self) -> Result<Vec<Listing>, StoreError> {
+        self.catalog.twins()
+    }
+
+    /// One version of a twin, or the latest, loaded if nobody holds it. Blocks while it loads.
+    ///
+    /// # Errors
+    /// As [`Catalog::version`] and [`Catalog::chunk`].
+    pub fn open(&self, name: &str, number: Option<u64>) -> Result<Arc<Resident>, StoreError> {
+        let version = self.catalog.version(name, number)?;
+        let slot = self.slot(&version);
+        let mut held = lock(&slot);
+        if let Some(resident) = held.upgrade() {
+            return Ok(resident);
+        }
+        let resident = Arc::new(self.load(version)?);
+        *held = Arc::downgrade(&resident);
+        Ok(resident)
+    }
+
+    /// The slot of a version. Slots that nobody holds or loads are dropped, so that they do not
+    /// pile up as versions come and go.
+    fn slot(&self, version: &Version) -> Slot {
+        let mut slots = lock(&self.slots);
+        slots.retain(|_, slot| Arc::strong_count(slot) > 1 || lock(slot).strong_count() > 0);
+        slots.entry((version.hash.clone(), version.number)).or_default().clone()
+    }
+
+    fn load(&self, version: Version) -> Result<Resident, StoreError> {
+        let chunks = version.manifest.chunks.par_iter();
+        let chunks = chunks.map(|entry| self.catalog.chunk(&version, entry).map(Arc::new));
+        let scene = Scene { chunks: chunks.collect::<Result<_, _>>()? };
+        Ok(Resident { version, scene })
+    }
+}
+
+/// A panic elsewhere leaves nothing half-done behind these locks.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,121 @@
+//! What can go wrong with a twin on disk.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use crate::ingest::IngestError;
+use crate::scene::profile::ProfileError;
+use crate::scene::rig::RigError;
+use crate::scene::trajectory::TrajectoryError;
+
+/// Why a twin could not be read or written. A failed commit leaves nothing behind.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The operating system refused.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried, as `write`.
+        action: &'static str,
+        /// On which file or directory.
+        path: PathBuf,
+        /// The reason given.
+        source: io::Error,
+    },
+    /// A twin's name could be mistaken for a path.
+    #[error("{name:?} is not a name of a twin: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
+    Name {
+        /// The refused name.
+        name: String,
+    },
+    /// No version of such a twin was ever committed.
+    #[error("there is no twin {name:?} in {}; {}", dir.display(), known_twins(known))]
+    NoTwin {
+        /// The name asked for.
+        name: String,
+        /// Where it was looked for.
+        dir: PathBuf,
+        /// The twins that are there.
+        known: Vec<String>,
+    },
+    /// The twin has other versions.
+    #[error("twin {name:?} has no version {number}; the latest is {latest}")]
+    NoVersion {
+        /// The twin.
+        name: String,
+        /// The version asked for.
+        number: u64,
+        /// The newest one.
+        latest: u64,
+    },
+    /// Bytes on disk are not what was committed.
+    #[error("{} is damaged: {reason}; import the twin again", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        reason: String,
+    },
+    /// Written by another version of this program.
+    #[error("{} has format {found}; this build reads format {supported}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// The format it says it has.
+        found: u32,
+        /// The format that can be read.
+        supported: u32,
+    },
+    /// Somebody else committed the same number first.
+    #[error("version {number} of twin {name:?} was committed by another import; try again")]
+    Conflict {
+        /// The twin.
+        name: String,
+        /// The version that was taken.
+        number: u64,
+    },
+    /// The Gaussians of a commit cannot be used.
+    #[error(transparent)]
+    Gaussians(#[from] IngestError),
+    /// The render profile of a commit cannot be used.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
+    /// The rig of a commit cannot be used.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// A trajectory of a commit cannot be used.
+    #[error(transparent)]
+    Trajectory(#[from] TrajectoryError),
+    /// Two trajectories share a name, or one has none that is usable.
+    #[error("{name:?} cannot name a trajectory: {must}")]
+    TrajectoryName {
+        /// The refused name.
+        name: String,
+        /// What must hold instead.
+        must: &'static str,
+    },
+    /// Everything but the chunks is too much for one manifest.
+    #[error(
+        "the manifest would take {bytes} bytes; at most {limit} are read: shorten trajectories"
+    )]
+    ManifestSize {
+        /// Its size.
+        bytes: u64,
+        /// The largest that is read.
+        limit: u64,
+    },
+}
+
+impl StoreError {
+    /// Turns an I/O error into one that says what was tried on which file.
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+}
+
+fn known_twins(known: &[String]) -> String {
+    match known {
+        [] => "it holds none".to_owned(),
+        names => format!("it holds {}", names.join(", ")),
+    }
+}

@@ -1,0 +1,340 @@
+//! The only file that opens files of a twin: objects by hash, log records by number, staging.
+
+use std::fs::{self, File, TryLockError};
+use std::io::{self, BufReader, BufWriter, ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+
+use crate::config;
+use crate::scene::rig::is_name;
+
+use super::StoreError;
+
+/// Bytes read or written at once.
+const BUFFER_BYTES: usize = 256 << 10;
+
+/// The directory of twins.
+#[derive(Clone, Debug)]
+pub(super) struct Objects {
+    root: PathBuf,
+}
+
+impl Objects {
+    pub(super) fn new(root: &Path) -> Self {
+        Self { root: root.to_owned() }
+    }
+
+    pub(super) fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Names of the twins that have a version, sorted.
+    pub(super) fn names(&self) -> Result<Vec<String>, StoreError> {
+        let mut names = entries(&self.root)?;
+        names.retain(|name| is_name(name) && !self.numbers(name).is_ok_and(|n| n.is_empty()));
+        Ok(names)
+    }
+
+    /// Numbers of the versions in a twin's log, rising; none for an unknown twin.
+    pub(super) fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
+        let entries = entries(&self.root.join(name).join("log"))?;
+        Ok(entries.iter().filter_map(|entry| entry.parse().ok()).collect())
+    }
+
+    /// Where one log record lies.
+    pub(super) fn record_path(&self, name: &str, number: u64) -> PathBuf {
+        self.root.join(name).join("log").join(format!("{number:010}"))
+    }
+
+    /// Reads one log record.
+    pub(super) fn record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
+        let path = self.record_path(name, number);
+        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let mut bytes = Vec::new();
+        file.take(config::LOG_RECORD_BYTES)
+            .read_to_end(&mut bytes)
+            .map_err(StoreError::io("read", &path))?;
+        Ok(bytes)
+    }
+
+    /// Where an object lies.
+    pub(super) fn path(&self, name: &str, hash: &str) -> PathBuf {
+        self.root.join(name).join("objects").join(&hash[..2]).join(hash)
+    }
+
+    /// Opens an object for reading; [`ObjectReader::finish`] compares it with its hash.
+    pub(super) fn open(&self, name: &str, hash: &str) -> Result<ObjectReader, StoreError> {
+        let path = self.path(name, hash);
+        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
+        let hashing = Hashing { inner: file, hasher: blake3::Hasher::new() };
+        let hash = hash.to_owned();
+        Ok(ObjectReader {
+            reader: BufReader::with_capacity(BUFFER_BYTES, hashing),
+            path,
+            hash,
+            bytes,
+        })
+    }
+
+    /// Names of the twins whose import was begun and not ended: it runs, or it was killed.
+    pub(super) fn begun(&self) -> Result<Vec<String>, StoreError> {
+        let mut names = entries(&self.root.join(STAGING))?;
+        names.retain(|name| is_name(name) && self.root.join(STAGING).join(name).is_dir());
+        Ok(names)
+    }
+
+    /// Begins a commit: waits until no other one of this twin runs, then empties its staging.
+    pub(super) fn stage(&self, name: &str) -> Result<Staging, StoreError> {
+        let dir = self.root.join(STAGING);
+        fs::create_dir_all(&dir).map_err(StoreError::io("create", &dir))?;
+        let (path, lock) = self.lock_file(name)?;
+        lock.lock().map_err(StoreError::io("lock", &path))?;
+        self.staging(name, lock)
+    }
+
+    /// Takes over the staging of a killed commit; none if it still runs.
+    pub(super) fn stage_abandoned(&self, name: &str) -> Result<Option<Staging>, StoreError> {
+        let (path, lock) = self.lock_file(name)?;
+        match lock.try_lock() {
+            Ok(()) => self.staging(name, lock).map(Some),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(source)) => Err(StoreError::io("lock", &path)(source)),
+        }
+    }
+
+    /// The lock file stays for ever: were it removed, two imports could lock two files of a name.
+    fn lock_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
+        let path = self.root.join(STAGING).join(format!("{name}.lock"));
+        let file = File::options().create(true).append(true).open(&path);
+        let file = file.map_err(StoreError::io("create", &path))?;
+        Ok((path, file))
+    }
+
+    fn staging(&self, name: &str, lock: File) -> Result<Staging, StoreError> {
+        let dir = self.root.join(STAGING).join(name);
+        let staging = Staging {
+            objects: self.clone(),
+            name: name.to_owned(),
+            dir,
+            staged: Vec::new(),
+            placed: Vec::new(),
+            _lock: lock,
+        };
+        if staging.dir.exists() {
+            fs::remove_dir_all(&staging.dir).map_err(StoreError::io("empty", &staging.dir))?;
+        }
+        fs::create_dir(&staging.dir).map_err(StoreError::io("create", &staging.dir))?;
+        Ok(staging)
+    }
+}
+
+const STAGING: &str = ".staging";
+
+/// Objects of a commit that nobody sees yet. Dropped before [`Staging::publish`] succeeds, it
+/// leaves nothing behind.
+#[derive(Debug)]
+pub(super) struct Staging {
+    objects: Objects,
+    name: String,
+    dir: PathBuf,
+    /// Hashes of the objects in `dir`.
+    staged: Vec<String>,
+    /// Objects that were not there before this commit put them.
+    placed: Vec<PathBuf>,
+    /// Released by the kernel when the process ends, however it ends.
+    _lock: File,
+}
+
+/// An object that was written: its hash as 64 hex digits, and its size.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Put {
+    pub(super) hash: String,
+    pub(super) bytes: u64,
+}
+
+impl Staging {
+    /// Writes one object, hashing on the way, and names it by its hash.
+    pub(super) fn put(
+        &mut self,
+        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+    ) -> Result<Put, StoreError> {
+        let path = self.dir.join("writing");
+        let failed = || StoreError::io("write", &path);
+        let file = File::create(&path).map_err(failed())?;
+        let hashing = Hashing { inner: file, hasher: blake3::Hasher::new() };
+        let mut writer = BufWriter::with_capacity(BUFFER_BYTES, hashing);
+        write(&mut writer).map_err(failed())?;
+        let Hashing { inner: file, hasher } =
+            writer.into_inner().map_err(|e| e.into_error()).map_err(failed())?;
+        file.sync_all().map_err(failed())?;
+        let (hash, bytes) = (hasher.finalize().to_hex().to_string(), hasher.count());
+        let staged = self.dir.join(&hash);
+        fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
+        self.staged.push(hash.clone());
+        Ok(Put { hash, bytes })
+    }
+
+    /// Makes the staged objects and then the log record visible.
+    pub(super) fn publish(mut self, number: u64, record: &[u8]) -> Result<(), StoreError> {
+        for hash in std::mem::take(&mut self.staged) {
+            self.place(&hash)?;
+        }
+        let staged = self.dir.join("record");
+        let failed = || StoreError::io("write", &staged);
+        let mut file = File::create(&staged).map_err(failed())?;
+        file.write_all(record).and_then(|()| file.sync_all()).map_err(failed())?;
+        let path = self.objects.record_path(&self.name, number);
+        create_parent(&path)?;
+        // A link, unlike a rename, fails if the number is taken: put if absent.
+        fs::hard_link(&staged, &path).map_err(|source| match source.kind() {
+            ErrorKind::AlreadyExists => StoreError::Conflict { name: self.name.clone(), number },
+            _ => StoreError::io("write", &path)(source),
+        })?;
+        self.placed.clear();
+        sync_parent(&path)
+    }
+
+    /// Removes objects that no version names: what a killed commit had already placed.
+    pub(super) fn sweep(&self, is_named: impl Fn(&str) -> bool) -> Result<(), StoreError> {
+        let objects = self.objects.root.join(&self.name).join("objects");
+        for prefix in entries(&objects)? {
+            for hash in entries(&objects.join(&prefix))? {
+                if !is_named(&hash) {
+                    let path = objects.join(&prefix).join(&hash);
+                    fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Moves a staged object to its place. Over an older copy, too: that heals a damaged one.
+    fn place(&mut self, hash: &str) -> Result<(), StoreError> {
+        let path = self.objects.path(&self.name, hash);
+        create_parent(&path)?;
+        if !path.exists() {
+            self.placed.push(path.clone());
+        }
+        let staged = self.dir.join(hash);
+        fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
+        sync_parent(&path)
+    }
+}
+
+impl Drop for Staging {
+    /// What cannot be removed here is removed by the next start, so failures need no report.
+    fn drop(&mut self) {
+        for path in &self.placed {
+            let _ = fs::remove_file(path);
+        }
+        let _ = fs::remove_dir_all(&self.dir);
+        let twin = self.objects.root.join(&self.name);
+        let prefixes = entries(&twin.join("objects")).unwrap_or_default();
+        for prefix in prefixes {
+            let _ = fs::remove_dir(twin.join("objects").join(prefix));
+        }
+        // Only empty directories go: those of a twin that never had a version.
+        for dir in [twin.join("objects"), twin.join("log"), twin] {
+            let _ = fs::remove_dir(dir);
+        }
+    }
+}
+
+/// Reads an object and hashes what it reads.
+#[derive(Debug)]
+pub(super) struct ObjectReader {
+    reader: BufReader<Hashing>,
+    path: PathBuf,
+    hash: String,
+    bytes: u64,
+}
+
+impl ObjectReader {
+    /// Size of the file, in bytes.
+    pub(super) fn size_bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Where the object lies.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads what is left and compares the whole with its hash.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] with both hashes.
+    pub(super) fn finish(mut self) -> Result<(), StoreError> {
+        io::copy(&mut self.reader, &mut io::sink()).map_err(StoreError::io("read", &self.path))?;
+        let found = self.reader.into_inner().hasher.finalize().to_hex();
+        if found.as_str() == self.hash {
+            return Ok(());
+        }
+        let reason = format!("its bytes hash to {found}");
+        Err(StoreError::Damaged { path: self.path, reason })
+    }
+}
+
+impl Read for ObjectReader {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.reader.read(buffer)
+    }
+}
+
+/// A file and the hash of what passed through it.
+#[derive(Debug)]
+struct Hashing {
+    inner: File,
+    hasher: blake3::Hasher,
+}
+
+impl Read for Hashing {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.inner.read(buffer)?;
+        self.hasher.update(&buffer[..read]);
+        Ok(read)
+    }
+}
+
+impl Write for Hashing {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.inner.write(bytes)?;
+        self.hasher.update(&bytes[..written]);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+/// Names in a directory, sorted; none if it does not exist.
+fn entries(dir: &Path) -> Result<Vec<String>, StoreError> {
+    let failed = || StoreError::io("list", dir);
+    let listing = match fs::read_dir(dir) {
+        Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            return Ok(Vec::new());
+        }
+        listing => listing.map_err(failed())?,
+    };
+    let mut names = Vec::new();
+    for entry in listing {
+        // A name that is not UTF-8 is not ours.
+        names.extend(entry.map_err(failed())?.file_name().into_string());
+    }
+    names.sort_unstable();
+    Ok(names)
+}
+
+fn create_parent(path: &Path) -> Result<(), StoreError> {
+    match path.parent() {
+        Some(dir) => fs::create_dir_all(dir).map_err(StoreError::io("create", dir)),
+        None => Ok(()),
+    }
+}
+
+/// Makes a rename or link last through a power cut: the directory is written out, too.
+fn sync_parent(path: &Path) -> Result<(), StoreError> {
+    let Some(dir) = path.parent() else { return Ok(()) };
+    File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
+}
