@@ -18,6 +18,10 @@ pub const INBOUND_MESSAGE_BYTES: usize = 1 << 20;
 /// six 1440x928 raw images with both are 88 MB.
 pub const OBSERVATION_BYTES: usize = 1 << 30;
 
+/// Largest header of an observation: 16 poses of 16 cameras are 256 images of 0.7 kB of metadata
+/// and 0.3 kB of tensor table, a quarter of this.
+pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
+
 /// Connections at once, WebSocket and HTTP together.
 pub const CONNECTIONS: usize = 1024;
 
@@ -41,6 +45,9 @@ pub const SEND_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// How long one step may take, rendering and waiting for other sessions included.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How long a client waits for an answer: the longest step, and the longest time to send it.
+pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(60 + 30);
 
 /// How long a session outlives its connection, waiting for `resume`.
 pub const RESUME_GRACE: Duration = Duration::from_secs(60);
