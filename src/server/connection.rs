@@ -11,11 +11,11 @@ use tokio::time::{Instant, sleep_until, timeout};
 
 use crate::session::{Frame, Outcome, Session, SessionError};
 
+use super::Server;
 use super::convert::{self, Command, Parsed};
 use super::fault::Fault;
 use super::sessions::{Answer, Place};
 use super::socket::{Incoming, Lost, Socket};
-use super::Server;
 
 /// Serves a client until it leaves or is turned away. An open session is parked then.
 pub(super) async fn serve(server: Arc<Server>, socket: Socket) {

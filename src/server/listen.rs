@@ -17,8 +17,7 @@ use super::{Server, router};
 /// Serves connections until the server stops. When all places are taken, further connections wait
 /// in the kernel's backlog.
 pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
-    let places =
-        Arc::new(Semaphore::new(server.limits.connections + config::SPARE_CONNECTIONS));
+    let places = Arc::new(Semaphore::new(server.limits.connections + config::SPARE_CONNECTIONS));
     let app = router::router(server.clone());
     loop {
         let accepted = async {
@@ -62,9 +61,8 @@ fn prepare(stream: &TcpStream) {
     let (idle, interval, retries) = config::KEEPALIVE;
     let keepalive =
         TcpKeepalive::new().with_time(idle).with_interval(interval).with_retries(retries);
-    let set = stream
-        .set_nodelay(true)
-        .and_then(|()| SockRef::from(stream).set_tcp_keepalive(&keepalive));
+    let set =
+        stream.set_nodelay(true).and_then(|()| SockRef::from(stream).set_tcp_keepalive(&keepalive));
     if let Err(error) = set {
         tracing::warn!("cannot set socket options: {error}");
     }

@@ -136,7 +136,9 @@ mod tests {
 
     #[test]
     fn local_origins() {
-        for origin in ["http://localhost", "http://127.0.0.1:8080", "https://[::1]:1", "http://[::1]"] {
+        for origin in
+            ["http://localhost", "http://127.0.0.1:8080", "https://[::1]:1", "http://[::1]"]
+        {
             assert!(is_local(origin), "{origin}");
         }
         for origin in [

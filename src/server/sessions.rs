@@ -108,7 +108,13 @@ impl Sessions {
                 (entry.leave, entry.parked) = (leave.clone(), None);
                 drop(entries);
                 let (sessions, name) = (self.clone(), name.to_owned());
-                return Ok(Place { sessions, name, outcome: Outcome::AgentLost, leave, seat: guard });
+                return Ok(Place {
+                    sessions,
+                    name,
+                    outcome: Outcome::AgentLost,
+                    leave,
+                    seat: guard,
+                });
             }
             if Instant::now() >= give_up {
                 return Err(Fault::SessionState("the session's last step is still running"));

@@ -181,10 +181,7 @@ mod tests {
     use glam::DQuat;
 
     fn at(x_m: f64, yaw_rad: f64) -> Pose {
-        Pose {
-            position_m: DVec3::new(x_m, 0.0, 0.0),
-            rotation: DQuat::from_rotation_z(yaw_rad),
-        }
+        Pose { position_m: DVec3::new(x_m, 0.0, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) }
     }
 
     fn driven(steps: u32, dt_us: i64, metres_per_step: f64) -> Episode {

@@ -276,10 +276,8 @@ fn redraw(
     pixels: &mut [Vec<u8>],
 ) -> Result<Vec<blake3::Hash>, RenderError> {
     let views: Vec<View> = observation::views(cameras, world_from_rig);
-    let mut targets: Vec<Target<'_>> = pixels
-        .iter_mut()
-        .map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() })
-        .collect();
+    let mut targets: Vec<Target<'_>> =
+        pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
     let frame = RenderFrame {
         scene: &resident.scene,
         profile: &resident.version.manifest.profile,

@@ -5,7 +5,6 @@ mod data;
 #[path = "../support/images.rs"]
 mod images;
 #[path = "../support/scene_files.rs"]
-#[expect(dead_code, reason = "the writers of files are for the tests of ingest")]
 mod scene_files;
 #[path = "../support/streets.rs"]
 mod streets;

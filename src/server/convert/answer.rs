@@ -185,7 +185,11 @@ fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
     let several = frame.images.iter().any(|image| image.pose > 0);
     let name = |image: &crate::session::Image| {
         let camera = &session.cameras()[image.camera].name;
-        if several { format!("pose/{}/camera/{camera}", image.pose) } else { format!("camera/{camera}") }
+        if several {
+            format!("pose/{}/camera/{camera}", image.pose)
+        } else {
+            format!("camera/{camera}")
+        }
     };
     frame.images.iter().map(name).collect()
 }

@@ -54,7 +54,9 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
     match error {
         SessionError::Twin(StoreError::Name { .. }) => (Code::InvalidName, field("twin")),
         SessionError::Twin(StoreError::NoTwin { .. }) => (Code::UnknownTwin, field("twin")),
-        SessionError::Twin(StoreError::NoVersion { .. }) => (Code::UnknownVersion, field("version")),
+        SessionError::Twin(StoreError::NoVersion { .. }) => {
+            (Code::UnknownVersion, field("version"))
+        }
         SessionError::Twin(_) => (Code::TwinDamaged, field("twin")),
         SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
         SessionError::UnknownCamera { index, .. } => {

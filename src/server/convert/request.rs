@@ -101,8 +101,7 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
         }
         Request::Open(open) => (open.seq, open_command(*open)),
         Request::Step { seq, pose, terminate } => {
-            let command =
-                pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
+            let command = pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
             (seq, command)
         }
         Request::Observe { seq, poses } => {
@@ -121,8 +120,8 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
         }
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
-            let command = name_of("session", session)
-                .map(|session| Command::Resume { session, last_seq });
+            let command =
+                name_of("session", session).map(|session| Command::Resume { session, last_seq });
             (seq, command)
         }
     }
@@ -217,9 +216,9 @@ fn not_finite(text: &str) -> Option<(Option<u64>, String)> {
             Some(format!("{name}.{part}[{index}]"))
         })
     };
-    let single = ["/pose", "/start/pose"].into_iter().find_map(|pointer| {
-        in_pose(&pointer[1..].replace('/', "."), value.pointer(pointer)?)
-    });
+    let single = ["/pose", "/start/pose"]
+        .into_iter()
+        .find_map(|pointer| in_pose(&pointer[1..].replace('/', "."), value.pointer(pointer)?));
     let of_list = |pointer: &str, name: &str, inner: &str| {
         let list = value.pointer(pointer)?.as_array()?;
         list.iter().enumerate().find_map(|(index, entry)| {
