@@ -3,7 +3,7 @@
 //! Everything is streamed through small buffers into [`Gaussians`], which take about what the file
 //! takes, and every Gaussian is checked before anyone sees one.
 
-mod axes;
+pub mod axes;
 mod ply;
 mod safetensors;
 pub mod validate;
