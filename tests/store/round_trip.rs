@@ -161,3 +161,14 @@ fn commits_at_once_get_numbers_of_their_own() {
     let verified = Catalog::open(dir.path()).unwrap().verify("street", &mut |_, _| {}).unwrap();
     assert_eq!(verified.damaged.len(), 0);
 }
+
+#[test]
+fn a_twin_may_be_empty() {
+    let dir = tempfile::tempdir().unwrap();
+    let version = commit(dir.path(), street(&gaussians(0, 1, 1.0, 1))).unwrap();
+    assert_eq!(version.manifest.chunks, []);
+    let catalog = Catalog::open(dir.path()).unwrap();
+    assert_eq!(catalog.version("street", None).unwrap(), version);
+    let resident = wildcity::residency::Cache::new(catalog).open("street", None).unwrap();
+    assert_eq!(resident.scene.gaussians(), 0);
+}
