@@ -334,3 +334,22 @@ fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let exponent: f32x16<S> = exponent.to_float();
     (t * series).mul_add(splat(std::f64::consts::LOG2_E), exponent)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn log2_is_within_two_units_of_f32() {
+        for i in 0..2_000 {
+            // From 2.5e-5, the square of the antialiasing floor, to 1; and around the seam at √½.
+            for x in [0.99_f32.powi(i).max(2.5e-5), 0.707 + 1e-7 * i as f32] {
+                let log = dispatch!(Level::new(), simd => {
+                    log2(simd, f32x16::splat(simd, x)).to_array()[0]
+                });
+                let error = f64::from(log) - f64::from(x).log2();
+                assert!(error.abs() < 2e-7 * f64::from(log).abs().max(1.0), "log2({x}) is {log}");
+            }
+        }
+    }
+}

@@ -263,21 +263,42 @@ fn blend<S: Simd, const DEPTH: bool>(
     (done, count)
 }
 
-/// `2^x` for x in [-126, 0], within 2e-7; anything, but no trap, elsewhere.
+/// `2^x` for x in [-126, 0], within 2e-7 and exact for whole x; anything, but no trap, elsewhere.
 ///
-/// The fraction's polynomial is the minimax fit of degree 5 on [0, 1] with value 1 at 0.
+/// The fraction's polynomial is the minimax fit of degree 5 to `2^f` on [0, 1) in relative error
+/// (8e-8) among those with value 1 at 0.
 #[inline(always)]
 fn exp2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let whole = x.floor();
     let f = x - whole;
     let power = f
-        .mul_add(splat(1.877_576_7e-3), splat(8.989_34e-3))
-        .mul_add(f, splat(5.582_631_8e-2))
-        .mul_add(f, splat(2.401_536_2e-1))
-        .mul_add(f, splat(6.931_530_7e-1))
-        .mul_add(f, splat(9.999_999_4e-1));
+        .mul_add(splat(1.867_130_2e-3), splat(9.017_03e-3))
+        .mul_add(f, splat(5.579_991_3e-2))
+        .mul_add(f, splat(2.401_644_4e-1))
+        .mul_add(f, splat(6.931_513e-1))
+        .mul_add(f, splat(1.0));
     let whole: i32x16<S> = whole.to_int();
     let power: i32x16<S> = power.bitcast();
     (power + (whole << 23)).bitcast()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp2_is_within_two_units_of_f32() {
+        for i in 0..=16_000 {
+            let x = -8.0 * i as f32 / 16_000.0;
+            let power = dispatch!(Level::new(), simd => {
+                exp2(simd, f32x16::splat(simd, x)).to_array()[0]
+            });
+            let error = f64::from(power) / f64::from(x).exp2() - 1.0;
+            assert!(error.abs() < 2e-7, "2^{x} is {power}, off by {error:e}");
+            if x.fract() == 0.0 {
+                assert_eq!(power, x.exp2());
+            }
+        }
+    }
 }
