@@ -1,5 +1,7 @@
 //! What an agent gets: every byte of an observation.
 
+use std::collections::BTreeMap;
+
 use serde_json::json;
 use wildcity::geometry::Pose;
 
@@ -92,7 +94,7 @@ async fn floats_can_be_read_in_place() {
         let seen = open(&server, outputs).await.step(1.0).await;
         let header = u64::from_le_bytes(seen.bytes[..8].try_into().unwrap()) as usize;
         let (_, layout) = safetensors::SafeTensors::read_metadata(&seen.bytes).unwrap();
-        for (name, info) in layout.tensors() {
+        for (name, info) in layout.tensors().into_iter().collect::<BTreeMap<_, _>>() {
             let at = 8 + header + info.data_offsets.0;
             let is_aligned = at.is_multiple_of(4);
             assert!(is_aligned || name.ends_with("/rgb"), "{encoding}: {name} at {at}");

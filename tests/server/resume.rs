@@ -108,7 +108,7 @@ async fn what_cannot_be_resumed() {
     let server = TestServer::start().await;
     refused(&resume(&server, "nobody", 0).await.1, "unknown_session");
     refused(&resume(&server, "../x", 0).await.1, "invalid_name");
-    let mut agent = server.driver("a").await;
+    let agent = server.driver("a").await;
     refused(&resume(&server, "a", agent.seq + 5).await.1, "seq_out_of_order");
     agent.closed_after_takeover().await;
     let (mut agent, _) = resume(&server, "a", 1).await;

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use crate::support::{Agent, TestServer, pose};
 
 /// The lines of a recorded episode.
-pub fn lines(path: &std::path::Path) -> Vec<Value> {
+pub(crate) fn lines(path: &std::path::Path) -> Vec<Value> {
     let text = std::fs::read_to_string(path).unwrap();
     assert!(text.ends_with('\n'), "{text}");
     text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()

@@ -25,22 +25,22 @@ use wildcity::server::{self, Config, Limits, Running};
 use wildcity::store::{Catalog, NewVersion};
 
 /// How long a test waits for anything before it fails.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Paints a pattern that is a function of where the camera stands, and nothing else.
 #[derive(Debug, Default)]
-pub struct Painter {
+pub(crate) struct Painter {
     /// Milliseconds that a frame takes.
-    pub slow_ms: AtomicU64,
+    pub(crate) slow_ms: AtomicU64,
     /// Whether the next frame crashes.
-    pub crash: AtomicBool,
+    pub(crate) crash: AtomicBool,
     /// Frames begun.
-    pub begun: AtomicU64,
+    pub(crate) begun: AtomicU64,
 }
 
 impl Painter {
     /// The colour of one byte of an image.
-    pub fn paint(world_from_camera: &Pose, index: usize) -> u8 {
+    pub(crate) fn paint(world_from_camera: &Pose, index: usize) -> u8 {
         let p = world_from_camera.position_m;
         let key = p.x.to_bits() ^ p.y.to_bits().rotate_left(17) ^ p.z.to_bits().rotate_left(31);
         let key = key ^ world_from_camera.rotation.z.to_bits().rotate_left(43);
@@ -49,7 +49,7 @@ impl Painter {
     }
 
     /// What the image of a camera must be.
-    pub fn image(world_from_camera: &Pose, camera: &Camera) -> Vec<u8> {
+    pub(crate) fn image(world_from_camera: &Pose, camera: &Camera) -> Vec<u8> {
         (0..3 * camera.pixels()).map(|index| Self::paint(world_from_camera, index)).collect()
     }
 }
@@ -88,14 +88,14 @@ impl Backend for Painter {
 }
 
 /// A directory with the twin `test`: a few Gaussians, two small cameras, 9 m of road.
-pub fn twins() -> tempfile::TempDir {
+pub(crate) fn twins() -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a temporary directory");
     commit_twin(dir.path());
     dir
 }
 
 /// Commits a version of the twin `test`.
-pub fn commit_twin(dir: &Path) {
+pub(crate) fn commit_twin(dir: &Path) {
     let gaussians = Gaussians {
         sh_degree: 0,
         means_m: (0..64).map(|i| [f64::from(i), f64::from(i % 5) - 2.0, 1.0]).collect(),
@@ -128,7 +128,7 @@ pub fn commit_twin(dir: &Path) {
 }
 
 /// The cameras of the twin `test`: `front`, 8 x 6 px, and `rear`, 5 x 4 px.
-pub fn rig() -> Rig {
+pub(crate) fn rig() -> Rig {
     let camera = |name: &str, width_px, height_px, yaw_rad: f64| {
         // Camera axes are x right, y down, z forward; rig axes x forward, y left, z up.
         let forward = DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
@@ -150,19 +150,19 @@ pub fn rig() -> Rig {
 }
 
 /// A server in this process.
-pub struct TestServer {
-    pub running: Running,
-    pub painter: Arc<Painter>,
-    pub twins: tempfile::TempDir,
-    pub episodes: tempfile::TempDir,
+pub(crate) struct TestServer {
+    pub(crate) running: Running,
+    pub(crate) painter: Arc<Painter>,
+    pub(crate) twins: tempfile::TempDir,
+    pub(crate) episodes: tempfile::TempDir,
 }
 
 impl TestServer {
-    pub async fn start() -> Self {
+    pub(crate) async fn start() -> Self {
         Self::with(Limits::default()).await
     }
 
-    pub async fn with(limits: Limits) -> Self {
+    pub(crate) async fn with(limits: Limits) -> Self {
         let (twins, painter) = (twins(), Arc::new(Painter::default()));
         let episodes = tempfile::tempdir().expect("a temporary directory");
         let config = Config {
@@ -176,26 +176,26 @@ impl TestServer {
         Self { running, painter, twins, episodes }
     }
 
-    pub fn address(&self) -> SocketAddr {
+    pub(crate) fn address(&self) -> SocketAddr {
         self.running.address()
     }
 
     /// Connected, welcomed.
-    pub async fn agent(&self) -> Agent {
+    pub(crate) async fn agent(&self) -> Agent {
         let mut agent = Agent::connect(self.address()).await;
         agent.hello().await;
         agent
     }
 
     /// Connected, welcomed, with a session of that name; raw images.
-    pub async fn driver(&self, name: &str) -> Agent {
+    pub(crate) async fn driver(&self, name: &str) -> Agent {
         let mut agent = self.agent().await;
         agent.open(json!({ "session": name, "outputs": { "encoding": "raw" } })).await;
         agent
     }
 
     /// Proves that the server still serves: a whole session of a client of its own.
-    pub async fn still_serves(&self) {
+    pub(crate) async fn still_serves(&self) {
         let mut agent = self.driver("still-serves").await;
         assert_eq!(agent.step(3.0).await.meta["step"], 1);
         let closed = agent.ask(json!({ "type": "close" })).await;
@@ -203,7 +203,7 @@ impl TestServer {
     }
 
     /// The recorded episodes, in order of name.
-    pub fn recorded(&self) -> Vec<PathBuf> {
+    pub(crate) fn recorded(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.episodes.path()).expect("episodes");
         let mut paths: Vec<_> = entries.map(|entry| entry.expect("an entry").path()).collect();
         paths.sort();
@@ -211,7 +211,7 @@ impl TestServer {
     }
 
     /// Waits until the server holds that many sessions.
-    pub async fn sessions_become(&self, count: usize) {
+    pub(crate) async fn sessions_become(&self, count: usize) {
         let reached = async {
             while self.running.sessions() != count {
                 tokio::time::sleep(Duration::from_millis(5)).await;
@@ -223,14 +223,14 @@ impl TestServer {
 }
 
 /// A client without a library: what it sends is what the test says.
-pub struct Agent {
-    pub socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
-    pub seq: u64,
+pub(crate) struct Agent {
+    pub(crate) socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+    pub(crate) seq: u64,
 }
 
 /// What came back.
 #[derive(Clone, Debug)]
-pub enum Reply {
+pub(crate) enum Reply {
     Text(Value),
     Binary(Bytes),
     Closed,
@@ -238,19 +238,19 @@ pub enum Reply {
 
 /// An observation, decoded with the safetensors crate.
 #[derive(Clone, Debug)]
-pub struct Seen {
-    pub meta: Value,
-    pub bytes: Bytes,
+pub(crate) struct Seen {
+    pub(crate) meta: Value,
+    pub(crate) bytes: Bytes,
 }
 
 /// Room for every observation.
-pub fn client_limits() -> Option<WebSocketConfig> {
+pub(crate) fn client_limits() -> Option<WebSocketConfig> {
     let bytes = Some(wildcity::config::OBSERVATION_BYTES);
     Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
 }
 
 impl Agent {
-    pub async fn connect(address: SocketAddr) -> Self {
+    pub(crate) async fn connect(address: SocketAddr) -> Self {
         let mut request =
             format!("ws://{address}/v1/session").into_client_request().expect("a request");
         let subprotocol = "wildcity.v1".parse().expect("a header");
@@ -260,19 +260,19 @@ impl Agent {
         Self { socket: connected.expect("a connection").0, seq: 0 }
     }
 
-    pub async fn hello(&mut self) -> Value {
+    pub(crate) async fn hello(&mut self) -> Value {
         let client = json!({ "name": "test", "version": "1" });
         self.ask(json!({ "type": "hello", "client": client, "protocols": ["wildcity.v1"] })).await
     }
 
     /// Opens a session on the twin `test`; `more` replaces or adds fields.
-    pub async fn open(&mut self, more: Value) -> Value {
+    pub(crate) async fn open(&mut self, more: Value) -> Value {
         let opened = self.try_open(more).await;
         assert_eq!(opened["type"], "opened", "{opened}");
         opened
     }
 
-    pub async fn try_open(&mut self, more: Value) -> Value {
+    pub(crate) async fn try_open(&mut self, more: Value) -> Value {
         let mut request = json!({ "type": "open", "twin": "test" });
         let fields = request.as_object_mut().expect("an object");
         fields.extend(more.as_object().expect("an object").clone());
@@ -280,12 +280,12 @@ impl Agent {
     }
 
     /// Steps to a place on the x axis.
-    pub async fn step(&mut self, x_m: f64) -> Seen {
+    pub(crate) async fn step(&mut self, x_m: f64) -> Seen {
         self.look(json!({ "type": "step", "pose": pose(x_m) })).await
     }
 
     /// Sends a request with the next number; its answer is text.
-    pub async fn ask(&mut self, request: Value) -> Value {
+    pub(crate) async fn ask(&mut self, request: Value) -> Value {
         self.send(request).await;
         match self.receive().await {
             Reply::Text(value) => value,
@@ -294,29 +294,29 @@ impl Agent {
     }
 
     /// Sends a request with the next number; its answer is an observation.
-    pub async fn look(&mut self, request: Value) -> Seen {
+    pub(crate) async fn look(&mut self, request: Value) -> Seen {
         self.send(request).await;
         self.seen().await
     }
 
-    pub async fn seen(&mut self) -> Seen {
+    pub(crate) async fn seen(&mut self) -> Seen {
         match self.receive().await {
             Reply::Binary(bytes) => Seen::decode(bytes),
             other => panic!("not an observation: {other:?}"),
         }
     }
 
-    pub async fn send(&mut self, mut request: Value) {
+    pub(crate) async fn send(&mut self, mut request: Value) {
         request["seq"] = self.seq.into();
         self.seq += 1;
         self.send_text(&request.to_string()).await;
     }
 
-    pub async fn send_text(&mut self, text: &str) {
+    pub(crate) async fn send_text(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.expect("sent");
     }
 
-    pub async fn receive(&mut self) -> Reply {
+    pub(crate) async fn receive(&mut self) -> Reply {
         let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
         match next.expect("an answer in time") {
             Some(Ok(Message::Text(text))) => {
@@ -329,13 +329,13 @@ impl Agent {
     }
 
     /// Asserts that the connection ends.
-    pub async fn closed(&mut self) {
+    pub(crate) async fn closed(&mut self) {
         let reply = self.receive().await;
         assert!(matches!(reply, Reply::Closed), "{reply:?}");
     }
 
     /// The TCP connection, for what WebSocket has no word for.
-    pub fn tcp(&mut self) -> &mut TcpStream {
+    pub(crate) fn tcp(&mut self) -> &mut TcpStream {
         match self.socket.get_mut() {
             MaybeTlsStream::Plain(stream) => stream,
             _ => unreachable!("no TLS here"),
@@ -344,28 +344,28 @@ impl Agent {
 }
 
 impl Seen {
-    pub fn decode(bytes: Bytes) -> Self {
+    pub(crate) fn decode(bytes: Bytes) -> Self {
         let (_, metadata) = safetensors::SafeTensors::read_metadata(&bytes).expect("a header");
         let metadata = metadata.metadata().clone().expect("metadata");
         let meta = serde_json::from_str(&metadata["observation"]).expect("JSON");
         Self { meta, bytes }
     }
 
-    pub fn tensors(&self) -> safetensors::SafeTensors<'_> {
+    pub(crate) fn tensors(&self) -> safetensors::SafeTensors<'_> {
         safetensors::SafeTensors::deserialize(&self.bytes).expect("safetensors")
     }
 
-    pub fn frame_hash(&self) -> &str {
+    pub(crate) fn frame_hash(&self) -> &str {
         self.meta["frame_hash"].as_str().expect("a hash")
     }
 }
 
 /// The wire's pose of a rig on the x axis.
-pub fn pose(x_m: f64) -> Value {
+pub(crate) fn pose(x_m: f64) -> Value {
     json!({ "xyz": [x_m, 0.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0] })
 }
 
 /// Asserts that an answer is an error of a code.
-pub fn refused(answer: &Value, code: &str) {
+pub(crate) fn refused(answer: &Value, code: &str) {
     assert_eq!((&answer["type"], &answer["code"]), (&"error".into(), &code.into()), "{answer}");
 }
