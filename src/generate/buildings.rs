@@ -127,8 +127,8 @@ impl Building {
             Wall::between(at(0.0, -DEPTH_M), at(0.0, 0.0)),
             Wall::between(at(width_m, 0.0), at(width_m, -DEPTH_M)),
         ];
-        for side in 0..2 {
-            let (wall, top_m) = (walls[side], self.style.height_m());
+        let top_m = self.style.height_m();
+        for (side, wall) in walls.into_iter().enumerate() {
             if self.open_sides[side] {
                 let style =
                     Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };
