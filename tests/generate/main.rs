@@ -35,7 +35,8 @@ fn there_are_enough_gaussians_and_density_scales_them() {
     assert!((300_000..600_000).contains(&count), "{count}");
     let sparse = StreetSettings { density: 0.25, ..StreetSettings::default() };
     let fewer = street(&sparse).unwrap().gaussians.len();
-    assert!(fewer < count / 2, "{fewer} of {count}");
+    // Leaves and windows do not get fewer, surfaces do.
+    assert!(fewer < count * 3 / 4, "{fewer} of {count}");
 }
 
 #[test]
