@@ -1,9 +1,9 @@
 //! The demo twin: a few hundred metres of a street, made from a seed.
 //!
-//! Surfaces are tiled with flat Gaussians ([`surface`]) whose colours carry the light of one sun
-//! ([`light`]). World: ENU in metres, z up, the road at z = 0, the street running east from the
+//! Surfaces are tiled with flat Gaussians (`surface.rs`) whose colours carry the light of one sun
+//! (`light.rs`). World: ENU in metres, z up, the road at z = 0, the street running east from the
 //! origin. The same settings give the same bytes: there is no clock, no thread, and one stream of
-//! random numbers per thing ([`random`]).
+//! random numbers per thing (`random.rs`).
 //!
 //! Where the 439,000 Gaussians of the default settings go, and how far apart they are before
 //! [`StreetSettings::density`] (0.8: 12 % wider):
