@@ -18,6 +18,10 @@ pub const INBOUND_MESSAGE_BYTES: usize = 1 << 20;
 /// six 1440x928 raw images with both are 88 MB.
 pub const OBSERVATION_BYTES: usize = 1 << 30;
 
+/// Largest header of an observation: 16 poses of 16 cameras are 256 images of 0.7 kB of metadata
+/// and 0.3 kB of tensor table, a quarter of this.
+pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
+
 /// Connections at once, WebSocket and HTTP together.
 pub const CONNECTIONS: usize = 1024;
 
@@ -42,6 +46,9 @@ pub const SEND_TIMEOUT: Duration = Duration::from_secs(30);
 /// How long one step may take, rendering and waiting for other sessions included.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// How long a client waits for an answer: the longest step, and the longest time to send it.
+pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(60 + 30);
+
 /// How long a session outlives its connection, waiting for `resume`.
 pub const RESUME_GRACE: Duration = Duration::from_secs(60);
 
@@ -53,6 +60,39 @@ pub const HISTORY_POSES: usize = 16;
 
 /// Spacing of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
+
+/// Shortest simulated time of a step, in microseconds: at 1 kHz the ego history needs 1,500 poses.
+pub const DT_MIN_US: i64 = 1_000;
+
+/// Longest simulated time of a step, in microseconds.
+pub const DT_MAX_US: i64 = 10_000_000;
+
+/// Connections beside [`CONNECTIONS`] that no WebSocket can take, so that health checks and
+/// refusals get through when all of those are taken.
+pub const SPARE_CONNECTIONS: usize = 64;
+
+/// Frames that may wait for the renderer. A session waits for one at a time; one whose deadline
+/// passed can leave a dead one behind, hence twice.
+pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
+
+/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`: 100 sessions with
+/// six raw 1440x928 images, depth and opacity (88 MB each), or every session with JPEGs.
+pub const ANSWERS_BYTES: u64 = 9 << 30;
+
+/// How long a refused client's last bytes are read and thrown away, so that it can read why.
+pub const LINGER: Duration = Duration::from_secs(2);
+
+/// Silence after which TCP asks whether the other side still exists, and how often it asks again;
+/// three unanswered probes end the connection: 20 + 3 x 5 = 35 s. The peer's kernel answers, so an
+/// agent that thinks for minutes without reading its socket stays connected.
+pub const KEEPALIVE: (Duration, Duration, u32) =
+    (Duration::from_secs(20), Duration::from_secs(5), 3);
+
+/// Longest line of an episode file: 256 image hashes of `observe` take 17 kB.
+pub const EPISODE_LINE_BYTES: usize = 1 << 20;
+
+/// The rig of a session on a twin that has none, unless the session says otherwise.
+pub const RIG: &str = "vehicle6";
 
 /// Longest PLY header. INRIA's with degree 3 is 1.5 KB.
 pub const PLY_HEADER_BYTES: usize = 64 << 10;

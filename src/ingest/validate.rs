@@ -5,13 +5,12 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::Pose;
 use crate::scene::Gaussians;
 
 use super::IngestError;
 
-/// Largest distance from the origin along an axis, in metres: that of poses.
-pub const MAX_COORDINATE_M: f64 = Pose::MAX_COORDINATE_M;
+/// Largest distance from the origin along an axis, in metres: as far as a pose may be.
+pub const MAX_COORDINATE_M: f64 = 1e8;
 /// Shortest and longest quaternion. Trainers leave them between 0.1 and 10.
 pub const QUAT_LENGTH: [f64; 2] = [1e-6, 1e6];
 /// Smallest and largest ln of a standard deviation: 1e-13 m and 22 km.

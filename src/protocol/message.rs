@@ -120,6 +120,24 @@ pub struct Open {
     pub deadline_ms: Option<u64>,
 }
 
+impl Open {
+    /// The latest version of a twin, and every default.
+    pub fn twin(name: impl Into<String>) -> Self {
+        Self {
+            seq: 0,
+            twin: name.into(),
+            version: None,
+            session: None,
+            seed: 0,
+            start: None,
+            rig: None,
+            outputs: Outputs::default(),
+            dt_us: None,
+            deadline_ms: None,
+        }
+    }
+}
+
 /// Where an episode starts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]

@@ -1,1 +1,188 @@
 //! WebSocket and HTTP.
+//!
+//! ```text
+//! listen      accepts connections, a bounded number
+//! router      HTTP routes, and the upgrade to WebSocket
+//! socket      WebSocket messages, with a time-out on every wait
+//! connection  one agent, in lock step: read a request, answer it
+//! sessions    who exists, who is connected, who waits to be resumed
+//! convert     wire to session and back
+//! shutdown    stopping without losing what runs
+//! ```
+
+mod connection;
+mod convert;
+mod fault;
+mod listen;
+mod router;
+mod sessions;
+mod shutdown;
+mod socket;
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+
+use crate::config;
+use crate::render::Backend;
+use crate::session::{Engine, EngineSettings, SessionError};
+use crate::store::{Catalog, StoreError};
+
+pub use shutdown::{Running, stop_signal};
+
+/// What a server is made of.
+#[derive(Clone)]
+pub struct Config {
+    /// Where to listen; port 0 takes a free one. A loopback address.
+    pub listen: SocketAddr,
+    /// Directory of twins.
+    pub twins: PathBuf,
+    /// Directory where episodes are recorded.
+    pub episodes: PathBuf,
+    /// What renders.
+    pub backend: Arc<dyn Backend>,
+    /// How long the server waits, and for how many.
+    pub limits: Limits,
+}
+
+/// How long the server waits for what, and how many it serves; see the constants in
+/// [`crate::config`] that are the defaults.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// For the first message of a connection.
+    pub hello: Duration,
+    /// For the next request.
+    pub idle: Duration,
+    /// For a client to read an answer.
+    pub send: Duration,
+    /// For one step, waiting for other sessions included.
+    pub step: Duration,
+    /// For a lost client to resume its session.
+    pub resume_grace: Duration,
+    /// For running steps when the server stops.
+    pub drain: Duration,
+    /// WebSocket connections at once.
+    pub connections: usize,
+    /// Sessions at once.
+    pub sessions: usize,
+}
+
+/// Why a server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// Anybody in the network could drive, and read the twins.
+    #[error(
+        "{address} is not a loopback address: there are no access tokens yet, so that only \
+         127.0.0.1 and [::1] are safe; reach them from elsewhere through an SSH tunnel"
+    )]
+    PublicAddress {
+        /// The refused address.
+        address: SocketAddr,
+    },
+    /// The address cannot be used.
+    #[error("cannot listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the operating system says.
+        source: io::Error,
+    },
+    /// The directory for episodes cannot be made.
+    #[error("cannot record episodes in {}: {source}", path.display())]
+    Episodes {
+        /// The directory.
+        path: PathBuf,
+        /// What the operating system says.
+        source: io::Error,
+    },
+    /// The directory of twins cannot be read.
+    #[error(transparent)]
+    Twins(#[from] StoreError),
+    /// The renderer cannot be started.
+    #[error(transparent)]
+    Engine(#[from] SessionError),
+}
+
+/// Starts a server within the running tokio runtime and returns once it listens.
+///
+/// # Errors
+/// The address is not a loopback address or cannot be used, or a directory cannot.
+pub async fn start(config: Config) -> Result<Running, ServerError> {
+    let Config { listen, twins, episodes, backend, limits } = config;
+    if !listen.ip().is_loopback() {
+        return Err(ServerError::PublicAddress { address: listen });
+    }
+    std::fs::create_dir_all(&episodes)
+        .map_err(|source| ServerError::Episodes { path: episodes.clone(), source })?;
+    let settings = EngineSettings {
+        catalog: Catalog::open(&twins)?,
+        episodes,
+        backend,
+        step_timeout: limits.step,
+    };
+    let engine = Engine::start(settings)?;
+    let failed = |source| ServerError::Listen { address: listen, source };
+    let listener = TcpListener::bind(listen).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    let (stop, stopping) = tokio::sync::watch::channel(false);
+    let server = Arc::new(Server {
+        engine,
+        sessions: sessions::Sessions::new(limits.sessions, limits.resume_grace),
+        agents: Arc::new(Semaphore::new(limits.connections)),
+        stopping,
+        limits,
+    });
+    Ok(Running::new(server, listener, address, stop))
+}
+
+/// What all connections share.
+struct Server {
+    engine: Arc<Engine>,
+    sessions: Arc<sessions::Sessions>,
+    /// One permit per WebSocket connection.
+    agents: Arc<Semaphore>,
+    /// Becomes true when the server stops.
+    stopping: tokio::sync::watch::Receiver<bool>,
+    limits: Limits,
+}
+
+impl Server {
+    /// Returns when the server stops.
+    async fn stopped(&self) {
+        // An error means that whoever could say so is gone, which says the same.
+        let _ = self.stopping.clone().wait_for(|&stop| stop).await;
+    }
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            hello: config::HELLO_TIMEOUT,
+            idle: config::IDLE_TIMEOUT,
+            send: config::SEND_TIMEOUT,
+            step: config::STEP_TIMEOUT,
+            resume_grace: config::RESUME_GRACE,
+            drain: config::DRAIN_TIMEOUT,
+            connections: config::CONNECTIONS,
+            sessions: config::SESSIONS,
+        }
+    }
+}
+
+impl std::fmt::Debug for Config {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { listen, twins, episodes, backend, limits } = self;
+        f.debug_struct("Config")
+            .field("listen", listen)
+            .field("twins", twins)
+            .field("episodes", episodes)
+            .field("backend", &backend.name())
+            .field("limits", limits)
+            .finish()
+    }
+}

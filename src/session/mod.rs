@@ -1,1 +1,420 @@
-//! Episodes.
+//! Episodes: reset, step, observe, record, replay.
+//!
+//! An [`Engine`] is what all sessions share; a [`Session`] is one agent's use of it. A request
+//! renders, is recorded, and only then changes the session: whatever fails on the way, nothing has
+//! happened, and the request can be sent again.
+
+mod engine;
+mod episode;
+mod error;
+mod observation;
+mod record;
+mod replay;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use crate::config;
+use crate::geometry::Pose;
+use crate::residency::Resident;
+use crate::scene::rig::{Rig, RigCamera};
+
+pub use engine::{Engine, EngineSettings};
+pub use episode::{Episode, History, Outcome, Summary};
+pub use error::SessionError;
+pub use observation::{
+    Buffer, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Image, Tensor, TensorKind, Timings,
+};
+pub use record::{EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs};
+pub use replay::{Change, Difference, Recording, Redrawn, ReplayError, Report};
+
+use observation::{Assembly, Layout};
+use record::{Line, Recorder};
+
+/// What opens a session. What is `None` is chosen by the twin or by `config`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Opening {
+    /// Name of the twin.
+    pub twin: String,
+    /// Its version; the latest if absent.
+    pub version: Option<u64>,
+    /// Seed of the first episode.
+    pub seed: u64,
+    /// Where to start: else the start of the twin's first trajectory, else the world's origin.
+    pub start: Option<Start>,
+    /// Cameras: else the twin's rig, else the preset `vehicle6`.
+    pub rig: Option<RigChoice>,
+    /// What each observation holds.
+    pub outputs: Outputs,
+    /// Simulated time of a step, in microseconds.
+    pub dt_us: Option<i64>,
+    /// How long one answer may take.
+    pub deadline: Option<Duration>,
+}
+
+/// Where an episode starts.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Start {
+    /// At a pose, `world_from_rig`.
+    Pose(Pose),
+    /// Along a recorded trajectory.
+    Station {
+        /// Its name.
+        trajectory: String,
+        /// Distance along it, in metres, within its length.
+        station_m: f64,
+    },
+}
+
+/// Which cameras.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RigChoice {
+    /// A rig that comes with the program.
+    Preset(String),
+    /// One written out; checked with [`Rig::check`] by whoever built it.
+    Full(Rig),
+}
+
+/// What each observation holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outputs {
+    /// Names of the cameras, in the order wanted; all if absent.
+    pub cameras: Option<Vec<String>>,
+    /// How colour images travel.
+    pub encoding: Encoding,
+    /// Whether to add depth.
+    pub depth: bool,
+    /// Whether to add opacity.
+    pub opacity: bool,
+}
+
+/// One agent's session on one version of a twin.
+#[derive(Debug)]
+pub struct Session {
+    engine: Arc<Engine>,
+    resident: Arc<Resident>,
+    name: String,
+    profile_hash: blake3::Hash,
+    rig_name: String,
+    layout: Arc<Layout>,
+    start: Pose,
+    dt_us: i64,
+    deadline: Duration,
+    episode: Episode,
+    /// Number of the current episode's file, and the file once something was rendered.
+    episode_number: u64,
+    recorder: Option<Recorder>,
+}
+
+impl Session {
+    /// Opens a session, loading the twin if nobody else has it.
+    ///
+    /// # Errors
+    /// Names the first field of `opening` that cannot be had; nothing was opened then.
+    pub async fn open(
+        engine: Arc<Engine>,
+        name: String,
+        opening: Opening,
+    ) -> Result<Self, SessionError> {
+        let dt_us = opening.dt_us.unwrap_or(config::DT_US);
+        let dt_limits_us = config::DT_MIN_US..=config::DT_MAX_US;
+        if !dt_limits_us.contains(&dt_us) {
+            let must = format!("{dt_us} µs; {dt_limits_us:?} µs are accepted");
+            return Err(SessionError::OutOfRange { field: "dt_us", must });
+        }
+        let longest = engine.step_timeout();
+        let deadline = opening.deadline.unwrap_or(longest);
+        if deadline.is_zero() || deadline > longest {
+            let must = format!("{deadline:?}; up to {longest:?} are accepted, and more than zero");
+            return Err(SessionError::OutOfRange { field: "deadline_ms", must });
+        }
+        let resident = engine.resident(opening.twin, opening.version).await?;
+        let manifest = &resident.version.manifest;
+        let (rig_name, cameras) = choose_cameras(&resident, opening.rig, &opening.outputs)?;
+        let Outputs { encoding, depth, opacity, .. } = opening.outputs;
+        let layout = Layout::new(cameras, encoding, depth, opacity)?;
+        let start = match &opening.start {
+            Some(start) => resolve_start(&resident, start)?,
+            None => manifest.trajectories.first().map_or(Pose::IDENTITY, |log| log.at_station(0.0)),
+        };
+        Ok(Self {
+            profile_hash: record::profile_hash(&manifest.profile),
+            rig_name,
+            layout: Arc::new(layout),
+            start,
+            dt_us,
+            deadline,
+            episode: Episode::new(opening.seed, start, dt_us),
+            episode_number: 0,
+            recorder: None,
+            engine,
+            resident,
+            name,
+        })
+    }
+
+    /// Moves the ego to its next pose (`world_from_rig`), lets `dt_us` pass and renders.
+    ///
+    /// # Errors
+    /// Nothing has changed then, and the step can be tried again. Dropping the future may record
+    /// the step but never takes it.
+    pub async fn step(&mut self, pose: Pose, terminate: bool) -> Result<Frame, SessionError> {
+        let next = self.episode.stepped(pose, terminate)?;
+        let frame = self.draw(&next, vec![pose]).await?;
+        self.record(FrameRequest::Step, &next, &[pose], &frame).await?;
+        self.episode = next;
+        Ok(frame)
+    }
+
+    /// Renders 1 to `config::OBSERVE_POSES` poses (`world_from_rig`) without moving.
+    ///
+    /// # Errors
+    /// As [`Session::step`].
+    pub async fn observe(&mut self, poses: Vec<Pose>) -> Result<Frame, SessionError> {
+        if !(1..=config::OBSERVE_POSES).contains(&poses.len()) {
+            let must = format!("{}; 1 to {} are accepted", poses.len(), config::OBSERVE_POSES);
+            return Err(SessionError::OutOfRange { field: "poses", must });
+        }
+        let episode = self.episode.clone();
+        let frame = self.draw(&episode, poses.clone()).await?;
+        self.record(FrameRequest::Observe, &episode, &poses, &frame).await?;
+        Ok(frame)
+    }
+
+    /// Starts a new episode at `start`, or where the session started, and renders it.
+    ///
+    /// # Errors
+    /// As [`Session::step`]: the old episode goes on.
+    pub async fn reset(&mut self, seed: u64, start: Option<Start>) -> Result<Frame, SessionError> {
+        let start = match &start {
+            Some(start) => resolve_start(&self.resident, start)?,
+            None => self.start,
+        };
+        let next = Episode::new(seed, start, self.dt_us);
+        let frame = self.draw(&next, vec![start]).await?;
+        let line = frame_line(FrameRequest::Reset, &next, &[start], &frame);
+        let (recorder, number) = self.begin_recording(&next, line).await?;
+        self.finish(Outcome::Completed).await;
+        (self.recorder, self.episode_number) = (Some(recorder), number);
+        self.episode = next;
+        Ok(frame)
+    }
+
+    /// Ends the session and tells how its last episode went.
+    pub async fn close(mut self, outcome: Outcome) -> Summary {
+        self.finish(outcome).await;
+        self.episode.summary(outcome)
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The twin's version and the Gaussians that all its sessions share.
+    pub fn resident(&self) -> &Arc<Resident> {
+        &self.resident
+    }
+
+    /// BLAKE3 of the render profile's JSON.
+    pub fn profile_hash(&self) -> blake3::Hash {
+        self.profile_hash
+    }
+
+    /// Name of the backend that renders.
+    pub fn backend(&self) -> &'static str {
+        self.engine.backend()
+    }
+
+    /// The cameras that are rendered, in the order of the images.
+    pub fn cameras(&self) -> &[RigCamera] {
+        self.layout.cameras()
+    }
+
+    /// How colour images travel.
+    pub fn encoding(&self) -> Encoding {
+        self.layout.encoding()
+    }
+
+    /// Whether observations hold depth, and whether opacity.
+    pub fn depth_and_opacity(&self) -> (bool, bool) {
+        self.layout.depth_and_opacity()
+    }
+
+    /// `world_from_rig` where episodes start unless `reset` says otherwise.
+    pub fn start(&self) -> Pose {
+        self.start
+    }
+
+    /// Simulated time of a step, in microseconds.
+    pub fn dt_us(&self) -> i64 {
+        self.dt_us
+    }
+
+    /// How long one answer may take.
+    pub fn deadline(&self) -> Duration {
+        self.deadline
+    }
+
+    /// The current episode.
+    pub fn episode(&self) -> &Episode {
+        &self.episode
+    }
+
+    /// Renders poses one after the other, each in its turn among the other sessions' frames.
+    async fn draw(&self, episode: &Episode, poses: Vec<Pose>) -> Result<Frame, SessionError> {
+        let deadline = Instant::now() + self.deadline;
+        let mut assembly =
+            Assembly::new(self.layout.clone(), self.engine.answers(), episode, poses.len())?;
+        for world_from_rig in poses {
+            let resident = self.resident.clone();
+            let (drawn, queued) = self
+                .engine
+                .run(deadline, move |scratch, backend| {
+                    assembly.draw(&resident, backend, world_from_rig, scratch).map(|()| assembly)
+                })
+                .await?;
+            assembly = drawn?;
+            assembly.add_queue_time(queued);
+        }
+        assembly.finish()
+    }
+
+    /// Writes what was rendered to the episode's file, which begins with its first frame.
+    async fn record(
+        &mut self,
+        request: FrameRequest,
+        episode: &Episode,
+        poses: &[Pose],
+        frame: &Frame,
+    ) -> Result<(), SessionError> {
+        let line = frame_line(request, episode, poses, frame);
+        match self.recorder.clone() {
+            Some(recorder) => append(recorder, line).await,
+            None => {
+                let (recorder, number) = self.begin_recording(&self.episode, line).await?;
+                (self.recorder, self.episode_number) = (Some(recorder), number);
+                Ok(())
+            }
+        }
+    }
+
+    /// Begins the file of an episode that has not moved yet, with its first frame.
+    async fn begin_recording(
+        &self,
+        episode: &Episode,
+        first_frame: Line,
+    ) -> Result<(Recorder, u64), SessionError> {
+        let version = &self.resident.version;
+        let (depth, opacity) = self.layout.depth_and_opacity();
+        let cameras = self.layout.cameras().to_vec();
+        let header = EpisodeHeader {
+            format: EpisodeHeader::FORMAT,
+            build: record::BUILD.to_owned(),
+            session: self.name.clone(),
+            twin: version.manifest.twin.clone(),
+            version: version.number,
+            version_hash: version.hash.clone(),
+            profile: version.manifest.profile,
+            profile_hash: self.profile_hash.to_hex().to_string(),
+            backend: self.engine.backend().to_owned(),
+            rig: Rig { name: self.rig_name.clone(), cameras },
+            outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity },
+            seed: episode.seed(),
+            start: episode.world_from_rig(),
+            dt_us: self.dt_us,
+        };
+        let (dir, name) = (self.engine.episodes().to_owned(), self.name.clone());
+        let (first_number, lines) =
+            (self.episode_number + 1, [Line::Episode(Box::new(header)), first_frame]);
+        let created = tokio::task::spawn_blocking(move || {
+            Recorder::create(&dir, &name, first_number, &lines)
+        });
+        let created = created.await;
+        Ok(created.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Writes the last line. The episode is over either way: a failure is only logged.
+    async fn finish(&mut self, outcome: Outcome) {
+        let Some(recorder) = self.recorder.take() else { return };
+        if let Err(error) = append(recorder, Line::End(self.episode.summary(outcome))).await {
+            tracing::warn!(session = self.name, "the episode's summary is missing: {error}");
+        }
+    }
+}
+
+async fn append(recorder: Recorder, line: Line) -> Result<(), SessionError> {
+    let appended = tokio::task::spawn_blocking(move || recorder.append(&[line])).await;
+    Ok(appended.map_err(|_| SessionError::Crashed)??)
+}
+
+fn frame_line(request: FrameRequest, episode: &Episode, poses: &[Pose], frame: &Frame) -> Line {
+    Line::Frame(FrameRecord {
+        request,
+        step: episode.step(),
+        time_us: episode.time_us(),
+        poses: poses.to_vec(),
+        terminated: episode.terminated(),
+        frame_hash: frame.frame_hash.to_hex().to_string(),
+        images: frame.images.iter().map(|image| image.hash.to_hex().to_string()).collect(),
+    })
+}
+
+/// The rig's name and the wanted cameras in the wanted order.
+fn choose_cameras(
+    resident: &Resident,
+    choice: Option<RigChoice>,
+    outputs: &Outputs,
+) -> Result<(String, Vec<RigCamera>), SessionError> {
+    let preset = |name: &str| {
+        Rig::preset(name).ok_or_else(|| SessionError::UnknownRig {
+            name: name.to_owned(),
+            known: Rig::preset_names().collect(),
+        })
+    };
+    let rig = match choice {
+        Some(RigChoice::Full(rig)) => rig,
+        Some(RigChoice::Preset(name)) => preset(&name)?,
+        None => match &resident.version.manifest.rig {
+            Some(rig) => rig.clone(),
+            None => preset(config::RIG)?,
+        },
+    };
+    let Some(names) = &outputs.cameras else { return Ok((rig.name, rig.cameras)) };
+    if !(1..=rig.cameras.len()).contains(&names.len()) {
+        let must = format!("{} names; 1 to {} are accepted", names.len(), rig.cameras.len());
+        return Err(SessionError::OutOfRange { field: "outputs.cameras", must });
+    }
+    let mut chosen: Vec<RigCamera> = Vec::with_capacity(names.len());
+    for (index, name) in names.iter().enumerate() {
+        let camera = rig.cameras.iter().find(|camera| camera.name == *name).ok_or_else(|| {
+            let known = rig.cameras.iter().map(|camera| camera.name.clone()).collect();
+            SessionError::UnknownCamera { index, name: name.clone(), known }
+        })?;
+        if chosen.contains(camera) {
+            return Err(SessionError::CameraTwice { index, name: name.clone() });
+        }
+        chosen.push(camera.clone());
+    }
+    Ok((rig.name, chosen))
+}
+
+fn resolve_start(resident: &Resident, start: &Start) -> Result<Pose, SessionError> {
+    let (name, station_m) = match start {
+        Start::Pose(pose) => return Ok(*pose),
+        Start::Station { trajectory, station_m } => (trajectory, *station_m),
+    };
+    let logs = &resident.version.manifest.trajectories;
+    let log = logs.iter().find(|log| log.name == *name).ok_or_else(|| {
+        let known = logs.iter().map(|log| log.name.clone()).collect();
+        SessionError::UnknownTrajectory { name: name.clone(), known }
+    })?;
+    let length_m = log.length_m();
+    if !(0.0..=length_m).contains(&station_m) {
+        let must = format!("{station_m} m; {name:?} is from 0 to {length_m} m long");
+        return Err(SessionError::OutOfRange { field: "start.station_m", must });
+    }
+    Ok(log.at_station(station_m))
+}

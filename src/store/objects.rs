@@ -347,3 +347,43 @@ fn sync_parent(path: &Path) -> Result<(), StoreError> {
     let Some(dir) = path.parent() else { return Ok(()) };
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_is_taken_once_and_the_loser_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let commit = |content: &[u8]| {
+            let mut staging = objects.stage("street")?;
+            let put = staging.put(|out| out.write_all(content))?;
+            staging.publish(1, content).map(|()| put)
+        };
+        let first = commit(b"first").unwrap();
+        assert_eq!(
+            (first.hash.as_str(), first.bytes),
+            (blake3::hash(b"first").to_hex().as_str(), 5)
+        );
+        let error = commit(b"second").unwrap_err();
+        assert!(matches!(error, StoreError::Conflict { number: 1, .. }), "{error}");
+        assert_eq!(objects.record("street", 1).unwrap(), b"first");
+        assert_eq!(objects.numbers("street").unwrap(), [1]);
+        objects.open("street", &first.hash).unwrap().finish().unwrap();
+        let lost = objects.path("street", &blake3::hash(b"second").to_hex());
+        assert!(!lost.exists() && !lost.parent().unwrap().exists());
+        assert_eq!(objects.begun().unwrap(), [""; 0]);
+    }
+
+    #[test]
+    fn a_running_commit_is_not_taken_over() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let running = objects.stage("street").unwrap();
+        assert!(objects.stage_abandoned("street").unwrap().is_none());
+        assert_eq!(objects.begun().unwrap(), ["street"]);
+        drop(running);
+        assert!(objects.stage_abandoned("street").unwrap().is_some());
+    }
+}

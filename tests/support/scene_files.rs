@@ -1,5 +1,7 @@
 //! Gaussians made of nothing, and the files that a trainer would make of them.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::fmt::Write as _;
 
 use wildcity::scene::{Gaussians, sh};

@@ -1,6 +1,6 @@
 //! PLY as PlayCanvas compresses it: 16 bytes per Gaussian, in chunks of 256 with their extremes.
 //!
-//! Source: the PlayCanvas engine's documentation of the format. A vertex has packed_position and
+//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has packed_position and
 //! packed_scale (11, 10, 11 bits from the top, between the chunk's extremes), packed_rotation (2
 //! bits for the largest component, 3 x 10 for the others) and packed_color (4 x 8: colour between
 //! the chunk's extremes, opacity). An element sh holds f_rest in 8 bits.

@@ -1,0 +1,34 @@
+"""Drives straight ahead through a twin and saves what the cameras see.
+
+    python drive.py ws://127.0.0.1:8080/v1/session TWIN [OUT]
+"""
+
+import math
+import sys
+from pathlib import Path
+
+import wildcity
+from PIL import Image
+from wildcity import Outputs, Pose
+
+
+def main(url: str, twin: str, out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    with wildcity.connect(url) as client, client.open(twin, outputs=Outputs(depth=True)) as session:
+        (x, y, z), (qw, qx, qy, qz) = session.opened.start.xyz, session.opened.start.q
+        yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        session.reset(seed=1)
+        for step in range(1, 21):
+            ahead = 0.5 * step  # metres: 5 m/s at 10 Hz
+            position = (x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z)
+            seen = session.step(Pose(position, (qw, qx, qy, qz)))
+            camera, image = next(iter(seen.images.items()))
+            print(f"{seen}: {camera} {image.shape}, nearest {seen.depth[camera].min():.1f} m")
+            if step % 10 == 0:
+                for camera, image in seen.images.items():
+                    Image.fromarray(image).save(out / f"{step:03}_{camera}.png")
+        print(session.close())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], Path(sys.argv[3] if len(sys.argv) > 3 else "drive"))

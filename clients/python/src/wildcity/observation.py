@@ -1,0 +1,272 @@
+"""The binary frame: safetensors layout, read in place."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from .errors import BadFrame, ProtocolError
+from .protocol import Ego, ImageInfo, Metadata, decode, parse_json
+
+HEADER_BYTES = 1 << 20
+"""Largest header accepted: 256 images take a quarter of it."""
+
+HISTORY_POSES = 16
+DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("u1"), "F32": np.dtype("<f4")}
+
+
+class Observation:
+    """What the ego sees. Arrays are read-only views of the frame; images are decoded when read.
+
+    `images["front"]` is uint8 [height, width, 3]; `depth` (camera z in metres) and `opacity` are
+    float32 [height, width], where asked for. They are those of the first pose; after an `observe`
+    of several poses, `views` has them all.
+    """
+
+    def __init__(self, frame: bytes) -> None:
+        self.frame = frame
+        self._tensors, text = _read_layout(frame)
+        try:
+            self.metadata: Metadata = decode(Metadata, parse_json(text, "metadata"), "metadata")
+        except BadFrame:
+            raise
+        except (ProtocolError, ValueError) as error:
+            raise BadFrame(str(error)) from error
+        self._check()
+        poses = {image.pose for image in self.metadata.images} | {0}
+        self.views: tuple[View, ...] = tuple(View(self, pose) for pose in sorted(poses))
+
+    @property
+    def ego(self) -> Ego:
+        """The ego at this time."""
+        return self.metadata.ego
+
+    @property
+    def history_xyz(self) -> NDArray[np.float32]:
+        """[16, 3]: past positions in metres in the rig frame of now, 0.1 s apart, last zero."""
+        return self.tensor("ego.history_xyz")
+
+    @property
+    def history_rot(self) -> NDArray[np.float32]:
+        """[16, 3, 3]: past rotations, rig(now) from rig(then), the last one identity."""
+        return self.tensor("ego.history_rot")
+
+    @property
+    def images(self) -> Mapping[str, NDArray[np.uint8]]:
+        """Colour images by camera."""
+        return self.views[0].images
+
+    @property
+    def depth(self) -> Mapping[str, NDArray[np.float32]]:
+        """Expected camera z by camera, in metres, 0 where opacity is 0."""
+        return self.views[0].depth
+
+    @property
+    def opacity(self) -> Mapping[str, NDArray[np.float32]]:
+        """Accumulated opacity by camera."""
+        return self.views[0].opacity
+
+    def tensor(self, name: str) -> NDArray[Any]:
+        """A tensor of the frame as it came, without a copy."""
+        tensor = self._tensors[name]
+        count = math.prod(tensor.shape)
+        array = np.frombuffer(self.frame, tensor.dtype, count, tensor.start)
+        return array.reshape(tensor.shape)
+
+    def encoded(self, image: ImageInfo) -> memoryview:
+        """The bytes of an image as it travelled: a JPEG or PNG file, or raw pixels."""
+        tensor = self._tensors[image.tensor]
+        return memoryview(self.frame)[tensor.start : tensor.start + math.prod(tensor.shape)]
+
+    def __repr__(self) -> str:
+        m = self.metadata
+        names = ", ".join(image.camera for image in m.images)
+        return f"<Observation {m.seq}: step {m.step} at {m.time_us} us, images {names}>"
+
+    def _check(self) -> None:
+        self._expect("ego.history_xyz", "F32", (HISTORY_POSES, 3))
+        self._expect("ego.history_rot", "F32", (HISTORY_POSES, 3, 3))
+        for image in self.metadata.images:
+            size = (image.height, image.width)
+            if image.encoding == "raw":
+                self._expect(image.tensor, "U8", (*size, 3))
+            else:
+                self._expect(image.tensor, "U8", None)
+            for output in ("depth", "opacity"):
+                if _sibling(image, output) in self._tensors:
+                    self._expect(_sibling(image, output), "F32", size)
+
+    def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
+        """`shape` None: any number of bytes."""
+        if name not in self._tensors:
+            raise BadFrame(f"there is no tensor {name!r}")
+        tensor = self._tensors[name]
+        fits = len(tensor.shape) == 1 if shape is None else tensor.shape == shape
+        if tensor.dtype != DTYPES[dtype] or not fits:
+            raise BadFrame(
+                f"tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; "
+                f"expected {dtype} {'[n]' if shape is None else list(shape)}"
+            )
+
+
+class View:
+    """The images from one pose."""
+
+    def __init__(self, observation: Observation, pose: int) -> None:
+        self._observation = observation
+        self._infos = {i.camera: i for i in observation.metadata.images if i.pose == pose}
+
+    @property
+    def cameras(self) -> Mapping[str, ImageInfo]:
+        """Size, intrinsics, times and hash of each image, in order."""
+        return self._infos
+
+    @cached_property
+    def images(self) -> Mapping[str, NDArray[np.uint8]]:
+        """uint8 [height, width, 3] by camera; JPEG and PNG are decoded when read, and kept."""
+        return _Lazy(self._infos, lambda image: _decode_image(self._observation, image))
+
+    @cached_property
+    def depth(self) -> Mapping[str, NDArray[np.float32]]:
+        """float32 [height, width] by camera: expected camera z in metres, where asked for."""
+        return self._floats("depth")
+
+    @cached_property
+    def opacity(self) -> Mapping[str, NDArray[np.float32]]:
+        """float32 [height, width] by camera: accumulated opacity, where asked for."""
+        return self._floats("opacity")
+
+    def _floats(self, output: str) -> Mapping[str, NDArray[np.float32]]:
+        tensors = self._observation._tensors
+        there = {name: i for name, i in self._infos.items() if _sibling(i, output) in tensors}
+        return _Lazy(there, lambda image: self._observation.tensor(_sibling(image, output)))
+
+
+class _Lazy(Mapping[str, NDArray[Any]]):
+    """Arrays by camera, made when first read."""
+
+    def __init__(
+        self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]]
+    ) -> None:
+        self._infos, self._make = infos, make
+        self._made: dict[str, NDArray[Any]] = {}
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._made:
+            self._made[name] = self._make(self._infos[name])
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._infos)
+
+    def __len__(self) -> int:
+        return len(self._infos)
+
+
+@dataclass(frozen=True)
+class _Tensor:
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    start: int
+    """Where its bytes begin in the frame."""
+
+
+def _sibling(image: ImageInfo, output: str) -> str:
+    """`camera/front/rgb` and `depth` give `camera/front/depth`."""
+    return image.tensor.removesuffix("rgb") + output
+
+
+def _decode_image(observation: Observation, image: ImageInfo) -> NDArray[np.uint8]:
+    if image.encoding == "raw":
+        return observation.tensor(image.tensor)
+    file = BytesIO(observation.encoded(image))
+    try:
+        with Image.open(file, formats=[image.encoding.upper()]) as opened:
+            # Checked before decoding, so that a small file cannot ask for a large buffer.
+            if opened.size != (image.width, image.height):
+                raise BadFrame(
+                    f"{image.tensor!r} is {opened.width}x{opened.height} px; "
+                    f"expected {image.width}x{image.height}"
+                )
+            pixels = np.asarray(opened.convert("RGB"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise BadFrame(f"{image.tensor!r} cannot be decoded: {error}") from error
+    pixels.flags.writeable = False
+    return pixels
+
+
+def _read_layout(frame: bytes) -> tuple[dict[str, _Tensor], str]:
+    """The tensors, checked to fill the frame without overlap, and the observation's JSON."""
+    if len(frame) < 8:
+        raise BadFrame(f"the frame ends within its header length, at {len(frame)} bytes")
+    (header_bytes,) = struct.unpack_from("<Q", frame)
+    if header_bytes > min(len(frame) - 8, HEADER_BYTES):
+        raise BadFrame(
+            f"the header length is {header_bytes}; the frame has {len(frame) - 8} bytes "
+            f"after it, and at most {HEADER_BYTES} are accepted"
+        )
+    try:
+        # Decoded here, as `json` would guess at other encodings than UTF-8.
+        header = parse_json(frame[8 : 8 + header_bytes].decode(), "the header")
+    except (ProtocolError, UnicodeDecodeError) as error:
+        raise BadFrame(f"the header cannot be read: {error}") from error
+    if not isinstance(header, dict):
+        raise BadFrame(f"the header is a {type(header).__name__}; expected a JSON object")
+    metadata = header.pop("__metadata__", None)
+    text = metadata.get("observation") if isinstance(metadata, dict) else None
+    if not isinstance(text, str):
+        raise BadFrame("the header's __metadata__ has no observation")
+    return _read_table(header, 8 + header_bytes, len(frame)), text
+
+
+def _read_table(header: dict[str, Any], data_start: int, frame_bytes: int) -> dict[str, _Tensor]:
+    rows = [(_offsets(name, info), name, info) for name, info in header.items()]
+    tensors, end = {}, 0
+    for (start, stop), name, info in sorted(rows, key=lambda row: row[0]):
+        if start != end:
+            raise BadFrame(f"tensor {name!r} has offset {start}, the one before it ends at {end}")
+        tensor = _Tensor(_dtype(name, info), _shape(name, info), data_start + start)
+        wanted = math.prod(tensor.shape) * tensor.dtype.itemsize
+        if stop - start != wanted:
+            raise BadFrame(f"tensor {name!r} has {stop - start} bytes; its shape asks for {wanted}")
+        tensors[name], end = tensor, stop
+    if data_start + end != frame_bytes:
+        raise BadFrame(
+            f"the tensors end at offset {end}, the frame at {frame_bytes - data_start}"
+        )
+    return tensors
+
+
+def _offsets(name: str, info: Any) -> tuple[int, int]:
+    offsets = info.get("data_offsets") if isinstance(info, dict) else None
+    if not _are_counts(offsets) or len(offsets) != 2 or offsets[0] > offsets[1]:
+        raise BadFrame(f"tensor {name!r} has offsets {offsets}; expected [start, end]")
+    return offsets[0], offsets[1]
+
+
+def _shape(name: str, info: dict[str, Any]) -> tuple[int, ...]:
+    shape = info.get("shape")
+    if not _are_counts(shape):
+        raise BadFrame(f"tensor {name!r} has shape {shape}; expected counts")
+    return tuple(shape)
+
+
+def _dtype(name: str, info: dict[str, Any]) -> np.dtype[Any]:
+    dtype = info.get("dtype")
+    if not isinstance(dtype, str) or dtype not in DTYPES:
+        raise BadFrame(f"tensor {name!r} has dtype {dtype!r}; expected {' or '.join(DTYPES)}")
+    return DTYPES[dtype]
+
+
+def _are_counts(values: Any) -> TypeGuard[list[int]]:
+    """Whether a list of whole numbers from zero; True and False are none."""
+    return isinstance(values, list) and all(type(v) is int and v >= 0 for v in values)

@@ -1,0 +1,375 @@
+"""The types of the wire, and their way to and from JSON. Names are those on the wire."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NoReturn, TypeVar
+
+from .errors import Code, ProtocolError
+
+PROTOCOL = "wildcity.v1"
+"""The WebSocket subprotocol."""
+
+OBSERVATION_BYTES = 1 << 30
+"""Largest message accepted from a server."""
+
+Encoding = Literal["jpeg", "png", "raw"]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid transform: position in metres, unit quaternion (w, x, y, z)."""
+
+    xyz: Vector = (0.0, 0.0, 0.0)
+    q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        # Accepts lists and arrays; what is stored is plain floats, as many as there must be.
+        for name, count in (("xyz", 3), ("q", 4)):
+            values = tuple(float(value) for value in getattr(self, name))
+            if len(values) != count:
+                raise ValueError(f"{name} has {len(values)} numbers; a pose needs {count}")
+            for index, value in enumerate(values):
+                if not math.isfinite(value):
+                    raise ValueError(f"{name}[{index}] is {value}; a pose needs finite numbers")
+            object.__setattr__(self, name, values)
+
+
+@dataclass(frozen=True)
+class Station:
+    """A place along a recorded trajectory, `station_m` metres from its start."""
+
+    trajectory: str
+    station_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera on the vehicle; sizes and intrinsics in pixels.
+
+    `camera_to_rig` takes camera coordinates (x right, y down, z forward) to the rig's.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_to_rig: Pose
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a vehicle, in the order in which images are answered."""
+
+    name: str
+    cameras: tuple[Camera, ...]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What each observation holds: which cameras (all if absent), how encoded, with what."""
+
+    cameras: tuple[str, ...] | None = None
+    encoding: Encoding = "jpeg"
+    quality: int | None = None
+    depth: bool = False
+    opacity: bool = False
+
+
+@dataclass(frozen=True)
+class ServerInfo:
+    """Name and version of the server."""
+
+    name: str
+    version: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the server accepts."""
+
+    message_bytes: int
+    observe_poses: int
+    cameras: int
+    side_px: int
+    answer_pixels: int
+    idle_ms: int
+    resume_ms: int
+
+
+@dataclass(frozen=True)
+class TrajectoryInfo:
+    """A recorded trajectory of a twin."""
+
+    name: str
+    length_m: float
+    keyframes: int
+
+
+@dataclass(frozen=True)
+class TwinInfo:
+    """A twin that can be opened."""
+
+    name: str
+    version: int
+    version_hash: str
+    gaussians: int
+    sh_degree: int
+    trajectories: tuple[TrajectoryInfo, ...]
+
+
+@dataclass(frozen=True)
+class Welcome:
+    """Answer to hello: who the server is and what it offers."""
+
+    seq: int
+    protocol: str
+    server: ServerInfo
+    limits: Limits
+    backend: str
+    twins: tuple[TwinInfo, ...]
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Answer to open: everything resolved, nothing implicit."""
+
+    seq: int
+    session: str
+    twin: str
+    version: int
+    version_hash: str
+    profile_hash: str
+    profile: dict[str, Any]
+    backend: str
+    seed: int
+    start: Pose
+    dt_us: int
+    deadline_ms: int
+    cameras: tuple[Camera, ...]
+    outputs: Outputs
+    trajectories: tuple[TrajectoryInfo, ...]
+    resident_bytes: int
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """Answer to resume: where the session stands."""
+
+    seq: int
+    session: str
+    last_seq: int
+    step: int
+    time_us: int
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How an episode went."""
+
+    outcome: Literal["completed", "agent_error", "agent_timeout", "agent_lost", "server_error"]
+    steps: int
+    time_us: int
+    distance_m: float
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Answer to close."""
+
+    seq: int
+    summary: Summary
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Answer to any request that was refused; `Refused` is raised from it."""
+
+    code: Code
+    message: str
+    fatal: bool
+    seq: int | None = None
+    field: str | None = None
+
+
+@dataclass(frozen=True)
+class Ego:
+    """The ego vehicle: `world_from_rig`, velocity in world axes in m/s.
+
+    The last `history_count` poses of the history were driven; earlier ones repeat the start.
+    """
+
+    pose: Pose
+    velocity: Vector
+    history_count: int
+
+
+@dataclass(frozen=True)
+class ImageInfo:
+    """One image: its camera, the request's pose it shows, size, intrinsics, times, hash.
+
+    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding.
+    """
+
+    camera: str
+    index: int
+    pose: int
+    tensor: str
+    encoding: Encoding
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_to_rig: Pose
+    shutter_start_us: int
+    shutter_end_us: int
+    hash: str
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Wall time of a render stage, in milliseconds."""
+
+    name: str
+    ms: float
+
+
+@dataclass(frozen=True)
+class Timings:
+    """What an observation cost, in milliseconds."""
+
+    queue_ms: float
+    render_ms: float
+    encode_ms: float
+    stages_ms: tuple[Stage, ...]
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What an observation says beside its tensors."""
+
+    seq: int
+    step: int
+    time_us: int
+    session: str
+    seed: int
+    terminated: bool
+    twin: str
+    version: int
+    version_hash: str
+    profile_hash: str
+    backend: str
+    frame_hash: str
+    ego: Ego
+    images: tuple[ImageInfo, ...]
+    timings: Timings
+
+
+ANSWERS: dict[str, type[Any]] = {
+    "welcome": Welcome,
+    "opened": Opened,
+    "resumed": Resumed,
+    "closed": Closed,
+    "error": Refusal,
+}
+
+
+def parse_json(text: str | bytes, what: str) -> Any:
+    """JSON without the extensions that Python's reader allows."""
+    try:
+        return json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"{what} is not JSON: {error}") from error
+
+
+def decode_answer(text: str) -> Any:
+    """A text frame from the server, as one of `ANSWERS`."""
+    value = parse_json(text, "an answer")
+    kind = value.get("type") if isinstance(value, dict) else None
+    if not isinstance(kind, str) or kind not in ANSWERS:
+        raise ProtocolError(f"an answer has type {kind!r}; expected one of {', '.join(ANSWERS)}")
+    return decode(ANSWERS[kind], value, kind)
+
+
+def encode(value: Any) -> Any:
+    """A dataclass as what `json` writes; what is None is left out."""
+    if dataclasses.is_dataclass(value):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {name: encode(item) for name, item in fields.items() if item is not None}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [encode(item) for item in value]
+    return value
+
+
+def decode(kind: Any, value: Any, path: str) -> Any:
+    """JSON as the type it must be; a mismatch names the path, as `opened.cameras[0].fx`.
+
+    Unknown fields are ignored: a server may say more than this client knows.
+    """
+    if kind is Any:
+        return value
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return value if value in arguments else _mismatch(path, value, " or ".join(arguments))
+    if origin in (types.UnionType, typing.Union):  # always `X | None`
+        return None if value is None else decode(arguments[0], value, path)
+    if origin is tuple:
+        return _decode_tuple(arguments, value, path)
+    if origin is dict or kind is dict:
+        return value if isinstance(value, dict) else _mismatch(path, value, "an object")
+    if dataclasses.is_dataclass(kind):
+        return _decode_dataclass(typing.cast(type[Any], kind), value, path)
+    if kind is float:
+        # Python's reader turns 1e999 into infinity, which is no JSON number.
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not math.isfinite(value):
+            return _mismatch(path, value, "a finite number")
+        return float(value)
+    if type(value) is not kind:
+        return _mismatch(path, value, kind.__name__)
+    return value
+
+
+def _decode_tuple(arguments: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        return _mismatch(path, value, "an array")
+    kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+    if len(kinds) != len(value):
+        return _mismatch(path, value, f"{len(kinds)} items")
+    pairs = enumerate(zip(kinds, value, strict=True))
+    return tuple(decode(kind, item, f"{path}[{index}]") for index, (kind, item) in pairs)
+
+
+def _decode_dataclass(kind: type[Any], value: Any, path: str) -> Any:
+    if not isinstance(value, dict):
+        return _mismatch(path, value, "an object")
+    hints = typing.get_type_hints(kind)
+    fields = {}
+    for field in dataclasses.fields(kind):
+        if field.name in value:
+            fields[field.name] = decode(hints[field.name], value[field.name], f"{path}.{field.name}")
+        elif field.default is dataclasses.MISSING:
+            raise ProtocolError(f"{path}.{field.name} is missing")
+    return kind(**fields)
+
+
+def _mismatch(path: str, value: Any, expected: str) -> NoReturn:
+    raise ProtocolError(f"{path} is {str(value)[:100]!r}; expected {expected}")
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")

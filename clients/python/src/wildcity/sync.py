@@ -1,0 +1,200 @@
+"""The blocking client."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TypeVar
+
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import ClientConnection
+from websockets.sync.client import connect as dial
+
+from .core import DIAL, Conversation, Exchange, keeps_connection, translated
+from .errors import ConnectFailed, Disconnected, WildCityError
+from .observation import Observation
+from .protocol import (
+    PROTOCOL,
+    Opened,
+    Outputs,
+    Pose,
+    Resumed,
+    Rig,
+    Station,
+    Summary,
+    Welcome,
+)
+
+T = TypeVar("T")
+
+
+def connect(url: str, *, name: str = "wildcity-python", timeout: float = 90.0) -> Client:
+    """Connects to `ws://host:port/v1/session` and says hello.
+
+    `timeout` is how long an answer may take, in seconds; the server's own limits are shorter.
+    """
+    return Client(url, name=name, timeout=timeout)
+
+
+class Client:
+    """A connection to a server. Use `connect`, and close it or use it in a `with` block."""
+
+    def __init__(self, url: str, *, name: str, timeout: float) -> None:
+        self.url, self.timeout = url, timeout
+        self._conversation = Conversation(name)
+        self._connection: ClientConnection | None = None
+        self.welcome: Welcome = self._connect()
+        """What the server said to hello: its limits, its twins."""
+
+    def open(
+        self,
+        twin: str,
+        *,
+        version: int | None = None,
+        session: str | None = None,
+        seed: int = 0,
+        start: Pose | Station | None = None,
+        rig: str | Rig | None = None,
+        outputs: Outputs | None = None,
+        dt_us: int | None = None,
+        deadline_ms: int | None = None,
+    ) -> Session:
+        """Opens a session on a twin; what is left out is the server's or the twin's default."""
+        opened = self._run(
+            self._conversation.open(
+                twin,
+                version=version,
+                session=session,
+                seed=seed,
+                start=start,
+                rig=rig,
+                outputs=outputs,
+                dt_us=dt_us,
+                deadline_ms=deadline_ms,
+            )
+        )
+        return Session(self, opened)
+
+    def resume(self, session: str, last_seq: int) -> Session:
+        """Continues a session that another client opened and lost.
+
+        `last_seq` is the number of the last answer that arrived there (`metadata.seq`). Only on a
+        fresh connection.
+        """
+        self._run(self._conversation.resume(session, last_seq))
+        return Session(self, None)
+
+    def close(self) -> None:
+        """Closes the connection; an open session can be resumed for a while."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _connect(self) -> Welcome:
+        self.close()
+        try:
+            # Entered here and closed in `close`, as it outlives any block.
+            connection = dial(self.url, **DIAL).__enter__()
+        except (OSError, ValueError, WebSocketException) as error:
+            raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
+        self._connection = connection
+        if connection.subprotocol != PROTOCOL:
+            self.close()
+            raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
+        return self._run(self._conversation.hello())
+
+    def _reconnect(self) -> Resumed:
+        self.welcome = self._connect()
+        return self._run(self._conversation.resume_own())
+
+    def _run(self, exchange: Exchange[T]) -> T:
+        # ValueError here, before anything is sent, changes nothing.
+        request = next(exchange)
+        # Taken away while a call runs: a second one at the same time is a mistake, not a queue.
+        connection, self._connection = self._connection, None
+        if connection is None:
+            raise Disconnected("there is no connection, or a call is under way on it")
+        keep = False
+        try:
+            connection.send(request)
+            exchange.send(connection.recv(timeout=self.timeout))
+        except StopIteration as done:
+            keep = True
+            result: T = done.value
+            return result
+        except BaseException as error:
+            keep = keeps_connection(error)
+            failure = translated(error, self.timeout)
+            if failure is None:
+                raise
+            raise failure from error
+        finally:
+            if keep:
+                self._connection = connection
+            else:
+                connection.close()
+        raise AssertionError("an exchange is one message each way")
+
+
+class Session:
+    """An open session. Closed at the end of a `with` block, if its connection still stands."""
+
+    def __init__(self, client: Client, opened: Opened | None) -> None:
+        self._client = client
+        self._conversation = client._conversation
+        self._opened = opened
+
+    @property
+    def opened(self) -> Opened:
+        """What the server resolved: cameras, start, hashes. Not known after `Client.resume`."""
+        if self._opened is None:
+            raise WildCityError("this session was opened by another client")
+        return self._opened
+
+    def step(self, pose: Pose, *, terminate: bool = False) -> Observation:
+        """Moves the ego to its next `world_from_rig`; `terminate` ends the episode with it."""
+        return self._client._run(self._conversation.step(pose, terminate))
+
+    def observe(self, poses: Sequence[Pose]) -> Observation:
+        """What would be seen from poses, without moving: one view for each."""
+        return self._client._run(self._conversation.observe(poses))
+
+    def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
+        """Starts a new episode, at the session's start if none is given."""
+        return self._client._run(self._conversation.reset(seed, start))
+
+    def close(self) -> Summary:
+        """Ends the session; another can be opened on the same client."""
+        return self._client._run(self._conversation.close())
+
+    def resume(self) -> Resumed:
+        """Connects again after `Disconnected` or `TimedOut`, and continues the session.
+
+        Then repeat the call that failed: it keeps its number, so it is carried out once, and if it
+        was carried out already its answer comes again.
+        """
+        return self._client._reconnect()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._client._connection is None or self._conversation.session is None:
+            return
+        try:
+            self.close()
+        except WildCityError:
+            # The error that ended the block says more than the one that followed it.
+            if error is None:
+                raise

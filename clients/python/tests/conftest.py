@@ -1,0 +1,74 @@
+"""What the tests share: the golden vectors, and both clients behind one face."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import wildcity
+import wildcity.aio
+
+PROTOCOL = Path(__file__).resolve().parents[3] / "protocol"
+
+
+def vector(name: str) -> Any:
+    """A golden JSON file."""
+    return json.loads((PROTOCOL / "vectors" / name).read_text())
+
+
+def frame(name: str) -> bytes:
+    """A golden binary file."""
+    return (PROTOCOL / "vectors" / name).read_bytes()
+
+
+@pytest.fixture(params=["sync", "aio"])
+def connect(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
+    """Either client's `connect`; clients left open are closed."""
+    clients = []
+    loop = asyncio.new_event_loop()
+
+    def connect(url: str, **options: Any) -> Any:
+        if request.param == "sync":
+            client: Any = wildcity.connect(url, **options)
+        else:
+            dialing = wildcity.aio.connect(url, **options)
+            client = Blocking(loop.run_until_complete(dialing), loop)
+        clients.append(client)
+        return client
+
+    yield connect
+    for client in clients:
+        client.close()
+    loop.close()
+
+
+class Blocking:
+    """An asyncio object whose methods are waited for."""
+
+    def __init__(self, inner: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self._inner, self._loop = inner, loop
+
+    def __getattr__(self, name: str) -> Any:
+        attribute = getattr(self._inner, name)
+        if not inspect.iscoroutinefunction(attribute):
+            return attribute
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            result = self._loop.run_until_complete(attribute(*arguments, **options))
+            is_ours = isinstance(result, (wildcity.aio.Client, wildcity.aio.Session))
+            return Blocking(result, self._loop) if is_ours else result
+
+        return call
+
+    def __enter__(self) -> Blocking:
+        self._loop.run_until_complete(self._inner.__aenter__())
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._loop.run_until_complete(self._inner.__aexit__(*error))
+

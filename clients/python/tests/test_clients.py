@@ -1,0 +1,191 @@
+"""Both clients against a server that follows a script."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import wildcity.aio
+from conftest import frame
+from fake_server import HANG_UP, SEEN, SILENCE, FakeServer, observation
+from wildcity import (
+    BadFrame,
+    ConnectFailed,
+    Disconnected,
+    Pose,
+    ProtocolError,
+    Refused,
+    TimedOut,
+    WildCityError,
+)
+
+Connect = Callable[..., Any]
+HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
+
+
+def seqs(requests: list[dict[str, Any]]) -> list[int]:
+    return [request["seq"] for request in requests]
+
+
+def test_a_whole_conversation(connect: Connect) -> None:
+    script: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, SEEN, "closed"]
+    with FakeServer(script) as server:
+        with connect(server.url) as client, client.open("street") as session:
+            assert client.welcome.twins[0].name == "street"
+            assert session.opened.cameras[1].name == "rear"
+            session.reset(seed=7)
+            seen = session.step(HERE)
+            assert seen.images["front"].shape == (3, 4, 3)
+            assert np.isfinite(seen.depth["rear"]).all()
+            session.observe([HERE, HERE])
+    types = [request["type"] for request in server.requests[0]]
+    assert types == ["hello", "open", "reset", "step", "observe", "close"]
+    assert seqs(server.requests[0]) == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_session_closed_by_hand_is_not_closed_again(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", "closed"]) as server:
+        with connect(server.url) as client, client.open("street") as session:
+            assert session.close().outcome == "completed"
+    assert len(server.requests[0]) == 3
+
+
+def test_a_refused_request_keeps_its_number(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", "error", SEEN]) as server:
+        session = connect(server.url).open("street")
+        with pytest.raises(Refused) as refused:
+            session.step(HERE)
+        assert refused.value.code == "pose_not_finite"
+        assert refused.value.field == "pose.q[2]"
+        assert not refused.value.fatal
+        session.step(HERE)
+    assert seqs(server.requests[0]) == [0, 1, 2, 2]
+
+
+def test_a_request_that_json_cannot_say_is_not_sent(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", SEEN]) as server:
+        client = connect(server.url)
+        with pytest.raises(ValueError, match="Out of range|not JSON compliant"):
+            client.open("street", seed=float("nan"))
+        client.open("street").step(HERE)
+    assert seqs(server.requests[0]) == [0, 1, 2]
+
+
+def test_a_fatal_error_ends_the_connection(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", "error_fatal"]) as server:
+        session = connect(server.url).open("street")
+        with pytest.raises(Refused, match="shutting_down") as refused:
+            session.step(HERE)
+        assert refused.value.fatal
+        with pytest.raises(Disconnected):
+            session.step(HERE)
+
+
+def test_a_lost_answer_is_fetched_after_resuming(connect: Connect) -> None:
+    """The golden `resumed` says that request 4 was carried out."""
+    first: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, HANG_UP]
+    with FakeServer(first, ["welcome", "resumed", SEEN, SEEN]) as server:
+        session = connect(server.url).open("street")
+        session.reset()
+        session.step(HERE)
+        with pytest.raises(Disconnected):
+            session.step(HERE)
+        assert session.resume().last_seq == 4
+        assert session.step(HERE).metadata.seq == 4
+        assert session.step(HERE).metadata.seq == 5
+    resume = {"type": "resume", "seq": 1, "session": "run-17", "last_seq": 3}
+    assert server.requests[1][1] == resume
+    assert seqs(server.requests[1]) == [0, 1, 4, 5]
+
+
+def test_another_client_can_take_a_session_over(connect: Connect) -> None:
+    with FakeServer(["welcome", "resumed", SEEN]) as server:
+        session = connect(server.url).resume("run-17", 4)
+        assert session.step(HERE).metadata.seq == 5
+        with pytest.raises(WildCityError, match="another client"):
+            _ = session.opened
+
+
+def test_a_session_that_is_elsewhere_is_not_taken_over(connect: Connect) -> None:
+    with FakeServer(["welcome", "resumed"]) as server:
+        with pytest.raises(ProtocolError, match="the session is at 4, not at 2"):
+            connect(server.url).resume("run-17", 2)
+
+
+def test_silence_ends_in_a_time_out(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", SILENCE]) as server:
+        session = connect(server.url, timeout=0.2).open("street")
+        with pytest.raises(TimedOut):
+            session.step(HERE)
+        # The answer may still come, so the connection cannot be used again.
+        with pytest.raises(Disconnected):
+            session.step(HERE)
+
+
+@pytest.mark.parametrize(
+    ("reply", "error", "says"),
+    [
+        (observation(3), ProtocolError, "answer to request 2, got one to 3"),
+        ("opened", ProtocolError, "step was answered with Opened"),
+        ('{"type":', ProtocolError, "not JSON"),
+        (frame("damaged/overlap.bin"), BadFrame, "offset"),
+    ],
+)
+def test_what_is_no_answer_is_named(
+    connect: Connect, reply: str | bytes, error: type[Exception], says: str
+) -> None:
+    with FakeServer(["welcome", "opened", reply]) as server:
+        session = connect(server.url).open("street")
+        with pytest.raises(error, match=says):
+            session.step(HERE)
+        with pytest.raises(Disconnected):
+            session.step(HERE)
+
+
+def test_nobody_there_is_no_connection(connect: Connect) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    for url in (f"ws://127.0.0.1:{port}/v1/session", "http://127.0.0.1/", "not a url"):
+        with pytest.raises(ConnectFailed):
+            connect(url)
+
+
+def test_a_cancelled_call_gives_the_connection_up() -> None:
+    async def cancel(url: str) -> None:
+        client = await wildcity.aio.connect(url)
+        session = await client.open("street")
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(session.step(HERE), 0.1)
+        with pytest.raises(Disconnected):
+            await session.step(HERE)
+
+    with FakeServer(["welcome", "opened", SILENCE]) as server:
+        asyncio.run(cancel(server.url))
+
+
+def test_calls_do_not_overlap() -> None:
+    """A second thread is told so, rather than getting the first one's answer."""
+    with FakeServer(["welcome", "opened", SILENCE]) as server:
+        client = wildcity.connect(server.url, timeout=0.5)
+        session = client.open("street")
+        started = threading.Event()
+
+        def first() -> None:
+            started.set()
+            with pytest.raises(TimedOut):
+                session.step(HERE)
+
+        thread = threading.Thread(target=first)
+        thread.start()
+        started.wait()
+        # Until the first call has the connection.
+        while client._connection is not None:
+            pass
+        with pytest.raises(Disconnected, match="under way"):
+            session.step(HERE)
+        thread.join()

@@ -1,0 +1,300 @@
+"""Against the real server, on a twin made here: 4,000 Gaussians on the walls of a corridor."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import wildcity
+from wildcity import Camera, Disconnected, Observation, Outputs, Pose, Refused, Rig, Station
+
+Connect = Callable[..., Any]
+
+# Looks along the rig's x: camera x is right (-y), camera y is down (-z).
+FORWARD = Pose((0.5, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5))
+BACK = Pose((-0.5, 0.0, 1.5), (0.5, -0.5, -0.5, 0.5))
+PAIR = Rig(
+    "pair",
+    (
+        Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0, FORWARD),
+        Camera("rear", 65, 43, 40.0, 40.0, 32.5, 21.5, BACK),
+    ),
+)
+RAW = Outputs(encoding="raw", depth=True, opacity=True)
+
+
+@dataclass(frozen=True)
+class Server:
+    url: str
+
+    def get(self, path: str) -> tuple[int, str]:
+        base = self.url.replace("ws://", "http://").removesuffix("/v1/session")
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        with opener.open(base + path, timeout=10) as answer:
+            return answer.status, answer.read().decode()
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    folder = tmp_path_factory.mktemp("end_to_end")
+    write_corridor(folder / "corridor.ply")
+    write_log(folder / "log.json")
+    twins = ["--twins", str(folder / "twins")]
+    files = ["--trajectory", str(folder / "log.json")]
+    importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
+    subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
+        try:
+            yield Server(listening_url(process))
+        finally:
+            process.terminate()
+            assert process.wait(timeout=20) == 0, "the server did not stop cleanly"
+
+
+def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client:
+        assert [twin.name for twin in client.welcome.twins] == ["corridor"]
+        start = Station("log", 2.0)
+        with client.open("corridor", rig=PAIR, outputs=RAW, start=start, seed=3) as session:
+            opened = session.opened
+            assert opened.start.xyz == pytest.approx((2.0, 0.0, 0.0))
+            assert [(c.name, c.width, c.height) for c in opened.cameras] == [
+                ("front", 96, 64),
+                ("rear", 65, 43),
+            ]
+            first = session.reset(seed=3)
+            check(first, step=0)
+            for step in range(1, 21):
+                seen = session.step(Pose((2.0 + 0.25 * step, 0.0, 0.0)))
+                check(seen, step)
+                assert seen.ego.velocity == pytest.approx((2.5, 0.0, 0.0))
+            assert not np.array_equal(first.images["front"], seen.images["front"])
+            # 0.25 m a step, looking back from where it is now.
+            assert seen.history_xyz[:, 0] == pytest.approx(0.25 * np.arange(-15, 1), abs=1e-6)
+            assert seen.ego.history_count == 16
+            summary = session.close()
+            assert (summary.outcome, summary.steps) == ("completed", 20)
+            assert summary.distance_m == pytest.approx(5.0)
+
+
+def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:
+    """Red wall on the left, green on the right; the rear camera sees them swapped."""
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR, outputs=RAW, start=Pose((10, 0, 0))) as session:
+            seen = session.reset()
+    for camera, left, right in (("front", 0, 1), ("rear", 1, 0)):
+        image = seen.images[camera].astype(float)
+        columns = image.shape[1] // 4
+        assert image[:, :columns, left].mean() > 3 * image[:, :columns, right].mean()
+        assert image[:, -columns:, right].mean() > 3 * image[:, -columns:, left].mean()
+    # The wall is 2 m to the left: z = fx * 2 m / (cx - u) for the pixel centre of column 8.
+    depth, opacity = seen.depth["front"][32, 8], seen.opacity["front"][32, 8]
+    assert opacity > 0.9
+    assert depth == pytest.approx(60.0 * 2.0 / (48.0 - 8.5), rel=0.1)
+
+
+def test_encodings_agree(connect: Connect, server: Server) -> None:
+    seen: dict[str, Observation] = {}
+    with connect(server.url) as client:
+        for encoding in ("raw", "png", "jpeg"):
+            outputs = Outputs(encoding=encoding, quality=95 if encoding == "jpeg" else None)
+            with client.open("corridor", rig=PAIR, outputs=outputs) as session:
+                seen[encoding] = session.reset()
+    raw = seen["raw"].images["front"]
+    assert np.array_equal(raw, seen["png"].images["front"])
+    error = np.abs(raw.astype(int) - seen["jpeg"].images["front"])
+    assert error.mean() < 8
+    hashes = {observation.metadata.frame_hash for observation in seen.values()}
+    assert len(hashes) == 1, "the hash is of the pixels before encoding"
+
+
+def test_the_same_drive_gives_the_same_hashes(connect: Connect, server: Server) -> None:
+    def drive() -> list[str]:
+        with connect(server.url) as client:
+            with client.open("corridor", rig=PAIR, start=Pose((1, 0, 0))) as session:
+                seen = [session.reset(seed=1)]
+                seen += [session.step(Pose((1.0 + k, 0.1 * k, 0.0))) for k in range(3)]
+                return [observation.metadata.frame_hash for observation in seen]
+
+    first = drive()
+    assert drive() == first
+    assert len(set(first)) > 1
+
+
+def test_observe_does_not_move(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR, outputs=RAW, start=Pose((3, 0, 0))) as session:
+            session.reset()
+            seen = session.observe([Pose((3, 0, 0)), Pose((6, 0, 0))])
+            assert len(seen.views) == 2
+            assert not np.array_equal(seen.views[0].images["front"], seen.views[1].images["front"])
+            assert seen.ego.pose.xyz == (3.0, 0.0, 0.0)
+            there = session.step(Pose((6, 0, 0)))
+            assert there.metadata.step == 1
+            assert np.array_equal(there.images["front"], seen.views[1].images["front"])
+            assert np.array_equal(there.depth["rear"], seen.views[1].depth["rear"])
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "field"),
+    [
+        ({"twin": "nowhere"}, "unknown_twin", "twin"),
+        ({"twin": "../etc"}, "invalid_name", "twin"),
+        ({"version": 99}, "unknown_version", "version"),
+        ({"rig": "bicycle"}, "unknown_rig", "rig"),
+        ({"rig": PAIR, "outputs": Outputs(("left",))}, "unknown_camera", "outputs.cameras[0]"),
+        ({"start": Station("nowhere")}, "unknown_trajectory", "start.trajectory"),
+        ({"start": Pose(q=(2, 0, 0, 0))}, "pose_invalid", "start.pose.q"),
+        ({"seed": -1}, "invalid_request", None),
+    ],
+)
+def test_bad_openings_are_refused_and_cost_nothing(
+    connect: Connect, server: Server, options: dict[str, Any], code: str, field: str | None
+) -> None:
+    with connect(server.url) as client:
+        with pytest.raises(Refused) as refused:
+            client.open(**{"twin": "corridor", **options})
+        assert (refused.value.code, refused.value.field) == (code, field)
+        assert not refused.value.fatal
+        client.open("corridor", rig=PAIR).close()
+
+
+def test_a_refused_step_changes_nothing(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR) as session:
+            session.reset()
+            with pytest.raises(Refused) as refused:
+                session.step(Pose((1e12, 0.0, 0.0)))
+            assert (refused.value.code, refused.value.field) == ("pose_invalid", "pose.xyz[0]")
+            seen = session.step(Pose((1.0, 0.0, 0.0)))
+            assert seen.metadata.step == 1
+
+
+def test_a_lost_connection_is_resumed(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR) as session:
+            session.reset()
+            before = session.step(Pose((1.0, 0.0, 0.0)))
+            client.close()
+            with pytest.raises(Disconnected):
+                session.step(Pose((2.0, 0.0, 0.0)))
+            resumed = session.resume()
+            assert (resumed.last_seq, resumed.step) == (before.metadata.seq, 1)
+            assert session.step(Pose((2.0, 0.0, 0.0))).metadata.step == 2
+
+
+def test_a_killed_agents_session_lives_on(connect: Connect, server: Server) -> None:
+    """The last answer comes again, byte for byte, to whoever takes the session over."""
+    with connect(server.url) as client:
+        session = client.open("corridor", rig=PAIR, session=f"killed-{time.time_ns()}")
+        name = session.opened.session
+        session.reset()
+        seen = session.step(Pose((1.0, 0.0, 0.0)))
+    with connect(server.url) as client:
+        session = client.resume(name, seen.metadata.seq - 1)
+        again = session.step(Pose((1.0, 0.0, 0.0)))
+        assert again.frame == seen.frame
+        assert session.step(Pose((2.0, 0.0, 0.0))).metadata.step == 2
+        session.close()
+    with connect(server.url) as client, pytest.raises(Refused) as refused:
+        client.resume(name, seen.metadata.seq)
+    assert refused.value.code == "unknown_session"
+
+
+def test_many_agents_at_once(server: Server) -> None:
+    hashes: queue.Queue[tuple[str, ...]] = queue.Queue()
+
+    def drive() -> None:
+        with wildcity.connect(server.url) as client:
+            with client.open("corridor", rig=PAIR) as session:
+                seen = [session.step(Pose((float(k), 0.0, 0.0))) for k in range(5)]
+                hashes.put(tuple(observation.metadata.frame_hash for observation in seen))
+
+    threads = [threading.Thread(target=drive) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert hashes.qsize() == 8
+    assert len({hashes.get() for _ in threads}) == 1
+
+
+def test_http_routes(server: Server) -> None:
+    assert server.get("/healthz")[0] == 200
+    assert server.get("/readyz")[0] == 200
+    status, body = server.get("/v1/twins")
+    assert status == 200
+    (twin,) = json.loads(body)["twins"]
+    assert (twin["name"], twin["gaussians"]) == ("corridor", 4000)
+
+
+def check(seen: Observation, step: int) -> None:
+    assert (seen.metadata.step, seen.metadata.time_us) == (step, 100_000 * step)
+    for name, height, width in (("front", 64, 96), ("rear", 43, 65)):
+        info = seen.views[0].cameras[name]
+        assert info.shutter_end_us == seen.metadata.time_us
+        assert seen.images[name].shape == (height, width, 3)
+        assert seen.images[name].max() > 50
+        assert seen.depth[name].shape == seen.opacity[name].shape == (height, width)
+        assert np.isfinite(seen.depth[name]).all()
+        assert 0.0 <= seen.opacity[name].min() <= seen.opacity[name].max() <= 1.0
+
+
+def listening_url(process: subprocess.Popen[str]) -> str:
+    lines: queue.Queue[str] = queue.Queue()
+    assert process.stdout is not None
+    # Reads on, so that the server never waits for a full pipe.
+    stdout = process.stdout
+    threading.Thread(target=lambda: [lines.put(line) for line in stdout], daemon=True).start()
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            line = lines.get(timeout=1)
+        except queue.Empty:
+            assert process.poll() is None, f"the server ended with {process.returncode}"
+            continue
+        if line.startswith("listening on "):
+            return line.removeprefix("listening on ").strip()
+    raise AssertionError("the server did not say where it listens")
+
+
+def write_corridor(path: Path) -> None:
+    """Walls 2 m to each side of the x axis, 3 m high: red on the left (y > 0), green right."""
+    count = 4000
+    numbers = np.random.default_rng(1)
+    x, z = numbers.uniform(-5, 25, count), numbers.uniform(0, 3, count)
+    left = np.arange(count) < count // 2
+    y = np.where(left, 2.0, -2.0)
+    # Degree-0 harmonics: colour = 0.5 + 0.2820948 dc.
+    bright, dark = (0.9 - 0.5) / 0.2820948, (0.05 - 0.5) / 0.2820948
+    dc = np.where(left[:, None], [bright, dark, dark], [dark, bright, dark])
+    opacity = np.full(count, 4.0)  # logit: 0.98
+    scale = np.log(np.broadcast_to([0.2, 0.02, 0.2], (count, 3)))
+    rotation = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (count, 4))
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    columns = np.column_stack([x, y, z, dc, opacity, scale, rotation]).astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for name in names.split()] + ["end_header", ""]
+    path.write_bytes("\n".join(header).encode() + columns.tobytes())
+
+
+def write_log(path: Path) -> None:
+    keyframes = [
+        {"time_us": 100_000 * k, "world_from_rig": {"xyz": [0.5 * k, 0, 0], "q": [1, 0, 0, 0]}}
+        for k in range(21)
+    ]
+    path.write_text(json.dumps({"name": "log", "keyframes": keyframes}))

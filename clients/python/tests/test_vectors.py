@@ -1,0 +1,251 @@
+"""The golden vectors: requests as built here, answers and frames as decoded here."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any, get_args
+
+import jsonschema
+import numpy as np
+import pytest
+from conftest import PROTOCOL, frame, vector
+from wildcity import (
+    BadFrame,
+    Camera,
+    Code,
+    Observation,
+    Outputs,
+    Pose,
+    ProtocolError,
+    Rig,
+    Station,
+)
+from wildcity.core import Conversation
+from wildcity.protocol import ANSWERS, decode_answer, encode
+
+HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
+ABOVE = Pose((12.5, -3.25, 30.0))
+LOG = Station("log", 12.5)
+FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
+REAR = dataclasses.replace(
+    FRONT, name="rear", camera_to_rig=Pose((-0.9, 0.0, 1.4), (0.5, -0.5, -0.5, 0.5))
+)
+
+REQUESTS: dict[str, Callable[[Conversation], Any]] = {
+    "hello": lambda c: c.hello(),
+    "open": lambda c: c.open(
+        "street",
+        version=3,
+        session="run-17",
+        seed=42,
+        start=LOG,
+        rig=Rig("pair", (FRONT, REAR)),
+        outputs=Outputs(("front", "rear"), "raw", 85, depth=True, opacity=True),
+        dt_us=100_000,
+        deadline_ms=20_000,
+    ),
+    "open_preset": lambda c: c.open("street", rig="vehicle6"),
+    "step": lambda c: c.step(HERE, False),
+    "step_terminate": lambda c: c.step(HERE, True),
+    "observe": lambda c: c.observe([HERE, ABOVE]),
+    "reset": lambda c: c.reset(7, None),
+    "reset_pose": lambda c: c.reset(8, HERE),
+    "reset_station": lambda c: c.reset(9, LOG),
+    "close": lambda c: c.close(),
+    "resume": lambda c: c.resume("run-17", 4),
+}
+
+
+def names(folder: str) -> list[str]:
+    return sorted(path.stem for path in (PROTOCOL / "vectors" / folder).glob("*.json"))
+
+
+@pytest.mark.parametrize("name", names("requests"))
+def test_requests_are_the_golden_ones(name: str) -> None:
+    golden = vector(f"requests/{name}.json")
+    conversation = Conversation("golden")
+    conversation.next_seq = golden["seq"]
+    assert json.loads(next(REQUESTS[name](conversation))) == golden
+
+
+@pytest.mark.parametrize("name", names("answers"))
+def test_answers_keep_everything(name: str) -> None:
+    golden = vector(f"answers/{name}.json")
+    answer = decode_answer(json.dumps(golden))
+    assert type(answer) is ANSWERS[golden.pop("type")]
+    assert plain(answer) == golden
+
+
+@pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses"])
+def test_observations_decode_to_what_went_in(name: str) -> None:
+    expected = vector(f"observations/{name}.expected.json")
+    observation = Observation(frame(f"observations/{name}.bin"))
+    assert plain(observation.metadata) == expected["observation"]
+    assert observation.ego.pose == HERE
+    assert observation.history_xyz.shape == (16, 3)
+    assert observation.history_rot.shape == (16, 3, 3)
+    assert observation.history_xyz[0].tolist() == expected["history_xyz_m_first"]
+    assert observation.history_xyz[-1].tolist() == expected["history_xyz_m_last"]
+    assert np.array_equal(observation.history_rot[-1], np.eye(3))
+    for tensor in expected["tensors"]:
+        array = observation.tensor(tensor["name"])
+        assert array.dtype == {"U8": np.uint8, "F32": np.float32}[tensor["dtype"]]
+        assert tensor["shape"] in (None, list(array.shape))
+    infos = observation.metadata.images
+    for info, image in zip(infos, expected["images"], strict=True):
+        check_image(observation, info.pose, info.camera, image, expected["rgb_tolerance"])
+
+
+def check_image(
+    observation: Observation, pose: int, camera: str, expected: dict[str, Any], tolerance: int
+) -> None:
+    view = observation.views[pose]
+    image = view.images[camera]
+    assert image.dtype == np.uint8 and list(image.shape) == expected["shape"]
+    assert not image.flags.writeable
+    assert view.images[camera] is image, "decoded twice"
+    for pixel in expected["pixels"]:
+        at = pixel["y"], pixel["x"]
+        assert np.abs(image[at].astype(int) - pixel["rgb"]).max() <= tolerance
+        for name, maps in (("depth_m", view.depth), ("opacity", view.opacity)):
+            if pixel[name] is None:
+                assert camera not in maps
+            else:
+                assert maps[camera].dtype == np.float32
+                assert maps[camera][at] == np.float32(pixel[name])
+
+
+def test_raw_tensors_are_read_in_place() -> None:
+    data = frame("observations/raw.bin")
+    observation = Observation(data)
+    whole = np.frombuffer(data, np.uint8)
+    for array in (observation.images["rear"], observation.depth["rear"], observation.history_xyz):
+        assert np.shares_memory(whole, array)
+
+
+def test_mappings_hold_the_cameras_in_order() -> None:
+    observation = Observation(frame("observations/raw.bin"))
+    assert list(observation.images) == ["front", "rear"] == list(observation.views[0].cameras)
+    with pytest.raises(KeyError):
+        observation.images["left"]
+    assert len(Observation(frame("observations/png.bin")).depth) == 0
+
+
+DAMAGED = {
+    "empty": "header length",
+    "short_length": "header length",
+    "short_header": "header length",
+    "short_data": "end at offset",
+    "trailing": "end at offset",
+    "header_beyond_frame": "header length",
+    "header_2_60": f"header length is {2**60}",
+    "header_not_json": "not JSON",
+    "header_not_object": "a JSON object",
+    "header_not_utf8": "utf-8",
+    "no_metadata": "__metadata__",
+    "overlap": "has offset 188",
+    "gap": "has offset 196",
+    "offset_past_end": "bytes; its shape asks for 48",
+    "reversed_offsets": "has offsets",
+    "negative_offset": "has offsets",
+    "unknown_dtype": "F33",
+    "wrong_dtype": "I32",
+    "wrong_shape": r"\[4, 3, 3\]; expected U8 \[3, 4, 3\]",
+    "shape_not_bytes": "its shape asks for 12",
+    "shape_overflow": "its shape asks for",
+    "shape_not_numbers": "expected counts",
+    "missing_tensor": "no tensor 'camera/left/rgb'",
+    "observation_not_json": "metadata is not JSON",
+    "observation_incomplete": "metadata.step is missing",
+    "image_not_png": "cannot be decoded",
+    "image_of_other_size": "2x1 px",
+}
+
+
+@pytest.mark.parametrize("case", vector("damaged/index.json"), ids=lambda case: case["file"])
+def test_damaged_frames_are_refused(case: dict[str, str]) -> None:
+    data = frame(f"damaged/{case['file']}")
+    says = DAMAGED[case["file"].removesuffix(".bin")]
+    if case["refused_at"] == "frame":
+        with pytest.raises(BadFrame, match=says):
+            Observation(data)
+    else:
+        observation = Observation(data)
+        with pytest.raises(BadFrame, match=says):
+            observation.images["front"]
+
+
+def test_no_prefix_and_no_flipped_byte_raises_anything_else() -> None:
+    data = frame("observations/png.bin")
+    for length in range(len(data)):
+        with pytest.raises(BadFrame):
+            Observation(data[:length])
+    refused = 0
+    for position in range(len(data)):
+        flipped = bytearray(data)
+        flipped[position] ^= 0x15
+        try:
+            observation = Observation(bytes(flipped))
+            for name in observation.images:
+                observation.images[name]
+        except BadFrame:
+            refused += 1
+    assert refused > len(data) // 4
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "not JSON"),
+        ("[1]", "type None"),
+        ('{"type": "sing"}', "type 'sing'"),
+        ('{"type": ["error"]}', "expected one of"),
+        ("[" * 100_000, "not JSON"),
+        ('{"type": "closed", "seq": 8}', "closed.summary is missing"),
+        ('{"type": "closed", "seq": true, "summary": {}}', "closed.seq is 'True'"),
+        ('{"type": "resumed", "seq": NaN}', "NaN"),
+        ('{"type": "error", "seq": 1, "code": "odd", "message": "", "fatal": false}', "error.code"),
+    ],
+)
+def test_what_is_no_answer_is_named(text: str, says: str) -> None:
+    with pytest.raises(ProtocolError, match=says):
+        decode_answer(text)
+
+
+def test_a_pose_is_finite_and_complete() -> None:
+    assert Pose(np.array([1, 2, 3]), [1, 0, 0, 0]).xyz == (1.0, 2.0, 3.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"q\[2\] is nan"):
+        Pose(q=(1.0, 0.0, float("nan"), 0.0))
+    with pytest.raises(ValueError, match="xyz has 2 numbers"):
+        Pose((1.0, 2.0))  # type: ignore[arg-type]
+
+
+def test_codes_are_those_of_the_schema() -> None:
+    schema = json.loads((PROTOCOL / "schema/answer.json").read_text())
+    assert {variant["const"] for variant in schema["$defs"]["Code"]["oneOf"]} == set(get_args(Code))
+
+
+def test_vectors_obey_the_schemas() -> None:
+    """And so do schemas: they are not so loose that a damaged message passes."""
+    for schema_name, folder in (("request", "requests"), ("answer", "answers")):
+        schema = json.loads((PROTOCOL / f"schema/{schema_name}.json").read_text())
+        for name in names(folder):
+            message = vector(f"{folder}/{name}.json")
+            jsonschema.validate(message, schema)
+            del message["type"]
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(message, schema)
+    schema = json.loads((PROTOCOL / "schema/observation.json").read_text())
+    for name in ("raw", "png", "jpeg", "two_poses"):
+        metadata = vector(f"observations/{name}.expected.json")["observation"]
+        jsonschema.validate(metadata, schema)
+        del metadata["frame_hash"]
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(metadata, schema)
+
+
+def plain(value: Any) -> Any:
+    """A dataclass as JSON would hold it."""
+    return json.loads(json.dumps(encode(value)))

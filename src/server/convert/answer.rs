@@ -1,0 +1,301 @@
+//! Session to wire.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use crate::config;
+use crate::geometry::{Camera, Pose};
+use crate::protocol::message::{
+    self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
+};
+use crate::protocol::observation::{Ego, Image, Observation, Stage, Timings};
+use crate::scene::{Manifest, Rig};
+use crate::server::Limits as ServerLimits;
+use crate::server::fault::Fault;
+use crate::session::{
+    DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, Session, Summary, TensorKind,
+};
+use crate::store::Version;
+
+use super::SUBPROTOCOL;
+use super::fault::code_and_field;
+
+/// To `hello`.
+pub(in crate::server) fn welcome(
+    seq: u64,
+    server: &ServerLimits,
+    backend: &str,
+    twins: &[Version],
+) -> Result<String, Fault> {
+    let limits = Limits {
+        message_bytes: config::INBOUND_MESSAGE_BYTES as u64,
+        observe_poses: config::OBSERVE_POSES as u64,
+        cameras: Rig::MAX_CAMERAS as u64,
+        side_px: Camera::MAX_SIDE_PX.into(),
+        answer_pixels: config::ANSWER_PIXELS,
+        idle_ms: server.idle.as_millis() as u64,
+        resume_ms: server.resume_grace.as_millis() as u64,
+    };
+    text(&Answer::Welcome {
+        seq,
+        protocol: SUBPROTOCOL.to_owned(),
+        server: ServerInfo {
+            name: env!("CARGO_PKG_NAME").to_owned(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        },
+        limits,
+        backend: backend.to_owned(),
+        twins: twins.iter().map(twin_info).collect(),
+    })
+}
+
+/// To `open`.
+pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
+    let resident = session.resident();
+    let Version { number, hash, manifest, .. } = &resident.version;
+    let profile = match serde_json::to_value(manifest.profile) {
+        Ok(serde_json::Value::Object(profile)) => profile,
+        other => return Err(Fault::Internal(format!("the profile is no object: {other:?}"))),
+    };
+    let (encoding, quality) = encoding(session.encoding());
+    let (depth, opacity) = session.depth_and_opacity();
+    let names = session.cameras().iter().map(|camera| camera.name.clone()).collect();
+    text(&Answer::Opened(Box::new(Opened {
+        seq,
+        session: session.name().to_owned(),
+        twin: manifest.twin.clone(),
+        version: *number,
+        version_hash: hash.clone(),
+        profile_hash: session.profile_hash().to_hex().to_string(),
+        profile,
+        backend: session.backend().to_owned(),
+        seed: session.episode().seed(),
+        start: pose(&session.start()),
+        dt_us: session.dt_us(),
+        deadline_ms: session.deadline().as_millis() as u64,
+        cameras: session.cameras().iter().map(camera).collect(),
+        outputs: message::Outputs { cameras: Some(names), encoding, quality, depth, opacity },
+        trajectories: trajectories(manifest),
+        resident_bytes: resident.scene.bytes() as u64,
+    })))
+}
+
+/// To `resume`.
+pub(in crate::server) fn resumed(
+    seq: u64,
+    last_seq: u64,
+    session: &Session,
+) -> Result<String, Fault> {
+    let episode = session.episode();
+    let (step, time_us) = (episode.step(), episode.time_us());
+    text(&Answer::Resumed { seq, session: session.name().to_owned(), last_seq, step, time_us })
+}
+
+/// To `close`.
+pub(in crate::server) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
+    let Summary { outcome, steps, time_us, distance_m } = *summary;
+    let outcome = match outcome {
+        Outcome::Completed => message::Outcome::Completed,
+        Outcome::AgentError => message::Outcome::AgentError,
+        Outcome::AgentTimeout => message::Outcome::AgentTimeout,
+        Outcome::AgentLost => message::Outcome::AgentLost,
+        Outcome::ServerError => message::Outcome::ServerError,
+    };
+    let summary = message::Summary { outcome, steps, time_us, distance_m };
+    text(&Answer::Closed { seq, summary })
+}
+
+/// To a request that was refused.
+pub(in crate::server) fn refused(seq: Option<u64>, fault: &Fault) -> String {
+    let (code, field) = code_and_field(fault);
+    let (message, fatal) = (fault.to_string(), fault.is_fatal());
+    // An error of strings and flags always has JSON.
+    text(&Answer::Error { seq, code, message, field, fatal }).unwrap_or_default()
+}
+
+/// The body of an HTTP answer that refuses: code and message.
+pub(in crate::server) fn refusal_body(fault: &Fault) -> serde_json::Value {
+    let (code, _) = code_and_field(fault);
+    serde_json::json!({ "code": code, "message": fault.to_string() })
+}
+
+/// The body of `GET /v1/twins`.
+pub(in crate::server) fn twins(versions: &[Version]) -> serde_json::Value {
+    serde_json::json!({ "twins": versions.iter().map(twin_info).collect::<Vec<_>>() })
+}
+
+/// Completes an observation: writes the header that says what its bytes are.
+pub(in crate::server) fn observation(
+    seq: u64,
+    session: &Session,
+    mut frame: Frame,
+) -> Result<Frame, Fault> {
+    let image_names = image_names(session, &frame);
+    let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
+    for tensor in &frame.tensors {
+        let name = match tensor.kind {
+            TensorKind::HistoryXyz => "ego.history_xyz".to_owned(),
+            TensorKind::HistoryRotation => "ego.history_rot".to_owned(),
+            TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
+            TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
+            TensorKind::Rgb(image) => format!("{}/rgb", image_names[image]),
+        };
+        let dtype = match tensor.dtype {
+            DType::F32 => "F32",
+            DType::U8 => "U8",
+        };
+        let data_offsets = [tensor.bytes.start, tensor.bytes.end];
+        header.tensors.insert(name, TensorInfo { dtype, shape: &tensor.shape, data_offsets });
+    }
+    let observation = text(&metadata(seq, session, &frame, &image_names))?;
+    header.metadata.insert("observation", observation);
+    let header = text(&header)?;
+
+    let room = frame.buffer.header_mut();
+    let (prefix, room) = room.split_at_mut(HEADER_PREFIX_BYTES);
+    if header.len() > room.len() {
+        let what = format!("a header of {} bytes, room for {}", header.len(), room.len());
+        return Err(Fault::Internal(what));
+    }
+    prefix.copy_from_slice(&(room.len() as u64).to_le_bytes());
+    let (written, padding) = room.split_at_mut(header.len());
+    written.copy_from_slice(header.as_bytes());
+    padding.fill(b' ');
+    Ok(frame)
+}
+
+#[derive(Serialize)]
+struct Header<'a> {
+    #[serde(rename = "__metadata__")]
+    metadata: BTreeMap<&'static str, String>,
+    #[serde(flatten)]
+    tensors: BTreeMap<String, TensorInfo<'a>>,
+}
+
+#[derive(Serialize)]
+struct TensorInfo<'a> {
+    dtype: &'static str,
+    shape: &'a [usize],
+    data_offsets: [usize; 2],
+}
+
+/// Where an image's tensors are, without the `/rgb` at the end.
+fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
+    let several = frame.images.iter().any(|image| image.pose > 0);
+    let name = |image: &crate::session::Image| {
+        let camera = &session.cameras()[image.camera].name;
+        if several {
+            format!("pose/{}/camera/{camera}", image.pose)
+        } else {
+            format!("camera/{camera}")
+        }
+    };
+    frame.images.iter().map(name).collect()
+}
+
+fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> Observation {
+    let (episode, version) = (session.episode(), &session.resident().version);
+    let (time_us, (encoding, _)) = (episode.time_us(), encoding(session.encoding()));
+    let image = |(drawn, name): (&crate::session::Image, &String)| {
+        let RigCamera { name: camera, width, height, fx, fy, cx, cy, camera_to_rig } =
+            camera(&session.cameras()[drawn.camera]);
+        Image {
+            camera,
+            index: drawn.camera as u64,
+            pose: drawn.pose as u64,
+            tensor: format!("{name}/rgb"),
+            encoding,
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            camera_to_rig,
+            shutter_start_us: time_us,
+            shutter_end_us: time_us,
+            hash: drawn.hash.to_hex().to_string(),
+        }
+    };
+    let timings = &frame.timings;
+    let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
+    let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
+    Observation {
+        seq,
+        step: episode.step(),
+        time_us,
+        session: session.name().to_owned(),
+        seed: episode.seed(),
+        terminated: episode.terminated(),
+        twin: version.manifest.twin.clone(),
+        version: version.number,
+        version_hash: version.hash.clone(),
+        profile_hash: session.profile_hash().to_hex().to_string(),
+        backend: session.backend().to_owned(),
+        frame_hash: frame.frame_hash.to_hex().to_string(),
+        ego: Ego {
+            pose: pose(&episode.world_from_rig()),
+            velocity: episode.velocity_m_s().to_array(),
+            history_count: frame.history_count as u64,
+        },
+        images: frame.images.iter().zip(image_names).map(image).collect(),
+        timings: Timings {
+            queue_ms: ms(timings.queue),
+            render_ms: ms(timings.render),
+            encode_ms: ms(timings.encode),
+            stages_ms: timings.stages_ms.iter().map(stage).collect(),
+        },
+    }
+}
+
+fn twin_info(version: &Version) -> TwinInfo {
+    let Version { number, hash, manifest, .. } = version;
+    TwinInfo {
+        name: manifest.twin.clone(),
+        version: *number,
+        version_hash: hash.clone(),
+        gaussians: manifest.gaussians(),
+        sh_degree: manifest.sh_degree,
+        trajectories: trajectories(manifest),
+    }
+}
+
+fn trajectories(manifest: &Manifest) -> Vec<TrajectoryInfo> {
+    let info = |log: &crate::scene::Trajectory| TrajectoryInfo {
+        name: log.name.clone(),
+        length_m: log.length_m(),
+        keyframes: log.keyframes.len() as u64,
+    };
+    manifest.trajectories.iter().map(info).collect()
+}
+
+fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {
+    let Camera { width_px, height_px, pinhole } = camera.camera;
+    RigCamera {
+        name: camera.name.clone(),
+        width: width_px.into(),
+        height: height_px.into(),
+        fx: pinhole.fx,
+        fy: pinhole.fy,
+        cx: pinhole.cx,
+        cy: pinhole.cy,
+        camera_to_rig: pose(&camera.rig_from_camera),
+    }
+}
+
+fn pose(pose: &Pose) -> message::Pose {
+    message::Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
+}
+
+fn encoding(encoding: Encoding) -> (message::Encoding, Option<u8>) {
+    match encoding {
+        Encoding::Jpeg(quality) => (message::Encoding::Jpeg, Some(quality)),
+        Encoding::Png => (message::Encoding::Png, None),
+        Encoding::Raw => (message::Encoding::Raw, None),
+    }
+}
+
+fn text(value: &impl Serialize) -> Result<String, Fault> {
+    serde_json::to_string(value).map_err(|error| Fault::Internal(error.to_string()))
+}

@@ -1,0 +1,82 @@
+//! Faults to the closed list of codes.
+
+use crate::geometry::PoseError;
+use crate::protocol::error::Code;
+use crate::scene::rig::RigError;
+use crate::server::fault::Fault;
+use crate::session::SessionError;
+use crate::store::StoreError;
+
+/// The code of a fault, and the field at fault where one is.
+pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
+    let field = |text: &str| Some(text.to_owned());
+    match fault {
+        Fault::MalformedJson(_) | Fault::BrokenFrame(_) => (Code::MalformedJson, None),
+        Fault::InvalidRequest(_) => (Code::InvalidRequest, None),
+        Fault::UnexpectedBinary => (Code::UnexpectedBinary, None),
+        Fault::MessageTooLarge { .. } => (Code::MessageTooLarge, None),
+        Fault::SeqOutOfOrder { .. } => (Code::SeqOutOfOrder, field("seq")),
+        Fault::WrongOrder(_) => (Code::WrongOrder, field("type")),
+        Fault::UnsupportedProtocol { .. } => (Code::UnsupportedProtocol, field("protocols")),
+        Fault::SessionState(_) | Fault::Replaced => (Code::SessionState, None),
+        Fault::UnknownSession { .. } => (Code::UnknownSession, field("session")),
+        Fault::SessionExists { .. } => (Code::SessionExists, field("session")),
+        Fault::InvalidName { field, .. } => (Code::InvalidName, Some(field.clone())),
+        Fault::Pose { field, source } => {
+            let code = match source {
+                PoseError::NotFinite { .. } => Code::PoseNotFinite,
+                PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
+            };
+            (code, Some(format!("{field}.{}", source.field())))
+        }
+        Fault::NotFinite { field } => (Code::PoseNotFinite, Some(field.clone())),
+        Fault::Camera { field, source } => {
+            (Code::CameraInvalid, Some(format!("{field}.{}", source.field())))
+        }
+        Fault::Rig { field, source } => {
+            let code = match source {
+                RigError::Count { .. } => Code::OutOfRange,
+                RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
+                RigError::Camera { .. } => Code::CameraInvalid,
+            };
+            (code, Some(field.clone()))
+        }
+        Fault::Busy { .. } => (Code::Busy, None),
+        Fault::TimedOut(_) => (Code::TimedOut, None),
+        Fault::ShuttingDown => (Code::ShuttingDown, None),
+        Fault::Internal(_) => (Code::Internal, None),
+        Fault::Session(error) => of_session(error),
+    }
+}
+
+fn of_session(error: &SessionError) -> (Code, Option<String>) {
+    let field = |text: &str| Some(text.to_owned());
+    match error {
+        SessionError::Twin(StoreError::Name { .. }) => (Code::InvalidName, field("twin")),
+        SessionError::Twin(StoreError::NoTwin { .. }) => (Code::UnknownTwin, field("twin")),
+        SessionError::Twin(StoreError::NoVersion { .. }) => {
+            (Code::UnknownVersion, field("version"))
+        }
+        SessionError::Twin(_) => (Code::TwinDamaged, field("twin")),
+        SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
+        SessionError::UnknownCamera { index, .. } => {
+            (Code::UnknownCamera, Some(format!("outputs.cameras[{index}]")))
+        }
+        SessionError::CameraTwice { index, .. } => {
+            (Code::OutOfRange, Some(format!("outputs.cameras[{index}]")))
+        }
+        SessionError::UnknownTrajectory { .. } => {
+            (Code::UnknownTrajectory, field("start.trajectory"))
+        }
+        SessionError::OutOfRange { field, .. } => (Code::OutOfRange, Some((*field).to_owned())),
+        SessionError::AnswerTooLarge { .. } => (Code::AnswerTooLarge, None),
+        SessionError::EpisodeOver { .. } => (Code::SessionState, None),
+        SessionError::Busy { .. } => (Code::Busy, None),
+        SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),
+        SessionError::Render(_)
+        | SessionError::Encode { .. }
+        | SessionError::Record(_)
+        | SessionError::Crashed
+        | SessionError::Thread { .. } => (Code::Internal, None),
+    }
+}

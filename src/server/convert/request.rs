@@ -1,0 +1,324 @@
+//! Wire to session.
+
+use std::time::Duration;
+
+use serde::Deserialize;
+
+use crate::config;
+use crate::geometry::camera::Pinhole;
+use crate::geometry::{Camera, Pose};
+use crate::protocol::message::{self, Request};
+use crate::scene::rig::{Rig, RigCamera, is_name};
+use crate::server::fault::Fault;
+use crate::session::{Encoding, Opening, Outputs, RigChoice, Start};
+
+use super::SUBPROTOCOL;
+
+/// A text frame, checked as far as it can be on its own.
+#[derive(Debug)]
+pub(in crate::server) struct Parsed {
+    /// Its number, if it could be read.
+    pub(in crate::server) seq: Option<u64>,
+    /// What is wanted, or why it is refused.
+    pub(in crate::server) command: Result<Command, Fault>,
+}
+
+/// What a client wants.
+#[derive(Debug)]
+pub(in crate::server) enum Command {
+    /// To be welcomed.
+    Hello {
+        /// Name and version of the client.
+        client: String,
+    },
+    /// A session, under a name if it chose one.
+    Open {
+        /// The name.
+        name: Option<String>,
+        /// The rest.
+        opening: Box<Opening>,
+    },
+    /// A step to a pose.
+    Step {
+        /// `world_from_rig`.
+        pose: Pose,
+        /// Whether it is the last.
+        terminate: bool,
+    },
+    /// Images of poses.
+    Observe {
+        /// `world_from_rig` each.
+        poses: Vec<Pose>,
+    },
+    /// A new episode.
+    Reset {
+        /// Its seed.
+        seed: u64,
+        /// Its start.
+        start: Option<Start>,
+    },
+    /// The end of the session.
+    Close,
+    /// A session of an earlier connection.
+    Resume {
+        /// Its name.
+        session: String,
+        /// Last request whose answer arrived.
+        last_seq: u64,
+    },
+}
+
+/// Reads a text frame.
+pub(in crate::server) fn parse(text: &str) -> Parsed {
+    use serde_json::error::Category;
+    let error = match serde_json::from_str::<Request>(text) {
+        Ok(request) => {
+            let (seq, command) = convert(request);
+            return Parsed { seq: Some(seq), command };
+        }
+        Err(error) => error,
+    };
+    if let Some((seq, field)) = not_finite(text) {
+        return Parsed { seq, command: Err(Fault::NotFinite { field }) };
+    }
+    match error.classify() {
+        Category::Data => {
+            Parsed { seq: seq_of(text), command: Err(Fault::InvalidRequest(error.to_string())) }
+        }
+        _ => Parsed { seq: None, command: Err(Fault::MalformedJson(error.to_string())) },
+    }
+}
+
+fn convert(request: Request) -> (u64, Result<Command, Fault>) {
+    match request {
+        Request::Hello { seq, client, protocols } => {
+            let command = if protocols.iter().any(|offered| offered == SUBPROTOCOL) {
+                Ok(Command::Hello { client: format!("{} {}", client.name, client.version) })
+            } else {
+                Err(Fault::UnsupportedProtocol { server: SUBPROTOCOL, offered: protocols })
+            };
+            (seq, command)
+        }
+        Request::Open(open) => (open.seq, open_command(*open)),
+        Request::Step { seq, pose, terminate } => {
+            let command = pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
+            (seq, command)
+        }
+        Request::Observe { seq, poses } => {
+            let poses: Result<_, _> = poses
+                .iter()
+                // One more than is accepted tells the session that there are too many.
+                .take(config::OBSERVE_POSES + 1)
+                .enumerate()
+                .map(|(index, pose)| pose_of(&format!("poses[{index}]"), pose))
+                .collect();
+            (seq, poses.map(|poses| Command::Observe { poses }))
+        }
+        Request::Reset { seq, seed, start } => {
+            let start = start.map(start_of).transpose();
+            (seq, start.map(|start| Command::Reset { seed, start }))
+        }
+        Request::Close { seq } => (seq, Ok(Command::Close)),
+        Request::Resume { seq, session, last_seq } => {
+            let command =
+                name_of("session", session).map(|session| Command::Resume { session, last_seq });
+            (seq, command)
+        }
+    }
+}
+
+fn open_command(open: message::Open) -> Result<Command, Fault> {
+    let name = open.session.map(|name| name_of("session", name)).transpose()?;
+    let rig = match open.rig {
+        None => None,
+        Some(message::RigChoice::Preset(name)) => Some(RigChoice::Preset(name)),
+        Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(rig_of(rig)?)),
+    };
+    let message::Outputs { cameras, encoding, quality, depth, opacity } = open.outputs;
+    let encoding = match encoding {
+        message::Encoding::Jpeg => Encoding::Jpeg(quality.unwrap_or(config::JPEG_QUALITY)),
+        message::Encoding::Png => Encoding::Png,
+        message::Encoding::Raw => Encoding::Raw,
+    };
+    let opening = Opening {
+        twin: name_of("twin", open.twin)?,
+        version: open.version,
+        seed: open.seed,
+        start: open.start.map(start_of).transpose()?,
+        rig,
+        outputs: Outputs { cameras, encoding, depth, opacity },
+        dt_us: open.dt_us,
+        deadline: open.deadline_ms.map(Duration::from_millis),
+    };
+    Ok(Command::Open { name, opening: Box::new(opening) })
+}
+
+fn start_of(start: message::Start) -> Result<Start, Fault> {
+    Ok(match start {
+        message::Start::Pose { pose } => Start::Pose(pose_of("start.pose", &pose)?),
+        message::Start::Station { trajectory, station_m } => {
+            Start::Station { trajectory, station_m }
+        }
+    })
+}
+
+fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
+    let cameras = rig
+        .cameras
+        .into_iter()
+        // One more than is accepted tells the check that there are too many.
+        .take(Rig::MAX_CAMERAS + 1)
+        .enumerate()
+        .map(|(index, camera)| {
+            let field = format!("rig.cameras[{index}]");
+            let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig } = camera;
+            let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy });
+            Ok(RigCamera {
+                name: name_of(&format!("{field}.name"), name)?,
+                rig_from_camera: pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?,
+                camera: camera.map_err(|source| Fault::Camera { field, source })?,
+            })
+        })
+        .collect::<Result<_, Fault>>()?;
+    let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };
+    rig.check().map_err(|source| Fault::Rig { field: "rig.cameras".to_owned(), source })?;
+    Ok(rig)
+}
+
+fn name_of(field: &str, name: String) -> Result<String, Fault> {
+    if is_name(&name) { Ok(name) } else { Err(Fault::InvalidName { field: field.into(), name }) }
+}
+
+fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
+    Pose::checked(pose.xyz, pose.q).map_err(|source| Fault::Pose { field: field.into(), source })
+}
+
+/// The number of something that has one but is no request.
+fn seq_of(text: &str) -> Option<u64> {
+    #[derive(Deserialize)]
+    struct Numbered {
+        seq: u64,
+    }
+    serde_json::from_str::<Numbered>(text).ok().map(|numbered| numbered.seq)
+}
+
+/// Finds NaN or infinity in a pose, and the number of the request.
+///
+/// JSON has no word for them, but agents that divide by zero say them all the same: Python writes
+/// `NaN`, JavaScript `null`, others `1e999`. They deserve a better answer than "not JSON".
+fn not_finite(text: &str) -> Option<(Option<u64>, String)> {
+    let value: serde_json::Value = serde_json::from_str(&without_infinities(text)).ok()?;
+    let seq = value.get("seq").and_then(serde_json::Value::as_u64);
+    let in_pose = |name: &str, pose: &serde_json::Value| {
+        ["xyz", "q"].into_iter().find_map(|part| {
+            let numbers = pose.get(part)?.as_array()?;
+            let index = numbers.iter().position(serde_json::Value::is_null)?;
+            Some(format!("{name}.{part}[{index}]"))
+        })
+    };
+    let single = ["/pose", "/start/pose"]
+        .into_iter()
+        .find_map(|pointer| in_pose(&pointer[1..].replace('/', "."), value.pointer(pointer)?));
+    let of_list = |pointer: &str, name: &str, inner: &str| {
+        let list = value.pointer(pointer)?.as_array()?;
+        list.iter().enumerate().find_map(|(index, entry)| {
+            let pose = if inner.is_empty() { Some(entry) } else { entry.get(&inner[1..]) };
+            in_pose(&format!("{name}[{index}]{inner}"), pose?)
+        })
+    };
+    let field = single
+        .or_else(|| of_list("/poses", "poses", ""))
+        .or_else(|| of_list("/rig/cameras", "rig.cameras", ".camera_to_rig"))?;
+    Some((seq, field))
+}
+
+/// The text with every bare number that is not finite replaced by `null`.
+fn without_infinities(text: &str) -> String {
+    let is_number = |c: char| c.is_ascii_alphanumeric() || "+-.".contains(c);
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(first) = rest.chars().next() {
+        let end = if first == '"' {
+            string_end(rest)
+        } else if is_number(first) {
+            rest.find(|c| !is_number(c)).unwrap_or(rest.len())
+        } else {
+            first.len_utf8()
+        };
+        let (token, after) = rest.split_at(end);
+        let infinite = is_number(first) && token.parse::<f64>().is_ok_and(|x| !x.is_finite());
+        out.push_str(if infinite { "null" } else { token });
+        rest = after;
+    }
+    out
+}
+
+/// Length of the string literal at the start of a text, its quotes included.
+fn string_end(text: &str) -> usize {
+    let mut escaped = true;
+    for (index, byte) in text.bytes().enumerate() {
+        match byte {
+            _ if escaped => escaped = false,
+            b'\\' => escaped = true,
+            b'"' => return index + 1,
+            _ => {}
+        }
+    }
+    text.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_finite_is_found_in_every_dialect() {
+        let step = |x: &str| {
+            format!(r#"{{"type":"step","seq":3,"pose":{{"xyz":[0,{x},0],"q":[1,0,0,0]}}}}"#)
+        };
+        for x in ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "null"] {
+            let Parsed { seq, command } = parse(&step(x));
+            assert_eq!(seq, Some(3), "{x}");
+            let field = field_of(command);
+            assert_eq!(field, "pose.xyz[1]", "{x}");
+        }
+        assert!(parse(&step("1e308")).command.is_err(), "too far");
+        assert!(parse(&step("1.5")).command.is_ok());
+        for x in ["nope", "\"1\"", "1e", "[1]"] {
+            let fault = parse(&step(x)).command.unwrap_err();
+            assert!(!matches!(fault, Fault::NotFinite { .. }), "{x}: {fault}");
+        }
+    }
+
+    fn field_of(command: Result<Command, Fault>) -> String {
+        match command {
+            Err(Fault::NotFinite { field }) => field,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn poses_in_lists_are_named() {
+        let unit = r#"{"xyz":[0,0,0],"q":[1,0,0,0]}"#;
+        let bad = r#"{"xyz":[0,0,0],"q":[1,0,NaN,0]}"#;
+        let observe = format!(r#"{{"type":"observe","seq":0,"poses":[{unit},{bad}]}}"#);
+        assert_eq!(field_of(parse(&observe).command), "poses[1].q[2]");
+        let camera = format!(r#"{{"name":"NaN \" NaN","camera_to_rig":{bad}}}"#);
+        let open = format!(r#"{{"type":"open","seq":1,"rig":{{"cameras":[{camera}]}}}}"#);
+        assert_eq!(field_of(parse(&open).command), "rig.cameras[0].camera_to_rig.q[2]");
+    }
+
+    #[test]
+    fn strings_are_left_alone() {
+        let text = r#"{"a":"NaN, \"NaN\\","b":[NaN,1.5,true]}"#;
+        let clean = r#"{"a":"NaN, \"NaN\\","b":[null,1.5,true]}"#;
+        assert_eq!(without_infinities(text), clean);
+        assert_eq!(without_infinities("\"open"), "\"open");
+    }
+
+    #[test]
+    fn deep_nesting_is_malformed() {
+        let fault = parse(&"[".repeat(100_000)).command.unwrap_err();
+        assert!(matches!(fault, Fault::MalformedJson(_)), "{fault}");
+    }
+}

@@ -1,0 +1,69 @@
+//! Accepts connections, a bounded number of them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use socket2::{SockRef, TcpKeepalive};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+
+use crate::config;
+
+use super::{Server, router};
+
+/// Serves connections until the server stops. When all places are taken, further connections wait
+/// in the kernel's backlog.
+pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
+    let places = Arc::new(Semaphore::new(server.limits.connections + config::SPARE_CONNECTIONS));
+    let app = router::router(server.clone());
+    loop {
+        let accepted = async {
+            // The semaphore is never closed.
+            let place = places.clone().acquire_owned().await.ok()?;
+            Some((place, listener.accept().await))
+        };
+        let (place, stream) = tokio::select! {
+            Some((place, accepted)) = accepted => match accepted {
+                Ok((stream, _)) => (place, stream),
+                Err(error) => {
+                    // Out of file descriptors, most likely: some will come free.
+                    tracing::warn!("cannot accept a connection: {error}");
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                    continue;
+                }
+            },
+            () = server.stopped() => return,
+        };
+        prepare(&stream);
+        // A WebSocket leaves HTTP behind but keeps its place, inside the request.
+        let app = app.clone().layer(axum::Extension(Arc::new(place)));
+        let connection = http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(server.limits.hello)
+            .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
+            .with_upgrades();
+        let server = server.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                // The client's fault, and of no interest: it went away, or never spoke HTTP.
+                _ = connection => {}
+                () = server.stopped() => {}
+            }
+        });
+    }
+}
+
+/// Small messages at once, and dead peers noticed.
+fn prepare(stream: &TcpStream) {
+    let (idle, interval, retries) = config::KEEPALIVE;
+    let keepalive =
+        TcpKeepalive::new().with_time(idle).with_interval(interval).with_retries(retries);
+    let set =
+        stream.set_nodelay(true).and_then(|()| SockRef::from(stream).set_tcp_keepalive(&keepalive));
+    if let Err(error) = set {
+        tracing::warn!("cannot set socket options: {error}");
+    }
+}

@@ -1,0 +1,156 @@
+//! HTTP routes, and the upgrade to WebSocket.
+
+use std::sync::Arc;
+
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use axum::{Extension, Json, Router};
+use hyper::upgrade::Upgraded;
+use hyper_util::rt::TokioIo;
+use tokio::net::TcpStream;
+use tokio::sync::OwnedSemaphorePermit;
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+
+use super::fault::Fault;
+use super::socket::Socket;
+use super::{Server, connection, convert};
+
+/// The routes of a server.
+pub(super) fn router(server: Arc<Server>) -> Router {
+    Router::new()
+        .route("/v1/session", get(session))
+        .route("/v1/twins", get(twins))
+        .route("/healthz", get(async || "ok\n"))
+        .route("/readyz", get(ready))
+        .with_state(server)
+}
+
+/// Whether sessions can be opened: the twins can be listed.
+async fn ready(State(server): State<Arc<Server>>) -> Response {
+    match server.engine.twins().await {
+        Ok(_) => "ready\n".into_response(),
+        Err(error) => refuse(StatusCode::SERVICE_UNAVAILABLE, &error.into()),
+    }
+}
+
+async fn twins(State(server): State<Arc<Server>>) -> Response {
+    match server.engine.twins().await {
+        Ok(versions) => Json(convert::twins(&versions)).into_response(),
+        Err(error) => refuse(StatusCode::INTERNAL_SERVER_ERROR, &error.into()),
+    }
+}
+
+/// `GET /v1/session`: checks the handshake (RFC 6455, section 4.2) and hands the socket over.
+async fn session(
+    State(server): State<Arc<Server>>,
+    Extension(place): Extension<Arc<OwnedSemaphorePermit>>,
+    mut request: Request,
+) -> Response {
+    let accept = match check(request.headers()) {
+        Ok(key) => derive_accept_key(key),
+        Err((status, message)) => return (status, format!("{message}\n")).into_response(),
+    };
+    let Ok(agent) = server.agents.clone().try_acquire_owned() else {
+        let limit = server.limits.connections;
+        let fault = Fault::Busy { what: "connections", limit };
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, &fault);
+    };
+    let upgrade = hyper::upgrade::on(&mut request);
+    tokio::spawn(async move {
+        // Both are held until the connection ends.
+        let _held = (place, agent);
+        match upgrade.await.map(into_tcp) {
+            Ok(Ok((stream, read_ahead))) => {
+                let socket = Socket::new(stream, read_ahead, server.limits.send).await;
+                connection::serve(server, socket).await;
+            }
+            Ok(Err(_)) => tracing::error!("a WebSocket upgrade did not give back its socket"),
+            Err(error) => tracing::debug!("a client left during its upgrade: {error}"),
+        }
+    });
+    let headers = [
+        (header::CONNECTION, "Upgrade"),
+        (header::UPGRADE, "websocket"),
+        (header::SEC_WEBSOCKET_ACCEPT, &accept),
+        (header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL),
+    ];
+    (StatusCode::SWITCHING_PROTOCOLS, headers).into_response()
+}
+
+/// The socket under an upgraded connection, and what was read from it already.
+fn into_tcp(upgraded: Upgraded) -> Result<(TcpStream, Vec<u8>), Upgraded> {
+    let parts = upgraded.downcast::<TokioIo<TcpStream>>()?;
+    Ok((parts.io.into_inner(), parts.read_buf.into()))
+}
+
+/// The client's key, if it may come in.
+fn check(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
+    let has = |name: header::HeaderName, wanted: &str| {
+        let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
+        values.flat_map(|value| value.split(',')).any(|v| v.trim().eq_ignore_ascii_case(wanted))
+    };
+    let bad = |message: &str| Err((StatusCode::BAD_REQUEST, message.to_owned()));
+    // Browsers send Origin and cannot leave it out; agents do not. Any page may try to reach
+    // 127.0.0.1, so only pages that come from there are let in.
+    if let Some(origin) = headers.get(header::ORIGIN)
+        && !origin.to_str().is_ok_and(is_local)
+    {
+        let message = format!("pages from {origin:?} may not drive; loopback origins may");
+        return Err((StatusCode::FORBIDDEN, message));
+    }
+    if !has(header::CONNECTION, "upgrade") || !has(header::UPGRADE, "websocket") {
+        let message = "this address speaks WebSocket: send an upgrade".to_owned();
+        return Err((StatusCode::UPGRADE_REQUIRED, message));
+    }
+    if !has(header::SEC_WEBSOCKET_VERSION, "13") {
+        return bad("Sec-WebSocket-Version must be 13");
+    }
+    if !has(header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL) {
+        return bad("offer the subprotocol wildcity.v1 in Sec-WebSocket-Protocol");
+    }
+    match headers.get(header::SEC_WEBSOCKET_KEY) {
+        Some(key) => Ok(key.as_bytes()),
+        None => bad("Sec-WebSocket-Key is missing"),
+    }
+}
+
+/// Whether an origin is a page served from this machine.
+fn is_local(origin: &str) -> bool {
+    let Some((_, authority)) = origin.split_once("://") else { return false };
+    let host = match authority.rsplit_once(':') {
+        Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
+        _ => authority,
+    };
+    ["localhost", "127.0.0.1", "[::1]"].contains(&host)
+}
+
+fn refuse(status: StatusCode, fault: &Fault) -> Response {
+    (status, Json(convert::refusal_body(fault))).into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn local_origins() {
+        for origin in
+            ["http://localhost", "http://127.0.0.1:8080", "https://[::1]:1", "http://[::1]"]
+        {
+            assert!(is_local(origin), "{origin}");
+        }
+        for origin in [
+            "null",
+            "http://example.org",
+            "http://localhost.example.org",
+            "http://127.0.0.1.example.org:80",
+            "http://example.org:127",
+            "http://user@example.org",
+            "http://localhost:80@example.org",
+        ] {
+            assert!(!is_local(origin), "{origin}");
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! Stopping without losing what runs.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use super::{Server, listen};
+
+/// A server that listens. Dropping it stops it without waiting.
+pub struct Running {
+    server: Arc<Server>,
+    address: SocketAddr,
+    stop: watch::Sender<bool>,
+    listening: JoinHandle<()>,
+}
+
+impl Running {
+    pub(super) fn new(
+        server: Arc<Server>,
+        listener: TcpListener,
+        address: SocketAddr,
+        stop: watch::Sender<bool>,
+    ) -> Self {
+        let listening = tokio::spawn(listen::listen(server.clone(), listener));
+        let reaping = server.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                () = reaping.sessions.reap() => {}
+                () = reaping.stopped() => {}
+            }
+        });
+        Self { server, address, stop, listening }
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// What agents dial.
+    pub fn url(&self) -> String {
+        format!("ws://{}/v1/session", self.address)
+    }
+
+    /// Sessions at this moment: connected, and waiting to be resumed.
+    pub fn sessions(&self) -> usize {
+        self.server.sessions.count()
+    }
+
+    /// Accepts nobody any more, lets running steps finish, tells every client, ends every session.
+    pub async fn stop(self) {
+        // Every receiver may be gone already: nobody is left to be told.
+        let _ = self.stop.send(true);
+        if let Err(error) = self.listening.await {
+            tracing::error!("the listener ended badly: {error}");
+        }
+        let Server { agents, limits, sessions, .. } = &*self.server;
+        // A connection holds one permit, so that all of them are there when all have ended.
+        let all = agents.acquire_many(limits.connections as u32);
+        if timeout(limits.drain, all).await.is_err() {
+            tracing::warn!("some clients did not leave within {:?}", limits.drain);
+        }
+        sessions.end_all_parked().await;
+    }
+}
+
+impl std::fmt::Debug for Running {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Running").field("address", &self.address).finish_non_exhaustive()
+    }
+}
+
+/// Returns when the process is asked to stop: SIGTERM, or Ctrl-C.
+///
+/// # Errors
+/// Signals cannot be received.
+pub async fn stop_signal() -> std::io::Result<()> {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        let mut terminate = signal(SignalKind::terminate())?;
+        tokio::select! {
+            result = tokio::signal::ctrl_c() => result,
+            _ = terminate.recv() => Ok(()),
+        }
+    }
+    #[cfg(not(unix))]
+    tokio::signal::ctrl_c().await
+}

@@ -1,0 +1,200 @@
+//! What all sessions share: the twins in memory, the backend, and one queue for the renderer.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::{Instant, timeout_at};
+
+use crate::config;
+use crate::render::Backend;
+use crate::residency::{Cache, Resident};
+use crate::store::{Catalog, StoreError, Version};
+
+use super::SessionError;
+
+/// What an engine is made of.
+pub struct EngineSettings {
+    /// The twins that can be opened.
+    pub catalog: Catalog,
+    /// Where episodes are recorded.
+    pub episodes: PathBuf,
+    /// What renders.
+    pub backend: Arc<dyn Backend>,
+    /// How long one step may take, waiting included.
+    pub step_timeout: Duration,
+}
+
+/// The renderer and the twins, shared by all sessions.
+///
+/// One frame is drawn at a time, on all cores: two at once would take as long together and hold
+/// twice the memory. Frames wait in the order in which they were asked for, and a session asks for
+/// one at a time, so that sessions take turns.
+pub struct Engine {
+    catalog: Catalog,
+    cache: Cache,
+    episodes: PathBuf,
+    backend: Arc<dyn Backend>,
+    step_timeout: Duration,
+    jobs: mpsc::Sender<Job>,
+    answers: Answers,
+}
+
+/// RGB images that are encoded and forgotten: kept between frames, so that no step allocates them.
+pub(super) type Scratch = Vec<Vec<u8>>;
+
+type Job = Box<dyn FnOnce(&mut Scratch) + Send>;
+
+/// The budget of bytes for answers that are made, sent or kept.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Answers(Arc<AtomicU64>);
+
+/// A part of the budget, given back when dropped.
+#[derive(Debug)]
+pub(super) struct Hold {
+    answers: Answers,
+    bytes: u64,
+}
+
+impl Engine {
+    /// Starts the render thread. It ends when the engine is dropped.
+    ///
+    /// # Errors
+    /// The thread cannot be started.
+    pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
+        let EngineSettings { catalog, episodes, backend, step_timeout } = settings;
+        let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
+        std::thread::Builder::new()
+            .name("render".to_owned())
+            .spawn(move || {
+                let mut scratch = Scratch::new();
+                while let Some(job) = queue.blocking_recv() {
+                    job(&mut scratch);
+                }
+            })
+            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        let cache = Cache::new(catalog.clone());
+        let answers = Answers::default();
+        Ok(Arc::new(Self { catalog, cache, episodes, backend, step_timeout, jobs, answers }))
+    }
+
+    /// The latest version of every twin, in order of name. A damaged one is logged and left out,
+    /// so that it does not hide the others.
+    ///
+    /// # Errors
+    /// The directory of twins cannot be read.
+    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Version>, SessionError> {
+        let engine = self.clone();
+        let listed = tokio::task::spawn_blocking(move || {
+            let mut versions = Vec::new();
+            for listing in engine.catalog.twins()? {
+                match engine.catalog.version(&listing.name, Some(listing.number)) {
+                    Ok(version) => versions.push(version),
+                    Err(error) => tracing::warn!(twin = listing.name, "not listed: {error}"),
+                }
+            }
+            Ok::<_, StoreError>(versions)
+        });
+        Ok(listed.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Name of the backend.
+    pub fn backend(&self) -> &'static str {
+        self.backend.name()
+    }
+
+    /// A version of a twin, or its latest, loaded if nobody has it.
+    pub(super) async fn resident(
+        self: &Arc<Self>,
+        twin: String,
+        version: Option<u64>,
+    ) -> Result<Arc<Resident>, SessionError> {
+        let engine = self.clone();
+        let loaded = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
+        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Does some work on the render thread when its turn comes, and tells how long it waited.
+    ///
+    /// # Errors
+    /// [`SessionError::Busy`] if too much is queued, [`SessionError::DeadlineExceeded`] if the
+    /// result is not there in time: work that has not begun by then is dropped, work that has is
+    /// finished and its result dropped.
+    pub(super) async fn run<T: Send + 'static>(
+        &self,
+        deadline: Instant,
+        work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
+    ) -> Result<(T, Duration), SessionError> {
+        let (reply, answer) = oneshot::channel();
+        let asked = Instant::now();
+        let backend = self.backend.clone();
+        let job = move |scratch: &mut Scratch| {
+            let queued = asked.elapsed();
+            if reply.is_closed() || Instant::now() >= deadline {
+                return;
+            }
+            // A defect in one session's frame must not end the thread that draws all sessions'.
+            let done = catch_unwind(AssertUnwindSafe(|| work(scratch, &*backend)));
+            // Nobody waits any more: the deadline has passed.
+            let _ = reply.send(done.map(|done| (done, queued)));
+        };
+        self.jobs.try_send(Box::new(job)).map_err(|error| match error {
+            mpsc::error::TrySendError::Full(_) => SessionError::Busy { what: "frames queued" },
+            mpsc::error::TrySendError::Closed(_) => SessionError::Crashed,
+        })?;
+        match timeout_at(deadline, answer).await {
+            Ok(Ok(Ok(done))) => Ok(done),
+            Ok(Ok(Err(_))) => Err(SessionError::Crashed),
+            Ok(Err(_)) | Err(_) => Err(SessionError::DeadlineExceeded),
+        }
+    }
+
+    pub(super) fn answers(&self) -> &Answers {
+        &self.answers
+    }
+
+    pub(super) fn episodes(&self) -> &Path {
+        &self.episodes
+    }
+
+    pub(super) fn step_timeout(&self) -> Duration {
+        self.step_timeout
+    }
+}
+
+impl std::fmt::Debug for Engine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Engine").field("backend", &self.backend.name()).finish_non_exhaustive()
+    }
+}
+
+impl Answers {
+    /// Takes a part of the budget.
+    ///
+    /// # Errors
+    /// [`SessionError::Busy`] if it is used up.
+    pub(super) fn hold(&self, bytes: u64) -> Result<Hold, SessionError> {
+        let limit = config::ANSWERS_BYTES;
+        let fits = |held: u64| held.checked_add(bytes).filter(|&sum| sum <= limit);
+        self.0
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits)
+            .map(|_| Hold { answers: self.clone(), bytes })
+            .map_err(|_| SessionError::Busy { what: "too many answers are kept" })
+    }
+}
+
+impl Hold {
+    /// Takes over another part of the same budget.
+    pub(super) fn join(&mut self, mut other: Self) {
+        self.bytes += std::mem::take(&mut other.bytes);
+    }
+}
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        self.answers.0.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
+}

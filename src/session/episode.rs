@@ -1,0 +1,244 @@
+//! One episode: where the ego is, when, and how it got there. Pure: no clock, no I/O.
+
+use std::collections::VecDeque;
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use crate::config::{HISTORY_POSES, HISTORY_STEP_US};
+use crate::geometry::Pose;
+
+use super::SessionError;
+
+/// How far back the history reaches: 15 steps of 0.1 s before now.
+const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
+
+/// The state of an episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Episode {
+    seed: u64,
+    dt_us: i64,
+    step: u64,
+    distance_m: f64,
+    velocity_m_s: DVec3,
+    terminated: bool,
+    /// World-from-rig by time in microseconds, rising; the last is now. Never empty, and no longer
+    /// than the history needs.
+    track: VecDeque<(i64, Pose)>,
+}
+
+/// Why an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The agent closed it, or ended it.
+    Completed,
+    /// The agent broke the protocol beyond repair.
+    AgentError,
+    /// The agent was silent for too long.
+    AgentTimeout,
+    /// The connection was lost and not resumed in time.
+    AgentLost,
+    /// The server failed, or was stopped.
+    ServerError,
+}
+
+/// How an episode went.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Summary {
+    /// Why it ended.
+    pub outcome: Outcome,
+    /// Steps done.
+    pub steps: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Distance driven, in metres: the sum of the straight lines between poses.
+    pub distance_m: f64,
+}
+
+/// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last is the identity.
+#[derive(Clone, Debug, PartialEq)]
+pub struct History {
+    /// Positions `[16, 3]`, in metres.
+    pub xyz_m: [[f32; 3]; HISTORY_POSES],
+    /// Rotation matrices `[16, 3, 3]`, row by row.
+    pub rotation: [[[f32; 3]; 3]; HISTORY_POSES],
+    /// How many, from the end, were driven; the earlier ones repeat the start.
+    pub count: usize,
+}
+
+impl Episode {
+    /// An episode at its start, at time zero. `dt_us` is above zero.
+    pub fn new(seed: u64, start: Pose, dt_us: i64) -> Self {
+        Self {
+            seed,
+            dt_us,
+            step: 0,
+            distance_m: 0.0,
+            velocity_m_s: DVec3::ZERO,
+            terminated: false,
+            track: VecDeque::from([(0, start)]),
+        }
+    }
+
+    /// The episode after one more step that ends at a pose (`world_from_rig`). `self` stays as it
+    /// is, so that a step whose rendering fails has not happened.
+    ///
+    /// # Errors
+    /// [`SessionError::EpisodeOver`] after the last step.
+    pub fn stepped(&self, world_from_rig: Pose, terminate: bool) -> Result<Self, SessionError> {
+        if self.terminated {
+            return Err(SessionError::EpisodeOver { steps: self.step });
+        }
+        let mut next = self.clone();
+        let moved_m = world_from_rig.position_m - self.world_from_rig().position_m;
+        let time_us = self.time_us() + self.dt_us;
+        next.step += 1;
+        next.distance_m += moved_m.length();
+        next.velocity_m_s = moved_m * (1e6 / self.dt_us as f64);
+        next.terminated = terminate;
+        next.track.push_back((time_us, world_from_rig));
+        // One pose at or before the history's begin must stay, to interpolate from.
+        while next.track.len() > 2 && next.track[1].0 <= time_us - HISTORY_US {
+            next.track.pop_front();
+        }
+        Ok(next)
+    }
+
+    /// Seed of the episode.
+    pub fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// Steps done.
+    pub fn step(&self) -> u64 {
+        self.step
+    }
+
+    /// Simulated time since the start, in microseconds.
+    pub fn time_us(&self) -> i64 {
+        self.track[self.track.len() - 1].0
+    }
+
+    /// Where the ego is.
+    pub fn world_from_rig(&self) -> Pose {
+        self.track[self.track.len() - 1].1
+    }
+
+    /// Velocity over the last step along world axes, in m/s; zero at the start.
+    pub fn velocity_m_s(&self) -> DVec3 {
+        self.velocity_m_s
+    }
+
+    /// Whether it has ended.
+    pub fn terminated(&self) -> bool {
+        self.terminated
+    }
+
+    /// How it went so far. An episode that the agent ended stays completed, whatever came after.
+    pub fn summary(&self, outcome: Outcome) -> Summary {
+        let outcome = if self.terminated { Outcome::Completed } else { outcome };
+        let (steps, time_us, distance_m) = (self.step, self.time_us(), self.distance_m);
+        Summary { outcome, steps, time_us, distance_m }
+    }
+
+    /// What the ego remembers now.
+    pub fn history(&self) -> History {
+        let rig_from_world = self.world_from_rig().inverse();
+        let mut xyz_m = [[0.0; 3]; HISTORY_POSES];
+        let mut rotation = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]; HISTORY_POSES];
+        // The last stays the identity: the product would be so only up to rounding.
+        for k in 0..HISTORY_POSES - 1 {
+            let age_us = (HISTORY_POSES - 1 - k) as i64 * HISTORY_STEP_US;
+            let rig_from_past = rig_from_world * self.at(self.time_us() - age_us);
+            xyz_m[k] = rig_from_past.position_m.as_vec3().to_array();
+            rotation[k] = rig_from_past.rotation_matrix().transpose().as_mat3().to_cols_array_2d();
+        }
+        let steps_back = self.time_us() / HISTORY_STEP_US;
+        let count = usize::try_from(steps_back).unwrap_or(0).min(HISTORY_POSES - 1) + 1;
+        History { xyz_m, rotation, count }
+    }
+
+    /// `world_from_rig` at a time, between the poses of the track.
+    fn at(&self, time_us: i64) -> Pose {
+        let after = self.track.partition_point(|&(t, _)| t < time_us);
+        let Some(&(after_us, to)) = self.track.get(after) else { return self.world_from_rig() };
+        match after.checked_sub(1) {
+            None => to,
+            Some(before) => {
+                let (before_us, from) = self.track[before];
+                let t = (time_us - before_us) as f64 / (after_us - before_us) as f64;
+                from.interpolate(&to, t)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+
+    fn at(x_m: f64, yaw_rad: f64) -> Pose {
+        Pose { position_m: DVec3::new(x_m, 0.0, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) }
+    }
+
+    fn driven(steps: u32, dt_us: i64, metres_per_step: f64) -> Episode {
+        (1..=steps).fold(Episode::new(7, at(0.0, 0.0), dt_us), |episode, i| {
+            episode.stepped(at(f64::from(i) * metres_per_step, 0.0), false).unwrap()
+        })
+    }
+
+    #[test]
+    fn the_history_is_empty_at_the_start_and_full_after_fifteen_steps() {
+        assert_eq!(driven(0, 100_000, 1.0).history().count, 1);
+        assert_eq!(driven(0, 100_000, 1.0).history().xyz_m, [[0.0; 3]; HISTORY_POSES]);
+        let two = driven(2, 100_000, 1.0).history();
+        assert_eq!(two.count, 3);
+        assert_eq!(two.xyz_m.map(|p| p[0])[11..], [-2.0, -2.0, -2.0, -1.0, 0.0]);
+        let full = driven(40, 100_000, 1.0).history();
+        assert_eq!(full.count, HISTORY_POSES);
+        assert_eq!(full.xyz_m.map(|p| p[0]), std::array::from_fn(|k| k as f32 - 15.0));
+    }
+
+    #[test]
+    fn the_history_is_in_the_frame_of_the_rig_now() {
+        // A quarter turn to the left on the spot, then one metre forward, which is +y.
+        let quarter = std::f64::consts::FRAC_PI_2;
+        let episode = Episode::new(0, at(0.0, 0.0), 100_000).stepped(at(0.0, quarter), false);
+        let forward = Pose { position_m: DVec3::Y, ..at(0.0, quarter) };
+        let History { xyz_m, rotation, .. } =
+            episode.unwrap().stepped(forward, false).unwrap().history();
+        assert_eq!(xyz_m[15], [0.0; 3]);
+        assert!((xyz_m[14][0] + 1.0).abs() < 1e-6, "one metre behind: {:?}", xyz_m[14]);
+        // Two steps ago the rig looked along what is now to its right: row 1 (left) of x is -1.
+        assert!((rotation[13][1][0] + 1.0).abs() < 1e-6, "{:?}", rotation[13]);
+        assert_eq!(rotation[15], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+    }
+
+    #[test]
+    fn other_rates_are_interpolated_and_the_track_stays_short() {
+        // 30 ms steps of 0.3 m: 0.1 s ago is 1 m back whatever the rate.
+        let episode = driven(1000, 30_000, 0.3);
+        assert!(episode.track.len() <= 53, "{}", episode.track.len());
+        for (k, xyz_m) in episode.history().xyz_m.iter().enumerate() {
+            assert!((f64::from(xyz_m[0]) - (k as f64 - 15.0)).abs() < 1e-4, "{k}: {xyz_m:?}");
+        }
+        let slow = driven(3, 2_000_000, 20.0);
+        assert!((slow.history().xyz_m[0][0] + 15.0).abs() < 1e-4, "{:?}", slow.history().xyz_m[0]);
+    }
+
+    #[test]
+    fn velocity_distance_and_the_end() {
+        let episode = driven(3, 50_000, 0.5);
+        assert_eq!(episode.velocity_m_s(), DVec3::new(10.0, 0.0, 0.0));
+        let over = episode.stepped(at(1.5, 0.0), true).unwrap();
+        let summary = over.summary(Outcome::AgentLost);
+        let expected =
+            Summary { outcome: Outcome::Completed, steps: 4, time_us: 200_000, distance_m: 1.5 };
+        assert_eq!(summary, expected);
+        let refused = over.stepped(at(2.0, 0.0), false);
+        assert!(matches!(refused, Err(SessionError::EpisodeOver { steps: 4 })));
+    }
+}

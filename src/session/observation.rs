@@ -1,0 +1,496 @@
+//! An observation: one buffer that goes to the socket as it is.
+//!
+//! ```text
+//! | header | ego.history_xyz, ego.history_rot | depth, opacity per image | colour per image |
+//! ```
+//!
+//! The renderer writes depth, opacity and raw colour where they stay; JPEGs and PNGs, whose length
+//! is known last, are appended. The header's room is reserved for `server`, which knows the wire.
+//! Floats come before bytes, so that every float tensor starts at a multiple of 4.
+
+use std::mem;
+use std::ops::Range;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use crate::config;
+use crate::geometry::Pose;
+use crate::render::{Backend, Frame as RenderFrame, Target, View};
+use crate::residency::Resident;
+use crate::scene::rig::RigCamera;
+
+use super::engine::{Answers, Hold, Scratch};
+use super::{Episode, History, SessionError};
+
+/// The length of the header, little-endian, stands before it.
+pub const HEADER_PREFIX_BYTES: usize = 8;
+
+/// Room for what the header says once: names of at most 64 bytes, hashes of 64, the ego's 10
+/// numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
+const HEADER_BASE_BYTES: usize = 4096;
+
+/// Room for what the header says per image: three tensors of at most 190 bytes, and 11 numbers of
+/// at most 24 digits, two names and a hash with their escaped keys: below 1,400 bytes.
+const HEADER_IMAGE_BYTES: usize = 1536;
+
+/// How colour images travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Encoding {
+    /// JPEG, 4:2:0, of a quality from 1 to 100.
+    Jpeg(u8),
+    /// PNG.
+    Png,
+    /// Pixels as they are.
+    Raw,
+}
+
+/// What every observation of a session looks like.
+#[derive(Debug)]
+pub(super) struct Layout {
+    cameras: Vec<RigCamera>,
+    encoding: Encoding,
+    depth: bool,
+    opacity: bool,
+}
+
+/// A finished observation.
+#[derive(Debug)]
+pub struct Frame {
+    /// The bytes of all tensors, behind the reserved header.
+    pub buffer: Buffer,
+    /// What is where in the buffer, in order and without gaps.
+    pub tensors: Vec<Tensor>,
+    /// The images, pose by pose, camera by camera.
+    pub images: Vec<Image>,
+    /// BLAKE3 of the images' hashes, 32 bytes each, in order.
+    pub frame_hash: blake3::Hash,
+    /// How many poses of the ego history were driven.
+    pub history_count: usize,
+    /// What it cost.
+    pub timings: Timings,
+}
+
+/// One image of a [`Frame`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Image {
+    /// Index of the camera among [`super::Session::cameras`].
+    pub camera: usize,
+    /// Which of the request's poses.
+    pub pose: usize,
+    /// BLAKE3 of the pixels, `[height, width, 3]`.
+    pub hash: blake3::Hash,
+}
+
+/// One tensor of a [`Frame`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tensor {
+    /// What it holds.
+    pub kind: TensorKind,
+    /// Type of its elements.
+    pub dtype: DType,
+    /// Its shape, row-major.
+    pub shape: Vec<usize>,
+    /// Where its bytes are, from the end of the header.
+    pub bytes: Range<usize>,
+}
+
+/// What a tensor holds; images by their index in [`Frame::images`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TensorKind {
+    /// Positions of the ego history, in metres: `[16, 3]`.
+    HistoryXyz,
+    /// Rotations of the ego history: `[16, 3, 3]`.
+    HistoryRotation,
+    /// Expected camera z in metres: `[height, width]`.
+    Depth(usize),
+    /// Accumulated opacity: `[height, width]`.
+    Opacity(usize),
+    /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
+    Rgb(usize),
+}
+
+/// Type of a tensor's elements.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DType {
+    /// 32-bit float, little-endian.
+    F32,
+    /// Byte.
+    U8,
+}
+
+/// What an observation cost.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Timings {
+    /// Waiting for other sessions' frames.
+    pub queue: Duration,
+    /// Rendering, with the encoding that ran beside it.
+    pub render: Duration,
+    /// CPU time of encoding and hashing.
+    pub encode: Duration,
+    /// Wall time per render stage, in milliseconds, in the order of the chain.
+    pub stages_ms: Vec<(&'static str, f64)>,
+}
+
+/// Bytes at an address that is a multiple of 8, counted against the budget for answers.
+#[derive(Debug)]
+pub struct Buffer {
+    words: Vec<u64>,
+    len: usize,
+    header: usize,
+    hold: Hold,
+}
+
+/// A frame in the making.
+pub(super) struct Assembly {
+    layout: Arc<Layout>,
+    answers: Answers,
+    buffer: Buffer,
+    history_count: usize,
+    poses: usize,
+    drawn: Vec<Drawn>,
+    timings: Timings,
+}
+
+/// One image as the worker thread left it.
+struct Drawn {
+    hash: blake3::Hash,
+    /// The file, unless the pixels are in the buffer already.
+    file: Vec<u8>,
+    took: Duration,
+}
+
+impl Layout {
+    /// # Errors
+    /// The quality is not one.
+    pub(super) fn new(
+        cameras: Vec<RigCamera>,
+        encoding: Encoding,
+        depth: bool,
+        opacity: bool,
+    ) -> Result<Self, SessionError> {
+        if let Encoding::Jpeg(quality) = encoding
+            && !(1..=100).contains(&quality)
+        {
+            let must = format!("{quality}; 1 to 100 are accepted");
+            return Err(SessionError::OutOfRange { field: "outputs.quality", must });
+        }
+        let layout = Self { cameras, encoding, depth, opacity };
+        layout.check_size(1)?;
+        Ok(layout)
+    }
+
+    pub(super) fn cameras(&self) -> &[RigCamera] {
+        &self.cameras
+    }
+
+    pub(super) fn encoding(&self) -> Encoding {
+        self.encoding
+    }
+
+    pub(super) fn depth_and_opacity(&self) -> (bool, bool) {
+        (self.depth, self.opacity)
+    }
+
+    fn check_size(&self, poses: usize) -> Result<(), SessionError> {
+        let pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
+        let (pixels, limit) = (pixels * poses as u64, config::ANSWER_PIXELS);
+        if pixels > limit {
+            return Err(SessionError::AnswerTooLarge { pixels, limit });
+        }
+        Ok(())
+    }
+
+    /// Bytes of one image's floats, and of its pixels where they are in the buffer.
+    fn image_bytes(&self, camera: &RigCamera) -> (usize, usize) {
+        let pixels = camera.camera.pixels();
+        let floats = usize::from(self.depth) + usize::from(self.opacity);
+        (4 * pixels * floats, if self.encoding == Encoding::Raw { 3 * pixels } else { 0 })
+    }
+
+    /// The same for all images of one pose.
+    fn pose_bytes(&self) -> (usize, usize) {
+        self.cameras.iter().fold((0, 0), |(floats, raw), camera| {
+            let (more_floats, more_raw) = self.image_bytes(camera);
+            (floats + more_floats, raw + more_raw)
+        })
+    }
+}
+
+impl Assembly {
+    /// Reserves the buffer of an observation and writes the ego history into it.
+    pub(super) fn new(
+        layout: Arc<Layout>,
+        answers: &Answers,
+        episode: &Episode,
+        poses: usize,
+    ) -> Result<Self, SessionError> {
+        layout.check_size(poses)?;
+        let images = poses * layout.cameras.len();
+        let header = HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES;
+        let (floats, raw) = layout.pose_bytes();
+        let History { xyz_m, rotation, count } = episode.history();
+        let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
+        let history = history.concat();
+        let len = header + history.len() + poses * (floats + raw);
+        let mut buffer = Buffer::zeroed(answers, len, header)?;
+        buffer.bytes_mut()[header..header + history.len()].copy_from_slice(&history);
+        Ok(Self {
+            layout,
+            answers: answers.clone(),
+            buffer,
+            history_count: count,
+            poses,
+            drawn: Vec::with_capacity(images),
+            timings: Timings::default(),
+        })
+    }
+
+    /// Renders the next pose.
+    pub(super) fn draw(
+        &mut self,
+        resident: &Resident,
+        backend: &dyn Backend,
+        world_from_rig: Pose,
+        scratch: &mut Scratch,
+    ) -> Result<(), SessionError> {
+        let layout = self.layout.clone();
+        let views = views(&layout.cameras, world_from_rig);
+        scratch.resize_with(scratch.len().max(views.len()), Vec::new);
+
+        let mut targets = self.targets(scratch);
+        let slots: Vec<OnceLock<Result<Drawn, String>>> =
+            views.iter().map(|_| OnceLock::new()).collect();
+        let finished = |view: usize, target: &Target<'_>| {
+            let camera = &layout.cameras[view].camera;
+            let pixels = target.rgb8.as_deref().unwrap_or_default();
+            let drawn = encode(pixels, camera.width_px, camera.height_px, layout.encoding);
+            // A backend calls this once per view.
+            let _ = slots[view].set(drawn);
+        };
+        let started = Instant::now();
+        let frame = RenderFrame {
+            scene: &resident.scene,
+            profile: &resident.version.manifest.profile,
+            views: &views,
+        };
+        let stats = backend.render(&frame, &mut targets, &finished)?;
+        self.timings.render += started.elapsed();
+        for (stage, ms) in stats.stages_ms {
+            match self.timings.stages_ms.iter_mut().find(|(name, _)| *name == stage) {
+                Some((_, sum)) => *sum += ms,
+                None => self.timings.stages_ms.push((stage, ms)),
+            }
+        }
+        for (slot, camera) in slots.into_iter().zip(&layout.cameras) {
+            let drawn = slot.into_inner().unwrap_or_else(|| Err("it was never finished".into()));
+            let drawn = drawn.map_err(|reason| {
+                let camera = camera.name.clone();
+                SessionError::Encode { camera, reason }
+            })?;
+            self.timings.encode += drawn.took;
+            self.drawn.push(drawn);
+        }
+        Ok(())
+    }
+
+    /// Where the renderer puts the next pose's images.
+    fn targets<'a>(&'a mut self, scratch: &'a mut Scratch) -> Vec<Target<'a>> {
+        let layout = &self.layout;
+        let pose = self.drawn.len() / layout.cameras.len();
+        let (floats, raw) = layout.pose_bytes();
+        let tail = self.buffer.len - self.poses * (floats + raw);
+        let (float_part, raw_part) =
+            self.buffer.bytes_mut()[tail..].split_at_mut(self.poses * floats);
+        let mut float_part = &mut float_part[pose * floats..(pose + 1) * floats];
+        let mut raw_part = &mut raw_part[pose * raw..(pose + 1) * raw];
+        let mut targets = Vec::with_capacity(layout.cameras.len());
+        for (camera, scratch) in layout.cameras.iter().zip(scratch) {
+            let pixels = camera.camera.pixels();
+            let depth_m = layout.depth.then(|| floats_of(take(&mut float_part, 4 * pixels)));
+            let opacity = layout.opacity.then(|| floats_of(take(&mut float_part, 4 * pixels)));
+            let rgb8 = if layout.encoding == Encoding::Raw {
+                take(&mut raw_part, 3 * pixels)
+            } else {
+                if scratch.len() < 3 * pixels {
+                    scratch.resize(3 * pixels, 0);
+                }
+                &mut scratch[..3 * pixels]
+            };
+            targets.push(Target { rgba: None, rgb8: Some(rgb8), depth_m, opacity });
+        }
+        targets
+    }
+
+    pub(super) fn add_queue_time(&mut self, queued: Duration) {
+        self.timings.queue += queued;
+    }
+
+    /// Appends what was encoded and names every tensor.
+    pub(super) fn finish(mut self) -> Result<Frame, SessionError> {
+        let layout = self.layout;
+        let files: Vec<&[u8]> = self.drawn.iter().map(|drawn| &drawn.file[..]).collect();
+        self.buffer.append(&self.answers, &files)?;
+
+        let mut tensors = Tensors { list: Vec::new(), end: 0 };
+        let poses = config::HISTORY_POSES;
+        tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
+        tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
+        let mut images = Vec::with_capacity(self.drawn.len());
+        for (index, drawn) in self.drawn.iter().enumerate() {
+            let (pose, camera) = (index / layout.cameras.len(), index % layout.cameras.len());
+            images.push(Image { camera, pose, hash: drawn.hash });
+            let [height, width] = size(&layout.cameras[camera]);
+            if layout.depth {
+                tensors.push(TensorKind::Depth(index), DType::F32, vec![height, width]);
+            }
+            if layout.opacity {
+                tensors.push(TensorKind::Opacity(index), DType::F32, vec![height, width]);
+            }
+        }
+        for (index, (drawn, image)) in self.drawn.iter().zip(&images).enumerate() {
+            let [height, width] = size(&layout.cameras[image.camera]);
+            let shape = match layout.encoding {
+                Encoding::Raw => vec![height, width, 3],
+                Encoding::Jpeg(_) | Encoding::Png => vec![drawn.file.len()],
+            };
+            tensors.push(TensorKind::Rgb(index), DType::U8, shape);
+        }
+        let frame_hash = frame_hash(images.iter().map(|image| image.hash));
+        Ok(Frame {
+            buffer: self.buffer,
+            tensors: tensors.list,
+            images,
+            frame_hash,
+            history_count: self.history_count,
+            timings: self.timings,
+        })
+    }
+}
+
+/// The cameras of a rig that stands somewhere.
+pub(super) fn views(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
+    let view = |camera: &RigCamera| View {
+        camera: camera.camera,
+        world_from_camera: world_from_rig * camera.rig_from_camera,
+    };
+    cameras.iter().map(view).collect()
+}
+
+/// The hash of a frame: of its images' hashes, in order.
+pub(super) fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
+    let mut hasher = blake3::Hasher::new();
+    for hash in images {
+        hasher.update(hash.as_bytes());
+    }
+    hasher.finalize()
+}
+
+/// Hashes the pixels of an image, and encodes them. Runs on a render thread, while other images
+/// are still drawn.
+fn encode(rgb8: &[u8], width: u32, height: u32, encoding: Encoding) -> Result<Drawn, String> {
+    let started = Instant::now();
+    let hash = blake3::hash(rgb8);
+    let mut file = Vec::new();
+    match encoding {
+        Encoding::Raw => {}
+        Encoding::Jpeg(quality) => {
+            let side = |px| u16::try_from(px).map_err(|_| format!("{px} px is beyond JPEG"));
+            // An eighth of the pixel bytes is what street scenes take at quality 90.
+            file.reserve(rgb8.len() / 8);
+            let mut encoder = jpeg_encoder::Encoder::new(&mut file, quality);
+            encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_2_2);
+            encoder
+                .encode(rgb8, side(width)?, side(height)?, jpeg_encoder::ColorType::Rgb)
+                .map_err(|error| error.to_string())?;
+        }
+        Encoding::Png => {
+            use image::ImageEncoder as _;
+            use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+            // `Fast` takes 13 ms for 1440x928, the default 30 times as long for 5 % less.
+            PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
+                .write_image(rgb8, width, height, image::ExtendedColorType::Rgb8)
+                .map_err(|error| error.to_string())?;
+        }
+    }
+    Ok(Drawn { hash, file, took: started.elapsed() })
+}
+
+/// Tensors one after the other.
+struct Tensors {
+    list: Vec<Tensor>,
+    end: usize,
+}
+
+impl Tensors {
+    fn push(&mut self, kind: TensorKind, dtype: DType, shape: Vec<usize>) {
+        let bytes = shape.iter().product::<usize>() * dtype.bytes();
+        let start = self.end;
+        self.end += bytes;
+        self.list.push(Tensor { kind, dtype, shape, bytes: start..self.end });
+    }
+}
+
+impl DType {
+    fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::U8 => 1,
+        }
+    }
+}
+
+impl Buffer {
+    fn zeroed(answers: &Answers, len: usize, header: usize) -> Result<Self, SessionError> {
+        let hold = answers.hold(len as u64)?;
+        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, hold })
+    }
+
+    /// The header's room, its length prefix included, and everything behind it.
+    pub fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.words)[..self.len]
+    }
+
+    /// The header's room, its length prefix included.
+    pub fn header_mut(&mut self) -> &mut [u8] {
+        let header = self.header;
+        &mut self.bytes_mut()[..header]
+    }
+
+    fn bytes_mut(&mut self) -> &mut [u8] {
+        &mut bytemuck::cast_slice_mut(&mut self.words)[..self.len]
+    }
+
+    fn append(&mut self, answers: &Answers, parts: &[&[u8]]) -> Result<(), SessionError> {
+        let mut start = self.len;
+        let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
+        let more = answers.hold((len - start) as u64)?;
+        self.hold.join(more);
+        self.words.resize(len.div_ceil(8), 0);
+        self.len = len;
+        for part in parts {
+            self.bytes_mut()[start..start + part.len()].copy_from_slice(part);
+            start += part.len();
+        }
+        Ok(())
+    }
+}
+
+/// Cuts the first bytes off a slice.
+fn take<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
+    let (first, others) = mem::take(rest).split_at_mut(bytes);
+    *rest = others;
+    first
+}
+
+/// Floats in place: the header's room, the history and other floats before them are multiples of 4
+/// bytes from the start of a buffer whose address is a multiple of 8.
+fn floats_of(bytes: &mut [u8]) -> &mut [f32] {
+    bytemuck::cast_slice_mut(bytes)
+}
+
+fn size(camera: &RigCamera) -> [usize; 2] {
+    [camera.camera.height_px as usize, camera.camera.width_px as usize]
+}

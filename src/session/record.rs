@@ -1,0 +1,239 @@
+//! The record of an episode: one JSON line per thing that happened.
+//!
+//! ```text
+//! <episodes>/<session>-<n>.jsonl
+//! {"kind":"episode", ...}    what it takes to render the same again
+//! {"kind":"frame", ...}      one per answer with images: request, poses, hashes
+//! {"kind":"end", ...}        how it went; missing if the server was killed
+//! ```
+//!
+//! A line is written before its answer is sent: what an agent was answered is on record. If that
+//! fails, on a full disk say, the file is cut back to its last whole line and the request is
+//! refused.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::Pose;
+use crate::scene::{RenderProfile, Rig};
+
+use super::{Encoding, Summary};
+
+/// What built this program, as it stands in records.
+pub(super) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
+
+/// The first line: everything that the images are a function of, but the poses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeHeader {
+    /// Version of this layout.
+    pub format: u32,
+    /// What recorded it, as `wildcity 0.1.0`.
+    pub build: String,
+    /// Name of the session.
+    pub session: String,
+    /// The twin.
+    pub twin: String,
+    /// Its version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// How it was rendered.
+    pub profile: RenderProfile,
+    /// BLAKE3 of the profile's JSON, in hex.
+    pub profile_hash: String,
+    /// Name of the backend.
+    pub backend: String,
+    /// The cameras that were rendered, in the order of the images.
+    pub rig: Rig,
+    /// What the observations held beside colour, and how colour travelled.
+    pub outputs: RecordedOutputs,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// `world_from_rig` at time zero.
+    pub start: Pose,
+    /// Simulated time of a step, in microseconds.
+    pub dt_us: i64,
+}
+
+/// What the agent saw.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedOutputs {
+    /// How colour travelled.
+    pub encoding: Encoding,
+    /// Whether there was depth.
+    pub depth: bool,
+    /// Whether there was opacity.
+    pub opacity: bool,
+}
+
+/// One answer with images.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrameRecord {
+    /// What was asked.
+    pub request: FrameRequest,
+    /// Steps done, this one included.
+    pub step: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// What was rendered, `world_from_rig`.
+    pub poses: Vec<Pose>,
+    /// Whether the episode ended with it.
+    pub terminated: bool,
+    /// BLAKE3 of the images' hashes, in hex.
+    pub frame_hash: String,
+    /// BLAKE3 of each image's pixels, in hex: pose by pose, camera by camera.
+    pub images: Vec<String>,
+}
+
+/// Requests that are answered with images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FrameRequest {
+    /// The start of an episode.
+    Reset,
+    /// A step.
+    Step,
+    /// Poses without moving.
+    Observe,
+}
+
+/// A line of an episode's file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub(super) enum Line {
+    /// The first.
+    Episode(Box<EpisodeHeader>),
+    /// One per answer with images.
+    Frame(FrameRecord),
+    /// The last.
+    End(Summary),
+}
+
+/// Why an episode could not be recorded.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot record the episode in {}: {source}", path.display())]
+pub struct RecordError {
+    /// The file or directory.
+    pub path: PathBuf,
+    /// What the operating system says.
+    pub source: io::Error,
+}
+
+/// An episode's file, open for appending.
+#[derive(Clone, Debug)]
+pub(super) struct Recorder {
+    file: Arc<File>,
+    path: Arc<Path>,
+}
+
+impl EpisodeHeader {
+    /// The layout that this build writes and reads.
+    pub const FORMAT: u32 = 0;
+}
+
+impl Recorder {
+    /// Creates the file of the first free number from `first_number` on and writes its first
+    /// lines; tells the number. No file is left behind if that fails.
+    pub(super) fn create(
+        dir: &Path,
+        session: &str,
+        first_number: u64,
+        lines: &[Line],
+    ) -> Result<(Self, u64), RecordError> {
+        let failed = |path: &Path, source| RecordError { path: path.to_owned(), source };
+        fs::create_dir_all(dir).map_err(|source| failed(dir, source))?;
+        let mut number = first_number;
+        loop {
+            let path = dir.join(format!("{session}-{number}.jsonl"));
+            match OpenOptions::new().append(true).create_new(true).open(&path) {
+                Ok(file) => {
+                    let recorder = Self { file: Arc::new(file), path: path.into() };
+                    return match recorder.append(lines) {
+                        Ok(()) => Ok((recorder, number)),
+                        Err(error) => {
+                            // The first failure says more than one to clean up after it.
+                            let _ = fs::remove_file(&recorder.path);
+                            Err(error)
+                        }
+                    };
+                }
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => number += 1,
+                Err(source) => return Err(failed(&path, source)),
+            }
+        }
+    }
+
+    /// Appends whole lines, or nothing.
+    pub(super) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
+        let mut text = Vec::with_capacity(2048);
+        let written = lines
+            .iter()
+            .try_for_each(|line| {
+                serde_json::to_writer(&mut text, line)?;
+                text.push(b'\n');
+                Ok(())
+            })
+            .and_then(|()| self.file.metadata())
+            .and_then(|before| {
+                let written = (&*self.file).write_all(&text);
+                if written.is_err() {
+                    self.file.set_len(before.len())?;
+                }
+                written
+            });
+        written.map_err(|source| RecordError { path: self.path.to_path_buf(), source })
+    }
+}
+
+/// BLAKE3 of a profile's JSON.
+pub(super) fn profile_hash(profile: &RenderProfile) -> blake3::Hash {
+    // Writing seven numbers to memory cannot fail, and an empty text would only change the hash.
+    blake3::hash(&serde_json::to_vec(profile).unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::session::Outcome;
+
+    fn end(steps: u64) -> Line {
+        Line::End(Summary { outcome: Outcome::Completed, steps, time_us: 0, distance_m: 0.0 })
+    }
+
+    #[test]
+    fn names_in_use_are_left_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let (first, number) = Recorder::create(dir.path(), "a", 1, &[end(1)]).unwrap();
+        assert_eq!(number, 1);
+        let (_, number) = Recorder::create(dir.path(), "a", 1, &[end(2)]).unwrap();
+        assert_eq!(number, 2);
+        first.append(&[end(3)]).unwrap();
+        let text = fs::read_to_string(dir.path().join("a-1.jsonl")).unwrap();
+        assert_eq!(text.lines().count(), 2);
+        assert!(text.ends_with('\n'));
+    }
+
+    #[test]
+    fn a_directory_that_cannot_be_made_is_named() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let dir = file.path().join("episodes");
+        let error = Recorder::create(&dir, "a", 1, &[end(1)]).unwrap_err();
+        assert!(error.to_string().contains("episodes"), "{error}");
+    }
+
+    #[test]
+    fn a_full_disk_refuses_the_line() {
+        let full = OpenOptions::new().append(true).open("/dev/full").unwrap();
+        let path = Path::new("/dev/full").into();
+        let recorder = Recorder { file: Arc::new(full), path };
+        let error = recorder.append(&[end(1)]).unwrap_err();
+        assert!(error.to_string().contains("/dev/full"), "{error}");
+    }
+}

@@ -1,0 +1,288 @@
+//! Replay: renders a recorded episode again and compares every image.
+
+use std::fs::File;
+use std::io::{self, BufRead as _, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+
+use crate::config::EPISODE_LINE_BYTES;
+use crate::geometry::Pose;
+use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
+use crate::residency::Resident;
+use crate::scene::rig::{RigCamera, RigError};
+use crate::store::StoreError;
+
+use super::record::{BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, profile_hash};
+use super::{Summary, observation};
+
+/// A recorded episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recording {
+    /// What it was rendered from, and how.
+    pub header: EpisodeHeader,
+    /// Everything rendered, in order; the first stands in line 2 of the file.
+    pub frames: Vec<FrameRecord>,
+    /// How it went; absent if the server was killed or is still running.
+    pub end: Option<Summary>,
+}
+
+/// How a replay went.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// Images rendered again.
+    pub images: u64,
+    /// What is not as it was when the episode was recorded.
+    pub changes: Vec<Change>,
+    /// The first image that differs. Nothing after it was rendered.
+    pub difference: Option<Difference>,
+}
+
+/// Something that is not as it was.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Change {
+    /// `build`, `backend`, `version hash` or `profile hash`.
+    pub what: &'static str,
+    /// As recorded.
+    pub recorded: String,
+    /// As it is now.
+    pub now: String,
+}
+
+/// An image that differs from the recorded one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Difference {
+    /// Line of the episode's file, from 1.
+    pub line: usize,
+    /// What was asked.
+    pub request: FrameRequest,
+    /// The step.
+    pub step: u64,
+    /// Which of the request's poses: 0 but for `observe`.
+    pub pose: usize,
+    /// Name of the camera.
+    pub camera: String,
+    /// The recorded hash.
+    pub recorded: String,
+    /// The hash now.
+    pub now: String,
+}
+
+/// An image that was rendered again.
+#[derive(Clone, Copy, Debug)]
+pub struct Redrawn<'a> {
+    /// The answer that it belongs to, counted from 0.
+    pub frame: usize,
+    /// What was asked.
+    pub request: FrameRequest,
+    /// The step.
+    pub step: u64,
+    /// Which of the request's poses.
+    pub pose: usize,
+    /// The camera.
+    pub camera: &'a RigCamera,
+    /// `[height, width, 3]`.
+    pub rgb8: &'a [u8],
+}
+
+/// Why an episode could not be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        source: io::Error,
+    },
+    /// A line is damaged, cut off, or not where it belongs.
+    #[error("{}, line {line}: {reason}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The recorded cameras cannot be used.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The twin cannot be had.
+    #[error(transparent)]
+    Twin(#[from] StoreError),
+    /// The backend refused a frame.
+    #[error("step {step}: {source}")]
+    Render {
+        /// The step.
+        step: u64,
+        /// Why.
+        source: RenderError,
+    },
+    /// What was to be done with an image failed.
+    #[error("step {step}, camera {camera:?}: {reason:#}")]
+    Visit {
+        /// The step.
+        step: u64,
+        /// The camera.
+        camera: String,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Recording {
+    /// Reads an episode's file.
+    ///
+    /// # Errors
+    /// Names the first line that is damaged or cut off.
+    pub fn read(path: &Path) -> Result<Self, ReplayError> {
+        let failed = |source| ReplayError::Read { path: path.to_owned(), source };
+        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let (mut header, mut frames, mut end) = (None, Vec::new(), None);
+        for line in 1.. {
+            let wrong = |reason: String| ReplayError::Line { path: path.to_owned(), line, reason };
+            let mut text = Vec::new();
+            let limit = EPISODE_LINE_BYTES as u64;
+            reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(failed)?;
+            match text.last() {
+                None => break,
+                Some(b'\n') => {}
+                Some(_) if text.len() == EPISODE_LINE_BYTES => {
+                    return Err(wrong(format!("longer than {limit} bytes")));
+                }
+                Some(_) => return Err(wrong("cut off: it has no end".to_owned())),
+            }
+            let parsed: Line = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
+            match parsed {
+                _ if end.is_some() => return Err(wrong("follows the episode's end".to_owned())),
+                Line::Episode(first) if line == 1 => {
+                    let format = first.format;
+                    if format != EpisodeHeader::FORMAT {
+                        let reads = EpisodeHeader::FORMAT;
+                        return Err(wrong(format!("format {format}; this build reads {reads}")));
+                    }
+                    first.rig.check()?;
+                    header = Some(*first);
+                }
+                Line::Frame(frame) if line > 1 => {
+                    let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
+                    let (poses, images) = (frame.poses.len(), frame.images.len());
+                    if images != poses * cameras {
+                        let what = format!("{images} images of {poses} poses, {cameras} cameras");
+                        return Err(wrong(what));
+                    }
+                    frames.push(frame);
+                }
+                Line::End(summary) if line > 1 => end = Some(summary),
+                Line::Episode(_) => return Err(wrong("a second beginning".to_owned())),
+                Line::Frame(_) | Line::End(_) => {
+                    return Err(wrong("the episode's beginning is missing".to_owned()));
+                }
+            }
+        }
+        let empty =
+            || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
+        Ok(Self { header: header.ok_or_else(empty)?, frames, end })
+    }
+
+    /// Renders everything again, up to the first image that differs. Each image is shown to
+    /// `visit` before it is compared.
+    ///
+    /// # Errors
+    /// The backend refuses a frame, or `visit` fails.
+    pub fn replay(
+        &self,
+        resident: &Resident,
+        backend: &dyn Backend,
+        visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
+    ) -> Result<Report, ReplayError> {
+        let mut report =
+            Report { images: 0, changes: self.changes(resident, backend), difference: None };
+        let cameras = &self.header.rig.cameras;
+        let mut pixels: Vec<Vec<u8>> =
+            cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
+        for (index, frame) in self.frames.iter().enumerate() {
+            let mut recorded = frame.images.iter();
+            for (pose, world_from_rig) in frame.poses.iter().enumerate() {
+                let hashes = redraw(resident, backend, cameras, *world_from_rig, &mut pixels)
+                    .map_err(|source| ReplayError::Render { step: frame.step, source })?;
+                for (((camera, rgb8), hash), recorded) in
+                    cameras.iter().zip(&pixels).zip(hashes).zip(&mut recorded)
+                {
+                    let FrameRecord { request, step, .. } = *frame;
+                    visit(&Redrawn { frame: index, request, step, pose, camera, rgb8 }).map_err(
+                        |reason| {
+                            let camera = camera.name.clone();
+                            ReplayError::Visit { step, camera, reason }
+                        },
+                    )?;
+                    report.images += 1;
+                    let now = hash.to_hex().to_string();
+                    if now != *recorded {
+                        report.difference = Some(Difference {
+                            line: index + 2,
+                            request,
+                            step,
+                            pose,
+                            camera: camera.name.clone(),
+                            recorded: recorded.clone(),
+                            now,
+                        });
+                        return Ok(report);
+                    }
+                }
+            }
+        }
+        Ok(report)
+    }
+
+    fn changes(&self, resident: &Resident, backend: &dyn Backend) -> Vec<Change> {
+        let header = &self.header;
+        let profile = profile_hash(&resident.version.manifest.profile).to_hex().to_string();
+        [
+            ("build", &*header.build, BUILD),
+            ("backend", &*header.backend, backend.name()),
+            ("version hash", &*header.version_hash, &*resident.version.hash),
+            ("profile hash", &*header.profile_hash, &*profile),
+        ]
+        .into_iter()
+        .filter(|(_, recorded, now)| recorded != now)
+        .map(|(what, recorded, now)| Change {
+            what,
+            recorded: recorded.to_owned(),
+            now: now.to_owned(),
+        })
+        .collect()
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { line, step, pose, camera, recorded, now, request } = self;
+        write!(f, "step {step}, camera {camera:?}")?;
+        if *request == FrameRequest::Observe {
+            write!(f, ", pose {pose} of observe")?;
+        }
+        write!(f, " (line {line}): recorded {recorded}, now {now}")
+    }
+}
+
+/// Renders the colour images of one pose, and hashes them.
+fn redraw(
+    resident: &Resident,
+    backend: &dyn Backend,
+    cameras: &[RigCamera],
+    world_from_rig: Pose,
+    pixels: &mut [Vec<u8>],
+) -> Result<Vec<blake3::Hash>, RenderError> {
+    let views: Vec<View> = observation::views(cameras, world_from_rig);
+    let mut targets: Vec<Target<'_>> =
+        pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
+    let frame = RenderFrame {
+        scene: &resident.scene,
+        profile: &resident.version.manifest.profile,
+        views: &views,
+    };
+    backend.render(&frame, &mut targets, &|_, _| {})?;
+    Ok(pixels.iter().map(|rgb8| blake3::hash(rgb8)).collect())
+}

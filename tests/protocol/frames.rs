@@ -1,0 +1,236 @@
+//! Small observations, and the layout they travel in, written by another hand than the server's.
+
+use serde_json::{Map, Value, json};
+use wildcity::protocol::message::{Encoding, Pose, RigCamera};
+use wildcity::protocol::observation::{Ego, Image, Observation, Stage, Timings};
+
+use super::messages::{front, rear};
+
+/// A tensor of a frame that is being put together.
+#[derive(Clone)]
+pub(crate) struct Tensor {
+    pub(crate) name: String,
+    pub(crate) dtype: &'static str,
+    pub(crate) shape: Vec<u64>,
+    pub(crate) bytes: Vec<u8>,
+}
+
+/// A frame in its parts.
+#[derive(Clone)]
+pub(crate) struct Frame {
+    pub(crate) metadata: Observation,
+    pub(crate) tensors: Vec<Tensor>,
+}
+
+/// What a frame is made of.
+#[derive(Clone, Copy)]
+pub(crate) struct Recipe {
+    pub(crate) encoding: Encoding,
+    pub(crate) poses: u64,
+    pub(crate) cameras: usize,
+    pub(crate) depth: bool,
+}
+
+/// Colour of a pixel. JPEG blurs, so its pixels are grey and change slowly.
+pub(crate) fn color(recipe: Recipe, image: u64, x: u64, y: u64) -> [u8; 3] {
+    let channels = match recipe.encoding {
+        Encoding::Jpeg => [100 + 8 * x + 4 * y + 20 * image; 3],
+        _ => [10 + 60 * x, 5 + 70 * y, 3 + 50 * image + 7 * x * y],
+    };
+    channels.map(|channel| u8::try_from(channel).unwrap())
+}
+
+/// Depth of a pixel, in metres; a third, so that it is not a round number in f32.
+pub(crate) fn depth_m(image: u64, x: u64, y: u64) -> f32 {
+    (1 + x + 10 * y + 100 * image) as f32 / 3.0
+}
+
+/// Opacity of a pixel.
+pub(crate) fn opacity(x: u64, y: u64) -> f32 {
+    (x + y) as f32 / 5.0
+}
+
+/// Past positions: half a metre a step.
+pub(crate) fn history_xyz_m(k: usize) -> [f32; 3] {
+    [0.5 * (k as f32 - 15.0), 0.0, 0.0]
+}
+
+impl Frame {
+    pub(crate) fn new(seq: u64, recipe: Recipe) -> Self {
+        let xyz: Vec<f32> = (0..16).flat_map(history_xyz_m).collect();
+        let rot: Vec<f32> =
+            (0..16).flat_map(|_| [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]).collect();
+        let mut tensors = vec![
+            f32_tensor("ego.history_xyz", vec![16, 3], &xyz),
+            f32_tensor("ego.history_rot", vec![16, 3, 3], &rot),
+        ];
+        let (mut images, mut hashes) = (Vec::new(), blake3::Hasher::new());
+        let cameras = [front(), rear()];
+        for pose in 0..recipe.poses {
+            for (index, camera) in cameras[..recipe.cameras].iter().enumerate() {
+                let number = images.len() as u64;
+                let pixels = pixels(recipe, number, camera);
+                let hash = blake3::hash(&pixels);
+                hashes.update(hash.as_bytes());
+                let prefix = if recipe.poses > 1 { format!("pose/{pose}/") } else { String::new() };
+                let stem = format!("{prefix}camera/{}", camera.name);
+                tensors.push(color_tensor(recipe, &stem, camera, pixels));
+                if recipe.depth {
+                    tensors.extend(depth_and_opacity(number, &stem, camera));
+                }
+                let tensor = format!("{stem}/rgb");
+                let hash = hash.to_hex().to_string();
+                images.push(image(recipe, camera, index as u64, pose, tensor, hash));
+            }
+        }
+        let frame_hash = hashes.finalize().to_hex().to_string();
+        Self { metadata: observation(seq, images, frame_hash), tensors }
+    }
+
+    /// The frame's bytes.
+    pub(crate) fn bytes(&self) -> Vec<u8> {
+        let (header, data) = self.header();
+        assemble(&serde_json::to_string(&header).unwrap(), &data)
+    }
+
+    /// The header as JSON, and the tensors' bytes.
+    pub(crate) fn header(&self) -> (Map<String, Value>, Vec<u8>) {
+        let mut header = Map::new();
+        let text = serde_json::to_string(&self.metadata).unwrap();
+        header.insert("__metadata__".into(), json!({"observation": text}));
+        let mut data = Vec::new();
+        for Tensor { name, dtype, shape, bytes } in &self.tensors {
+            let offsets = [data.len(), data.len() + bytes.len()];
+            let info = json!({"dtype": dtype, "shape": shape, "data_offsets": offsets});
+            header.insert(name.clone(), info);
+            data.extend_from_slice(bytes);
+        }
+        (header, data)
+    }
+}
+
+/// Length, header padded with spaces to a multiple of eight, data.
+pub(crate) fn assemble(header: &str, data: &[u8]) -> Vec<u8> {
+    let padded = header.len().next_multiple_of(8);
+    let mut bytes = (padded as u64).to_le_bytes().to_vec();
+    bytes.extend_from_slice(header.as_bytes());
+    bytes.resize(8 + padded, b' ');
+    bytes.extend_from_slice(data);
+    bytes
+}
+
+fn pixels(recipe: Recipe, image: u64, camera: &RigCamera) -> Vec<u8> {
+    (0..camera.height)
+        .flat_map(|y| (0..camera.width).flat_map(move |x| color(recipe, image, x, y)))
+        .collect()
+}
+
+fn color_tensor(recipe: Recipe, stem: &str, camera: &RigCamera, pixels: Vec<u8>) -> Tensor {
+    let (width, height) = (camera.width as u16, camera.height as u16);
+    let bytes = match recipe.encoding {
+        Encoding::Raw => pixels,
+        Encoding::Png => png(&pixels, width.into(), height.into()),
+        Encoding::Jpeg => {
+            let mut bytes = Vec::new();
+            let encoder = jpeg_encoder::Encoder::new(&mut bytes, 95);
+            encoder.encode(&pixels, width, height, jpeg_encoder::ColorType::Rgb).unwrap();
+            // So that what comes behind it does not lie on a multiple of four bytes. Decoders stop
+            // at the end marker.
+            if bytes.len().is_multiple_of(2) {
+                bytes.push(0);
+            }
+            bytes
+        }
+    };
+    let shape = match recipe.encoding {
+        Encoding::Raw => vec![camera.height, camera.width, 3],
+        Encoding::Png | Encoding::Jpeg => vec![bytes.len() as u64],
+    };
+    Tensor { name: format!("{stem}/rgb"), dtype: "U8", shape, bytes }
+}
+
+/// A PNG file.
+pub(crate) fn png(pixels: &[u8], width: u32, height: u32) -> Vec<u8> {
+    use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+    let mut bytes = Vec::new();
+    PngEncoder::new(&mut bytes)
+        .write_image(pixels, width, height, ExtendedColorType::Rgb8)
+        .unwrap();
+    bytes
+}
+
+fn depth_and_opacity(image: u64, stem: &str, camera: &RigCamera) -> [Tensor; 2] {
+    let grid = || (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+    let depth: Vec<f32> = grid().map(|(x, y)| depth_m(image, x, y)).collect();
+    let opacity: Vec<f32> = grid().map(|(x, y)| opacity(x, y)).collect();
+    let shape = vec![camera.height, camera.width];
+    [
+        f32_tensor(&format!("{stem}/depth"), shape.clone(), &depth),
+        f32_tensor(&format!("{stem}/opacity"), shape, &opacity),
+    ]
+}
+
+fn f32_tensor(name: &str, shape: Vec<u64>, values: &[f32]) -> Tensor {
+    let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    Tensor { name: name.into(), dtype: "F32", shape, bytes }
+}
+
+fn image(
+    recipe: Recipe,
+    camera: &RigCamera,
+    index: u64,
+    pose: u64,
+    tensor: String,
+    hash: String,
+) -> Image {
+    let RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig } = camera.clone();
+    Image {
+        camera: name,
+        index,
+        pose,
+        tensor,
+        encoding: recipe.encoding,
+        width,
+        height,
+        fx,
+        fy,
+        cx,
+        cy,
+        camera_to_rig,
+        shutter_start_us: 200_000,
+        shutter_end_us: 200_000,
+        hash,
+    }
+}
+
+fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> Observation {
+    Observation {
+        seq,
+        step: 2,
+        time_us: 200_000,
+        session: "run-17".into(),
+        seed: 42,
+        terminated: false,
+        twin: "street".into(),
+        version: 3,
+        version_hash: blake3::hash(b"a manifest").to_hex().to_string(),
+        profile_hash: blake3::hash(b"a profile").to_hex().to_string(),
+        backend: "cpu".into(),
+        frame_hash,
+        ego: Ego {
+            pose: Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] },
+            velocity: [1.4, 4.8, 0.0],
+            history_count: 3,
+        },
+        images,
+        timings: Timings {
+            queue_ms: 0.5,
+            render_ms: 12.25,
+            encode_ms: 1.5,
+            stages_ms: vec![
+                Stage { name: "project".into(), ms: 2.0 },
+                Stage { name: "rasterize".into(), ms: 9.75 },
+            ],
+        },
+    }
+}

@@ -1,0 +1,204 @@
+//! Golden text messages: one file per request and per answer.
+
+use serde_json::json;
+use wildcity::protocol::PROTOCOL;
+use wildcity::protocol::error::Code;
+use wildcity::protocol::message::*;
+
+use super::{check_json, read};
+
+#[test]
+fn requests_are_the_golden_ones() {
+    for (name, request) in requests() {
+        let file = format!("vectors/requests/{name}.json");
+        check_json(&file, &request);
+        assert_eq!(serde_json::from_slice::<Request>(&read(&file)).unwrap(), request, "{name}");
+    }
+}
+
+#[test]
+fn answers_are_the_golden_ones() {
+    for (name, answer) in answers() {
+        let file = format!("vectors/answers/{name}.json");
+        check_json(&file, &answer);
+        assert_eq!(serde_json::from_slice::<Answer>(&read(&file)).unwrap(), answer, "{name}");
+    }
+}
+
+#[test]
+fn what_may_be_left_out_has_a_default() {
+    let open = Request::Open(Box::new(Open { seq: 1, ..Open::twin("street") }));
+    let parse = |text: &str| serde_json::from_str::<Request>(text);
+    assert_eq!(parse(r#"{"type":"open","seq":1,"twin":"street"}"#).unwrap(), open);
+    let pose = r#""pose":{"xyz":[0,0,0],"q":[1,0,0,0]}"#;
+    let step = parse(&format!(r#"{{"type":"step","seq":2,{pose}}}"#)).unwrap();
+    assert!(matches!(step, Request::Step { terminate: false, .. }));
+    let reset = parse(r#"{"type":"reset","seq":3}"#).unwrap();
+    assert_eq!(reset, Request::Reset { seq: 3, seed: 0, start: None });
+    // Unknown fields are mistakes, not extensions.
+    let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
+    assert!(parse(&unknown).unwrap_err().to_string().contains("speed"));
+}
+
+/// Every code is spelled in the page that explains them, and the page spells no other.
+#[test]
+fn the_page_lists_every_error_code() {
+    let page = String::from_utf8(read("README.md")).unwrap();
+    let schema = serde_json::to_value(schemars::schema_for!(Code)).unwrap();
+    let variants = schema["oneOf"].as_array().expect("one variant per code");
+    let mut codes: Vec<&str> = variants.iter().map(|v| v["const"].as_str().unwrap()).collect();
+    let section = page.split("## Errors").nth(1).expect("a section on errors");
+    let section = section.split("\n## ").next().unwrap();
+    let mut rows: Vec<&str> =
+        section.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+    codes.sort_unstable();
+    rows.sort_unstable();
+    assert_eq!(rows, codes);
+}
+
+fn pose(xyz: [f64; 3], q: [f64; 4]) -> Pose {
+    Pose { xyz, q }
+}
+
+pub(crate) fn front() -> RigCamera {
+    RigCamera {
+        name: "front".into(),
+        width: 4,
+        height: 3,
+        fx: 3.5,
+        fy: 3.5,
+        cx: 2.0,
+        cy: 1.5,
+        camera_to_rig: pose([1.6, 0.0, 1.5], [0.5, -0.5, 0.5, -0.5]),
+    }
+}
+
+pub(crate) fn rear() -> RigCamera {
+    RigCamera {
+        name: "rear".into(),
+        camera_to_rig: pose([-0.9, 0.0, 1.4], [0.5, -0.5, -0.5, 0.5]),
+        ..front()
+    }
+}
+
+fn requests() -> Vec<(&'static str, Request)> {
+    let station = Start::Station { trajectory: "log".into(), station_m: 12.5 };
+    let rig = Rig { name: "pair".into(), cameras: vec![front(), rear()] };
+    let open = Open {
+        seq: 1,
+        version: Some(3),
+        session: Some("run-17".into()),
+        seed: 42,
+        start: Some(station.clone()),
+        rig: Some(RigChoice::Full(rig)),
+        outputs: Outputs {
+            cameras: Some(vec!["front".into(), "rear".into()]),
+            encoding: Encoding::Raw,
+            quality: Some(85),
+            depth: true,
+            opacity: true,
+        },
+        dt_us: Some(100_000),
+        deadline_ms: Some(20_000),
+        ..Open::twin("street")
+    };
+    let preset =
+        Open { seq: 1, rig: Some(RigChoice::Preset("vehicle6".into())), ..Open::twin("street") };
+    let there = pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]);
+    let above = pose([12.5, -3.25, 30.0], [1.0, 0.0, 0.0, 0.0]);
+    let start = Start::Pose { pose: there };
+    let client = ClientInfo { name: "golden".into(), version: "0.1.0".into() };
+    let protocols = vec![PROTOCOL.to_owned()];
+    vec![
+        ("hello", Request::Hello { seq: 0, client, protocols }),
+        ("open", Request::Open(Box::new(open))),
+        ("open_preset", Request::Open(Box::new(preset))),
+        ("step", Request::Step { seq: 3, pose: there, terminate: false }),
+        ("step_terminate", Request::Step { seq: 4, pose: there, terminate: true }),
+        ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
+        ("reset", Request::Reset { seq: 2, seed: 7, start: None }),
+        ("reset_pose", Request::Reset { seq: 6, seed: 8, start: Some(start) }),
+        ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
+        ("close", Request::Close { seq: 8 }),
+        ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
+    ]
+}
+
+fn answers() -> Vec<(&'static str, Answer)> {
+    let trajectory = TrajectoryInfo { name: "log".into(), length_m: 350.5, keyframes: 702 };
+    let version_hash = blake3::hash(b"a manifest").to_hex().to_string();
+    let profile_hash = blake3::hash(b"a profile").to_hex().to_string();
+    let twin = TwinInfo {
+        name: "street".into(),
+        version: 3,
+        version_hash: version_hash.clone(),
+        gaussians: 300_000,
+        sh_degree: 1,
+        trajectories: vec![trajectory.clone()],
+    };
+    let welcome = Answer::Welcome {
+        seq: 0,
+        protocol: PROTOCOL.into(),
+        server: ServerInfo { name: "wildcity".into(), version: "0.1.0".into() },
+        limits: Limits {
+            message_bytes: 1_048_576,
+            observe_poses: 16,
+            cameras: 16,
+            side_px: 16_384,
+            answer_pixels: 134_217_728,
+            idle_ms: 600_000,
+            resume_ms: 60_000,
+        },
+        backend: "cpu".into(),
+        twins: vec![twin],
+    };
+    let profile = json!({"alpha_cap": 0.99, "antialiased": false, "near": 0.01});
+    let opened = Opened {
+        seq: 1,
+        session: "run-17".into(),
+        twin: "street".into(),
+        version: 3,
+        version_hash,
+        profile_hash,
+        profile: profile.as_object().unwrap().clone(),
+        backend: "cpu".into(),
+        seed: 42,
+        start: pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]),
+        dt_us: 100_000,
+        deadline_ms: 20_000,
+        cameras: vec![front(), rear()],
+        outputs: Outputs {
+            encoding: Encoding::Raw,
+            depth: true,
+            opacity: true,
+            ..Outputs::default()
+        },
+        trajectories: vec![trajectory],
+        resident_bytes: 36_000_000,
+    };
+    let session = "run-17".to_owned();
+    let summary =
+        Summary { outcome: Outcome::Completed, steps: 2, time_us: 200_000, distance_m: 1.75 };
+    let refused = Answer::Error {
+        seq: Some(3),
+        code: Code::PoseNotFinite,
+        message: "q[2] is NaN; a pose needs finite numbers".into(),
+        field: Some("pose.q[2]".into()),
+        fatal: false,
+    };
+    let fatal = Answer::Error {
+        seq: None,
+        code: Code::ShuttingDown,
+        message: "the server is shutting down; resume elsewhere".into(),
+        field: None,
+        fatal: true,
+    };
+    vec![
+        ("welcome", welcome),
+        ("opened", Answer::Opened(Box::new(opened))),
+        ("resumed", Answer::Resumed { seq: 1, session, last_seq: 4, step: 2, time_us: 200_000 }),
+        ("closed", Answer::Closed { seq: 8, summary }),
+        ("error", refused),
+        ("error_fatal", fatal),
+    ]
+}

@@ -1,0 +1,146 @@
+//! Golden observations: the frame, and what a client must find in it.
+
+use serde_json::{Value, json};
+use wildcity::client::{FrameError, ImageView, Observation};
+use wildcity::protocol::message::Encoding;
+
+use super::frames::{self, Frame, Recipe};
+use super::{blessing, check_file, check_json, read};
+
+/// The golden frames; `seq` is that of the request vector that it answers.
+fn golden() -> [(&'static str, u64, Recipe); 4] {
+    let raw = Recipe { encoding: Encoding::Raw, poses: 1, cameras: 2, depth: true };
+    [
+        ("raw", 3, raw),
+        ("png", 3, Recipe { encoding: Encoding::Png, depth: false, ..raw }),
+        ("jpeg", 3, Recipe { encoding: Encoding::Jpeg, cameras: 1, ..raw }),
+        ("two_poses", 5, Recipe { poses: 2, cameras: 1, depth: false, ..raw }),
+    ]
+}
+
+/// A frame whose every pixel is known.
+pub(crate) fn raw_frame() -> Frame {
+    let (_, seq, recipe) = golden()[0];
+    Frame::new(seq, recipe)
+}
+
+/// A frame with PNG files.
+pub(crate) fn png_frame() -> Frame {
+    let (_, seq, recipe) = golden()[1];
+    Frame::new(seq, recipe)
+}
+
+#[test]
+fn golden_frames_decode_to_what_went_in() {
+    for (name, seq, recipe) in golden() {
+        let frame = Frame::new(seq, recipe);
+        let file = format!("vectors/observations/{name}.bin");
+        // Encoded images may change with their encoder, and stay good.
+        if blessing() || recipe.encoding == Encoding::Raw {
+            check_file(&file, &frame.bytes());
+        }
+        check_json(
+            &format!("vectors/observations/{name}.expected.json"),
+            &expected(&frame, recipe),
+        );
+
+        let observation = Observation::decode(read(&file)).unwrap();
+        assert_eq!(observation.metadata(), &frame.metadata, "{name}");
+        observation.verify().unwrap();
+        check_history(&observation);
+        assert_eq!(observation.images().count() as u64, recipe.poses * recipe.cameras as u64);
+        for (number, image) in observation.images().enumerate() {
+            check_image(&image, recipe, number as u64);
+        }
+    }
+}
+
+#[test]
+fn raw_tensors_are_read_in_place() {
+    let observation = Observation::decode(read("vectors/observations/raw.bin")).unwrap();
+    let frame = observation.frame().as_ptr_range();
+    for image in observation.images() {
+        let rgb = image.rgb().unwrap();
+        assert!(frame.contains(&rgb.as_ptr()), "{} was copied", image.metadata().tensor);
+    }
+}
+
+#[test]
+fn a_wrong_pixel_or_hash_is_found() {
+    let mut frame = raw_frame();
+    frame.tensors[2].bytes[7] ^= 1;
+    let pixel = Observation::decode(frame.bytes()).unwrap().verify();
+    assert!(matches!(pixel, Err(FrameError::Hash { name, .. }) if name == "camera/front/rgb"));
+
+    let mut frame = raw_frame();
+    frame.metadata.frame_hash = "0".repeat(64);
+    let hash = Observation::decode(frame.bytes()).unwrap().verify();
+    assert!(matches!(hash, Err(FrameError::Hash { name, .. }) if name == "frame_hash"));
+}
+
+fn check_history(observation: &Observation) {
+    let xyz_m = observation.history_xyz_m();
+    let expected: Vec<f32> = (0..16).flat_map(frames::history_xyz_m).collect();
+    assert_eq!(xyz_m.as_ref(), expected);
+    let rot = observation.history_rot();
+    assert_eq!(rot.len(), 16 * 9);
+    assert_eq!(rot[15 * 9..], [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+}
+
+fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
+    let rgb = image.rgb().unwrap();
+    let (depth_m, opacity) = (image.depth_m(), image.opacity());
+    assert_eq!(depth_m.is_some(), recipe.depth);
+    assert_eq!(opacity.is_some(), recipe.depth);
+    for (pixel, rgb) in rgb.chunks_exact(3).enumerate() {
+        let (x, y) = (pixel as u64 % 4, pixel as u64 / 4);
+        let expected = frames::color(recipe, number, x, y);
+        let close = rgb.iter().zip(expected).all(|(&a, b)| a.abs_diff(b) <= tolerance(recipe));
+        assert!(close, "pixel ({x}, {y}) of image {number}: {rgb:?}, not {expected:?}");
+        if let Some(depth_m) = &depth_m {
+            assert_eq!(depth_m[pixel], frames::depth_m(number, x, y));
+        }
+        if let Some(opacity) = &opacity {
+            assert_eq!(opacity[pixel], frames::opacity(x, y));
+        }
+    }
+    assert_eq!(rgb.len(), 4 * 3 * 3);
+}
+
+/// How far a decoded channel may be off.
+fn tolerance(recipe: Recipe) -> u8 {
+    if recipe.encoding == Encoding::Jpeg { 4 } else { 0 }
+}
+
+/// What a client in any language can compare with; a few pixels of each image.
+fn expected(frame: &Frame, recipe: Recipe) -> Value {
+    let tensors: Vec<Value> = frame
+        .tensors
+        .iter()
+        .map(|t| {
+            // How long a JPEG or PNG file is belongs to its encoder.
+            let file = t.name.ends_with("/rgb") && recipe.encoding != Encoding::Raw;
+            let shape = if file { Value::Null } else { json!(t.shape) };
+            json!({"name": t.name, "dtype": t.dtype, "shape": shape})
+        })
+        .collect();
+    let images: Vec<Value> = (0..frame.metadata.images.len() as u64)
+        .map(|image| {
+            let pixels = [(0, 0), (3, 0), (1, 2)].map(|(x, y)| {
+                let depth_m = recipe.depth.then(|| frames::depth_m(image, x, y));
+                let opacity = recipe.depth.then(|| frames::opacity(x, y));
+                let rgb = frames::color(recipe, image, x, y);
+                json!({"x": x, "y": y, "rgb": rgb, "depth_m": depth_m, "opacity": opacity})
+            });
+            json!({"shape": [3, 4, 3], "pixels": pixels})
+        })
+        .collect();
+    json!({
+        "observation": frame.metadata,
+        "tensors": tensors,
+        "history_xyz_m_first": frames::history_xyz_m(0),
+        "history_xyz_m_last": frames::history_xyz_m(15),
+        "images": images,
+        "rgb_tolerance": tolerance(recipe),
+    })
+}

@@ -1,0 +1,15 @@
+//! The backends against each other, against images made by others, and at the extremes.
+
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/images.rs"]
+mod images;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+#[path = "../support/streets.rs"]
+mod streets;
+
+mod determinism;
+mod extremes;
+mod others;
+mod parity;
