@@ -18,13 +18,39 @@ impl Twins {
         if let Some(dir) = &self.twins {
             return Ok(dir.clone());
         }
-        let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-        let data = set("XDG_DATA_HOME").or_else(|| set("HOME").map(|h| h.join(".local/share")));
-        match data {
+        match user_dir("XDG_DATA_HOME", ".local/share") {
             Some(data) => Ok(data.join("wildcity/twins")),
             None => anyhow::bail!("neither HOME nor XDG_DATA_HOME is set: give --twins DIR"),
         }
     }
+}
+
+/// `--episodes`, for every command that records.
+#[derive(Debug, clap::Args)]
+pub(super) struct Episodes {
+    /// Directory where episodes are recorded [default: $XDG_STATE_HOME/wildcity/episodes, or
+    /// ~/.local/state/wildcity/episodes]
+    #[arg(long, value_name = "DIR")]
+    episodes: Option<PathBuf>,
+}
+
+impl Episodes {
+    /// The directory given, or the user's own.
+    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+        if let Some(dir) = &self.episodes {
+            return Ok(dir.clone());
+        }
+        match user_dir("XDG_STATE_HOME", ".local/state") {
+            Some(state) => Ok(state.join("wildcity/episodes")),
+            None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --episodes DIR"),
+        }
+    }
+}
+
+/// A directory of the XDG base directory specification: from the environment, or below HOME.
+fn user_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
+    let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))
 }
 
 /// A twin and perhaps one of its versions, as `street` or `street@3`.

@@ -1,11 +1,134 @@
 //! `wildcity replay`.
 
-/// Repeat a recorded episode and compare every frame.
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+
+use crate::residency::Cache;
+use crate::session::{FrameRequest, Recording, Redrawn};
+use crate::store::Catalog;
+
+use super::places::Twins;
+use super::progress;
+use super::scene_source::Engine;
+
+/// Show a recorded episode, render it again, and compare every frame.
+///
+/// Without --out or --verify, prints what was recorded. With either, renders it again and names the
+/// first step and camera whose pixels are not the recorded ones.
 #[derive(Debug, clap::Args)]
-pub(super) struct Replay {}
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Replay {
+    /// The episode's file, <session>-<n>.jsonl.
+    #[arg(value_name = "EPISODE")]
+    episode: PathBuf,
+
+    /// Render every frame again and fail with exit code 1 at the first that differs.
+    #[arg(long)]
+    verify: bool,
+
+    /// Write every image as DIR/<frame>_<request>_<camera>.png; made if it is missing.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    engine: Engine,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity replay ~/.local/state/wildcity/episodes/agent-1.jsonl
+  wildcity replay agent-1.jsonl --verify
+  wildcity replay agent-1.jsonl --out pictures --backend reference";
 
 impl Replay {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!("not built yet")
+        let recording = Recording::read(&self.episode)?;
+        let mut out = io::stdout().lock();
+        summary(&mut out, &recording)?;
+        if !self.verify && self.out.is_none() {
+            return Ok(());
+        }
+        if let Some(dir) = &self.out {
+            fs::create_dir_all(dir).with_context(|| format!("{}", dir.display()))?;
+        }
+        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let header = &recording.header;
+        let resident = cache.open(&header.twin, Some(header.version))?;
+        let backend = self.engine.backend()?;
+
+        let bar = progress::count("rendering");
+        bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
+        let report = recording.replay(&resident, &*backend, &mut |image| {
+            bar.inc(1);
+            match &self.out {
+                Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
+                None => Ok(()),
+            }
+        })?;
+        bar.finish_and_clear();
+
+        for change in &report.changes {
+            writeln!(out, "changed     {}: {} -> {}", change.what, change.recorded, change.now)?;
+        }
+        match &report.difference {
+            None => {
+                writeln!(out, "verified    {} images, all as recorded", report.images)?;
+                Ok(())
+            }
+            Some(difference) if self.verify => anyhow::bail!("differs at {difference}"),
+            Some(difference) => {
+                writeln!(out, "differs     {difference}")?;
+                Ok(())
+            }
+        }
     }
+}
+
+fn summary(out: &mut impl Write, recording: &Recording) -> io::Result<()> {
+    let Recording { header, frames, end } = recording;
+    let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
+    let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
+    writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
+    writeln!(out, "twin        {} version {}", header.twin, header.version)?;
+    writeln!(out, "manifest    {}", header.version_hash)?;
+    writeln!(out, "recorded by {}, backend {}", header.build, header.backend)?;
+    writeln!(out, "rig         {}: {}", header.rig.name, cameras.join(", "))?;
+    writeln!(out, "frames      {} with {images} images", frames.len())?;
+    match end {
+        Some(end) => writeln!(
+            out,
+            "end         {:?} after {} steps, {:.1} s, {:.1} m",
+            end.outcome,
+            end.steps,
+            end.time_us as f64 * 1e-6,
+            end.distance_m,
+        ),
+        None => writeln!(out, "end         not recorded: the episode still runs, or was cut off"),
+    }
+}
+
+fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
+    let Redrawn { frame, request, pose, camera, rgb8, .. } = image;
+    let request = match request {
+        FrameRequest::Reset => "reset".to_owned(),
+        FrameRequest::Step => "step".to_owned(),
+        FrameRequest::Observe => format!("observe{pose}"),
+    };
+    let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
+    let (width, height) = (camera.camera.width_px, camera.camera.height_px);
+    let write = || {
+        let mut file = BufWriter::new(File::create(&path)?);
+        PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
+            .write_image(rgb8, width, height, ExtendedColorType::Rgb8)?;
+        anyhow::Ok(file.flush()?)
+    };
+    write().with_context(|| format!("{}", path.display()))
 }

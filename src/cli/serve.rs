@@ -1,11 +1,69 @@
 //! `wildcity serve`.
 
+use std::io::{self, Write};
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use tracing_subscriber::EnvFilter;
+
+use crate::config;
+use crate::server::{self, Limits};
+
+use super::places::{Episodes, Twins};
+use super::scene_source::Engine;
+
 /// Serve twins to agents over WebSocket.
+///
+/// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
+/// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
 #[derive(Debug, clap::Args)]
-pub(super) struct Serve {}
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Serve {
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    episodes: Episodes,
+
+    /// Loopback address and port to listen on; port 0 takes a free one.
+    #[arg(long, value_name = "ADDR", default_value = config::LISTEN)]
+    listen: SocketAddr,
+
+    #[command(flatten)]
+    engine: Engine,
+
+    /// What to log, as `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
+    #[arg(long, value_name = "FILTER")]
+    log: Option<String>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity serve
+  wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
+  curl http://127.0.0.1:8080/v1/twins";
 
 impl Serve {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!("not built yet")
+        let log = self.log.or_else(|| std::env::var("RUST_LOG").ok());
+        let filter = EnvFilter::try_new(log.as_deref().unwrap_or("info"))?;
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
+        let config = server::Config {
+            listen: self.listen,
+            twins: self.twins.dir()?,
+            episodes: self.episodes.dir()?,
+            backend: Arc::from(self.engine.backend()?),
+            limits: Limits::default(),
+        };
+        tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display());
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        runtime.block_on(async {
+            let running = server::start(config).await?;
+            writeln!(io::stdout(), "listening on {}", running.url())?;
+            server::stop_signal().await?;
+            tracing::info!("stopping");
+            running.stop().await;
+            Ok(())
+        })
     }
 }

@@ -5,8 +5,10 @@
 //! strings there.
 //!
 //! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
-//! then per image `camera/<name>/rgb` u8, `camera/<name>/depth` f32 and `camera/<name>/opacity`
-//! f32 where asked for. With several poses (`observe`) image names start with `pose/<k>/`.
+//! then per image `camera/<name>/depth` f32 and `camera/<name>/opacity` f32 where asked for, then
+//! per image `camera/<name>/rgb` u8. The header's length is a multiple of 8 and floats come first,
+//! so that they lie on multiples of 4 and can be read in place. With several poses (`observe`)
+//! image names start with `pose/<k>/`.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
