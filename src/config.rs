@@ -111,3 +111,6 @@ pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 
 /// Largest rig or trajectory file: what fits a manifest.
 pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
+
+/// Largest camera list: 300 B per camera, so 50,000 cameras.
+pub const CAMERA_LIST_BYTES: u64 = 16 << 20;

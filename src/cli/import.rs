@@ -10,8 +10,9 @@ use serde::de::DeserializeOwned;
 use crate::config;
 use crate::ingest::{self, Axes};
 use crate::scene::manifest::Provenance;
+use crate::scene::rig::is_name;
 use crate::scene::{RenderProfile, Rig, Trajectory};
-use crate::store::{Catalog, NewVersion};
+use crate::store::{Catalog, NewVersion, StoreError};
 
 use super::places::Twins;
 use super::progress;
@@ -72,7 +73,10 @@ Examples:
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
         // Everything that is quick to check, before the long part.
-        let axes: Axes = self.axes.parse()?;
+        if !is_name(&self.twin) {
+            return Err(StoreError::Name { name: self.twin }.into());
+        }
+        let axes = self.axes.parse::<Axes>()?.scaled(self.scale)?;
         let mut profile = RenderProfile::default();
         for setting in &self.profile {
             profile.set(setting)?;
@@ -89,7 +93,7 @@ impl Import {
         let bar = progress::bytes("reading");
         let gaussians = ingest::read(&self.source, &mut progress::show(&bar));
         let mut gaussians = gaussians.with_context(cannot)?;
-        axes.apply(&mut gaussians, self.scale)?;
+        axes.apply(&mut gaussians);
         bar.finish_and_clear();
 
         let bar = progress::count("writing");

@@ -10,6 +10,7 @@ mod places;
 mod progress;
 mod render;
 mod replay;
+mod scene_source;
 mod serve;
 mod verify;
 

@@ -1,11 +1,130 @@
 //! `wildcity render`.
 
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+
+use crate::config;
+use crate::render::{Frame, Target};
+
+use super::progress;
+use super::scene_source::{SceneSource, Shot};
+
 /// Render cameras of a file to images.
+///
+/// Writes DIR/<name>.<format> for each camera of the list. PNG and JPEG hold the colour clamped to
+/// [0, 1] and rounded to 8 bit; npy holds float32 [height, width, 4]: linear premultiplied red,
+/// green, blue on black, and opacity.
 #[derive(Debug, clap::Args)]
-pub(super) struct Render {}
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Render {
+    #[command(flatten)]
+    source: SceneSource,
+
+    /// Directory for the images; made if it is missing.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+
+    /// What to write.
+    #[arg(long, value_enum, default_value_t)]
+    format: Format,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity render skull.ply --cameras front.json --out pictures
+  wildcity render street --cameras views.json --out truth --backend reference --format npy
+  wildcity render scene.ply --cameras views.json --out p --profile near=0.2 --profile alpha_cap=0.999";
+
+#[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
+enum Format {
+    #[default]
+    Png,
+    Jpeg,
+    Npy,
+}
 
 impl Render {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!("not built yet")
+        let ready = self.source.open()?;
+        fs::create_dir_all(&self.out).with_context(|| format!("{}", self.out.display()))?;
+        let bar = progress::count("rendering");
+        bar.set_length(ready.shots.len() as u64);
+        let mut out = io::stdout().lock();
+        for shot in &ready.shots {
+            let pixels = shot.view.camera.pixels();
+            let frame = Frame {
+                scene: &ready.scene,
+                profile: &shot.profile,
+                views: std::slice::from_ref(&shot.view),
+            };
+            let path = self.out.join(format!("{}.{}", shot.name, self.format.extension()));
+            let mut rgba = Vec::new();
+            let mut rgb8 = Vec::new();
+            let target = match self.format {
+                Format::Npy => {
+                    rgba.resize(4 * pixels, 0.0);
+                    Target { rgba: Some(&mut rgba), ..Target::default() }
+                }
+                Format::Png | Format::Jpeg => {
+                    rgb8.resize(3 * pixels, 0);
+                    Target { rgb8: Some(&mut rgb8), ..Target::default() }
+                }
+            };
+            ready.backend.render(&frame, &mut [target], &|_, _| {})?;
+            self.format
+                .write(&path, shot, &rgba, &rgb8)
+                .with_context(|| format!("{}", path.display()))?;
+            bar.inc(1);
+            writeln!(out, "{}", path.display())?;
+        }
+        bar.finish_and_clear();
+        Ok(())
     }
+}
+
+impl Format {
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Png => "png",
+            Self::Jpeg => "jpg",
+            Self::Npy => "npy",
+        }
+    }
+
+    fn write(self, path: &Path, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> anyhow::Result<()> {
+        let (width, height) = (shot.view.camera.width_px, shot.view.camera.height_px);
+        let file = || File::create(path).map(BufWriter::new);
+        match self {
+            Self::Png => {
+                PngEncoder::new_with_quality(file()?, CompressionType::Fast, FilterType::Adaptive)
+                    .write_image(rgb8, width, height, ExtendedColorType::Rgb8)?
+            }
+            Self::Jpeg => {
+                let encoder = jpeg_encoder::Encoder::new(file()?, config::JPEG_QUALITY);
+                let (width, height) = (u16::try_from(width)?, u16::try_from(height)?);
+                encoder.encode(rgb8, width, height, jpeg_encoder::ColorType::Rgb)?;
+            }
+            Self::Npy => write_npy(&mut file()?, [height, width, 4], rgba)?,
+        }
+        Ok(())
+    }
+}
+
+/// Version 1.0 of NumPy's format: magic, header length, a Python dict padded to 64 bytes, data.
+fn write_npy(out: &mut impl Write, shape: [u32; 3], values: &[f32]) -> io::Result<()> {
+    let [h, w, c] = shape;
+    let dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({h}, {w}, {c}), }}");
+    let padded = (10 + dict.len() + 1).next_multiple_of(64) - 10;
+    out.write_all(b"\x93NUMPY\x01\x00")?;
+    out.write_all(&(padded as u16).to_le_bytes())?;
+    writeln!(out, "{dict:width$}", width = padded - 1)?;
+    for value in values {
+        out.write_all(&value.to_le_bytes())?;
+    }
+    out.flush()
 }

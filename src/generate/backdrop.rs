@@ -63,7 +63,8 @@ fn sky_rgb(away: DVec3, seed: u64) -> DVec3 {
     // A flat layer of clouds, seen from below.
     let layer = away.truncate() / (away.z + 0.16);
     let octave = |scale: f64, seed: u64| noise(seed, scale * layer.x, scale * layer.y);
-    let cover = octave(1.1, seed + 20) + 0.55 * octave(2.6, seed + 21) + 0.3 * octave(6.0, seed + 22);
+    let cover =
+        octave(1.1, seed + 20) + 0.55 * octave(2.6, seed + 21) + 0.3 * octave(6.0, seed + 22);
     let cloud = smooth((cover - 0.12) / 0.65) * smooth((away.z - 0.02) / 0.12);
     let lit = DVec3::splat(0.97) - 0.10 * smooth((cover - 0.6) / 0.6) * DVec3::new(1.0, 0.9, 0.75);
     clear.lerp(lit, 0.88 * cloud)
@@ -86,10 +87,15 @@ fn skyline(painter: &mut Painter, middle_m: DVec3, seed: u64) {
         let half_m = 0.5 * width_rad * away_m;
         let us = painter.even(-half_m, half_m, 4.5);
         let vs = painter.even(0.0, height_m, 4.5);
-        painter.sheet(&us, &vs, |u_m, v_m| foot_m + u_m * right + v_m * DVec3::Z, |u_m, v_m| {
-            let rgb = wall * (1.0 + 0.05 * noise(seed + 23, 0.3 * u_m, 0.3 * v_m));
-            Some(Paint::glowing(rgb.x, rgb.y, rgb.z))
-        });
+        painter.sheet(
+            &us,
+            &vs,
+            |u_m, v_m| foot_m + u_m * right + v_m * DVec3::Z,
+            |u_m, v_m| {
+                let rgb = wall * (1.0 + 0.05 * noise(seed + 23, 0.3 * u_m, 0.3 * v_m));
+                Some(Paint::glowing(rgb.x, rgb.y, rgb.z))
+            },
+        );
         azimuth_rad += 0.9 * width_rad;
     }
 }

@@ -1,6 +1,6 @@
 //! Houses: which stand where, and what is above and beside their facades.
 
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec3};
 
 use super::facade::{self, GroundFloor, Style, Wall};
 use super::light::Occluder;
@@ -41,7 +41,8 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
             let style = style(&mut random, main);
             let (s_m, _) = route.project(front.at(0.5 * front.width_m, 0.0, 0.0));
             let driven = main && (-5.0..route.length_m + 5.0).contains(&s_m);
-            let spacing = if driven { 1.0 } else { 2.1 };
+            let spacing = if driven { 1.0 } else { 2.5 };
+            let style = Style { near: driven, ..style };
             let last = index + 2 == breaks_m.len();
             buildings.push(Building {
                 front,
@@ -113,6 +114,7 @@ impl Building {
         let mut random = self.random.clone();
         painter.coarser(self.spacing, |painter| {
             facade::paint(painter, &self.front, &self.style, &mut random);
+            self.back(painter, &self.front);
             self.sides(painter, &mut random);
             self.roof(painter, &mut random);
         });
@@ -128,12 +130,10 @@ impl Building {
         for side in 0..2 {
             let (wall, top_m) = (walls[side], self.style.height_m());
             if self.open_sides[side] {
-                let style = Style {
-                    balconies: false,
-                    ground_floor: GroundFloor::Flats,
-                    ..self.style
-                };
+                let style =
+                    Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };
                 painter.coarser(1.25, |painter| facade::paint(painter, &wall, &style, random));
+                self.back(painter, &wall);
             } else if self.neighbours_m[side] < top_m {
                 let us = painter.even(0.0, DEPTH_M, 0.8);
                 let vs = painter.even(self.neighbours_m[side], top_m, 0.8);
@@ -146,7 +146,23 @@ impl Building {
         }
     }
 
-    /// A tiled slope behind the eaves, a ridge, and chimneys.
+    /// The dark of the rooms, 1.6 m behind a wall: what is seen between its surfels.
+    fn back(&self, painter: &mut Painter, wall: &Wall) {
+        let (inset_m, top_m) = (1.6, self.style.height_m() - 1.6);
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(wall.right, DVec3::Z, wall.out));
+        let us = painter.even(inset_m, wall.width_m - inset_m, 2.2);
+        let vs = painter.even(0.6, top_m, 2.2);
+        for v in vs.windows(2) {
+            for u in us.windows(2) {
+                let middle_m = wall.at(0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1]), -inset_m);
+                let sigmas_m = DVec3::new(0.65 * (u[1] - u[0]), 0.65 * (v[1] - v[0]), 0.05);
+                let rgb = 0.38 * self.style.wall.rgb;
+                painter.gaussian(middle_m, rotation, sigmas_m, 0.96, rgb, DVec3::ZERO);
+            }
+        }
+    }
+
+    /// A tiled slope behind the eaves up to the ridge, gables on both sides, and chimneys.
     fn roof(&self, painter: &mut Painter, random: &mut Random) {
         let (wall, eaves_m) = (self.front, self.style.height_m());
         let tiles = random.pick(&[
@@ -155,17 +171,27 @@ impl Building {
             Paint::matt(0.36, 0.36, 0.39),
             Paint::matt(0.42, 0.38, 0.36),
         ]);
-        let (run_m, rise_m) = (5.0, random.range(2.4, 3.6));
-        let us = painter.even(-0.1, wall.width_m + 0.1, 0.50);
-        let vs = painter.even(0.0, 1.0, 0.07);
-        let place = |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
+        let (run_m, rise_m) = (0.5 * DEPTH_M, random.range(2.8, 4.0));
+        let us = painter.graded(-0.1, wall.width_m + 0.1, 0.3, 0.9);
+        let vs = painter.even(0.0, 1.0, 0.12);
+        let place =
+            |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
         let courses = |u_m: f64, t: f64| 0.07 * noise(11, 2.0 * u_m, (t * 24.0).floor());
         painter.sheet(&us, &vs, place, |u_m, t| Some(tiles.times(1.0 + courses(u_m, t))));
+
+        let gable = self.style.wall.times(0.92);
+        let depths = [painter.even(-DEPTH_M, 0.0, 0.9), painter.even(0.0, DEPTH_M, 0.9)];
+        for (u_m, depths, sign) in [(0.0, &depths[0], 1.0), (wall.width_m, &depths[1], -1.0)] {
+            let top_m = |depth_m: f64| rise_m * (1.0 - (depth_m / run_m + 1.0).abs());
+            let place =
+                |d_m: f64, t: f64| wall.at(u_m, eaves_m + t * top_m(sign * d_m), sign * d_m);
+            painter.sheet(depths, &[0.0, 0.35, 0.65, 0.85, 0.96, 1.0], place, |_, _| Some(gable));
+        }
 
         let brick = Paint::matt(0.52, 0.36, 0.31);
         for _ in 0..1 + random.below(2) {
             let u_m = random.range(1.5, wall.width_m - 1.5);
-            let at_m = wall.at(u_m, eaves_m, -run_m + 0.8);
+            let at_m = wall.at(u_m, eaves_m, -run_m + 0.3);
             let (half_m, top_m) = (0.38, rise_m + 1.1);
             let vs = painter.even(rise_m - 1.0, top_m, 0.35);
             let corners = [
@@ -177,9 +203,12 @@ impl Building {
             for side in 0..4 {
                 let face = Wall::between(corners[side], corners[(side + 1) % 4]);
                 let us = painter.even(0.0, face.width_m, 0.38);
-                painter.sheet(&us, &vs, |u_m, v_m| face.at(u_m, v_m, 0.0), |_, v_m| {
-                    Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick })
-                });
+                painter.sheet(
+                    &us,
+                    &vs,
+                    |u_m, v_m| face.at(u_m, v_m, 0.0),
+                    |_, v_m| Some(if v_m > top_m - 0.2 { brick.times(1.25) } else { brick }),
+                );
             }
         }
     }
@@ -238,6 +267,7 @@ fn style(random: &mut Random, main_street: bool) -> Style {
         window_m: random.range(1.5, 1.9),
         brick,
         balconies: random.chance(0.35),
+        near: true,
         ground_floor: if shop { GroundFloor::Shop } else { GroundFloor::Flats },
     }
 }

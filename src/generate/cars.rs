@@ -1,10 +1,10 @@
 //! Parked cars: one body, lofted through outlines that each kind gives as a table.
 
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec3};
 
 use super::light::Occluder;
 use super::random::{Random, smooth};
-use super::surface::{Paint, Painter, Patch};
+use super::surface::{Paint, Painter};
 
 /// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
 ///
@@ -111,11 +111,14 @@ pub(super) struct Car {
     forward: DVec3,
     left: DVec3,
     paint: Paint,
+    spacing: f64,
 }
 
 impl Car {
     /// A car with its middle on `middle_m` that looks along `forward`.
-    pub(super) fn new(middle_m: DVec3, forward: DVec3, mut random: Random) -> Self {
+    ///
+    /// `spacing` above 1 is for cars that are seen from afar only.
+    pub(super) fn new(middle_m: DVec3, forward: DVec3, spacing: f64, mut random: Random) -> Self {
         let kind = random.pick(&[&HATCHBACK, &HATCHBACK, &SEDAN, &SEDAN, &WAGON, &WAGON, &VAN]);
         let paint = random.pick(&[
             Paint::matt(0.86, 0.87, 0.88),
@@ -129,7 +132,7 @@ impl Car {
         ]);
         let left = DVec3::Z.cross(forward);
         let tail_m = middle_m - 0.5 * kind.length_m * forward;
-        Self { kind, tail_m, forward, left, paint: paint.gloss(0.14) }
+        Self { kind, tail_m, forward, left, paint: paint.gloss(0.14), spacing }
     }
 
     /// What stands in the sun's way: the body and the cabin, a little smaller than painted.
@@ -153,6 +156,10 @@ impl Car {
 
     /// Paints body, glass, lamps and wheels.
     pub(super) fn paint(&self, painter: &mut Painter) {
+        painter.coarser(self.spacing, |painter| self.paint_all(painter));
+    }
+
+    fn paint_all(&self, painter: &mut Painter) {
         let xs = self.lengthwise(painter);
         for side in [-1.0, 1.0] {
             self.flank(painter, &xs, side);
@@ -165,6 +172,21 @@ impl Car {
         self.end(painter, 1.0);
         self.end(painter, 0.0);
         self.shade_below(painter);
+        self.inside(painter);
+    }
+
+    /// The dark inside: seats and shadow, what is seen between the surfels.
+    fn inside(&self, painter: &mut Painter) {
+        let Kind { length_m, width_m, .. } = *self.kind;
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(self.forward, self.left, DVec3::Z));
+        for (x, z_m, half_m) in
+            [(0.22, 0.58, 0.26), (0.5, 0.58, 0.26), (0.78, 0.52, 0.20), (0.37, 0.98, 0.16)]
+        {
+            let mean_m = self.place(x * length_m, 0.0, z_m);
+            let sigmas_m = DVec3::new(0.07 * length_m, 0.16 * width_m, 0.5 * half_m);
+            let rgb = DVec3::new(0.09, 0.09, 0.10);
+            painter.gaussian(mean_m, rotation, sigmas_m, 0.97, rgb, DVec3::ZERO);
+        }
     }
 
     /// Break points along the car, in metres from the tail: at every feature, and evenly between.
@@ -178,7 +200,7 @@ impl Car {
         features.dedup_by(|b, a| *b - *a < 0.012);
         let mut xs = vec![0.0];
         for pair in features.windows(2) {
-            let steps = painter.even(pair[0] * kind.length_m, pair[1] * kind.length_m, 0.12);
+            let steps = painter.even(pair[0] * kind.length_m, pair[1] * kind.length_m, 0.14);
             xs.extend(&steps[1..]);
         }
         xs
@@ -207,7 +229,7 @@ impl Car {
     /// The side from sill to shoulder, slightly bellied, with the wheel arches cut out.
     fn flank(&self, painter: &mut Painter, xs: &[f64], side: f64) {
         let length_m = self.kind.length_m;
-        let vs = painter.even(0.0, 1.0, 0.14);
+        let vs = painter.even(0.0, 1.0, 0.16);
         let place = |x_m: f64, v: f64| {
             let x = x_m / length_m;
             let belly = 1.0 - 0.10 * (1.0 - v) * (1.0 - v) - 0.03 * v * v;
@@ -231,9 +253,11 @@ impl Car {
                 if arch {
                     return None;
                 }
-                let seam = self.kind.side_glass.iter().any(|glass| {
-                    (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36
-                });
+                let seam = self
+                    .kind
+                    .side_glass
+                    .iter()
+                    .any(|glass| (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36);
                 let sill = if z_m < 0.34 { 0.45 } else { 1.0 };
                 let shade = if seam { 0.72 } else { 1.0 };
                 let open = 0.62 + 0.38 * smooth((z_m - 0.1) / 0.6);
@@ -249,7 +273,7 @@ impl Car {
         let mut vs = vec![0.0, 0.12];
         vs.extend(painter.even(0.12, 0.86, 0.25).into_iter().skip(1));
         vs.push(1.0);
-        vs.extend(painter.even(1.0, 2.0, 0.24).into_iter().skip(1));
+        vs.extend(painter.even(1.0, 2.0, 0.34).into_iter().skip(1));
         let section = |x_m: f64, v: f64| {
             let x = x_m / length_m;
             let (belt_m, top_m) = (self.belt_m(x), self.middle_line_m(x));
@@ -280,8 +304,8 @@ impl Car {
                 let side_glass = (0.12..0.86).contains(&v)
                     && cabin_m > 0.14
                     && self.kind.side_glass.iter().any(|&glass| within(x, glass));
-                let screen = v > 1.0
-                    && (within(x, self.kind.windscreen) || within(x, self.kind.rear_glass));
+                let screen =
+                    v > 1.0 && (within(x, self.kind.windscreen) || within(x, self.kind.rear_glass));
                 Some(if side_glass || screen { glass() } else { self.paint })
             },
         );
@@ -294,7 +318,7 @@ impl Car {
         let (half_m, top_m) = (0.97 * self.half_width_m(x), self.belt_m(x) + 0.01);
         // As seen from outside, u runs to the right: the car's left when one looks at its nose.
         let ys = painter.graded(-half_m, half_m, 0.10, 0.14);
-        let zs = painter.even(SILL_M - 0.02, top_m, 0.075);
+        let zs = painter.even(SILL_M - 0.02, top_m, 0.08);
         let bulge = |y_m: f64| 0.05 * (1.0 - (y_m / half_m).powi(2));
         let place = |u_m: f64, z_m: f64| {
             let x_m = x * self.kind.length_m + outwards * bulge(u_m);
@@ -305,18 +329,20 @@ impl Car {
             let lamp = aside_m > half_m - 0.30 && (0.62..0.98).contains(&height);
             let plate = aside_m < 0.26 && (0.30..0.55).contains(&height);
             let grille = nose && aside_m < half_m - 0.36 && (0.62..0.95).contains(&height);
-            Some(if lamp && nose {
-                Paint::matt(0.93, 0.94, 0.96).gloss(0.2)
-            } else if lamp {
-                Paint::matt(0.74, 0.09, 0.08).gloss(0.1)
-            } else if plate {
-                Paint::matt(0.90, 0.90, 0.87)
-            } else if grille || height < 0.22 {
-                Paint::matt(0.12, 0.12, 0.13).gloss(0.05)
-            } else {
-                self.paint
-            }
-            .open(0.65 + 0.35 * smooth(height / 0.6)))
+            Some(
+                if lamp && nose {
+                    Paint::matt(0.93, 0.94, 0.96).gloss(0.2)
+                } else if lamp {
+                    Paint::matt(0.74, 0.09, 0.08).gloss(0.1)
+                } else if plate {
+                    Paint::matt(0.90, 0.90, 0.87)
+                } else if grille || height < 0.22 {
+                    Paint::matt(0.12, 0.12, 0.13).gloss(0.05)
+                } else {
+                    self.paint
+                }
+                .open(0.65 + 0.35 * smooth(height / 0.6)),
+            )
         });
     }
 
@@ -362,21 +388,26 @@ impl Car {
         });
     }
 
-    /// A door mirror: one blob.
+    /// A door mirror: a small box with glass towards the tail.
     fn mirror(&self, painter: &mut Painter, side: f64) {
         let x = self.kind.windscreen[1] - 0.055;
-        let center_m = self.place(
-            x * self.kind.length_m,
-            side * (self.half_width_m(x) + 0.06),
-            self.belt_m(x) + 0.09,
-        );
-        for (edge_u_m, edge_v_m) in [
-            (0.20 * side * self.left, 0.14 * DVec3::Z),
-            (-0.20 * side * self.left, 0.14 * DVec3::Z),
-            (-0.12 * side * self.forward, 0.14 * DVec3::Z),
-        ] {
-            painter.patch(&Patch { center_m, edge_u_m, edge_v_m }, self.paint.times(0.9));
+        let (x_m, z_m) = (x * self.kind.length_m, self.belt_m(x) + 0.03);
+        let inner_m = self.half_width_m(x) - 0.04;
+        let ys = [0.0, 0.06, 0.12, 0.18];
+        let zs = [0.0, 0.06, 0.12];
+        // Towards the tail u runs to the car's right, towards the nose to its left.
+        for (forward_m, sign) in [(-0.05, -1.0), (0.05, 1.0)] {
+            let us = facing(&ys, sign * side);
+            let place = |u_m: f64, v_m: f64| {
+                self.place(x_m + forward_m, side * inner_m + sign * u_m, z_m + v_m)
+            };
+            painter.sheet(&us, &zs, place, |_, _| {
+                Some(if sign < 0.0 { glass() } else { self.paint.times(0.85) })
+            });
         }
+        let outer =
+            |u_m: f64, v_m: f64| self.place(x_m - side * u_m, side * (inner_m + 0.18), z_m + v_m);
+        painter.sheet(&[-0.05, 0.05], &zs, outer, |_, _| Some(self.paint.times(0.85)));
     }
 
     /// The dark between the wheels, 2 cm above the road.
@@ -384,10 +415,15 @@ impl Car {
         let (half_m, length_m) = (0.5 * self.kind.width_m, self.kind.length_m);
         let xs = painter.even(0.02, length_m - 0.02, 0.26);
         let ys = painter.even(-half_m + 0.02, half_m - 0.02, 0.26);
-        painter.sheet(&xs, &ys, |x_m, y_m| self.place(x_m, y_m, 0.02), |x_m, y_m| {
-            let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
-            Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
-        });
+        painter.sheet(
+            &xs,
+            &ys,
+            |x_m, y_m| self.place(x_m, y_m, 0.02),
+            |x_m, y_m| {
+                let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
+                Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
+            },
+        );
     }
 }
 

@@ -39,8 +39,6 @@ pub(super) enum GroundFloor {
     Flats,
     /// Shop windows with a sign and awnings.
     Shop,
-    /// Nothing but the wall: towards a neighbour or a yard.
-    Blind,
 }
 
 /// How a house looks from outside.
@@ -66,6 +64,8 @@ pub(super) struct Style {
     pub(super) balconies: bool,
     /// What fills the ground floor.
     pub(super) ground_floor: GroundFloor,
+    /// Whether one can drive past: then the windows have all their parts.
+    pub(super) near: bool,
 }
 
 /// Height of a ground floor, in metres.
@@ -90,7 +90,6 @@ pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &
     for bay in 0..count {
         let u_m = bay as f64 * facade.bay_m;
         match style.ground_floor {
-            GroundFloor::Blind => facade.plain([u_m, u_m + facade.bay_m], [0.0, GROUND_FLOOR_M]),
             _ if bay == door => facade.door_bay(u_m),
             GroundFloor::Shop => facade.shop_bay(u_m, random),
             GroundFloor::Flats => facade.window_bay(u_m, [0.0, GROUND_FLOOR_M], 1.25, random),
@@ -99,13 +98,13 @@ pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &
     for floor in 0..style.upper_floors {
         let from_m = GROUND_FLOOR_M + FLOOR_M * floor as f64;
         // What is higher is farther from every camera.
-        facade.painter.coarser(1.0 + 0.22 * floor as f64, |painter| {
+        facade.painter.coarser(1.0 + 0.32 * floor as f64, |painter| {
             let mut facade = Facade { painter, ..facade };
             for bay in 0..count {
                 let u_m = bay as f64 * facade.bay_m;
                 facade.window_bay(u_m, [from_m, from_m + FLOOR_M], 0.85, random);
                 let centred = bay % 2 == count / 2 % 2;
-                if style.balconies && centred {
+                if style.balconies && style.near && centred {
                     facade.balcony(u_m + 0.5 * facade.bay_m, from_m);
                 }
             }
@@ -121,10 +120,8 @@ struct Facade<'p, 'a, 'w> {
     bay_m: f64,
 }
 
-/// Spacing at edges of colour, in metres.
-const EDGE_M: f64 = 0.07;
-/// Spacing on plain wall, in metres.
-const PLAIN_M: f64 = 0.38;
+/// Spacing on plain wall, beside an opening and in between, in metres. Surrounds cover its edge.
+const WALL_M: [f64; 2] = [0.15, 0.52];
 /// How deep window panes lie in the wall, in metres.
 const RECESS_M: f64 = 0.14;
 
@@ -135,21 +132,32 @@ impl Facade<'_, '_, '_> {
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
         let v = [v_m[0] + sill_m, (v_m[0] + sill_m + self.style.window_m).min(v_m[1] - 0.35)];
-        self.plain([u_m, u[0]], v_m);
-        self.plain([u[1], u_m + self.bay_m], v_m);
+        self.pier([u_m, u[0]], v_m);
+        self.pier([u[1], u_m + self.bay_m], v_m);
         self.plain(u, [v_m[0], v[0]]);
         self.plain(u, [v[1], v_m[1]]);
         self.surround(u, v);
         self.window(u, v, random);
     }
 
-    /// Wall without anything in it, fine at its sides.
+    /// Wall beside openings: fine at its sides.
+    fn pier(&mut self, u: [f64; 2], v: [f64; 2]) {
+        let us = self.painter.graded(u[0], u[1], WALL_M[0], WALL_M[1]);
+        let vs = self.painter.even(v[0], v[1], 0.62);
+        self.wall(&us, &vs);
+    }
+
+    /// Wall above or below an opening: fine at its top and bottom.
     fn plain(&mut self, u: [f64; 2], v: [f64; 2]) {
-        let us = self.painter.graded(u[0], u[1], EDGE_M, PLAIN_M);
-        let vs = self.painter.graded(v[0], v[1], EDGE_M, PLAIN_M);
+        let us = self.painter.even(u[0], u[1], WALL_M[1]);
+        let vs = self.painter.graded(v[0], v[1], WALL_M[0], WALL_M[1]);
+        self.wall(&us, &vs);
+    }
+
+    fn wall(&mut self, us: &[f64], vs: &[f64]) {
         let style = *self.style;
         let at_m = self.wall.corner_m;
-        self.rect(&us, &vs, 0.0, |u_m, v_m| {
+        self.rect(us, vs, 0.0, |u_m, v_m| {
             // Stains run down, splashes from the pavement darken the foot.
             let seed = (at_m.x * 16.0) as i64 as u64;
             let stain = 0.030 * noise(seed, 1.3 * u_m, 0.25 * v_m)
@@ -177,6 +185,9 @@ impl Facade<'_, '_, '_> {
         self.rect(&us, &[v[1], v[1] + wide_m + 0.03], out_m, |_, _| trim);
         // The sill stands out: its top, its face, and the shade below it.
         self.rect(&us, &[v[0] - 0.09, v[0]], 0.10, |_, _| trim.times(1.04));
+        if !self.style.near {
+            return;
+        }
         self.rect(&us, &[v[0] - 0.19, v[0] - 0.10], 0.01, |_, _| trim.times(0.72));
         // Reveals: the wall's thickness beside and above the panes.
         let shade = self.style.wall.open(0.6);
@@ -197,12 +208,18 @@ impl Facade<'_, '_, '_> {
         let middle_m = 0.5 * (u[0] + u[1]);
         let transom_m = v[1] - 0.30 * (v[1] - v[0]);
         let verticals = [u[0] + 0.5 * rim_m, middle_m, u[1] - 0.5 * rim_m];
+        if !self.style.near {
+            let us = self.painter.even(u[0], u[1], 0.2);
+            let vs = self.painter.even(v[0], v[1], 0.2);
+            return self.rect(&us, &vs, depth_m, |_, _| glass());
+        }
         for at_m in verticals {
             let vs = self.painter.even(v[0], v[1], 0.34);
             let us = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
             self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
         }
-        for at_m in [v[0] + 0.5 * rim_m, transom_m, v[1] - 0.5 * rim_m] {
+        let horizontals = [v[0] + 0.5 * rim_m, transom_m, v[1] - 0.5 * rim_m];
+        for at_m in horizontals {
             let us = self.painter.even(u[0], u[1], 0.30);
             let vs = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
             self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
@@ -217,9 +234,9 @@ impl Facade<'_, '_, '_> {
             Paint::matt(0.58, 0.47, 0.40),
         ]);
         for [u0, u1] in [[u[0] + rim_m, middle_m], [middle_m, u[1] - rim_m]] {
-            let us = self.painter.graded(u0, u1, 0.09, 0.26);
+            let us = self.painter.graded(u0, u1, 0.12, 0.26);
             for [v0, v1] in [[v[0] + rim_m, transom_m], [transom_m, v[1] - rim_m]] {
-                let vs = self.painter.graded(v0, v1, 0.10, 0.34);
+                let vs = self.painter.even(v0, v1, 0.27);
                 let [left_m, right_m] = u;
                 let [low_m, high_m] = v;
                 self.rect(&us, &vs, depth_m, |u_m, v_m| {
@@ -243,8 +260,8 @@ impl Facade<'_, '_, '_> {
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
         let (door_m, light_m) = (2.35, 3.0);
-        self.plain([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
-        self.plain([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
+        self.pier([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
+        self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
         self.plain(u, [light_m, GROUND_FLOOR_M]);
         self.surround(u, [0.30, light_m]);
         let wood = self.style.accent.times(0.75);
@@ -253,13 +270,13 @@ impl Facade<'_, '_, '_> {
         self.rect(&us, &vs, -RECESS_M, |at_m, v_m| {
             let panel = |x: f64, from: f64, to: f64| (from..to).contains(&x);
             let aside_m = (at_m - middle_m).abs() / half_m;
-            let inset = panel(aside_m, 0.15, 0.8)
-                && (panel(v_m, 0.25, 0.95) || panel(v_m, 1.15, 2.1));
+            let inset =
+                panel(aside_m, 0.15, 0.8) && (panel(v_m, 0.25, 0.95) || panel(v_m, 1.15, 2.1));
             wood.times(if inset { 0.78 } else { 1.0 }).gloss(0.06)
         });
         let vs = self.painter.graded(door_m, light_m, 0.08, 0.25);
         self.rect(&us, &vs, -RECESS_M, |_, v_m| {
-            if v_m < door_m + 0.1 { self_frame() } else { glass() }
+            if v_m < door_m + 0.1 { Paint::matt(0.80, 0.79, 0.76) } else { glass() }
         });
         let step = Paint::matt(0.62, 0.61, 0.59);
         let wall = *self.wall;
@@ -272,7 +289,7 @@ impl Facade<'_, '_, '_> {
             edge_u_m: 0.16 * wall.right,
             edge_v_m: 0.26 * DVec3::Z,
         };
-        self.painter.patch(&lamp, Paint::glowing(0.98, 0.92, 0.75));
+        self.painter.patch(&lamp, Paint::matt(0.90, 0.86, 0.74));
     }
 
     /// A bay of shop window: plinth, glass with goods behind it, sign, awning.
@@ -281,11 +298,13 @@ impl Facade<'_, '_, '_> {
         let pier_m = 0.22;
         let u = [u_m + pier_m, u_m + self.bay_m - pier_m];
         let (plinth_m, head_m, sign_m) = (0.45, 2.75, 3.45);
-        self.plain([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
-        self.plain([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
+        self.pier([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
+        self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
         self.plain(u, [sign_m, GROUND_FLOOR_M]);
         let us = self.painter.graded(u[0], u[1], 0.08, 0.3);
-        self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| accent.times(0.7).open(0.7 + 0.5 * v_m));
+        self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| {
+            accent.times(0.7).open(0.7 + 0.5 * v_m)
+        });
         // Goods: blurred shelves of colours behind the glass.
         let seed = random.below(1 << 30) as u64;
         let panes = self.painter.graded(plinth_m, head_m, 0.08, 0.22);
@@ -294,11 +313,13 @@ impl Facade<'_, '_, '_> {
             if mullion || v_m > head_m - 0.09 || v_m < plinth_m + 0.08 {
                 return frame;
             }
-            let shelf = (v_m / 0.42).floor();
-            let goods = |channel: u64| noise(seed + channel, 3.2 * at_m, 1.7 * shelf);
-            let warm = 0.5 + 0.5 * smooth((v_m - 1.2) / 1.4);
-            let mut paint = Paint::matt(0.42, 0.37, 0.31).times(0.75 + 0.5 * warm).gloss(0.22);
-            paint.rgb += 0.16 * DVec3::new(goods(0), goods(1), goods(2));
+            // Below the eyes goods stand on shelves, above is the lit room.
+            let shelf = (v_m / 0.5).floor();
+            let goods = |channel: u64| noise(seed + channel, 2.3 * at_m, 1.7 * shelf);
+            let room = smooth((v_m - 1.5) / 0.5);
+            let mut paint = Paint::matt(0.44, 0.40, 0.35).times(0.85 + 0.45 * room).gloss(0.26);
+            let hue = DVec3::new(goods(0), goods(1), goods(2)) * 0.07;
+            paint.rgb += (1.0 - room) * (hue + 0.12 * goods(3));
             paint
         });
         // The sign, with blocks that pass for letters.
@@ -362,7 +383,7 @@ impl Facade<'_, '_, '_> {
     fn bands(&mut self) {
         let (width_m, top_m) = (self.wall.width_m, self.style.height_m());
         let trim = self.style.trim;
-        let us = self.painter.even(0.0, width_m, 0.45);
+        let us = self.painter.even(0.0, width_m, 0.6);
         let band = [GROUND_FLOOR_M - 0.16, GROUND_FLOOR_M - 0.03, GROUND_FLOOR_M + 0.10];
         self.rect(&us, &band, 0.09, |_, v_m| trim.times(0.8 + 0.2 * smooth((v_m - band[0]) / 0.1)));
         let base_m = top_m - CORNICE_M;
@@ -383,8 +404,4 @@ impl Facade<'_, '_, '_> {
 
 fn glass() -> Paint {
     Paint::matt(0.26, 0.31, 0.36).gloss(0.34)
-}
-
-fn self_frame() -> Paint {
-    Paint::matt(0.80, 0.79, 0.76)
 }

@@ -86,8 +86,8 @@ pub(super) fn planter(
 fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
     let axis = (ends_m[1] - ends_m[0]).normalize();
     let (side, front) = axis.any_orthonormal_pair();
-    let around = painter.even(0.0, std::f64::consts::TAU, 0.9);
-    let step_m = (4.0 * radius_m).clamp(0.12, 0.30);
+    let around = painter.even(0.0, std::f64::consts::TAU, 1.05);
+    let step_m = (5.0 * radius_m).clamp(0.15, 0.40);
     let along = painter.even(0.0, ends_m[0].distance(ends_m[1]), step_m);
     let place = |angle_rad: f64, z_m: f64| {
         let (sin, cos) = angle_rad.sin_cos();
@@ -107,9 +107,12 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
         let width_m = from_m.distance(to_m);
         let right = (to_m - from_m) / width_m;
         let us = painter.graded(0.0, width_m, 0.10, 0.24);
-        painter.sheet(&us, &vs, |u_m, v_m| from_m + u_m * right + v_m * DVec3::Z, |_, v_m| {
-            Some(paint.open(0.75 + 0.25 * (v_m / size_m.z)))
-        });
+        painter.sheet(
+            &us,
+            &vs,
+            |u_m, v_m| from_m + u_m * right + v_m * DVec3::Z,
+            |_, v_m| Some(paint.open(0.75 + 0.25 * (v_m / size_m.z))),
+        );
     }
     let (us, vs) = ([-1.0, -0.4, 0.4, 1.0], [-1.0, 0.0, 1.0]);
     let lid = |i: f64, j: f64| corner(i, j) + size_m.z * DVec3::Z;

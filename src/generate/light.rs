@@ -10,11 +10,11 @@ use super::random::{noise, smooth};
 const TO_SUN: DVec3 = DVec3::new(-0.600, -0.400, 0.693);
 
 /// Light from the sun on a surface that faces it, red, green, blue.
-const SUN: DVec3 = DVec3::new(1.24, 1.14, 0.98);
+const SUN: DVec3 = DVec3::new(1.22, 1.11, 0.94);
 /// Light from the whole sky on a surface that faces up.
-const SKY: DVec3 = DVec3::new(0.36, 0.41, 0.50);
+const SKY: DVec3 = DVec3::new(0.50, 0.55, 0.63);
 /// Light that the ground throws back on a surface that faces down.
-const GROUND: DVec3 = DVec3::new(0.20, 0.19, 0.17);
+const GROUND: DVec3 = DVec3::new(0.28, 0.27, 0.25);
 
 /// Side of a cell of the shadow grid, in metres.
 const CELL_M: f64 = 6.0;

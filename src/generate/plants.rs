@@ -12,15 +12,18 @@ pub(super) struct Tree {
     foot_m: DVec3,
     trunk_m: f64,
     crown_m: f64,
+    near: bool,
     random: Random,
 }
 
 impl Tree {
     /// A tree whose trunk stands at `foot_m`.
-    pub(super) fn new(foot_m: DVec3, mut random: Random) -> Self {
-        let trunk_m = random.range(2.9, 3.5);
-        let crown_m = random.range(1.55, 2.05);
-        Self { foot_m, trunk_m, crown_m, random }
+    ///
+    /// `near` is whether one can drive past: then it has all its leaves.
+    pub(super) fn new(foot_m: DVec3, near: bool, mut random: Random) -> Self {
+        let trunk_m = random.range(3.1, 3.7);
+        let crown_m = random.range(1.9, 2.5);
+        Self { foot_m, trunk_m, crown_m, near, random }
     }
 
     /// What stands in the sun's way.
@@ -52,12 +55,14 @@ impl Tree {
             Paint::matt(0.50, 0.57, 0.25),
             Paint::matt(0.34, 0.48, 0.27),
         ]);
-        for _ in 0..11 {
-            let away = ball(&mut random) * DVec3::new(0.62, 0.62, 0.72);
+        let (leaves, size_m) = if self.near { (88, 0.057) } else { (26, 0.115) };
+        for _ in 0..14 {
+            let away = ball(&mut random) * DVec3::new(0.64, 0.64, 0.72);
             let middle_m = self.middle_m() + self.crown_m * away;
-            let radius_m = self.crown_m * random.range(0.40, 0.56);
+            let radii_m = DVec3::splat(self.crown_m * random.range(0.34, 0.50));
             let tone = random.range(0.88, 1.12);
-            clump(painter, &mut random, middle_m, DVec3::splat(radius_m), 95, green.times(tone));
+            let foliage = Foliage { leaves, size_m, green: green.times(tone) };
+            foliage.clump(painter, &mut random, middle_m, radii_m);
         }
     }
 
@@ -87,37 +92,42 @@ pub(super) fn hedge(
         let x_m = (2.0 * (i as f64 + 0.5) / count as f64 - 1.0) * size_m.x;
         let middle_m = base_m + x_m * along + 0.55 * size_m.z * DVec3::Z;
         let radii_m = DVec3::new(0.30, size_m.y, 0.5 * size_m.z);
-        clump(painter, random, middle_m, radii_m, 70, green.times(random.clone().range(0.9, 1.1)));
+        let green = green.times(random.range(0.9, 1.1));
+        Foliage { leaves: 60, size_m: 0.05, green }.clump(painter, random, middle_m, radii_m);
     }
 }
 
-/// Leaves on an ellipsoid of these radii around an opaque, dark core.
-fn clump(
-    painter: &mut Painter,
-    random: &mut Random,
-    middle_m: DVec3,
-    radii_m: DVec3,
+/// How leaves look: how many to a clump, how long, in metres, and how green.
+struct Foliage {
     leaves: usize,
+    size_m: f64,
     green: Paint,
-) {
-    let core = painter.shade(middle_m, DVec3::Z, &green.times(0.45).open(0.8));
-    painter.gaussian(middle_m, DQuat::IDENTITY, 0.38 * radii_m, 0.9, core, DVec3::ZERO);
-    for _ in 0..leaves {
-        let away = ball(random).normalize_or_zero();
-        let depth = random.range(0.72, 1.05);
-        let mean_m = middle_m + depth * away * radii_m;
-        // Leaves face anywhere, on the whole outwards and up.
-        let normal = (away + 0.9 * ball(random) + 0.4 * DVec3::Z).normalize_or(DVec3::Z);
-        let tone = random.range(0.78, 1.2) * (0.55 + 0.45 * depth);
-        let mut paint = green.times(tone);
-        paint.rgb.x *= random.range(0.85, 1.15);
-        // What points down or lies deep in the crown sees little of the sky.
-        let rgb = painter.shade(mean_m, normal, &paint.open(0.72 + 0.28 * away.z));
-        let size_m = random.range(0.055, 0.10);
-        let sigmas_m = DVec3::new(1.5 * size_m, size_m, 0.012);
-        let rotation = DQuat::from_rotation_arc(DVec3::Z, normal)
-            * DQuat::from_rotation_z(random.range(0.0, 3.14));
-        painter.gaussian(mean_m, rotation, sigmas_m, 0.93, rgb, DVec3::ZERO);
+}
+
+impl Foliage {
+    /// Leaves on an ellipsoid of these radii around an opaque, dark core.
+    fn clump(&self, painter: &mut Painter, random: &mut Random, middle_m: DVec3, radii_m: DVec3) {
+        let green = self.green;
+        let core = painter.shade(middle_m, DVec3::Z, &green.times(0.45).open(0.8));
+        painter.gaussian(middle_m, DQuat::IDENTITY, 0.36 * radii_m, 0.9, core, DVec3::ZERO);
+        for _ in 0..self.leaves {
+            let away = ball(random).normalize_or_zero();
+            let depth = random.range(0.70, 1.08);
+            let mean_m = middle_m + depth * away * radii_m;
+            // Leaves face anywhere, on the whole outwards and up.
+            let normal = (away + 0.9 * ball(random) + 0.4 * DVec3::Z).normalize_or(DVec3::Z);
+            let tone = random.range(0.72, 1.28) * (0.5 + 0.5 * depth);
+            let mut paint = green.times(tone);
+            paint.rgb.x *= random.range(0.82, 1.18);
+            // What points down or lies deep in the crown sees little of the sky.
+            let rgb = painter.shade(mean_m, normal, &paint.open(0.70 + 0.30 * away.z));
+            let size_m = self.size_m * random.range(0.8, 1.5);
+            let sigmas_m = DVec3::new(1.4 * size_m, size_m, 0.012);
+            let turn_rad = random.range(0.0, std::f64::consts::PI);
+            let rotation =
+                DQuat::from_rotation_arc(DVec3::Z, normal) * DQuat::from_rotation_z(turn_rad);
+            painter.gaussian(mean_m, rotation, sigmas_m, 0.93, rgb, DVec3::ZERO);
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::random::{noise, smooth};
+use super::random::{Random, noise, smooth};
 use super::route::{BEYOND_M, Route, Station};
 use super::surface::{Paint, Painter};
 
@@ -39,11 +39,12 @@ const LINE_M: f64 = 0.065;
 /// Width of a zebra stripe and of the gap beside it, in metres.
 const STRIPE_M: f64 = 0.48;
 /// Pavement slabs are squares of this side, in metres.
-const SLAB_M: f64 = 0.72;
+const SLAB_M: f64 = 0.90;
 
 /// Paints all ground along the street; `cross_s_m` is the middle of the crossing.
 pub(super) fn paint(painter: &mut Painter, route: &Route, cross_s_m: f64, seed: u64) {
     let ground = Ground { route, cross_s_m, seed };
+    ground.covers().for_each(|(s_m, t_m)| ground.cover(painter, s_m, t_m));
     let drive = [0.0, route.length_m];
     let [approach, leave] = [-1.0, 1.0].map(|side| {
         let (near, far) = (cross_s_m + side * ZEBRA_M[0], cross_s_m + side * STOP_M[1]);
@@ -108,8 +109,48 @@ impl Ground<'_> {
         self.flat(painter, &ss, &ts, 0.0, |s_m, t_m| self.lane_paint(s_m, t_m));
     }
 
+    /// Where manholes are: one in 31 m, off the wheel tracks of one lane or the other.
+    fn covers(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
+        let (seed, cross_s_m) = (self.seed, self.cross_s_m);
+        (0..(self.route.length_m / 31.0) as usize).filter_map(move |index| {
+            let mut random = Random::new(seed, "manhole", index);
+            let s_m = 31.0 * (index as f64 + random.range(0.2, 0.8));
+            let t_m = random.pick(&[-1.0, 1.0]) * random.range(1.5, 2.0);
+            ((s_m - cross_s_m).abs() > JUNCTION_M + 1.0).then_some((s_m, t_m))
+        })
+    }
+
+    /// A manhole cover: a ring and ribs of iron.
+    fn cover(&self, painter: &mut Painter, s_m: f64, t_m: f64) {
+        let around = painter.even(0.0, std::f64::consts::TAU, std::f64::consts::TAU / 14.0);
+        let rings = [0.0, 0.09, 0.18, 0.27, 0.32, COVER_M];
+        let place = |angle_rad: f64, radius_m: f64| {
+            let (sin, cos) = angle_rad.sin_cos();
+            // Turning clockwise, u × v looks up.
+            self.route.at(s_m + radius_m * cos).beside(t_m - radius_m * sin, 0.008)
+        };
+        painter.sheet(&around, &rings, place, |angle_rad, radius_m| {
+            let rib = (angle_rad * 14.0 / std::f64::consts::TAU + radius_m / 0.09) as i64 % 2 == 0;
+            let ring = radius_m > 0.27;
+            let tone = if ring {
+                0.46
+            } else if rib {
+                0.24
+            } else {
+                0.33
+            };
+            Some(Paint::matt(tone, 0.98 * tone, 0.95 * tone).gloss(0.08))
+        });
+    }
+
     /// Asphalt or marking at a point of the lanes.
     fn lane_paint(&self, s_m: f64, t_m: f64) -> Option<Paint> {
+        let covered = |(at_s_m, at_t_m): (f64, f64)| {
+            (s_m - at_s_m).powi(2) + (t_m - at_t_m).powi(2) < (0.75 * COVER_M).powi(2)
+        };
+        if self.covers().any(covered) {
+            return None;
+        }
         let ahead_m = s_m - self.cross_s_m;
         let away_m = ahead_m.abs();
         let on_line = if (ZEBRA_M[0]..ZEBRA_M[1]).contains(&away_m) {
@@ -137,7 +178,7 @@ impl Ground<'_> {
 
     /// Asphalt with grain, wheel tracks, repaired patches and oil in the middle of each lane.
     fn asphalt(&self, s_m: f64, t_m: f64) -> Paint {
-        let grain = 0.045 * noise(self.seed + 3, 4.0 * s_m, 4.0 * t_m)
+        let grain = 0.09 * noise(self.seed + 3, 4.0 * s_m, 4.0 * t_m)
             + 0.05 * noise(self.seed + 4, 0.35 * s_m, 0.9 * t_m)
             + 0.03 * noise(self.seed + 5, 0.05 * s_m, 0.3 * t_m);
         let off_lane_m = t_m.abs() - LANE_T_M.abs();
@@ -145,7 +186,7 @@ impl Ground<'_> {
         let oil = -0.05 * (1.0 - smooth(off_lane_m.abs() / 0.5));
         // A trench was opened and closed again here and there.
         let trench = noise(self.seed + 6, (s_m / 9.0).floor(), (t_m / 1.8).floor());
-        let patch = if trench > 0.72 { -0.09 } else { 0.0 };
+        let patch = if trench > 0.72 { -0.15 } else { 0.0 };
         Paint::matt(0.400, 0.402, 0.412).times(1.0 + grain + track + oil + patch).gloss(0.10)
     }
 
@@ -153,7 +194,7 @@ impl Ground<'_> {
     fn verge(&self, painter: &mut Painter, side: f64, from_s_m: f64, to_s_m: f64) {
         let side_of = |ts: Vec<f64>| oriented(side, ts);
         let ss = painter.even(from_s_m, to_s_m, 0.45);
-        let bays = side_of(painter.even(LANES_M, KERB_M, 0.31));
+        let bays = side_of(painter.even(LANES_M, KERB_M, 0.36));
         self.flat(painter, &ss, &bays, 0.0, |s_m, t_m| {
             let gutter = smooth((t_m.abs() - (KERB_M - 0.5)) / 0.5);
             let tint = self.asphalt(s_m, 3.0 * t_m).times(0.93);
@@ -208,7 +249,9 @@ impl Ground<'_> {
         let crossing = self.route.at(self.cross_s_m);
         // In the side street's own axes: x away from the main street, y to the left of that.
         let place = |x_m: f64, y_m: f64, z_m: f64| {
-            crossing.point_m + side * (x_m * crossing.left - y_m * crossing.forward) + z_m * DVec3::Z
+            crossing.point_m
+                + side * (x_m * crossing.left - y_m * crossing.forward)
+                + z_m * DVec3::Z
         };
         let mut stretch = |from_m: f64, to_m: f64, factor: f64| {
             painter.coarser(factor, |painter| {
@@ -271,6 +314,9 @@ impl Ground<'_> {
         painter.sheet(ss, ts, place, paint);
     }
 }
+
+/// Radius of a manhole cover, in metres.
+const COVER_M: f64 = 0.37;
 
 /// Width of a pavement joint, in metres.
 const JOINT_M: f64 = 0.03;

@@ -86,9 +86,7 @@ impl Route {
         let squared_m2 = |node: &DVec3| (node.x - point_m.x).powi(2) + (node.y - point_m.y).powi(2);
         let nearest = (0..self.nodes_m.len())
             .step_by(16)
-            .min_by(|&a, &b| {
-                squared_m2(&self.nodes_m[a]).total_cmp(&squared_m2(&self.nodes_m[b]))
-            })
+            .min_by(|&a, &b| squared_m2(&self.nodes_m[a]).total_cmp(&squared_m2(&self.nodes_m[b])))
             .unwrap_or(0);
         let mut s_m = self.first_s_m + nearest as f64 * NODE_M;
         for _ in 0..3 {

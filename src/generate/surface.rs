@@ -6,10 +6,11 @@ use crate::scene::{Gaussians, sh};
 
 use super::light::Light;
 
-/// Standard deviation of a surfel as a part of its cell's edge. At 0.62 four neighbours of opacity
-/// 0.96 cover their common corner, 0.5 / 0.62 = 0.81 sigma from each along both axes, to
-/// `1 - (1 - 0.96 exp(-0.81²))⁴` = 94 %, and the next ring closes most of the rest.
-const OVERLAP: f64 = 0.62;
+/// Standard deviation of a surfel as a part of its cell's edge: a smaller one shows the pattern of
+/// cells, a larger one blurs. At 0.66 four neighbours of opacity 0.97 cover their common corner,
+/// 0.5 / 0.66 = 0.76 sigma from each along both axes, to `1 - (1 - 0.97 exp(-0.76²))⁴` = 96 %, and
+/// the next ring of eight to 97.5 %.
+const OVERLAP: f64 = 0.66;
 
 /// Half thickness of a surfel, in metres.
 const THICKNESS_M: f64 = 0.004;
@@ -150,21 +151,30 @@ impl<'a> Painter<'a> {
     }
 
     /// One lit surfel. A patch without area paints nothing.
+    ///
+    /// A parallelogram with edges u, v has the covariance `(u uᵀ + v vᵀ) / 12`; the surfel has its
+    /// principal axes and ratio.
     pub(super) fn patch(&mut self, patch: &Patch, paint: Paint) {
         let Patch { center_m, edge_u_m, edge_v_m } = *patch;
         let normal = edge_u_m.cross(edge_v_m).normalize_or_zero();
-        let (along, length_u_m) = (edge_u_m.normalize_or_zero(), edge_u_m.length());
+        let along = edge_u_m.normalize_or_zero();
         let across = normal.cross(along);
-        let length_v_m = edge_v_m.dot(across);
-        let has_area = length_u_m > 2e-3 && length_v_m > 2e-3;
+        // In the basis (along, across): u = (a, 0), v = (shear, b).
+        let (a, b, shear) = (edge_u_m.length(), edge_v_m.dot(across), edge_v_m.dot(along));
+        let has_area = a > 2e-3 && b > 2e-3;
         if !has_area {
             return;
         }
-        let sigmas_m = DVec3::new(OVERLAP * length_u_m, OVERLAP * length_v_m, THICKNESS_M);
-        let rotation = DQuat::from_mat3(&DMat3::from_cols(along, across, normal));
+        let (xx, xy, yy) = (a * a + shear * shear, shear * b, b * b);
+        let apart = (0.5 * (xx - yy)).hypot(xy);
+        let (major, minor) = (0.5 * (xx + yy) + apart, (0.5 * (xx + yy) - apart).max(1e-6));
+        let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
+        let axes = DMat3::from_cols(cos * along + sin * across, cos * across - sin * along, normal);
+        let rotation = DQuat::from_mat3(&axes);
+        let sigmas_m = DVec3::new(OVERLAP * major.sqrt(), OVERLAP * minor.sqrt(), THICKNESS_M);
         // Seen at 60° from the normal, d·n = -0.5, the mirror adds nothing.
         let rgb = self.lit(center_m, normal, &paint) + 0.3 * paint.gloss * MIRRORED_SKY;
-        self.gaussian(center_m, rotation, sigmas_m, 0.96, rgb, mirror(normal, paint.gloss));
+        self.gaussian(center_m, rotation, sigmas_m, 0.97, rgb, mirror(normal, paint.gloss));
     }
 
     /// Display colour of a surface in this light.

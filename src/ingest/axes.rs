@@ -10,10 +10,11 @@ use crate::scene::{Gaussians, sh};
 
 use super::IngestError;
 
-/// A rotation, or a rotation and a mirror, from the axes of a file to a twin's.
+/// The way from a file to a twin: a rotation, perhaps with a mirror, and then a scale.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axes {
     twin_from_file: DMat3,
+    metres_per_unit: f64,
 }
 
 /// Name, what it is, and the twin's x, y, z in the file's: rows of the matrix.
@@ -38,7 +39,7 @@ const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
 
 impl Axes {
     /// Nothing changes.
-    pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY };
+    pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
 
     /// How far `M Mᵀ` may be from the identity: a matrix typed with four digits passes.
     const MAX_ERROR: f64 = 1e-3;
@@ -62,38 +63,38 @@ impl Axes {
         let y = (y - x * x.dot(y)).normalize();
         let z_right = x.cross(y);
         let z = z_right * z_right.dot(z).signum();
-        Ok(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose() })
+        Ok(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
     }
 
-    /// Turns and then scales Gaussians in place, `metres_per_unit` metres for one unit of the file.
-    ///
-    /// A mirror turns each ellipsoid as its rotation `-M` does, for an ellipsoid equals its own
-    /// reflection through its centre; the colours follow `M` itself.
+    /// The same axes with a unit of so many metres.
     ///
     /// # Errors
     /// [`IngestError::Frame`] if the scale is not from 1e-6 to 1e6.
-    pub fn apply(
-        &self,
-        gaussians: &mut Gaussians,
-        metres_per_unit: f64,
-    ) -> Result<(), IngestError> {
+    pub fn scaled(self, metres_per_unit: f64) -> Result<Self, IngestError> {
         if !(1e-6..=1e6).contains(&metres_per_unit) {
             let reason = "a scale is from 1e-6 to 1e6 metres per unit".to_owned();
             return Err(frame_error("--scale", metres_per_unit.to_string(), reason));
         }
-        if *self != Self::IDENTITY {
+        Ok(Self { metres_per_unit, ..self })
+    }
+
+    /// Turns and then scales Gaussians in place. The identity changes no bit.
+    ///
+    /// A mirror turns each ellipsoid as its rotation `-M` does, for an ellipsoid equals its own
+    /// reflection through its centre; the colours follow `M` itself.
+    pub fn apply(&self, gaussians: &mut Gaussians) {
+        if self.twin_from_file != DMat3::IDENTITY {
             self.turn(gaussians);
         }
-        if metres_per_unit != 1.0 {
-            let ln = metres_per_unit.ln();
+        if self.metres_per_unit != 1.0 {
+            let ln = self.metres_per_unit.ln();
             for mean in &mut gaussians.means_m {
-                *mean = mean.map(|m| m * metres_per_unit);
+                *mean = mean.map(|m| m * self.metres_per_unit);
             }
             for scale in &mut gaussians.ln_scales {
                 *scale = scale.map(|s| (f64::from(s) + ln) as f32);
             }
         }
-        Ok(())
     }
 
     fn turn(&self, gaussians: &mut Gaussians) {

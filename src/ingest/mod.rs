@@ -4,6 +4,7 @@
 //! takes, and every Gaussian is checked before anyone sees one.
 
 pub mod axes;
+pub mod cameras;
 mod ply;
 mod safetensors;
 pub mod validate;

@@ -96,34 +96,33 @@ impl<'a> Plan<'a> {
             let missing = || bad(&format!("tensor {name}"), "is missing".into());
             metadata.info(name).ok_or_else(missing)
         };
-        let means = find("means")?;
-        let n = means.shape.first().copied().unwrap_or(0);
-        let shaped = |name: &str, tail: &[Option<usize>]| {
+        let shaped = |name: &str, wanted: &[Option<usize>]| {
             let info = find(name)?;
-            let wanted = [&[Some(n)], tail].concat();
-            let fits = info.shape.len() == wanted.len()
-                && info.shape.iter().zip(&wanted).all(|(&d, w)| w.is_none_or(|w| w == d));
             let is_float = info.dtype == Dtype::F32 || (info.dtype, name) == (Dtype::F64, "means");
             if !is_float {
                 let wanted = if name == "means" { "F32 or F64" } else { "F32" };
                 let reason = format!("is {:?}; {wanted} is read", info.dtype);
                 return Err(bad(&format!("tensor {name}"), reason));
             }
+            let fits = info.shape.len() == wanted.len()
+                && info.shape.iter().zip(wanted).all(|(&d, w)| w.is_none_or(|w| w == d));
             if !fits {
-                let wanted: Vec<_> =
-                    wanted.iter().map(|w| w.map_or("K".into(), |w| w.to_string())).collect();
+                let any = |w: &Option<usize>| w.map_or("any".into(), |w| w.to_string());
+                let wanted: Vec<_> = wanted.iter().map(any).collect();
                 let reason = format!("has shape {:?}, not [{}]", info.shape, wanted.join(", "));
                 return Err(bad(&format!("tensor {name}"), reason));
             }
             Ok(info)
         };
+        let means = shaped("means", &[None, Some(3)])?;
+        let n = Some(means.shape[0]);
         let one_tensor = metadata.info("sh0").is_none() && metadata.info("coeffs").is_some();
         let colours = if one_tensor {
-            vec![shaped("coeffs", &[None, Some(3)])?]
+            vec![shaped("coeffs", &[n, None, Some(3)])?]
         } else {
-            let mut colours = vec![shaped("sh0", &[Some(1), Some(3)])?];
+            let mut colours = vec![shaped("sh0", &[n, Some(1), Some(3)])?];
             if metadata.info("shN").is_some() {
-                colours.push(shaped("shN", &[None, Some(3)])?);
+                colours.push(shaped("shN", &[n, None, Some(3)])?);
             }
             colours
         };
@@ -137,12 +136,12 @@ impl<'a> Plan<'a> {
             bad(&format!("tensor {name}"), reason)
         })?;
         Ok(Self {
-            count: check_count(n as u64)?,
+            count: check_count(means.shape[0] as u64)?,
             sh_degree,
-            means: shaped("means", &[Some(3)])?,
-            quats: shaped("quats", &[Some(4)])?,
-            scales: shaped("scales", &[Some(3)])?,
-            opacities: shaped("opacities", &[])?,
+            means,
+            quats: shaped("quats", &[n, Some(4)])?,
+            scales: shaped("scales", &[n, Some(3)])?,
+            opacities: shaped("opacities", &[n])?,
             colours,
             one_tensor,
         })

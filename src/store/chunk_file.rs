@@ -151,3 +151,48 @@ fn encoding() -> impl bincode::config::Config {
     const LIMIT: usize = PAGE_BYTES - PREFIX_BYTES;
     bincode::config::standard().with_fixed_int_encoding().with_limit::<LIMIT>()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header() -> Header {
+        Header { cell: [3, -4], origin_m: [192.0, -256.0, 64.0], sh_degree: 1, count: 0 }
+    }
+
+    /// What is wrong with a header page after a change.
+    fn refused(change: impl FnOnce(&mut [u8; PAGE_BYTES])) -> String {
+        let mut page = header_page(&header()).unwrap();
+        change(&mut page);
+        match read(&mut &page[..], PAGE_BYTES as u64).unwrap_err() {
+            ReadError::Io(error) => error.to_string(),
+            ReadError::Damaged(reason) => reason,
+            ReadError::Format(found) => format!("format {found}"),
+        }
+    }
+
+    #[test]
+    fn a_header_fills_one_page() {
+        let page = header_page(&header()).unwrap();
+        assert_eq!(parse_page(&page).unwrap(), header());
+        // Two i32, three f64, a u8 and a u64.
+        assert_eq!(page[12..16], 41_u32.to_le_bytes());
+        assert_eq!(page[PREFIX_BYTES + 41..], [0; PAGE_BYTES - PREFIX_BYTES - 41]);
+        let chunk = read(&mut &page[..], PAGE_BYTES as u64).unwrap();
+        assert_eq!((chunk.cell(), chunk.len()), ([3, -4], 0));
+    }
+
+    #[test]
+    fn a_header_that_lies_is_refused() {
+        assert_eq!(refused(|page| page[0] = b'X'), "it does not start as a chunk");
+        assert_eq!(refused(|page| page[8] = 7), "format 7");
+        assert_eq!(refused(|page| page[14] = 1), "its header is longer than a page");
+        assert_eq!(refused(|page| page[12] = 42), "its header has bytes that mean nothing");
+        assert!(refused(|page| page[12] = 40).starts_with("its header does not decode"));
+        let degree = PREFIX_BYTES + 32;
+        assert_eq!(refused(|page| page[degree] = 4), "SH degree is 4, not 0 to 3");
+        // 2^56 Gaussians, and a count whose size overflows: nothing is allocated for them.
+        assert!(refused(|page| page[degree + 8] = 1).contains("are not 4096 bytes"));
+        assert!(refused(|page| page[degree + 1..degree + 9].fill(255)).contains("are not 4096"));
+    }
+}

@@ -176,9 +176,7 @@ impl Staging {
 
     /// Makes the staged objects and then the log record visible.
     pub(super) fn publish(mut self, number: u64, record: &[u8]) -> Result<(), StoreError> {
-        for hash in std::mem::take(&mut self.staged) {
-            self.place(&hash)?;
-        }
+        self.place_all()?;
         let staged = self.dir.join("record");
         let failed = || StoreError::io("write", &staged);
         let mut file = File::create(&staged).map_err(failed())?;
@@ -192,6 +190,14 @@ impl Staging {
         })?;
         self.placed.clear();
         sync_parent(&path)
+    }
+
+    /// Puts the staged objects in the place of those of a version that is there already, which
+    /// heals damaged and lost ones.
+    pub(super) fn restore(mut self) -> Result<(), StoreError> {
+        self.place_all()?;
+        self.placed.clear();
+        Ok(())
     }
 
     /// Removes objects that no version names: what a killed commit had already placed.
@@ -208,16 +214,19 @@ impl Staging {
         Ok(())
     }
 
-    /// Moves a staged object to its place. Over an older copy, too: that heals a damaged one.
-    fn place(&mut self, hash: &str) -> Result<(), StoreError> {
-        let path = self.objects.path(&self.name, hash);
-        create_parent(&path)?;
-        if !path.exists() {
-            self.placed.push(path.clone());
+    /// Moves the staged objects to their places, over older copies, too.
+    fn place_all(&mut self) -> Result<(), StoreError> {
+        for hash in std::mem::take(&mut self.staged) {
+            let path = self.objects.path(&self.name, &hash);
+            create_parent(&path)?;
+            if !path.exists() {
+                self.placed.push(path.clone());
+            }
+            let staged = self.dir.join(&hash);
+            fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
+            sync_parent(&path)?;
         }
-        let staged = self.dir.join(hash);
-        fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
-        sync_parent(&path)
+        Ok(())
     }
 }
 
@@ -337,4 +346,44 @@ fn create_parent(path: &Path) -> Result<(), StoreError> {
 fn sync_parent(path: &Path) -> Result<(), StoreError> {
     let Some(dir) = path.parent() else { return Ok(()) };
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_is_taken_once_and_the_loser_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let commit = |content: &[u8]| {
+            let mut staging = objects.stage("street")?;
+            let put = staging.put(|out| out.write_all(content))?;
+            staging.publish(1, content).map(|()| put)
+        };
+        let first = commit(b"first").unwrap();
+        assert_eq!(
+            (first.hash.as_str(), first.bytes),
+            (blake3::hash(b"first").to_hex().as_str(), 5)
+        );
+        let error = commit(b"second").unwrap_err();
+        assert!(matches!(error, StoreError::Conflict { number: 1, .. }), "{error}");
+        assert_eq!(objects.record("street", 1).unwrap(), b"first");
+        assert_eq!(objects.numbers("street").unwrap(), [1]);
+        objects.open("street", &first.hash).unwrap().finish().unwrap();
+        let lost = objects.path("street", &blake3::hash(b"second").to_hex());
+        assert!(!lost.exists() && !lost.parent().unwrap().exists());
+        assert_eq!(objects.begun().unwrap(), [""; 0]);
+    }
+
+    #[test]
+    fn a_running_commit_is_not_taken_over() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let running = objects.stage("street").unwrap();
+        assert!(objects.stage_abandoned("street").unwrap().is_none());
+        assert_eq!(objects.begun().unwrap(), ["street"]);
+        drop(running);
+        assert!(objects.stage_abandoned("street").unwrap().is_some());
+    }
 }

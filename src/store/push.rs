@@ -15,7 +15,7 @@ use crate::scene::{Gaussians, Manifest, RenderProfile, Rig, Trajectory};
 
 use super::catalog::Record;
 use super::objects::Staging;
-use super::{Catalog, StoreError, Version, chunk_file};
+use super::{Catalog, StoreError, Version, chunk_file, recover};
 
 /// What a new version of a twin consists of.
 #[derive(Clone, Debug)]
@@ -48,6 +48,7 @@ impl Catalog {
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
         new.check()?;
+        recover::clean(self)?;
         let mut staging = self.objects.stage(new.name)?;
         let manifest = Manifest {
             format: Manifest::FORMAT,
@@ -67,11 +68,12 @@ impl Catalog {
         let hash = staging.put(|out| out.write_all(&bytes))?.hash;
 
         let latest = self.objects.numbers(new.name)?.last().copied();
-        if let Some(number) = latest {
-            let record = self.record(new.name, number)?;
-            if record.manifest == hash {
-                return Ok(Version { number, hash, created_us: record.created_us, manifest });
-            }
+        if let Some(number) = latest
+            && let Ok(record) = self.record(new.name, number)
+            && record.manifest == hash
+        {
+            staging.restore()?;
+            return Ok(Version { number, hash, created_us: record.created_us, manifest });
         }
         let number = latest.unwrap_or(0) + 1;
         let record = Record { manifest: hash, created_us: now_us() };

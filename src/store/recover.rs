@@ -1,24 +1,38 @@
 //! Cleaning up after imports that were killed.
 
 use std::collections::BTreeSet;
+use std::io::{self, ErrorKind};
 
 use super::{Catalog, StoreError};
 
 /// Removes what killed imports left: their staging, and objects they placed without a record.
+///
+/// Who may only read the directory leaves that to those who may write.
 pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
     for name in catalog.objects.begun()? {
-        if let Some(staging) = catalog.objects.stage_abandoned(&name)? {
-            // With a damaged version nobody knows what it named, so everything stays.
-            if let Ok(named) = named(catalog, &name) {
-                staging.sweep(|hash| named.contains(hash))?;
-            }
+        match clean_twin(catalog, &name) {
+            Err(StoreError::Io { source, .. }) if is_read_only(&source) => {}
+            cleaned => cleaned?,
         }
     }
     Ok(())
 }
 
+fn clean_twin(catalog: &Catalog, name: &str) -> Result<(), StoreError> {
+    let Some(staging) = catalog.objects.stage_abandoned(name)? else { return Ok(()) };
+    match named(catalog, name) {
+        Ok(named) => staging.sweep(|hash| named.contains(hash)),
+        // With a damaged version nobody knows what it named, so everything stays.
+        Err(_) => Ok(()),
+    }
+}
+
+fn is_read_only(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem)
+}
+
 /// Hashes of all objects that any version of a twin names.
-pub(super) fn named(catalog: &Catalog, name: &str) -> Result<BTreeSet<String>, StoreError> {
+fn named(catalog: &Catalog, name: &str) -> Result<BTreeSet<String>, StoreError> {
     let mut named = BTreeSet::new();
     for number in catalog.objects.numbers(name)? {
         let hash = catalog.record(name, number)?.manifest;

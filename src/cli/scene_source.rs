@@ -1,0 +1,133 @@
+//! What the rendering commands share: a scene to render, cameras, a profile, a backend.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+
+use crate::ingest::cameras::{self, ListedCamera};
+use crate::ingest::{self};
+use crate::render::cpu::{Cpu, Simd};
+use crate::render::reference::Reference;
+use crate::render::{Backend, View};
+use crate::residency::Cache;
+use crate::scene::{RenderProfile, Scene};
+use crate::store::Catalog;
+
+use super::places::{TwinVersion, Twins};
+use super::progress;
+
+/// A scene, cameras and settings on the command line.
+#[derive(Debug, clap::Args)]
+pub(super) struct SceneSource {
+    /// A scene file (PLY or safetensors), or the name of a twin (NAME or NAME@VERSION).
+    #[arg(value_name = "SCENE")]
+    scene: String,
+
+    /// JSON list of cameras in the scene's own axes: name, width, height, fx, fy, cx, cy, position
+    /// (or position_ply), R_world_to_cam (rows), and optionally near.
+    #[arg(long, value_name = "FILE")]
+    cameras: PathBuf,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// A setting of the render profile, over the twin's or gsplat's; may be given again. Keys: near,
+    /// far, blur, antialiased, alpha_cap, alpha_cut, stop.
+    #[arg(long = "profile", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+
+    #[command(flatten)]
+    engine: Engine,
+}
+
+/// Which backend, on what.
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Engine {
+    /// Who renders.
+    #[arg(long, value_enum, default_value_t)]
+    backend: BackendName,
+
+    /// Render threads; 0 for one per core. Pixels do not depend on it.
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+
+    /// Instruction set of the cpu backend.
+    #[arg(long, value_enum, default_value_t)]
+    simd: Simd,
+}
+
+/// The backends of this build.
+#[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
+enum BackendName {
+    /// The fastest of this machine.
+    #[default]
+    Auto,
+    /// f32, SIMD, all cores.
+    Cpu,
+    /// f64 by definition: slow.
+    Reference,
+}
+
+impl Engine {
+    /// Makes the backend.
+    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+        Ok(match self.backend {
+            BackendName::Auto | BackendName::Cpu => Box::new(Cpu::new(self.threads, self.simd)?),
+            BackendName::Reference => Box::new(Reference),
+        })
+    }
+}
+
+/// Everything that a rendering command needs.
+pub(super) struct Ready {
+    pub(super) scene: Scene,
+    pub(super) shots: Vec<Shot>,
+    pub(super) backend: Box<dyn Backend>,
+}
+
+/// A camera with the profile that it is rendered with.
+pub(super) struct Shot {
+    pub(super) name: String,
+    pub(super) view: View,
+    pub(super) profile: RenderProfile,
+}
+
+impl SceneSource {
+    /// Reads the scene and the cameras, and makes the backend.
+    pub(super) fn open(&self) -> anyhow::Result<Ready> {
+        let cameras =
+            cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
+        let (scene, profile) = self.scene()?;
+        let shots = cameras.into_iter().map(|camera| self.shot(camera, profile));
+        let shots = shots.collect::<anyhow::Result<_>>()?;
+        Ok(Ready { scene, shots, backend: self.engine.backend()? })
+    }
+
+    /// A camera's own near counts more than the twin's, and less than one on the command line.
+    fn shot(&self, camera: ListedCamera, mut profile: RenderProfile) -> anyhow::Result<Shot> {
+        let ListedCamera { name, camera, world_from_camera, near } = camera;
+        profile.near = near.unwrap_or(profile.near);
+        for setting in &self.settings {
+            profile.set(setting)?;
+        }
+        profile.check().with_context(|| format!("camera {name:?}"))?;
+        Ok(Shot { name, view: View { camera, world_from_camera }, profile })
+    }
+
+    fn scene(&self) -> anyhow::Result<(Scene, RenderProfile)> {
+        let path = Path::new(&self.scene);
+        if path.is_file() {
+            let bar = progress::bytes("reading");
+            let gaussians = ingest::read(path, &mut progress::show(&bar))
+                .with_context(|| format!("{}", path.display()))?;
+            bar.finish_and_clear();
+            return Ok((Scene::from_gaussians(&gaussians), RenderProfile::default()));
+        }
+        let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
+        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let resident = cache.open(&named.name, named.number).with_context(|| {
+            format!("{:?} is no file, and as the name of a twin it fails", self.scene)
+        })?;
+        Ok((resident.scene.clone(), resident.version.manifest.profile))
+    }
+}

@@ -1,0 +1,175 @@
+//! Camera lists: JSON files of pinhole views in the scene's own axes.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use glam::{DMat3, DQuat, DVec3};
+use serde::Deserialize;
+
+use crate::config;
+use crate::geometry::camera::Pinhole;
+use crate::geometry::{Camera, CameraError, Pose, PoseError};
+
+/// A camera of a list.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ListedCamera {
+    /// Its name, which becomes part of file names.
+    pub name: String,
+    /// Size and intrinsics.
+    pub camera: Camera,
+    /// Where it stands, in the axes and units of the scene.
+    pub world_from_camera: Pose,
+    /// Nearest z that it draws, if the list says so, in units of the scene.
+    pub near: Option<f64>,
+}
+
+/// Why a camera list was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum CamerasError {
+    /// The operating system refused.
+    #[error("cannot read the camera list: {0}")]
+    Io(#[from] std::io::Error),
+    /// Larger than any list should be.
+    #[error("the camera list is larger than {} bytes", config::CAMERA_LIST_BYTES)]
+    TooLarge,
+    /// Not the JSON that is asked for.
+    #[error(
+        "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
+         fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
+    )]
+    Json(#[from] serde_json::Error),
+    /// There is no camera in it.
+    #[error("the camera list is empty")]
+    Empty,
+    /// A name that cannot be part of a file name, or comes twice.
+    #[error("camera {index}: name {name:?} {must}")]
+    Name {
+        /// Which camera, from 0.
+        index: usize,
+        /// The refused name.
+        name: String,
+        /// What must hold instead.
+        must: &'static str,
+    },
+    /// Neither `position` nor `position_ply`, or both.
+    #[error("camera {name:?}: give either position or position_ply")]
+    Position {
+        /// The camera.
+        name: String,
+    },
+    /// The matrix is not a rotation.
+    #[error(
+        "camera {name:?}: R_world_to_cam is no rotation (rows off by {error:.1e} from orthonormal, \
+         determinant {determinant:.3})"
+    )]
+    Rotation {
+        /// The camera.
+        name: String,
+        /// Largest entry of R Rᵀ - I.
+        error: f64,
+        /// Its determinant; -1 is a mirror.
+        determinant: f64,
+    },
+    /// The position cannot be used.
+    #[error("camera {name:?}: {source}")]
+    Pose {
+        /// The camera.
+        name: String,
+        /// What is wrong.
+        source: PoseError,
+    },
+    /// The size or an intrinsic cannot be used.
+    #[error("camera {name:?}: {source}")]
+    Camera {
+        /// The camera.
+        name: String,
+        /// What is wrong.
+        source: CameraError,
+    },
+}
+
+/// One entry, as written; fields that are not named here are somebody else's notes.
+#[derive(Deserialize)]
+struct Entry {
+    name: String,
+    width: u64,
+    height: u64,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    near: Option<f64>,
+    position: Option<[f64; 3]>,
+    position_ply: Option<[f64; 3]>,
+    #[serde(rename = "R_world_to_cam")]
+    rotation: [[f64; 3]; 3],
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum List {
+    Many(Vec<Entry>),
+    One(Box<Entry>),
+}
+
+/// Reads a camera list.
+///
+/// A camera's axes are x right, y down, z forward: `p_camera = R_world_to_cam (p - position)`.
+///
+/// # Errors
+/// Names the camera and the field at fault.
+pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
+    let mut text = Vec::new();
+    let file = BufReader::new(File::open(path)?);
+    file.take(config::CAMERA_LIST_BYTES + 1).read_to_end(&mut text)?;
+    if text.len() as u64 > config::CAMERA_LIST_BYTES {
+        return Err(CamerasError::TooLarge);
+    }
+    let entries = match serde_json::from_slice(&text)? {
+        List::Many(entries) => entries,
+        List::One(entry) => vec![*entry],
+    };
+    if entries.is_empty() {
+        return Err(CamerasError::Empty);
+    }
+    let mut cameras: Vec<ListedCamera> = Vec::with_capacity(entries.len());
+    for (index, entry) in entries.into_iter().enumerate() {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+        let usable = (1..=64).contains(&entry.name.len())
+            && entry.name.chars().all(allowed)
+            && !entry.name.starts_with('.');
+        let twice = cameras.iter().any(|camera| camera.name == entry.name);
+        if !usable || twice {
+            let must = if twice { "comes twice" } else { "must be 1 to 64 of A-Z a-z 0-9 . _ -" };
+            return Err(CamerasError::Name { index, name: entry.name, must });
+        }
+        cameras.push(check(entry)?);
+    }
+    Ok(cameras)
+}
+
+fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
+    let Entry { name, width, height, fx, fy, cx, cy, near, .. } = entry;
+    let position = match (entry.position, entry.position_ply) {
+        (Some(position), None) | (None, Some(position)) => position,
+        _ => return Err(CamerasError::Position { name }),
+    };
+    // glam's columns are the file's rows, so this is the inverse: world_from_camera.
+    let rotation = DMat3::from_cols_array_2d(&entry.rotation);
+    let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
+    let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
+    let determinant = rotation.determinant();
+    let is_rotation = error <= 1e-4 && determinant > 0.0;
+    if !is_rotation {
+        return Err(CamerasError::Rotation { name, error, determinant });
+    }
+    let rotation = DQuat::from_mat3(&rotation).normalize();
+    let q = [rotation.w, rotation.x, rotation.y, rotation.z];
+    let pose = Pose::checked(DVec3::from_array(position).to_array(), q);
+    let world_from_camera =
+        pose.map_err(|source| CamerasError::Pose { name: name.clone(), source })?;
+    let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy })
+        .map_err(|source| CamerasError::Camera { name: name.clone(), source })?;
+    Ok(ListedCamera { name, camera, world_from_camera, near })
+}

@@ -1,0 +1,28 @@
+//! Reading outside formats: what is written comes back, what is damaged is refused by name.
+
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+
+mod axes;
+mod damage;
+mod fuzz;
+mod real_scenes;
+mod round_trip;
+
+use wildcity::ingest::{self, IngestError};
+use wildcity::scene::Gaussians;
+
+/// Reads a file with these bytes.
+fn read(bytes: &[u8]) -> Result<Gaussians, IngestError> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene");
+    std::fs::write(&path, bytes).unwrap();
+    ingest::read(&path, &mut |_, _| {})
+}
+
+/// What is said about a file with these bytes.
+fn refusal(bytes: &[u8]) -> String {
+    read(bytes).unwrap_err().to_string()
+}

@@ -1,0 +1,113 @@
+//! Files that others made, read in place.
+
+use std::collections::HashMap;
+
+use wildcity::ingest;
+use wildcity::scene::Gaussians;
+
+use crate::data;
+
+fn read(file: &str) -> Option<Gaussians> {
+    let path = data::real(file)?;
+    Some(ingest::read(&path, &mut |_, _| {}).unwrap_or_else(|e| panic!("{file}: {e}")))
+}
+
+/// The bits of one Gaussian, to find it in another file.
+fn bits(g: &Gaussians, index: usize) -> Vec<u32> {
+    let mean = g.means_m[index].map(|m| m as f32);
+    let opacity = [g.logit_opacities[index]];
+    let parts: [&[f32]; 5] =
+        [&mean, &g.quats_wxyz[index], &g.ln_scales[index], &opacity, g.sh_of(index)];
+    parts.concat().into_iter().map(f32::to_bits).collect()
+}
+
+#[test]
+fn the_skull_is_what_its_readme_says() {
+    let Some(skull) = read("scenes/skull/skull.ply") else { return };
+    assert_eq!((skull.len(), skull.sh_degree), (82_621, 3));
+    let Some(train) = read("scenes/train-1000.ply") else { return };
+    assert_eq!((train.len(), train.sh_degree), (1_000, 3));
+    let lengths = train.quats_wxyz.iter().map(|q| q.iter().map(|q| q * q).sum::<f32>().sqrt());
+    let (low, high) = lengths.fold((9.0_f32, 0.0_f32), |(l, h), x| (l.min(x), h.max(x)));
+    assert!((0.63..0.65).contains(&low) && (1.31..1.33).contains(&high), "{low} to {high}");
+}
+
+#[test]
+fn the_small_skull_is_the_same_in_both_formats_and_a_part_of_the_whole() {
+    let Some(skull) = read("scenes/skull/skull.ply") else { return };
+    let Some(from_ply) = read("conformance/skull_small.ply") else { return };
+    let Some(from_tensors) = read("conformance/skull_small.safetensors") else { return };
+    assert_eq!(from_ply.len(), 19_300);
+    assert!(from_ply == from_tensors, "the two formats differ");
+    let whole: HashMap<_, _> = (0..skull.len()).map(|i| (bits(&skull, i), i)).collect();
+    let missing = (0..from_ply.len()).filter(|&i| !whole.contains_key(&bits(&from_ply, i))).count();
+    assert_eq!(missing, 0, "Gaussians of the small skull that the whole has not");
+    assert!(from_ply.logit_opacities.iter().all(|&logit| logit > 0.0), "opacity above 0.5");
+}
+
+#[test]
+fn gsplats_own_test_case_is_read() {
+    let Some(case) = read("reference/gsplat_tiny_case.safetensors") else { return };
+    assert_eq!((case.len(), case.sh_degree), (4, 3));
+}
+
+#[test]
+fn three_gaussians_of_train_are_read() {
+    let file = "conformance/metalsplatter/test-splat.3-points-from-train.ply";
+    let Some(three) = read(file) else { return };
+    assert_eq!((three.len(), three.sh_degree), (3, 3));
+}
+
+/// The compressed skull is the skull: same Gaussians within the steps of its quantisation, though
+/// in another order, so each is compared with its nearest of the original.
+#[test]
+fn compressed_ply_is_what_it_was_made_of() {
+    let Some(skull) = read("scenes/skull/skull.ply") else { return };
+    let Some(compressed) = read("conformance/skull.compressed.ply") else { return };
+    assert_eq!((compressed.len(), compressed.sh_degree), (82_621, 3));
+    // 1 cm buckets around every original.
+    let bucket = |m: &[f64; 3]| m.map(|x| (x / 0.01).round() as i32);
+    let mut originals: HashMap<[i32; 3], Vec<usize>> = HashMap::new();
+    for (index, mean) in skull.means_m.iter().enumerate() {
+        originals.entry(bucket(mean)).or_default().push(index);
+    }
+    let mut matched = 0;
+    let sampled = (0..compressed.len()).step_by(40);
+    let total = sampled.len();
+    for i in sampled {
+        let [x, y, z] = bucket(&compressed.means_m[i]);
+        let around = (-1..=1)
+            .flat_map(|dx| (-1..=1).flat_map(move |dy| (-1..=1).map(move |dz| [dx, dy, dz])));
+        let near =
+            around.filter_map(|[dx, dy, dz]| originals.get(&[x + dx, y + dy, z + dz])).flatten();
+        matched += usize::from(near.into_iter().any(|&j| is_alike(&compressed, i, &skull, j)));
+    }
+    assert!(matched * 100 >= total * 99, "{matched} of {total} found");
+}
+
+fn is_alike(a: &Gaussians, i: usize, b: &Gaussians, j: usize) -> bool {
+    let close = |a: &[f32], b: &[f32], by: f32| a.iter().zip(b).all(|(a, b)| (a - b).abs() <= by);
+    let unit = |q: [f32; 4]| {
+        let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
+        q.map(|q| q / length)
+    };
+    let (p, q) = (unit(a.quats_wxyz[i]), unit(b.quats_wxyz[j]));
+    let dot: f32 = p.iter().zip(q).map(|(p, q)| p * q).sum();
+    let sigmoid = |logit: f32| 1.0 / (1.0 + (-logit).exp());
+    let apart = |axis: usize| (a.means_m[i][axis] - b.means_m[j][axis]).abs();
+    (0..3).all(|axis| apart(axis) < 2e-3)
+        && dot.abs() > 0.9999
+        && close(&a.ln_scales[i], &b.ln_scales[j], 0.05)
+        && (sigmoid(a.logit_opacities[i]) - sigmoid(b.logit_opacities[j])).abs() < 0.01
+        && close(&a.sh_of(i)[..3], &b.sh_of(j)[..3], 0.05)
+        // 8 bits over [-4, 4] are steps of 0.031.
+        && close(&a.sh_of(i)[3..], &b.sh_of(j)[3..], 0.02)
+}
+
+#[test]
+fn the_biker_and_the_guitar_are_read_compressed() {
+    let Some(biker) = read("scenes/biker/biker.compressed.ply") else { return };
+    assert_eq!((biker.len(), biker.sh_degree), (152_746, 0));
+    let Some(guitar) = read("scenes/guitar/guitar.compressed.ply") else { return };
+    assert_eq!((guitar.len(), guitar.sh_degree), (90_854, 0));
+}

@@ -1,0 +1,89 @@
+//! What importing and serving take: one test, alone in its process, so that the numbers are its own.
+
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+
+use std::fs::{self, File};
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use wildcity::residency::Cache;
+use wildcity::store::Catalog;
+
+use scene_files::{gaussians, inria_columns, ply, ply_header};
+
+/// The program itself, buffers and thread stacks.
+const CONSTANT_BYTES: u64 = 30 << 20;
+
+#[test]
+fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = dir.path().join("twins");
+    // Degree 0 is the worst for the import: f64 centres and sort keys against 56 bytes of a row.
+    for (sh_degree, n) in [(0, 1_800_000), (1, 600_000)] {
+        let source = dir.path().join("scene.ply");
+        write_ply(&source, sh_degree, n);
+        let file_bytes = fs::metadata(&source).unwrap().len();
+        let import = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+            .arg("import")
+            .arg(&source)
+            .args(["--twin", &format!("degree{sh_degree}"), "--twins"])
+            .arg(&twins)
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        let peak = peak_bytes(import);
+        let times = peak as f64 / file_bytes as f64;
+        assert!(peak > file_bytes, "{peak} of {file_bytes}: this cannot be the whole import");
+        assert!(peak <= 2 * file_bytes + CONSTANT_BYTES, "import: {peak} bytes, {times:.2} x file");
+    }
+
+    let n = 600_000;
+    let cache = Cache::new(Catalog::open(&twins).unwrap());
+    let before = status_bytes("self", "VmRSS").unwrap();
+    let resident = cache.open("degree1", None).unwrap();
+    assert_eq!(resident.scene.gaussians(), n);
+    let peak = status_bytes("self", "VmHWM").unwrap();
+    // Loading activates in a stream: at its peak it holds the result and one batch per thread.
+    let allowed = before + 120 * n as u64 + CONSTANT_BYTES;
+    assert!(peak <= allowed, "loading: from {before} to {peak} bytes, {allowed} allowed");
+    assert!(peak - before >= 92 * n as u64, "the chunks are in memory");
+}
+
+/// Writes a large file of a small one's rows, shifted by whole cells, without holding it: this
+/// process' own peak counts, too.
+fn write_ply(path: &Path, sh_degree: u8, n: usize) {
+    let few = 20_000;
+    let columns = inria_columns(sh_degree, false);
+    let mut scene = gaussians(few, sh_degree, 30.0, 1);
+    let mut out = BufWriter::new(File::create(path).unwrap());
+    out.write_all(ply_header(n, &columns).as_bytes()).unwrap();
+    let header_bytes = ply_header(few, &columns).len();
+    for _ in 0..n / few {
+        out.write_all(&ply(&scene, &columns)[header_bytes..]).unwrap();
+        for mean in &mut scene.means_m {
+            mean[0] += 64.0;
+        }
+    }
+    out.into_inner().unwrap().sync_all().unwrap();
+}
+
+/// Highest resident memory that a child was seen with before it ended well.
+fn peak_bytes(mut child: Child) -> u64 {
+    let mut peak = 0;
+    while child.try_wait().unwrap().is_none() {
+        peak = status_bytes(&child.id().to_string(), "VmHWM").unwrap_or(0).max(peak);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(child.wait().unwrap().success());
+    peak
+}
+
+/// A size of /proc/<pid>/status; none once the process has ended.
+fn status_bytes(process: &str, field: &str) -> Option<u64> {
+    let status = fs::read_to_string(format!("/proc/{process}/status")).ok()?;
+    let line = status.lines().find(|line| line.starts_with(field))?;
+    line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|kib| kib << 10)
+}

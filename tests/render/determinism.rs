@@ -1,0 +1,104 @@
+//! The same input, the same bytes.
+
+use std::sync::Mutex;
+
+use glam::DVec3;
+use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::render::{Backend, Frame, RenderError, Target, View};
+use wildcity::scene::{RenderProfile, Scene};
+
+use crate::images::{cpu, look, render, render_one};
+use crate::scene_files::gaussians;
+use crate::streets::street;
+
+fn views() -> Vec<View> {
+    (0..6)
+        .map(|i| {
+            let yaw = f64::from(i);
+            let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
+            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
+        })
+        .collect()
+}
+
+#[test]
+fn a_hundred_repeats_are_equal_to_the_bit() {
+    let scene = Scene::from_gaussians(&street(20_000, 1, 11));
+    let (backend, profile) = (cpu(), RenderProfile::default());
+    let first = render(&backend, &scene, &profile, &views());
+    for repeat in 1..100 {
+        assert!(render(&backend, &scene, &profile, &views()) == first, "repeat {repeat}");
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_show() {
+    let scene = Scene::from_gaussians(&street(40_000, 1, 12));
+    let profile = RenderProfile::default();
+    let by = |threads| render(&Cpu::new(threads, Simd::Best).unwrap(), &scene, &profile, &views());
+    let one = by(1);
+    for threads in [2, 3, 7] {
+        assert!(by(threads) == one, "{threads} threads");
+    }
+}
+
+#[test]
+fn a_view_does_not_see_its_neighbours() {
+    let scene = Scene::from_gaussians(&street(20_000, 1, 13));
+    let (backend, profile) = (cpu(), RenderProfile::default());
+    let together = render(&backend, &scene, &profile, &views());
+    for (view, image) in views().into_iter().zip(&together) {
+        assert!(render_one(&backend, &scene, &profile, view) == *image);
+    }
+    let mut backward = views();
+    backward.reverse();
+    let mut reversed = render(&backend, &scene, &profile, &backward);
+    reversed.reverse();
+    assert!(reversed == together);
+}
+
+#[test]
+fn a_frame_leaves_nothing_for_the_next() {
+    let street = Scene::from_gaussians(&street(20_000, 1, 14));
+    let cloud = Scene::from_gaussians(&gaussians(5_000, 3, 4.0, 15));
+    let (backend, profile) = (cpu(), RenderProfile::default());
+    let fresh = render(&cpu(), &street, &profile, &views());
+    render(&backend, &cloud, &profile, &views()[..2]);
+    assert!(render(&backend, &street, &profile, &views()) == fresh);
+}
+
+#[test]
+fn every_view_is_told_of_once_when_it_is_done() {
+    let scene = Scene::from_gaussians(&street(5_000, 0, 16));
+    let (profile, views) = (RenderProfile::default(), views());
+    let alone = render(&cpu(), &scene, &profile, &views);
+    let mut images: Vec<Vec<u8>> = views.iter().map(|v| vec![0; 3 * v.camera.pixels()]).collect();
+    let mut targets: Vec<Target<'_>> =
+        images.iter_mut().map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
+    let told = Mutex::new(Vec::new());
+    let finished = |view: usize, target: &Target<'_>| {
+        let rgb8 = target.rgb8.as_deref().unwrap().to_vec();
+        told.lock().unwrap().push((view, rgb8));
+    };
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    cpu().render(&frame, &mut targets, &finished).unwrap();
+    let mut told = told.into_inner().unwrap();
+    told.sort();
+    assert_eq!(told.iter().map(|(view, _)| *view).collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);
+    assert!(told.iter().zip(&alone).all(|((_, rgb8), image)| *rgb8 == image.rgb8));
+}
+
+#[test]
+fn targets_of_another_size_are_refused() {
+    let scene = Scene::default();
+    let (profile, views) = (RenderProfile::default(), views());
+    let frame = Frame { scene: &scene, profile: &profile, views: &views[..1] };
+    let mut short = vec![0; 10];
+    let target = Target { rgb8: Some(&mut short), ..Target::default() };
+    let wanted = 3 * 150 * 90;
+    assert_eq!(
+        cpu().render(&frame, &mut [target], &|_, _| {}),
+        Err(RenderError::TargetSize { view: 0, buffer: "rgb8", given: 10, wanted })
+    );
+    assert_eq!(cpu().render(&frame, &mut [], &|_, _| {}), Err(RenderError::Views { count: 1 }));
+}

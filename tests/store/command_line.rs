@@ -1,0 +1,163 @@
+use std::fs;
+use std::path::Path;
+use std::process::Output;
+
+use crate::scene_files::{gaussians, inria_columns, ply};
+use crate::wildcity;
+
+fn import(dir: &Path, bytes: &[u8], more: &[&str]) -> Output {
+    let source = dir.join("scene.ply");
+    fs::write(&source, bytes).unwrap();
+    let mut command = wildcity();
+    command.arg("import").arg(source).args(["--twin", "street", "--twins"]).arg(dir.join("twins"));
+    command.args(more).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+fn refusal(output: &Output) -> String {
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert_eq!(output.stdout, b"");
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+#[test]
+fn import_inspect_and_verify_tell_what_is_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = ply(&gaussians(3_000, 1, 100.0, 1), &inria_columns(1, true));
+    let rig = r#"{"name": "car", "cameras": [{"name": "front",
+        "camera": {"width_px": 64, "height_px": 48,
+                   "pinhole": {"fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.0}},
+        "rig_from_camera": {"xyz": [1.5, 0, 1.6], "q": [0.5, -0.5, 0.5, -0.5]}}]}"#;
+    let log = r#"{"name": "log", "keyframes": [
+        {"time_us": 0, "world_from_rig": {"xyz": [0, 0, 0], "q": [1, 0, 0, 0]}},
+        {"time_us": 100000, "world_from_rig": {"xyz": [3, 4, 0], "q": [1, 0, 0, 0]}}]}"#;
+    let path = |name: &str| dir.path().join(name).display().to_string();
+    fs::write(path("rig.json"), rig).unwrap();
+    fs::write(path("log.json"), log).unwrap();
+    let options = [
+        "--axes",
+        "y-down-z-forward",
+        "--scale",
+        "2",
+        "--rig",
+        &path("rig.json"),
+        "--trajectory",
+        &path("log.json"),
+        "--profile",
+        "near=0.2",
+        "--profile",
+        "alpha_cap=0.999",
+    ];
+    let output = import(dir.path(), &scene, &options);
+    let said = stdout(&output);
+    assert!(said.starts_with("twin street version 1: 3000 Gaussians of SH degree 1 in "), "{said}");
+    assert_eq!(output.stderr, b"", "no progress bar where there is no terminal");
+    let hash = said.trim_end().rsplit(' ').next().unwrap().to_owned();
+    assert_eq!(hash.len(), 64);
+
+    let inspect = |more: &[&str]| {
+        let twins = dir.path().join("twins");
+        stdout(
+            &wildcity()
+                .args(["inspect", "street", "--twins"])
+                .arg(twins)
+                .args(more)
+                .output()
+                .unwrap(),
+        )
+    };
+    let said = inspect(&[]);
+    for line in [
+        &format!("manifest    {hash}\n"),
+        "gaussians   3000, SH degree 1\n",
+        "profile     near=0.2 far=",
+        "rig         car: front\n",
+        "trajectory  log: 2 keyframes, 5.0 m\n",
+        "builder     wildcity 0.1.0 axes=y-down-z-forward scale=2\n",
+    ] {
+        assert!(said.contains(line), "{line}\n{said}");
+    }
+    let json: serde_json::Value = serde_json::from_str(&inspect(&["--json"])).unwrap();
+    assert_eq!(json["hash"], hash);
+    assert_eq!(json["gaussians"], 3000);
+    let source = format!("blake3:{}", blake3::hash(&scene).to_hex());
+    assert_eq!(json["manifest"]["provenance"]["source"], source);
+    let chunks = json["manifest"]["chunks"].as_array().unwrap();
+    assert_eq!(chunks.iter().map(|c| c["count"].as_u64().unwrap()).sum::<u64>(), 3000);
+    for chunk in chunks {
+        assert!(
+            said.contains(&chunk["object"].as_str().unwrap()[..16]),
+            "the table has every chunk"
+        );
+    }
+
+    let twins = dir.path().join("twins");
+    let verify = wildcity().args(["verify", "street", "--twins"]).arg(twins).output().unwrap();
+    let said = stdout(&verify);
+    assert!(said.starts_with(&format!("twin street: {} objects, ", chunks.len() + 1)), "{said}");
+    assert!(said.ends_with("all sound\n"));
+}
+
+#[test]
+fn a_truncated_ply_leaves_no_twin_and_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = ply(&gaussians(1_000, 0, 10.0, 1), &inria_columns(0, false));
+    let said = refusal(&import(dir.path(), &whole[..30_000], &[]));
+    assert!(said.contains("scene.ply: PLY body: the header promises 56000 bytes"), "{said}");
+    assert!(said.contains("it is truncated"), "{said}");
+    assert!(!dir.path().join("twins").exists());
+}
+
+#[test]
+fn bad_options_are_named_before_the_file_is_read() {
+    let dir = tempfile::tempdir().unwrap();
+    fs::write(dir.path().join("broken.json"), "{").unwrap();
+    let broken = dir.path().join("broken.json").display().to_string();
+    for (options, wanted) in [
+        (["--axes", "sideways"], "--axes \"sideways\": expected nine numbers"),
+        (["--scale", "-2"], "--scale \"-2\": a scale is from 1e-6 to 1e6"),
+        (["--profile", "fog=1"], "there is no field \"fog\""),
+        (["--rig", &broken], "broken.json"),
+        (["--trajectory", "/nonexistent.json"], "cannot read /nonexistent.json"),
+    ] {
+        let scene = ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false));
+        let output = import(dir.path(), &scene, &options);
+        assert!(!output.status.success());
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(said.contains(wanted), "{options:?}: {said}");
+        assert!(!dir.path().join("twins").exists(), "{options:?}");
+    }
+}
+
+#[test]
+fn help_teaches_with_examples() {
+    for (command, wanted) in [
+        ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
+        ("inspect", "wildcity inspect street@2"),
+        ("verify", "wildcity verify street"),
+    ] {
+        let said = stdout(&wildcity().args([command, "--help"]).output().unwrap());
+        assert!(said.contains(wanted) && said.contains("--twins <DIR>"), "{said}");
+    }
+}
+
+#[test]
+fn twins_lie_where_the_user_keeps_data() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("scene.ply");
+    fs::write(&source, ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false))).unwrap();
+    let import = |variable: &str, value: &Path| {
+        let mut command = wildcity();
+        command.env_remove("XDG_DATA_HOME").env_remove("HOME").env(variable, value);
+        command.arg("import").arg(&source).args(["--twin", "street"]).output().unwrap()
+    };
+    stdout(&import("XDG_DATA_HOME", &dir.path().join("xdg")));
+    assert!(dir.path().join("xdg/wildcity/twins/street/log/0000000001").is_file());
+    stdout(&import("HOME", &dir.path().join("home")));
+    assert!(dir.path().join("home/.local/share/wildcity/twins/street/log/0000000001").is_file());
+    assert!(refusal(&import("NEITHER", dir.path())).contains("give --twins DIR"));
+}

@@ -1,0 +1,133 @@
+//! Bytes that changed on disk are found, named, and healed by the same import.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use wildcity::residency::Cache;
+use wildcity::scene::Gaussians;
+use wildcity::store::{Catalog, StoreError, Version};
+
+use crate::scene_files::gaussians;
+use crate::{commit, street, wildcity};
+
+struct Twin {
+    dir: tempfile::TempDir,
+    scene: Gaussians,
+    version: Version,
+}
+
+fn twin() -> Twin {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = gaussians(2_000, 1, 100.0, 1);
+    let version = commit(dir.path(), street(&scene)).unwrap();
+    Twin { dir, scene, version }
+}
+
+impl Twin {
+    fn object(&self, hash: &str) -> PathBuf {
+        self.dir.path().join("street/objects").join(&hash[..2]).join(hash)
+    }
+
+    /// What each way of reading says about an object that is not what it was.
+    fn assert_found(&self, hash: &str, wanted: &str) {
+        let catalog = Catalog::open(self.dir.path()).unwrap();
+        let verified = catalog.verify("street", &mut |_, _| {}).unwrap();
+        let named: Vec<_> = verified.damaged.iter().map(|damage| damage.object.as_str()).collect();
+        assert_eq!(named, [hash]);
+        let text = Cache::new(catalog).open("street", None).unwrap_err().to_string();
+        assert!(text.contains(hash) && text.contains(wanted), "{text}");
+
+        let mut verify = wildcity();
+        verify.args(["verify", "street", "--twins"]).arg(self.dir.path());
+        let output = verify.output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let said = String::from_utf8(output.stdout).unwrap();
+        assert!(said.starts_with(&format!("damaged {hash}: ")), "{said}");
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(said.contains("error: 1 of ") && said.contains(" objects are damaged"), "{said}");
+    }
+
+    fn assert_healed_by_import(&self) {
+        let again = commit(self.dir.path(), street(&self.scene)).unwrap();
+        assert_eq!(again.hash, self.version.hash);
+        let catalog = Catalog::open(self.dir.path()).unwrap();
+        let verified = catalog.verify("street", &mut |_, _| {}).unwrap();
+        assert_eq!(verified.damaged.len(), 0);
+        assert_eq!(verified.objects, self.version.manifest.chunks.len() + 1);
+        Cache::new(catalog).open("street", None).unwrap();
+    }
+}
+
+fn flip(path: &Path, byte: usize) {
+    let mut bytes = fs::read(path).unwrap();
+    bytes[byte] ^= 0x10;
+    fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn one_flipped_bit_anywhere_in_a_chunk_is_found() {
+    let twin = twin();
+    let hash = twin.version.manifest.chunks[2].object.clone();
+    let path = twin.object(&hash);
+    let size = fs::metadata(&path).unwrap().len() as usize;
+    // Magic, format, header length, cell, count, padding, the first and the last record.
+    for byte in [0, 8, 12, 17, 49, 4000, 4096, size - 1] {
+        flip(&path, byte);
+        twin.assert_found(&hash, "its bytes hash to");
+        flip(&path, byte);
+    }
+    flip(&path, 4500);
+    twin.assert_healed_by_import();
+}
+
+#[test]
+fn a_short_or_lost_chunk_is_found() {
+    let twin = twin();
+    let hash = twin.version.manifest.chunks[0].object.clone();
+    let path = twin.object(&hash);
+    let whole = fs::read(&path).unwrap();
+    for length in [0, 100, 4096, whole.len() - 92] {
+        fs::write(&path, &whole[..length]).unwrap();
+        twin.assert_found(&hash, "its bytes hash to");
+    }
+    fs::remove_file(&path).unwrap();
+    twin.assert_found(&hash, "cannot open");
+    twin.assert_healed_by_import();
+}
+
+#[test]
+fn a_changed_manifest_is_found() {
+    let twin = twin();
+    let hash = twin.version.hash.clone();
+    flip(&twin.object(&hash), 40);
+    twin.assert_found(&hash, "its bytes hash to");
+    twin.assert_healed_by_import();
+}
+
+#[test]
+fn a_changed_log_record_is_no_path_out_of_the_twin() {
+    let twin = twin();
+    let record = twin.dir.path().join("street/log/0000000001");
+    for text in ["", "{}", r#"{"manifest":"../../../etc/passwd","created_us":0}"#] {
+        fs::write(&record, text).unwrap();
+        let error = Catalog::open(twin.dir.path()).unwrap().version("street", None).unwrap_err();
+        assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
+    }
+    // The next import makes a new version past the damaged record.
+    assert_eq!(commit(twin.dir.path(), street(&twin.scene)).unwrap().number, 2);
+}
+
+#[test]
+fn a_later_format_is_named_as_such() {
+    let twin = twin();
+    let manifest = fs::read_to_string(twin.object(&twin.version.hash)).unwrap();
+    let later = manifest.replacen("\"format\":0", "\"format\":9,\"new\":1", 1);
+    let hash = blake3::hash(later.as_bytes()).to_hex().to_string();
+    let path = twin.object(&hash);
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    fs::write(path, later).unwrap();
+    let record = format!(r#"{{"manifest":"{hash}","created_us":0}}"#);
+    fs::write(twin.dir.path().join("street/log/0000000002"), record).unwrap();
+    let error = Catalog::open(twin.dir.path()).unwrap().version("street", None).unwrap_err();
+    assert!(error.to_string().ends_with("has format 9; this build reads format 0"), "{error}");
+}

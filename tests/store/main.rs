@@ -1,0 +1,59 @@
+//! Twins on disk: what is committed comes back, and whatever goes wrong leaves old or nothing.
+
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+
+mod command_line;
+mod crash;
+mod damage;
+mod real_scenes;
+mod residency;
+mod round_trip;
+
+use std::path::{Path, PathBuf};
+
+use wildcity::scene::manifest::Provenance;
+use wildcity::scene::{Gaussians, RenderProfile};
+use wildcity::store::{Catalog, NewVersion, StoreError, Version};
+
+/// A version of twin "street" with nothing but Gaussians.
+fn street(gaussians: &Gaussians) -> NewVersion<'_> {
+    NewVersion {
+        name: "street",
+        gaussians,
+        profile: RenderProfile::default(),
+        rig: None,
+        trajectories: Vec::new(),
+        provenance: Provenance {
+            source: "test".into(),
+            builder: "test".into(),
+            options: Vec::new(),
+        },
+    }
+}
+
+fn commit(dir: &Path, new: NewVersion<'_>) -> Result<Version, StoreError> {
+    Catalog::open(dir)?.commit(new, &mut |_, _| {})
+}
+
+/// All files below a directory, sorted.
+fn files(dir: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(dir).into_iter().flatten() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path));
+        } else {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The command that users run.
+fn wildcity() -> std::process::Command {
+    std::process::Command::new(env!("CARGO_BIN_EXE_wildcity"))
+}

@@ -1,0 +1,63 @@
+use std::fs;
+use std::sync::Arc;
+
+use wildcity::residency::Cache;
+use wildcity::store::Catalog;
+
+use crate::scene_files::gaussians;
+use crate::{commit, street};
+
+#[test]
+fn sessions_share_one_resident_twin() {
+    let dir = tempfile::tempdir().unwrap();
+    commit(dir.path(), street(&gaussians(20_000, 1, 100.0, 1))).unwrap();
+    let cache = Cache::new(Catalog::open(dir.path()).unwrap());
+    let held: Vec<_> = std::thread::scope(|scope| {
+        let opens: Vec<_> =
+            (0..8).map(|_| scope.spawn(|| cache.open("street", None).unwrap())).collect();
+        opens.into_iter().map(|open| open.join().unwrap()).collect()
+    });
+    assert!(held.iter().all(|resident| Arc::ptr_eq(resident, &held[0])), "loaded once");
+    assert_eq!(Arc::strong_count(&held[0]), 8);
+    assert_eq!(held[0].scene.gaussians(), 20_000);
+    assert_eq!(held[0].version.number, 1);
+
+    // A session keeps the version it opened; a new one gets the latest.
+    commit(dir.path(), street(&gaussians(10, 1, 100.0, 2))).unwrap();
+    let latest = cache.open("street", None).unwrap();
+    assert_eq!((latest.version.number, latest.scene.gaussians()), (2, 10));
+    let old = cache.open("street", Some(1)).unwrap();
+    assert!(Arc::ptr_eq(&old, &held[0]));
+
+    // With the last session the memory goes.
+    let gone = Arc::downgrade(&held[0]);
+    drop((held, old));
+    assert!(gone.upgrade().is_none());
+    assert_eq!(cache.open("street", Some(1)).unwrap().scene.gaussians(), 20_000);
+    assert_eq!(cache.twins().unwrap().len(), 1);
+}
+
+#[test]
+fn a_failed_load_is_tried_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let version = commit(dir.path(), street(&gaussians(1_000, 0, 10.0, 1))).unwrap();
+    let cache = Cache::new(Catalog::open(dir.path()).unwrap());
+    let hash = &version.manifest.chunks[0].object;
+    let path = dir.path().join("street/objects").join(&hash[..2]).join(hash);
+    let away = dir.path().join("away");
+    fs::rename(&path, &away).unwrap();
+    assert!(cache.open("street", None).unwrap_err().to_string().contains("cannot open"));
+    fs::rename(&away, &path).unwrap();
+    assert_eq!(cache.open("street", None).unwrap().scene.gaussians(), 1_000);
+}
+
+#[test]
+fn a_gaussian_of_degree_one_takes_at_most_120_bytes() {
+    let dir = tempfile::tempdir().unwrap();
+    commit(dir.path(), street(&gaussians(50_000, 1, 200.0, 1))).unwrap();
+    let cache = Cache::new(Catalog::open(dir.path()).unwrap());
+    let scene = &cache.open("street", None).unwrap().scene;
+    assert!(scene.chunks.len() > 30);
+    let each = scene.bytes() as f64 / 50_000.0;
+    assert!((92.0..120.0).contains(&each), "{each} bytes");
+}

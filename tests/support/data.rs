@@ -1,0 +1,24 @@
+//! The real data: `$WILDCITY_DATA`, or `../shared/data` beside the project.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+/// A file of the real data; `None`, said on standard error, where the data is absent.
+///
+/// # Panics
+/// If the data is there and the file is not: that is a mistake in the test.
+pub(crate) fn real(file: &str) -> Option<PathBuf> {
+    let beside = concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data");
+    let root = std::env::var_os("WILDCITY_DATA").unwrap_or_else(|| beside.into());
+    let root = PathBuf::from(root);
+    if !root.is_dir() {
+        // Not eprintln: the test harness would swallow it.
+        let test = std::thread::current().name().unwrap_or("a test").to_owned();
+        let line = format!("NOT RUN: {test}: no real data at {}\n", root.display());
+        std::io::stderr().write_all(line.as_bytes()).unwrap();
+        return None;
+    }
+    let path = root.join(file);
+    assert!(path.is_file(), "{} is missing from the real data", path.display());
+    Some(path)
+}

@@ -1,0 +1,34 @@
+//! Scenes with the shape of a street: flat things, thin things, near and far.
+
+use wildcity::scene::{Gaussians, sh};
+
+use crate::scene_files::Random;
+
+/// `n` Gaussians of a road, two facades and clutter along +z, y down (a camera's own axes).
+pub(crate) fn street(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
+    let mut random = Random(seed);
+    let mut g = Gaussians::with_capacity(sh_degree, n);
+    for i in 0..n {
+        let z = 150.0 * random.unit();
+        let (mean, scale) = match i % 10 {
+            0..=2 => ([16.0 * random.unit() - 8.0, 1.6, z], [0.08, 0.01, 0.08]),
+            3..=7 => {
+                let side = if random.unit() < 0.5 { -1.0 } else { 1.0 };
+                let x = side * (8.0 + 0.6 * random.unit());
+                ([x, 1.6 - 14.0 * random.unit(), z], [0.01, 0.1, 0.1])
+            }
+            _ => {
+                let x = 18.0 * random.unit() - 9.0;
+                ([x, 1.6 - 6.0 * random.unit(), z], [0.06; 3])
+            }
+        };
+        g.means_m.push(mean);
+        g.quats_wxyz
+            .push([1.0, 0.0, 0.0, 0.0].map(|q: f64| (q + 0.2 * random.unit() - 0.1) as f32));
+        g.ln_scales.push(scale.map(|s: f64| (s.ln() + random.unit() - 0.5) as f32));
+        g.logit_opacities.push(random.between(-2.0, 4.0));
+        g.sh.extend((0..3).map(|_| random.between(-1.5, 1.5)));
+        g.sh.extend((3..3 * sh::coefficients(sh_degree)).map(|_| random.between(-0.3, 0.3)));
+    }
+    g
+}
