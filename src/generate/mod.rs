@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use crate::scene::{Gaussians, Trajectory};
 
 /// Counts the generator's changes: a demo twin of another revision is built again.
-pub const REVISION: u32 = 1;
+pub const REVISION: u32 = 2;
 
 /// What the street is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
