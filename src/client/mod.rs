@@ -204,7 +204,7 @@ impl Client {
 
     async fn observation(&mut self, request: &Request) -> Result<Observation, ClientError> {
         match self.exchange(request).await? {
-            Incoming::Observation(observation) => Ok(observation),
+            Incoming::Observation(observation) => Ok(*observation),
             other => Err(self.break_off("an observation", &other)),
         }
     }

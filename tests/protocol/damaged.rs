@@ -10,6 +10,9 @@ use super::frames::{Frame, assemble, png};
 use super::observations::{png_frame, raw_frame};
 use super::{check_file, check_json, protocol_path, read};
 
+/// Whether an error is the right one.
+type Refusal = fn(&FrameError) -> bool;
+
 /// A damaged frame, and what the client must say.
 struct Damaged {
     name: &'static str,
@@ -17,7 +20,7 @@ struct Damaged {
     bytes: Vec<u8>,
     /// Whether only the image is damaged, which shows when it is decoded.
     image_only: bool,
-    refused: fn(&FrameError) -> bool,
+    refused: Refusal,
 }
 
 #[test]
@@ -111,7 +114,7 @@ fn damaged() -> Vec<Damaged> {
 
 /// The header is JSON, but its tensors cannot be.
 fn damaged_tables() -> Vec<Damaged> {
-    let edits: [(&str, &str, &str, Value, fn(&FrameError) -> bool); 11] = [
+    let edits: [(&str, &str, &str, Value, Refusal); 11] = [
         (
             "overlap",
             "two tensors overlap",
@@ -217,7 +220,7 @@ fn damaged_tables() -> Vec<Damaged> {
         let (mut header, data) = raw_frame().header();
         header["__metadata__"]["observation"] = json!(text);
         let bytes = assemble(&Value::Object(header).to_string(), &data);
-        let refused: fn(&FrameError) -> bool = |e| matches!(e, FrameError::Observation(_));
+        let refused: Refusal = |e| matches!(e, FrameError::Observation(_));
         cases.push(Damaged { name, what, bytes, image_only: false, refused });
     }
     cases

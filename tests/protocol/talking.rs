@@ -11,6 +11,9 @@ use wildcity::protocol::message::{Open, Outcome, Pose, Request};
 use super::fake_server::{FakeServer, Reply, seq_of};
 use super::read;
 
+/// Whether an error is the right one.
+type Refusal = fn(&ClientError) -> bool;
+
 const HERE: Pose = Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] };
 
 const HELLO: Reply = Reply::Golden("welcome");
@@ -148,7 +151,7 @@ async fn a_dropped_call_gives_the_connection_up() {
 #[tokio::test]
 async fn what_is_no_answer_is_named() {
     let damaged = read("vectors/damaged/overlap.bin");
-    let cases: [(Reply, fn(&ClientError) -> bool); 5] = [
+    let cases: [(Reply, Refusal); 5] = [
         (Reply::Observation(1), |e| {
             matches!(e, ClientError::SeqMismatch { expected: 2, got: Some(3) })
         }),
