@@ -24,7 +24,7 @@ const GATHER: usize = 64;
 /// The splats of a frame by tile.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
-    /// All splats, view after view, each from the nearest.
+    /// All splats of this frame, view after view, each from the nearest; more room behind.
     splats: Vec<Splat>,
     /// Indices into `splats`, tile after tile. Atomic so that blocks can fill their places side by
     /// side without unsafe code; a relaxed store is an ordinary store.
@@ -77,7 +77,11 @@ impl Bins {
         cutoffs: &Cutoffs,
     ) -> Result<(), RenderError> {
         let grids: Vec<Grid> = views.iter().map(Grid::new).collect();
-        self.splats.resize(sorted.len(), Splat::default());
+        if self.splats.len() < sorted.len() {
+            let wanted = sorted.len() + sorted.len() / 8;
+            self.splats.reserve_exact(wanted - self.splats.len());
+            self.splats.resize(wanted, Splat::default());
+        }
 
         // Count: put the splats in order, and count each block's instances per tile.
         let mut blocks = Vec::new();
@@ -130,7 +134,10 @@ impl Bins {
         // Emit.
         self.used = total as usize;
         if self.instances.len() < self.used {
-            self.instances.resize_with(self.used, AtomicU32::default);
+            // An eighth to spare, not as much again: a drive's frames differ by little.
+            let wanted = self.used + self.used / 8;
+            self.instances.reserve_exact(wanted - self.instances.len());
+            self.instances.resize_with(wanted, AtomicU32::default);
         }
         let mut first = 0;
         let blocks: Vec<_> = blocks

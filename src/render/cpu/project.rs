@@ -34,6 +34,18 @@ pub(super) struct Unit {
     pub(super) keys: Vec<u64>,
 }
 
+impl Unit {
+    /// Takes a copy without the spare room of a vector that grew.
+    fn refill(&mut self, from: &Self) {
+        self.splats.clear();
+        self.splats.reserve_exact(from.splats.len());
+        self.splats.extend_from_slice(&from.splats);
+        self.keys.clear();
+        self.keys.reserve_exact(from.keys.len());
+        self.keys.extend_from_slice(&from.keys);
+    }
+}
+
 struct Job<'a> {
     view: usize,
     chunk: &'a Chunk,
@@ -51,11 +63,12 @@ impl Projected {
         }
         self.used = jobs.len();
         let units = self.units[..self.used].par_iter_mut().zip(&jobs).enumerate();
-        units.for_each(|(place, (unit, job))| {
-            unit.splats.clear();
-            unit.keys.clear();
+        units.for_each_init(Unit::default, |buffer, (place, (unit, job))| {
+            buffer.splats.clear();
+            buffer.keys.clear();
             let base = (job.view as u64) << (DEPTH_BITS + 32) | (place as u64) << UNIT_BITS;
-            dispatch!(level, simd => project_unit(simd, job, cutoffs, base, unit));
+            dispatch!(level, simd => project_unit(simd, job, cutoffs, base, buffer));
+            unit.refill(buffer);
         });
     }
 

@@ -16,6 +16,7 @@ impl Sorted {
     /// and the place counts through (view, global id): equal depths keep the order of ids.
     pub(super) fn sort(&mut self, projected: &Projected) {
         self.keys.clear();
+        self.keys.reserve_exact(projected.units().iter().map(|unit| unit.keys.len()).sum());
         self.keys.extend(projected.units().iter().flat_map(|unit| &unit.keys));
         self.keys.par_sort_unstable();
     }
