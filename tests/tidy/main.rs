@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Each room, and the rooms it may name. A room that is missing here fails the test.
 const ROOMS: &[(&str, &[&str])] = &[
@@ -40,6 +40,7 @@ const ROOMS: &[(&str, &[&str])] = &[
 /// Packages that belong to some places alone.
 const PACKAGES: &[(&str, &[&str])] = &[
     ("axum", &["server"]),
+    ("hyper", &["server"]),
     ("tokio_tungstenite", &["client", "server"]),
     ("bincode", &["store/chunk_file.rs"]),
     ("clap", &["cli", "render/cpu/mod.rs"]),
