@@ -3,47 +3,48 @@
 //! Work is cut into units of (view, 16 clusters of one chunk), whose results keep the order
 //! (view, global id) wherever they were computed.
 
+use std::sync::{Mutex, PoisonError};
+
 use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
 use rayon::prelude::*;
 
 use super::lanes::Vec3x16;
 
-use crate::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, MAX_SIGMA_PX};
+use crate::render::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
 use crate::render::{Frame, View};
 use crate::scene::chunk::{CLUSTER, LANES, Lanes, column};
 use crate::scene::{Chunk, RenderProfile, sh};
 
-/// Clusters of a unit: 4096 Gaussians, so that 12 bits name a splat within its unit.
+/// Clusters of a unit: 4096 Gaussians take some 100 µs, long enough to be worth handing out.
 const UNIT_CLUSTERS: usize = 16;
-const UNIT_BITS: u32 = (UNIT_CLUSTERS * CLUSTER).ilog2();
+
+/// Splats of a page.
+const PAGE: usize = 1 << PAGE_BITS;
+const PAGE_BITS: u32 = 8;
+
+/// 12 KiB of splats. Units come and go as the ego moves; pages are handed from one to another, so
+/// that memory follows the largest frame and not the largest of each unit.
+type Page = Box<[Splat; PAGE]>;
 
 /// All splats of a frame.
 #[derive(Debug, Default)]
 pub(super) struct Projected {
+    /// Pages in order of (view, global id); the last of each unit may have room.
+    pages: Vec<Page>,
     units: Vec<Unit>,
-    used: usize,
+    free: Mutex<Vec<Page>>,
 }
 
 /// The splats of one view and 4096 Gaussians.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Unit {
-    /// In order of global ids.
-    splats: Vec<Splat>,
-    /// Sort keys of the splats.
-    pub(super) keys: Vec<u64>,
-}
-
-impl Unit {
-    /// Takes a copy without the spare room of a vector that grew.
-    fn refill(&mut self, from: &Self) {
-        self.splats.clear();
-        self.splats.reserve_exact(from.splats.len());
-        self.splats.extend_from_slice(&from.splats);
-        self.keys.clear();
-        self.keys.reserve_exact(from.keys.len());
-        self.keys.extend_from_slice(&from.keys);
-    }
+    /// Whose screen.
+    pub(super) view: usize,
+    /// How many splats.
+    pub(super) len: usize,
+    /// The first of its pages.
+    first_page: usize,
 }
 
 struct Job<'a> {
@@ -57,31 +58,62 @@ struct Job<'a> {
 impl Projected {
     /// Projects every Gaussian of the scene into every view.
     pub(super) fn project(&mut self, level: Level, frame: &Frame<'_>, cutoffs: &Cutoffs) {
+        let Self { pages, units, free } = self;
+        let all_free = free.get_mut().unwrap_or_else(PoisonError::into_inner);
+        all_free.append(pages);
         let jobs: Vec<Job<'_>> = jobs(frame);
-        if self.units.len() < jobs.len() {
-            self.units.resize_with(jobs.len(), Unit::default);
+        let filled: Vec<(usize, Vec<Page>)> = jobs
+            .par_iter()
+            .map_init(Vec::new, |splats, job| {
+                splats.clear();
+                dispatch!(level, simd => project_unit(simd, job, cutoffs, splats));
+                (splats.len(), into_pages(splats, free))
+            })
+            .collect();
+        units.clear();
+        for (job, (len, mut filled)) in jobs.iter().zip(filled) {
+            units.push(Unit { view: job.view, len, first_page: pages.len() });
+            pages.append(&mut filled);
         }
-        self.used = jobs.len();
-        let units = self.units[..self.used].par_iter_mut().zip(&jobs).enumerate();
-        units.for_each_init(Unit::default, |buffer, (place, (unit, job))| {
-            buffer.splats.clear();
-            buffer.keys.clear();
-            let base = (job.view as u64) << (DEPTH_BITS + 32) | (place as u64) << UNIT_BITS;
-            dispatch!(level, simd => project_unit(simd, job, cutoffs, base, buffer));
-            unit.refill(buffer);
-        });
+    }
+
+    /// How many splats.
+    pub(super) fn len(&self) -> usize {
+        self.units.iter().map(|unit| unit.len).sum()
     }
 
     /// The units in order of (view, global id).
     pub(super) fn units(&self) -> &[Unit] {
-        &self.units[..self.used]
+        &self.units
     }
 
-    /// The splat of a sort key.
-    pub(super) fn splat(&self, key: u64) -> &Splat {
-        let place = key as u32;
-        &self.units[(place >> UNIT_BITS) as usize].splats[(place & ((1 << UNIT_BITS) - 1)) as usize]
+    /// Places and splats of one unit, in order of global ids.
+    pub(super) fn unit(&self, unit: &Unit) -> impl Iterator<Item = (u32, &Splat)> {
+        let first = (unit.first_page << PAGE_BITS) as u32;
+        let pages = &self.pages[unit.first_page..];
+        (first..).zip(pages.iter().flat_map(|page| page.iter()).take(unit.len))
     }
+
+    /// The splat at a place.
+    #[inline(always)]
+    pub(super) fn splat(&self, place: u32) -> &Splat {
+        &self.pages[(place >> PAGE_BITS) as usize][place as usize % PAGE]
+    }
+}
+
+/// Copies splats to free pages, or new ones where there are none left.
+fn into_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
+    let wanted = splats.len().div_ceil(PAGE);
+    let mut pages = {
+        let mut free = free.lock().unwrap_or_else(PoisonError::into_inner);
+        let kept = free.len().saturating_sub(wanted);
+        free.split_off(kept)
+    };
+    pages.resize_with(wanted, || Box::new([Splat::default(); PAGE]));
+    for (page, splats) in pages.iter_mut().zip(splats.chunks(PAGE)) {
+        page[..splats.len()].copy_from_slice(splats);
+    }
+    pages
 }
 
 /// The units of a frame: chunks that a view cannot see cost one test.
@@ -120,7 +152,7 @@ fn jobs_of<'a>(
 }
 
 #[inline(always)]
-fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, base: u64, unit: &mut Unit) {
+fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut Vec<Splat>) {
     let blocks = job.chunk.len().div_ceil(LANES);
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
         if !job.frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m) {
@@ -130,8 +162,8 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, base: u64, u
         for block in first..(first + CLUSTER / LANES).min(blocks) {
             let columns = job.chunk.block(block);
             let degree = job.chunk.sh_degree();
-            if let Some(splats) = project_block(simd, columns, degree, &job.chunk_view, cutoffs) {
-                splats.append(cutoffs.near_m, base, unit);
+            if let Some(lanes) = project_block(simd, columns, degree, &job.chunk_view, cutoffs) {
+                lanes.append(splats);
             }
         }
     }
@@ -145,16 +177,13 @@ struct SplatLanes {
 
 impl SplatLanes {
     #[inline(always)]
-    fn append(&self, near_m: f32, base: u64, unit: &mut Unit) {
+    fn append(&self, splats: &mut Vec<Splat>) {
         let mut visible = self.visible;
         while visible != 0 {
             let lane = visible.trailing_zeros() as usize;
             visible &= visible - 1;
             let c = |column: usize| self.columns[column][lane];
-            let depth = c(9).to_bits() - near_m.to_bits();
-            let depth = u64::from(depth.min((1 << DEPTH_BITS) - 1));
-            unit.keys.push(base | depth << 32 | unit.splats.len() as u64);
-            unit.splats.push(Splat {
+            splats.push(Splat {
                 mean_px: [c(0), c(1)],
                 factor: [c(2), c(3), c(4)],
                 log2_opacity: c(5),
