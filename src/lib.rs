@@ -4,19 +4,19 @@
 //!
 //! | room | what it is | may name |
 //! |---|---|---|
-//! | [`config`] | every default and every limit, checked once | nothing |
+//! | [`config`] | every default and every limit | nothing |
 //! | [`geometry`] | poses, cameras, boxes | nothing |
 //! | [`scene`] | what a city twin is | geometry |
 //! | [`generate`] | the procedural demo twin | geometry, scene |
-//! | [`ingest`] | one file per outside format | scene |
-//! | [`store`] | twins on disk, versioned, content-addressed | geometry, scene, ingest |
-//! | [`residency`] | what is in memory now | geometry, scene, store |
-//! | [`render`] | six images per step: `cpu`, `reference` | geometry, scene |
-//! | [`session`] | episodes: reset, step, observe, record, replay | all above |
+//! | [`ingest`] | one file per outside format | config, geometry, scene |
+//! | [`store`] | twins on disk, versioned, content-addressed | config, geometry, scene, ingest |
+//! | [`residency`] | what is in memory now | config, scene, store |
+//! | [`render`] | six images per step: `cpu`, `reference` | config, geometry, scene |
+//! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
 //! | [`protocol`] | the wire, and only the wire | nothing |
-//! | [`server`] | WebSocket and HTTP | protocol, store, session |
-//! | [`client`] | the Rust client of the protocol | protocol |
-//! | [`cli`] | one file per subcommand | everything |
+//! | [`server`] | WebSocket and HTTP | config, geometry, scene, store, render, session, protocol |
+//! | [`client`] | the Rust client of the protocol | config, protocol |
+//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, server, client |
 //!
 //! Data goes one way: file, ingest, store, residency, render, session, server, agent; an agent's
 //! pose goes server, session. Nothing downstream calls upstream.
@@ -33,7 +33,7 @@
 //! 8. Every queue, message, buffer and count has a maximum, all in [`config`].
 //! 9. A scene pays only for what it has: no SH, no depth wanted, no work for it.
 //!
-//! `tests/tidy` holds this table against the source.
+//! `tests/tidy` reads this table and holds the source to it, and to invariants 1 and 2.
 
 pub mod cli;
 pub mod client;

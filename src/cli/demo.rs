@@ -3,7 +3,7 @@
 mod mosaic;
 
 use std::fs;
-use std::io::{self, Write};
+use std::io::{self, ErrorKind, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,9 +12,8 @@ use std::time::Instant;
 use anyhow::Context;
 use serde_json::json;
 
-use crate::client::{Client, Observation};
+use crate::client::{Client, Observation, Open, Pose};
 use crate::generate::{self, StreetSettings};
-use crate::protocol::message::{Open, Pose};
 use crate::scene::manifest::Provenance;
 use crate::scene::{RenderProfile, Rig, Trajectory};
 use crate::server::{self, Limits};
@@ -55,6 +54,8 @@ Examples:
 
 /// Name of the demo twin.
 const TWIN: &str = "demo";
+/// How the source of every revision of it begins.
+const STREET: &str = "street ";
 /// How fast the agent drives, in m/s; a step takes 0.1 s.
 const SPEED_M_PER_S: f64 = 8.0;
 /// Steps between two mosaics.
@@ -179,22 +180,22 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
     Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
 }
 
-/// The demo twin in the user's store: built on first use, and again after the generator changed.
+/// The demo twin in the user's store: built on first use, and again after the generator changed or
+/// the disk lost some of it.
 fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
+    let revision = generate::REVISION;
     let provenance = Provenance {
-        source: format!("street {}: {}", generate::REVISION, serde_json::to_string(&settings)?),
+        source: format!("{STREET}{revision}: {}", serde_json::to_string(&settings)?),
         builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).into(),
         options: Vec::new(),
     };
-    match catalog.version(TWIN, None) {
-        Ok(version) if version.manifest.provenance == provenance => return Ok(version),
-        Ok(_) | Err(StoreError::NoTwin { .. }) => {}
-        Err(error) => return Err(error.into()),
-    }
-    let mut err = io::stderr().lock();
-    writeln!(err, "building the demo twin in {} (once)", twins.display())?;
+    let why = match built(&catalog, &provenance)? {
+        Ok(version) => return Ok(version),
+        Err(why) => why,
+    };
+    writeln!(io::stderr(), "building the demo twin in {} ({why})", twins.display())?;
     let street = generate::street(&settings)?;
     let bar = progress::count("writing");
     let version = catalog.commit(
@@ -210,4 +211,46 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
     )?;
     bar.finish_and_clear();
     Ok(version)
+}
+
+/// The demo twin as it was built, or why it must be built.
+///
+/// # Errors
+/// The name belongs to a twin that somebody imported: it is not ours to add a version to.
+fn built(
+    catalog: &Catalog,
+    provenance: &Provenance,
+) -> anyhow::Result<Result<Version, &'static str>> {
+    const DAMAGED: &str = "again, since it is damaged";
+    let version = match catalog.version(TWIN, None) {
+        Ok(version) => version,
+        Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
+        Err(StoreError::Damaged { .. } | StoreError::Format { .. }) => return Ok(Err(DAMAGED)),
+        Err(StoreError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {
+            return Ok(Err(DAMAGED));
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let found = &version.manifest.provenance;
+    anyhow::ensure!(
+        found.source.starts_with(STREET),
+        "twin {TWIN:?} in {} is not the demo street (its source is {:?}): give --twins another \
+         directory, or import yours under another name",
+        catalog.dir().display(),
+        found.source,
+    );
+    if found != provenance {
+        return Ok(Err("anew, as the generator changed"));
+    }
+    Ok(if is_sound(catalog, &version)? { Ok(version) } else { Err(DAMAGED) })
+}
+
+/// Whether every chunk of a version is what was committed; older versions may be as they like.
+fn is_sound(catalog: &Catalog, version: &Version) -> anyhow::Result<bool> {
+    let bar = progress::bytes("checking");
+    let verified = catalog.verify(TWIN, &mut progress::show(&bar))?;
+    bar.finish_and_clear();
+    let chunks = &version.manifest.chunks;
+    let mut damaged = verified.damaged.iter().map(|damage| &damage.object);
+    Ok(!damaged.any(|object| chunks.iter().any(|chunk| chunk.object == *object)))
 }

@@ -1,15 +1,14 @@
 //! `wildcity render`.
 
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::fs;
+use std::io::{self, Write};
+use std::path::PathBuf;
 
 use anyhow::Context;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 
 use crate::config;
 use crate::render::{Frame, Target};
+use crate::session;
 
 use super::progress;
 use super::scene_source::{SceneSource, Shot};
@@ -76,9 +75,9 @@ impl Render {
                 }
             };
             ready.backend.render(&frame, &mut [target], &|_, _| {})?;
-            self.format
-                .write(&path, shot, &rgba, &rgb8)
-                .with_context(|| format!("{}", path.display()))?;
+            let file = self.format.file(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
+            file.and_then(|file| Ok(fs::write(&path, file)?))
+                .with_context(|| format!("cannot write {}", path.display()))?;
             bar.inc(1);
             writeln!(out, "{}", path.display())?;
         }
@@ -96,35 +95,25 @@ impl Format {
         }
     }
 
-    fn write(self, path: &Path, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> anyhow::Result<()> {
+    /// The whole file: written at once, so that no error is lost in a buffer.
+    fn file(self, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> Result<Vec<u8>, String> {
         let (width, height) = (shot.view.camera.width_px, shot.view.camera.height_px);
-        let file = || File::create(path).map(BufWriter::new);
         match self {
-            Self::Png => {
-                PngEncoder::new_with_quality(file()?, CompressionType::Fast, FilterType::Adaptive)
-                    .write_image(rgb8, width, height, ExtendedColorType::Rgb8)?
-            }
-            Self::Jpeg => {
-                let encoder = jpeg_encoder::Encoder::new(file()?, config::JPEG_QUALITY);
-                let (width, height) = (u16::try_from(width)?, u16::try_from(height)?);
-                encoder.encode(rgb8, width, height, jpeg_encoder::ColorType::Rgb)?;
-            }
-            Self::Npy => write_npy(&mut file()?, [height, width, 4], rgba)?,
+            Self::Png => session::png(rgb8, width, height),
+            Self::Jpeg => session::jpeg(rgb8, width, height, config::JPEG_QUALITY),
+            Self::Npy => Ok(npy([height, width, 4], rgba)),
         }
-        Ok(())
     }
 }
 
 /// Version 1.0 of NumPy's format: magic, header length, a Python dict padded to 64 bytes, data.
-fn write_npy(out: &mut impl Write, shape: [u32; 3], values: &[f32]) -> io::Result<()> {
+fn npy(shape: [u32; 3], values: &[f32]) -> Vec<u8> {
     let [h, w, c] = shape;
     let dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({h}, {w}, {c}), }}");
     let padded = (10 + dict.len() + 1).next_multiple_of(64) - 10;
-    out.write_all(b"\x93NUMPY\x01\x00")?;
-    out.write_all(&(padded as u16).to_le_bytes())?;
-    writeln!(out, "{dict:width$}", width = padded - 1)?;
-    for value in values {
-        out.write_all(&value.to_le_bytes())?;
-    }
-    out.flush()
+    let mut file = b"\x93NUMPY\x01\x00".to_vec();
+    file.extend((padded as u16).to_le_bytes());
+    file.extend(format!("{dict:width$}\n", width = padded - 1).into_bytes());
+    file.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    file
 }

@@ -1,15 +1,13 @@
 //! `wildcity replay`.
 
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::fs;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 
 use crate::residency::Cache;
-use crate::session::{Extent, FrameRequest, Recording, Redrawn};
+use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
 use crate::store::Catalog;
 
 use super::places::Twins;
@@ -126,11 +124,7 @@ fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
     };
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
     let (width, height) = (camera.camera.width_px, camera.camera.height_px);
-    let write = || {
-        let mut file = BufWriter::new(File::create(&path)?);
-        PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
-            .write_image(rgb8, width, height, ExtendedColorType::Rgb8)?;
-        anyhow::Ok(file.flush()?)
-    };
-    write().with_context(|| format!("{}", path.display()))
+    let file = session::png(rgb8, width, height).map_err(anyhow::Error::msg);
+    file.and_then(|file| Ok(fs::write(&path, file)?))
+        .with_context(|| format!("cannot write {}", path.display()))
 }

@@ -54,7 +54,7 @@ pub(super) struct Engine {
 
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
-    simd: Simd,
+    simd: SimdName,
 }
 
 /// The backends of this build.
@@ -69,11 +69,38 @@ enum BackendName {
     Reference,
 }
 
+/// The instruction sets of [`Simd`].
+#[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
+enum SimdName {
+    /// The best of the machine.
+    #[default]
+    Best,
+    /// Sixteen lanes.
+    Avx512,
+    /// Eight lanes, with fused multiply-add.
+    Avx2,
+    /// Four lanes, without fused multiply-add.
+    Sse42,
+}
+
+impl From<SimdName> for Simd {
+    fn from(name: SimdName) -> Self {
+        match name {
+            SimdName::Best => Self::Best,
+            SimdName::Avx512 => Self::Avx512,
+            SimdName::Avx2 => Self::Avx2,
+            SimdName::Sse42 => Self::Sse42,
+        }
+    }
+}
+
 impl Engine {
     /// Makes the backend.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         Ok(match self.backend {
-            BackendName::Auto | BackendName::Cpu => Box::new(Cpu::new(self.threads, self.simd)?),
+            BackendName::Auto | BackendName::Cpu => {
+                Box::new(Cpu::new(self.threads, self.simd.into())?)
+            }
             BackendName::Reference => Box::new(Reference),
         })
     }

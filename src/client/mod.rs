@@ -14,11 +14,12 @@ use crate::config;
 use crate::protocol::PROTOCOL;
 use crate::protocol::error::Code;
 use crate::protocol::message::{
-    Answer, ClientInfo, Limits, Open, Opened, Pose, Request, ServerInfo, Start, Summary, TwinInfo,
+    Answer, ClientInfo, Limits, Opened, Request, ServerInfo, Start, Summary, TwinInfo,
 };
 
 use connection::{Connection, Incoming};
 
+pub use crate::protocol::message::{Open, Pose};
 pub use error::{ClientError, FrameError};
 pub use observation::{ImageView, Observation};
 

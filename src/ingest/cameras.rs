@@ -1,15 +1,17 @@
 //! Camera lists: JSON files of pinhole views in the scene's own axes.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat};
 use serde::Deserialize;
 
 use crate::config;
 use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, CameraError, Pose, PoseError};
+use crate::scene::rig::MAX_NAME_BYTES;
 
 /// A camera of a list.
 #[derive(Clone, Debug, PartialEq)]
@@ -133,13 +135,14 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     if entries.is_empty() {
         return Err(CamerasError::Empty);
     }
-    let mut cameras: Vec<ListedCamera> = Vec::with_capacity(entries.len());
+    let mut cameras = Vec::with_capacity(entries.len());
+    let mut names = BTreeSet::new();
     for (index, entry) in entries.into_iter().enumerate() {
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-        let usable = (1..=64).contains(&entry.name.len())
+        let usable = (1..=MAX_NAME_BYTES).contains(&entry.name.len())
             && entry.name.chars().all(allowed)
             && !entry.name.starts_with('.');
-        let twice = cameras.iter().any(|camera| camera.name == entry.name);
+        let twice = !names.insert(entry.name.clone());
         if !usable || twice {
             let must = if twice { "comes twice" } else { "must be 1 to 64 of A-Z a-z 0-9 . _ -" };
             return Err(CamerasError::Name { index, name: entry.name, must });
@@ -166,7 +169,7 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     }
     let rotation = DQuat::from_mat3(&rotation).normalize();
     let q = [rotation.w, rotation.x, rotation.y, rotation.z];
-    let pose = Pose::checked(DVec3::from_array(position).to_array(), q);
+    let pose = Pose::checked(position, q);
     let world_from_camera =
         pose.map_err(|source| CamerasError::Pose { name: name.clone(), source })?;
     let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy })

@@ -4,8 +4,7 @@
 //! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. Tensors of
 //! other names are skipped.
 
-use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{self, Read};
 
 use ::safetensors::Dtype;
 use ::safetensors::tensor::{Metadata, TensorInfo};
@@ -14,39 +13,42 @@ use crate::config;
 use crate::scene::{Gaussians, sh};
 
 use super::validate::{self, Field};
-use super::{BUFFER_BYTES, IngestError, Progress, check_count};
+use super::{IngestError, Progress, check_count};
 
-/// Reads a safetensors file of a known size.
+/// Reads a safetensors file of a known size, from front to back.
 pub(super) fn read(
-    file: File,
+    mut input: impl Read,
     file_bytes: u64,
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, file);
     let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
-    let plan = Plan::of(&metadata)?;
-    let count = plan.count;
+    let mut plan = Plan::of(&metadata)?;
     let coefficients = sh::coefficients(plan.sh_degree);
-    let mut gaussians = Gaussians::with_capacity(plan.sh_degree, count);
+    let mut gaussians = Gaussians::with_capacity(plan.sh_degree, plan.count);
+    gaussians.sh.resize(3 * coefficients * plan.count, 0.0);
     let mut body = Body { input, body_start, done: body_start, file_bytes, progress };
 
-    body.rows(plan.means, |row: [f64; 3]| gaussians.means_m.push(row))?;
-    body.rows(plan.quats, |row| gaussians.quats_wxyz.push(row.map(|q| q as f32)))?;
-    body.rows(plan.scales, |row| gaussians.ln_scales.push(row.map(|s| s as f32)))?;
-    body.rows(plan.opacities, |[o]| gaussians.logit_opacities.push(o as f32))?;
-    gaussians.sh.resize(3 * coefficients * count, 0.0);
-    let mut first = 0;
-    for tensor in plan.colours {
-        // Coefficient `first` to `first + of_tensor - 1` of each Gaussian, as in memory.
-        let of_tensor = tensor.shape[1];
-        let mut row = 0;
-        body.rows(tensor, |rgb: [f64; 3]| {
-            let at = 3 * (row / of_tensor * coefficients + first + row % of_tensor);
-            gaussians.sh[at..at + 3].copy_from_slice(&rgb.map(|c| c as f32));
-            row += 1;
-        })?;
-        first += of_tensor;
+    plan.tensors.sort_by_key(|(_, tensor)| tensor.data_offsets);
+    for (column, tensor) in plan.tensors {
+        let g = &mut gaussians;
+        match column {
+            Column::Means => body.rows(tensor, |row| g.means_m.push(row))?,
+            Column::Quats => body.rows(tensor, |row| g.quats_wxyz.push(row.map(|q| q as f32)))?,
+            Column::Scales => body.rows(tensor, |row| g.ln_scales.push(row.map(|s| s as f32)))?,
+            Column::Opacities => body.rows(tensor, |[o]| g.logit_opacities.push(o as f32))?,
+            // Coefficient `first` to `first + of_tensor - 1` of each Gaussian, as in memory.
+            Column::Colours { first } => {
+                let of_tensor = tensor.shape[1];
+                let mut row = 0;
+                body.rows(tensor, |rgb: [f64; 3]| {
+                    let at = 3 * (row / of_tensor * coefficients + first + row % of_tensor);
+                    g.sh[at..at + 3].copy_from_slice(&rgb.map(|c| c as f32));
+                    row += 1;
+                })?;
+            }
+        }
     }
+    (body.progress)(file_bytes, file_bytes);
     let one_tensor = plan.one_tensor;
     validate::check(&gaussians, &|field| file_name(field, one_tensor))?;
     Ok(gaussians)
@@ -81,13 +83,21 @@ fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u6
 struct Plan<'a> {
     count: usize,
     sh_degree: u8,
-    means: &'a TensorInfo,
-    quats: &'a TensorInfo,
-    scales: &'a TensorInfo,
-    opacities: &'a TensorInfo,
-    colours: Vec<&'a TensorInfo>,
+    tensors: Vec<(Column, &'a TensorInfo)>,
     /// Whether all colours are in coeffs.
     one_tensor: bool,
+}
+
+/// Where a tensor goes.
+enum Column {
+    Means,
+    Quats,
+    Scales,
+    Opacities,
+    /// From this coefficient on.
+    Colours {
+        first: usize,
+    },
 }
 
 impl<'a> Plan<'a> {
@@ -135,37 +145,40 @@ impl<'a> Plan<'a> {
             let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
             bad(&format!("tensor {name}"), reason)
         })?;
-        Ok(Self {
-            count: check_count(means.shape[0] as u64)?,
-            sh_degree,
-            means,
-            quats: shaped("quats", &[n, Some(4)])?,
-            scales: shaped("scales", &[n, Some(3)])?,
-            opacities: shaped("opacities", &[n])?,
-            colours,
-            one_tensor,
-        })
+        let mut tensors = vec![
+            (Column::Means, means),
+            (Column::Quats, shaped("quats", &[n, Some(4)])?),
+            (Column::Scales, shaped("scales", &[n, Some(3)])?),
+            (Column::Opacities, shaped("opacities", &[n])?),
+        ];
+        // coeffs and sh0 start at coefficient 0, shN at 1.
+        let colours = colours.into_iter().enumerate();
+        tensors.extend(colours.map(|(first, tensor)| (Column::Colours { first }, tensor)));
+        Ok(Self { count: check_count(means.shape[0] as u64)?, sh_degree, tensors, one_tensor })
     }
 }
 
 /// The bytes after the header.
-struct Body<'a> {
-    input: BufReader<File>,
+struct Body<'a, R> {
+    input: R,
     body_start: u64,
+    /// Bytes of the file that were read.
     done: u64,
     file_bytes: u64,
     progress: Progress<'a>,
 }
 
-impl Body<'_> {
-    /// Hands a tensor to `take` in rows of `N`.
+impl<R: Read> Body<'_, R> {
+    /// Hands a tensor to `take` in rows of `N`. It starts no earlier than the last one ended, since
+    /// tensors do not overlap; what lies between is skipped.
     fn rows<const N: usize>(
         &mut self,
         tensor: &TensorInfo,
         mut take: impl FnMut([f64; N]),
     ) -> Result<(), IngestError> {
         let (start, end) = tensor.data_offsets;
-        self.input.seek(SeekFrom::Start(self.body_start + start as u64))?;
+        let between = (self.body_start + start as u64).saturating_sub(self.done);
+        self.done += io::copy(&mut (&mut self.input).take(between), &mut io::sink())?;
         let is_f64 = tensor.dtype == Dtype::F64;
         let mut row = vec![0; N * if is_f64 { 8 } else { 4 }];
         for index in 0..(end - start) / row.len() {

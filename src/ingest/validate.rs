@@ -5,12 +5,11 @@
 
 use rayon::prelude::*;
 
+use crate::geometry::Pose;
 use crate::scene::Gaussians;
 
 use super::IngestError;
 
-/// Largest distance from the origin along an axis, in metres: as far as a pose may be.
-pub const MAX_COORDINATE_M: f64 = 1e8;
 /// Shortest and longest quaternion. Trainers leave them between 0.1 and 10.
 pub const QUAT_LENGTH: [f64; 2] = [1e-6, 1e6];
 /// Smallest and largest ln of a standard deviation: 1e-13 m and 22 km.
@@ -76,7 +75,7 @@ type Fault = (Field, String, &'static str);
 /// Every test is phrased as what must hold, so that NaN fails it.
 fn first_fault(gaussians: &Gaussians, index: usize) -> Option<Fault> {
     for (axis, &m) in gaussians.means_m[index].iter().enumerate() {
-        let near = m.abs() <= MAX_COORDINATE_M;
+        let near = m.abs() <= Pose::MAX_COORDINATE_M;
         if !near {
             return Some((
                 Field::Mean(axis),

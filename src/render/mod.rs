@@ -9,7 +9,7 @@ pub mod layout;
 pub mod reference;
 
 use crate::geometry::{Camera, Pose};
-use crate::scene::{RenderProfile, Scene};
+use crate::scene::{RenderProfile, Rig, Scene};
 
 /// A camera somewhere in the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -31,8 +31,8 @@ pub struct Frame<'a> {
     pub views: &'a [View],
 }
 
-/// Most views of one frame: the depth sort's key keeps 4 bits for the camera.
-pub const MAX_VIEWS: usize = 16;
+/// Most views of one frame: those of the largest rig.
+pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
 /// Where the pixels of one view go, row by row from the top; what is `None` is not computed.
 #[derive(Debug, Default)]

@@ -112,12 +112,17 @@ impl Rig {
     }
 }
 
+/// Longest name, in bytes.
+pub const MAX_NAME_BYTES: usize = 64;
+
 /// Whether a text may name a twin, a rig, a camera, a trajectory or a session.
 ///
 /// 1 to 64 of `a-z 0-9 . _ -`, not starting with a dot: safe as a file name, never a path.
 pub fn is_name(text: &str) -> bool {
     let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"._-".contains(&b);
-    (1..=64).contains(&text.len()) && !text.starts_with('.') && text.bytes().all(allowed)
+    (1..=MAX_NAME_BYTES).contains(&text.len())
+        && !text.starts_with('.')
+        && text.bytes().all(allowed)
 }
 
 #[derive(Serialize, Deserialize)]

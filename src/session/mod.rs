@@ -26,6 +26,7 @@ use crate::scene::rig::{Rig, RigCamera};
 
 pub use buffer::Buffer;
 pub use encode::Encoding;
+pub(crate) use encode::{jpeg, png};
 pub use engine::{Engine, EngineSettings};
 pub use episode::{Episode, History, Outcome, Summary};
 pub use error::SessionError;

@@ -8,7 +8,8 @@ use crate::scene::profile::ProfileError;
 use crate::scene::rig::RigError;
 use crate::scene::trajectory::TrajectoryError;
 
-/// Why a twin could not be read or written. A failed commit leaves nothing behind.
+/// Why a twin could not be read or written. A failed commit leaves nothing behind, except
+/// [`StoreError::NotSynced`].
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The operating system refused.
@@ -72,6 +73,19 @@ pub enum StoreError {
         name: String,
         /// The version that was taken.
         number: u64,
+    },
+    /// A version is committed and visible, but the disk refused to say that it will stay.
+    #[error(
+        "version {number} of twin {name:?} is in place, but might not last through a power cut \
+         ({source}); import the same again"
+    )]
+    NotSynced {
+        /// The twin.
+        name: String,
+        /// The version.
+        number: u64,
+        /// What failed.
+        source: Box<StoreError>,
     },
     /// The Gaussians of a commit cannot be used.
     #[error(transparent)]

@@ -37,12 +37,17 @@ impl Objects {
     /// Numbers of the versions in a twin's log, rising; none for an unknown twin.
     pub(super) fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
         let entries = entries(&self.root.join(name).join("log"))?;
-        Ok(entries.iter().filter_map(|entry| entry.parse().ok()).collect())
+        let number = |entry: &String| {
+            let number = entry.parse().ok()?;
+            // "1" and "+1" are numbers, too, but nobody wrote them here.
+            (record_name(number) == *entry).then_some(number)
+        };
+        Ok(entries.iter().filter_map(number).collect())
     }
 
     /// Where one log record lies.
     pub(super) fn record_path(&self, name: &str, number: u64) -> PathBuf {
-        self.root.join(name).join("log").join(format!("{number:010}"))
+        self.root.join(name).join("log").join(record_name(number))
     }
 
     /// Reads one log record.
@@ -86,7 +91,7 @@ impl Objects {
     /// Begins a commit: waits until no other one of this twin runs, then empties its staging.
     pub(super) fn stage(&self, name: &str) -> Result<Staging, StoreError> {
         let dir = self.root.join(STAGING);
-        fs::create_dir_all(&dir).map_err(StoreError::io("create", &dir))?;
+        create_dirs(&dir)?;
         let (path, lock) = self.lock_file(name)?;
         lock.lock().map_err(StoreError::io("lock", &path))?;
         self.staging(name, lock)
@@ -175,6 +180,9 @@ impl Staging {
     }
 
     /// Makes the staged objects and then the log record visible.
+    ///
+    /// # Errors
+    /// Nothing is visible, unless it is [`StoreError::NotSynced`].
     pub(super) fn publish(mut self, number: u64, record: &[u8]) -> Result<(), StoreError> {
         self.place_all()?;
         let staged = self.dir.join("record");
@@ -188,16 +196,22 @@ impl Staging {
             ErrorKind::AlreadyExists => StoreError::Conflict { name: self.name.clone(), number },
             _ => StoreError::io("write", &path)(source),
         })?;
+        // Whoever looks has seen the version from here on, so it is not taken back.
         self.placed.clear();
-        sync_parent(&path)
+        sync_parent(&path).map_err(|error| self.not_synced(number, error))
     }
 
     /// Puts the staged objects in the place of those of a version that is there already, which
-    /// heals damaged and lost ones.
-    pub(super) fn restore(mut self) -> Result<(), StoreError> {
+    /// heals damaged and lost ones, and sees to it that its record lasts.
+    pub(super) fn restore(mut self, number: u64) -> Result<(), StoreError> {
         self.place_all()?;
         self.placed.clear();
-        Ok(())
+        let path = self.objects.record_path(&self.name, number);
+        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+    }
+
+    fn not_synced(&self, number: u64, error: StoreError) -> StoreError {
+        StoreError::NotSynced { name: self.name.clone(), number, source: Box::new(error) }
     }
 
     /// Removes objects that no version names: what a killed commit had already placed.
@@ -317,6 +331,11 @@ impl Write for Hashing {
     }
 }
 
+/// Ten digits, so that names sort as numbers do.
+fn record_name(number: u64) -> String {
+    format!("{number:010}")
+}
+
 /// Names in a directory, sorted; none if it does not exist.
 fn entries(dir: &Path) -> Result<Vec<String>, StoreError> {
     let failed = || StoreError::io("list", dir);
@@ -336,15 +355,30 @@ fn entries(dir: &Path) -> Result<Vec<String>, StoreError> {
 }
 
 fn create_parent(path: &Path) -> Result<(), StoreError> {
-    match path.parent() {
-        Some(dir) => fs::create_dir_all(dir).map_err(StoreError::io("create", dir)),
-        None => Ok(()),
+    path.parent().map_or(Ok(()), create_dirs)
+}
+
+/// Makes a directory and those above it that are missing, each to last through a power cut: what is
+/// written into a directory is lost with the directory's own entry.
+fn create_dirs(dir: &Path) -> Result<(), StoreError> {
+    // The parent of "twins" is "", which is the directory that we are in.
+    if dir.as_os_str().is_empty() || dir.is_dir() {
+        return Ok(());
+    }
+    create_parent(dir)?;
+    match fs::create_dir(dir) {
+        // Another process may have been faster.
+        Err(error) if error.kind() != ErrorKind::AlreadyExists || !dir.is_dir() => {
+            Err(StoreError::io("create", dir)(error))
+        }
+        _ => sync_parent(dir),
     }
 }
 
-/// Makes a rename or link last through a power cut: the directory is written out, too.
+/// Makes a new name last through a power cut: the directory is written out, too.
 fn sync_parent(path: &Path) -> Result<(), StoreError> {
     let Some(dir) = path.parent() else { return Ok(()) };
+    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
 }
 
@@ -374,6 +408,40 @@ mod tests {
         let lost = objects.path("street", &blake3::hash(b"second").to_hex());
         assert!(!lost.exists() && !lost.parent().unwrap().exists());
         assert_eq!(objects.begun().unwrap(), [""; 0]);
+    }
+
+    #[test]
+    fn a_version_that_may_not_last_is_not_said_to_be_gone() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let staging = objects.stage("street").unwrap();
+        let source = StoreError::io("sync", dir.path())(ErrorKind::StorageFull.into());
+        let said = staging.not_synced(3, source).to_string();
+        assert!(said.starts_with("version 3 of twin \"street\" is in place, but"), "{said}");
+        assert!(said.contains("cannot sync"), "{said}");
+    }
+
+    #[test]
+    fn directories_are_made_with_those_above_them() {
+        let dir = tempfile::tempdir().unwrap();
+        create_dirs(&dir.path().join("a/b/c")).unwrap();
+        create_dirs(&dir.path().join("a/b/c")).unwrap();
+        assert!(dir.path().join("a/b/c").is_dir());
+        fs::write(dir.path().join("file"), "").unwrap();
+        let said = create_dirs(&dir.path().join("file/d")).unwrap_err().to_string();
+        assert!(said.starts_with("cannot create"), "{said}");
+    }
+
+    #[test]
+    fn only_names_that_are_written_here_are_versions() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Objects::new(dir.path());
+        let log = dir.path().join("street/log");
+        fs::create_dir_all(&log).unwrap();
+        for name in ["0000000002", "10000000000", "1", "+1", "+000000003", "00000000004", "x"] {
+            fs::write(log.join(name), "").unwrap();
+        }
+        assert_eq!(objects.numbers("street").unwrap(), [2, 10_000_000_000]);
     }
 
     #[test]

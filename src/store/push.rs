@@ -41,7 +41,8 @@ impl Catalog {
     ///
     /// # Errors
     /// Names what cannot be accepted, before anything is written; or what could not be written,
-    /// and then nothing of it is left.
+    /// and then nothing of it is left. [`StoreError::NotSynced`] alone means that the version is
+    /// there, but might not be after a power cut.
     pub fn commit(
         &self,
         new: NewVersion<'_>,
@@ -72,7 +73,7 @@ impl Catalog {
             && let Ok(record) = self.record(new.name, number)
             && record.manifest == hash
         {
-            staging.restore()?;
+            staging.restore(number)?;
             return Ok(Version { number, hash, created_us: record.created_us, manifest });
         }
         let number = latest.unwrap_or(0) + 1;

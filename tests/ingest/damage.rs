@@ -176,9 +176,3 @@ fn a_file_that_is_not_there_is_an_error() {
     assert!(text.starts_with("cannot read: "), "{text}");
     assert!(read(&[0; 4]).is_err());
 }
-
-#[test]
-fn a_gaussian_may_be_as_far_away_as_a_pose() {
-    let reach = wildcity::ingest::validate::MAX_COORDINATE_M;
-    assert_eq!(reach, wildcity::geometry::Pose::MAX_COORDINATE_M);
-}

@@ -96,6 +96,42 @@ fn progress_ends_at_the_file_size() {
 }
 
 #[test]
+fn the_hash_is_that_of_the_bytes_that_were_read() {
+    let scene = gaussians(20_000, 1, 1.0, 6);
+    let mut tensors = gsplat_tensors(&scene);
+    // In another order than they are needed, with a stranger in the middle and one at the end.
+    tensors.reverse();
+    tensors.insert(2, ("step", vec![1], vec![30_000.0]));
+    tensors.push(("seed", vec![3], vec![1.0; 3]));
+    let dir = tempfile::tempdir().unwrap();
+    for bytes in [ply(&scene, &inria_columns(1, true)), safetensors(&tensors, &["step"])] {
+        let path = dir.path().join("scene");
+        std::fs::write(&path, &bytes).unwrap();
+        let mut last = (0, 0);
+        let read = wildcity::ingest::read_hashed(&path, &mut |done, total| last = (done, total));
+        assert_eq!(read.unwrap(), (scene.clone(), blake3::hash(&bytes).to_hex().to_string()));
+        assert_eq!(last, (bytes.len() as u64, bytes.len() as u64));
+    }
+}
+
+#[test]
+fn progress_is_told_now_and_then_whatever_comes_first() {
+    let scene = gaussians(1, 0, 1.0, 5);
+    let plain = ply(&scene, &inria_columns(0, false));
+    let header_end = plain.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = String::from_utf8(plain[..header_end].to_vec()).unwrap();
+    let header =
+        header.replace("element vertex", "element id 100000\nproperty uchar a\nelement vertex");
+    let file = [header.as_bytes(), &[7; 100_000], &plain[header_end..]].concat();
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene");
+    std::fs::write(&path, &file).unwrap();
+    let mut reports = 0;
+    assert_eq!(wildcity::ingest::read(&path, &mut |_, _| reports += 1).unwrap(), scene);
+    assert!((6..12).contains(&reports), "{reports}");
+}
+
+#[test]
 fn the_name_of_a_file_says_nothing() {
     // `read` writes to a file without extension; what counts is how it starts.
     let text = refusal(b"x y z 1.0 2.0 3.0\n");

@@ -26,19 +26,20 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
         let source = dir.path().join("scene.ply");
         write_ply(&source, sh_degree, n);
         let file_bytes = fs::metadata(&source).unwrap().len();
-        let import = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-            .arg("import")
-            .arg(&source)
-            .args(["--twin", &format!("degree{sh_degree}"), "--twins"])
-            .arg(&twins)
-            .stdout(Stdio::null())
-            .spawn()
-            .unwrap();
-        let peak = peak_bytes(import);
+        let peak = import_peak_bytes(&source, &format!("degree{sh_degree}"), &twins);
         let times = peak as f64 / file_bytes as f64;
         assert!(peak > file_bytes, "{peak} of {file_bytes}: this cannot be the whole import");
         assert!(peak <= 2 * file_bytes + CONSTANT_BYTES, "import: {peak} bytes, {times:.2} x file");
     }
+
+    // Compressed to 16 bytes, a Gaussian takes what it takes from a row of 56.
+    let n = 1_000_000;
+    let source = dir.path().join("scene.compressed.ply");
+    write_compressed_ply(&source, n);
+    let peak = import_peak_bytes(&source, "compressed", &twins);
+    let plain_bytes = 56 * n as u64;
+    assert!(peak > plain_bytes, "{peak} of {plain_bytes}: this cannot be the whole import");
+    assert!(peak <= 2 * plain_bytes + CONSTANT_BYTES, "compressed import: {peak} bytes");
 
     let n = 600_000;
     let cache = Cache::new(Catalog::open(&twins).unwrap());
@@ -68,6 +69,51 @@ fn write_ply(path: &Path, sh_degree: u8, n: usize) {
         }
     }
     out.into_inner().unwrap().sync_all().unwrap();
+}
+
+/// Writes a compressed PLY of chunks that are alike, 10 m apart.
+fn write_compressed_ply(path: &Path, n: usize) {
+    let fields = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
+    let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
+    header += &format!("element chunk {}\n", n.div_ceil(256));
+    for end in ["min", "max"] {
+        header += &fields.map(|field| format!("property float {end}_{field}\n")).concat();
+    }
+    header += &format!("element vertex {n}\n");
+    for field in ["position", "rotation", "scale", "color"] {
+        header += &format!("property uint packed_{field}\n");
+    }
+    header += "end_header\n";
+    let mut out = BufWriter::new(File::create(path).unwrap());
+    out.write_all(header.as_bytes()).unwrap();
+    for chunk in 0..n.div_ceil(256) {
+        let x = 10.0 * (chunk % 100) as f32;
+        let low = [x, 0.0, 0.0, -6.0, -6.0, -6.0, 0.0, 0.0, 0.0];
+        let high = [x + 10.0, 10.0, 5.0, -2.0, -2.0, -2.0, 1.0, 1.0, 1.0];
+        for value in [low, high].concat() {
+            out.write_all(&value.to_le_bytes()).unwrap();
+        }
+    }
+    for index in 0..n as u32 {
+        let mixed = index.wrapping_mul(0x9E37_79B9);
+        // All but the largest component of the rotation are in the middle of their range: zero.
+        for word in [mixed, 0x2008_0200, mixed.rotate_left(7), mixed.rotate_left(15)] {
+            out.write_all(&word.to_le_bytes()).unwrap();
+        }
+    }
+    out.into_inner().unwrap().sync_all().unwrap();
+}
+
+fn import_peak_bytes(source: &Path, twin: &str, twins: &Path) -> u64 {
+    let import = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .arg("import")
+        .arg(source)
+        .args(["--twin", twin, "--twins"])
+        .arg(twins)
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    peak_bytes(import)
 }
 
 /// Highest resident memory that a child was seen with before it ended well.

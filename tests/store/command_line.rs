@@ -186,9 +186,24 @@ fn an_absurd_number_of_threads_is_a_mistake_on_the_command_line() {
 }
 
 #[test]
+fn what_the_options_made_of_a_sound_file_is_said_to_be_their_doing() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut scene = gaussians(10, 0, 1.0, 1);
+    scene.means_m[7][1] = 3e6;
+    let bytes = ply(&scene, &inria_columns(0, false));
+    let said = refusal(&import(dir.path(), &bytes, &["--scale", "1000"]));
+    let wanted = "after --axes \"identity\" --scale 1000: Gaussian 7: means_m[1] is 3000000000";
+    assert!(said.contains(wanted), "{said}");
+    scene.means_m[7][1] = 3e9;
+    let said = refusal(&import(dir.path(), &ply(&scene, &inria_columns(0, false)), &[]));
+    assert!(said.contains("scene.ply: Gaussian 7: y is 3000000000"), "{said}");
+}
+
+#[test]
 fn help_teaches_with_examples() {
     for (command, wanted) in [
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
+        ("import", "Memory: twice the file"),
         ("inspect", "wildcity inspect street@2"),
         ("verify", "wildcity verify street"),
     ] {
@@ -212,4 +227,35 @@ fn twins_lie_where_the_user_keeps_data() {
     stdout(&import("HOME", &dir.path().join("home")));
     assert!(dir.path().join("home/.local/share/wildcity/twins/street/log/0000000001").is_file());
     assert!(refusal(&import("NEITHER", dir.path())).contains("give --twins DIR"));
+}
+
+#[test]
+fn a_picture_that_cannot_be_written_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    fs::write(path("scene.ply"), ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false))).unwrap();
+    let camera = r#"{"name": "front", "width": 32, "height": 16, "fx": 20, "fy": 20, "cx": 16,
+        "cy": 8, "position": [0, 0, -5], "R_world_to_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"#;
+    fs::write(path("cameras.json"), camera).unwrap();
+    fs::create_dir(path("out")).unwrap();
+    for (format, extension, start) in [
+        ("png", "png", &b"\x89PNG"[..]),
+        ("jpeg", "jpg", b"\xff\xd8\xff"),
+        ("npy", "npy", b"\x93NUM"),
+    ] {
+        let render = || {
+            let mut command = wildcity();
+            command.arg("render").arg(path("scene.ply")).arg("--cameras").arg(path("cameras.json"));
+            command.args(["--format", format, "--out"]).arg(path("out")).output().unwrap()
+        };
+        let picture = path("out").join(format!("front.{extension}"));
+        stdout(&render());
+        assert!(fs::read(&picture).unwrap().starts_with(start), "{format}");
+        // Smaller than any buffer: the only error is that of the last write.
+        fs::remove_file(&picture).unwrap();
+        std::os::unix::fs::symlink("/dev/full", &picture).unwrap();
+        let said = refusal(&render());
+        assert!(said.contains(&format!("cannot write {}", picture.display())), "{said}");
+        assert!(said.contains("No space left on device"), "{said}");
+    }
 }

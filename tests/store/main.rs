@@ -8,6 +8,7 @@ mod scene_files;
 mod command_line;
 mod crash;
 mod damage;
+mod demo;
 mod real_scenes;
 mod residency;
 mod round_trip;

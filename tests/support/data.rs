@@ -6,12 +6,15 @@ use std::path::PathBuf;
 /// A file of the real data; `None`, said on standard error, where the data is absent.
 ///
 /// # Panics
-/// If the data is there and the file is not: that is a mistake in the test.
+/// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI beside the data; or if the
+/// data is there and the file is not: that is a mistake in the test.
 pub(crate) fn real(file: &str) -> Option<PathBuf> {
     let beside = concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data");
     let root = std::env::var_os("WILDCITY_DATA").unwrap_or_else(|| beside.into());
     let root = PathBuf::from(root);
     if !root.is_dir() {
+        let required = std::env::var_os("WILDCITY_DATA_REQUIRED").is_some_and(|set| set == "1");
+        assert!(!required, "no real data at {}, and WILDCITY_DATA_REQUIRED=1", root.display());
         // Not eprintln: the test harness would swallow it.
         let test = std::thread::current().name().unwrap_or("a test").to_owned();
         let line = format!("NOT RUN: {test}: no real data at {}\n", root.display());

@@ -1,41 +1,11 @@
-//! The rooms of `src`, and whom each may name. The table in `src/lib.rs` says the same in prose.
+//! The table and the invariants of `src/lib.rs`, held against the source.
+
+mod links;
+mod scanner;
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
-
-/// Each room, and the rooms it may name. A room that is missing here fails the test.
-const ROOMS: &[(&str, &[&str])] = &[
-    ("config", &[]),
-    ("geometry", &[]),
-    ("scene", &["geometry"]),
-    ("generate", &["geometry", "scene"]),
-    ("ingest", &["config", "geometry", "scene"]),
-    ("store", &["config", "geometry", "scene", "ingest"]),
-    ("residency", &["config", "geometry", "scene", "store"]),
-    ("render", &["config", "geometry", "scene"]),
-    ("session", &["config", "geometry", "scene", "store", "residency", "render"]),
-    ("protocol", &[]),
-    ("server", &["config", "geometry", "scene", "store", "render", "session", "protocol"]),
-    ("client", &["config", "protocol"]),
-    (
-        "cli",
-        &[
-            "config",
-            "geometry",
-            "scene",
-            "generate",
-            "ingest",
-            "store",
-            "residency",
-            "render",
-            "session",
-            "protocol",
-            "server",
-            "client",
-        ],
-    ),
-];
 
 /// Packages that belong to some places alone.
 const PACKAGES: &[(&str, &[&str])] = &[
@@ -43,7 +13,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("hyper", &["server"]),
     ("tokio_tungstenite", &["client", "server"]),
     ("bincode", &["store/chunk_file.rs"]),
-    ("clap", &["cli", "render/cpu/mod.rs"]),
+    ("clap", &["cli"]),
     ("anyhow", &["cli"]),
     ("indicatif", &["cli"]),
     ("fearless_simd", &["render/cpu"]),
@@ -52,59 +22,140 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("schemars", &["protocol"]),
 ];
 
+/// Who may touch files: those of a twin only `store/objects.rs`; the others scenes and settings of
+/// the user, episodes (the server makes their directory), and pictures.
+const FILES: &[&str] = &[
+    "store/objects.rs",
+    "ingest",
+    "session/record.rs",
+    "session/replay.rs",
+    "server/mod.rs",
+    "cli",
+];
+/// The modules that open files.
+const FILE_MODULES: &[&[&str]] = &[&["std", "fs"], &["tokio", "fs"]];
+
 /// Within the server, only the converter knows the wire's types.
 const WIRE_IN_SERVER: &str = "server/convert";
 
+/// Rooms, and whom each may name.
+type Table = BTreeMap<String, Vec<String>>;
+
 #[test]
 fn every_room_names_only_whom_it_may() {
-    let found = violations(&sources());
+    let found = violations(&table(&lib()), &sources());
     assert!(found.is_empty(), "{}", found.join("\n"));
 }
 
 #[test]
+fn the_table_has_every_room_and_no_other() {
+    let (lib, table) = (lib(), table(&lib()));
+    let modules = lib.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+    let modules: Vec<_> = modules.collect();
+    assert!(modules.is_sorted() && modules.len() > 10, "{modules:?}");
+    assert_eq!(table.keys().collect::<Vec<_>>(), modules);
+    for (room, may_name) in &table {
+        for other in may_name {
+            assert!(table.contains_key(other), "{room} may name {other}, which is no room");
+            assert!(!table[other].contains(room), "{room} and {other} name each other");
+        }
+    }
+}
+
+#[test]
 fn a_planted_violation_is_found() {
-    for (file, line, reason) in [
+    let url = r#"let url = "http://here"; axum::serve();"#;
+    let many = "use crate::{\n    geometry::Pose,\n    protocol::PROTOCOL,\n};";
+    let inline = "mod tests {\n use super::super::super::store::Catalog;\n}";
+    for (file, planted, reason) in [
         ("geometry/pose.rs", "use crate::scene::Rig;", "geometry may not name scene"),
         ("render/cpu/bin.rs", "use crate::{protocol::PROTOCOL};", "render may not name protocol"),
+        ("render/cpu/bin.rs", many, "render may not name protocol"),
+        ("render/cpu/bin.rs", "use super::super::super::server;", "render may not name server"),
+        ("render/mod.rs", "use super::cli::main;", "render may not name cli"),
+        ("scene/rig.rs", inline, "scene may not name store"),
         ("scene/rig.rs", "let x = crate::store::Catalog::open(dir);", "scene may not name store"),
+        ("scene/rig.rs", "let x: Vec<crate::store::Version> = y;", "scene may not name store"),
+        ("scene/rig.rs", "use crate::*;", "scene may not name the whole crate"),
+        ("scene/rig.rs", "use crate as all;", "scene may not name the whole crate"),
         ("session/episode.rs", "use axum::Router;", "only server may name axum"),
+        ("session/episode.rs", "use axum;", "only server may name axum"),
+        ("session/episode.rs", "use ::axum as web;", "only server may name axum"),
+        ("session/episode.rs", url, "only server may name axum"),
+        ("session/episode.rs", "let c = '\"'; axum::serve();", "only server may name axum"),
         (
             "server/router.rs",
             "use crate::protocol::message::Open;",
             "only server/convert may name protocol",
         ),
+        (
+            "server/router.rs",
+            "use super::super::protocol;",
+            "only server/convert may name protocol",
+        ),
         ("store/catalog.rs", "use bincode::Encode;", "only store/chunk_file.rs may name bincode"),
+        ("store/catalog.rs", "use std::{fs, io};", "may name std::fs"),
+        ("store/recover.rs", "let f = std::fs::File::open(path);", "may name std::fs"),
+        ("store/verify.rs", "use std::fs::OpenOptions;", "may name std::fs"),
+        ("residency/cache.rs", "use std::fs::File;", "may name std::fs"),
+        ("server/router.rs", "tokio::fs::read(path).await", "may name tokio::fs"),
         ("attic/mod.rs", "", "room attic is not in the table"),
     ] {
         let mut sources = sources();
-        sources.entry(file.into()).or_default().push_str(&format!("\n{line}\n"));
-        let found = violations(&sources);
+        sources.entry(file.into()).or_default().push_str(&format!("\n{planted}\n"));
+        let found = violations(&table(&lib()), &sources);
         assert!(
             found.iter().any(|violation| violation.contains(reason)),
-            "{line:?} in {file} went unnoticed: {found:?}"
+            "{planted:?} in {file} went unnoticed: {found:?}"
         );
     }
 }
 
 #[test]
-fn what_a_comment_says_is_no_violation() {
-    let text =
-        "//! As in [`crate::server`].\n/// See crate::cli.\n// axum::Router\nuse glam::DVec3;\n";
-    let sources = BTreeMap::from([("geometry/pose.rs".to_owned(), text.to_owned())]);
-    assert_eq!(violations(&sources), Vec::<String>::new());
+fn a_row_that_allows_less_forbids_more() {
+    let lib = lib().replacen("| geometry, scene |", "| geometry |", 1);
+    let found = violations(&table(&lib), &sources());
+    assert!(found.iter().all(|violation| violation.contains("generate may not name scene")));
+    assert!(!found.is_empty());
 }
 
 #[test]
-fn the_table_of_rooms_is_the_one_in_the_documentation() {
-    let lib = fs::read_to_string(root().join("src/lib.rs")).unwrap();
-    for (room, _) in ROOMS {
-        assert!(lib.contains(&format!("| [`{room}`] |")), "{room} is missing in src/lib.rs");
-        assert!(lib.contains(&format!("pub mod {room};")), "{room} is no module of src/lib.rs");
-    }
+fn what_a_comment_or_a_text_says_is_no_violation() {
+    let text = r##"//! As in [`crate::server`].
+/// See crate::cli.
+// axum::Router
+/* axum::Router /* and */ crate::store */
+use glam::DVec3;
+const A: &str = "crate::server \" crate::cli";
+const B: &str = r#"" crate::server"#;
+fn c<'a>(d: &'a str) -> char { d.fs(); '"' }
+mod tests {
+    use super::super::camera;
+}
+use super::camera;
+"##;
+    let sources = BTreeMap::from([("geometry/pose.rs".to_owned(), text.to_owned())]);
+    assert_eq!(violations(&table(&lib()), &sources), Vec::<String>::new());
 }
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn lib() -> String {
+    fs::read_to_string(root().join("src/lib.rs")).unwrap()
+}
+
+/// The table of the documentation: ``//! | [`room`] | what it is | may name |``.
+fn table(lib: &str) -> Table {
+    let rows = lib.lines().filter_map(|line| line.strip_prefix("//! | [`"));
+    rows.map(|row| {
+        let cells: Vec<_> = row.split('|').map(str::trim).collect();
+        let [room, _, may_name, ""] = cells[..] else { panic!("{row}") };
+        let may_name = may_name.split(", ").filter(|room| *room != "nothing");
+        (room.trim_end_matches("`]").to_owned(), may_name.map(str::to_owned).collect())
+    })
+    .collect()
 }
 
 /// Text of every file of every room, by its path within `src`.
@@ -127,58 +178,58 @@ fn sources() -> BTreeMap<String, String> {
     sources
 }
 
-fn violations(sources: &BTreeMap<String, String>) -> Vec<String> {
+fn violations(table: &Table, sources: &BTreeMap<String, String>) -> Vec<String> {
     let mut found = Vec::new();
     for (file, text) in sources {
         let room = file.split(['/', '.']).next().unwrap();
-        let Some((_, may_name)) = ROOMS.iter().find(|(name, _)| *name == room) else {
-            found.push(format!("{file}: room {room} is not in the table of tests/tidy"));
+        let Some(may_name) = table.get(room) else {
+            found.push(format!("{file}: room {room} is not in the table of src/lib.rs"));
             continue;
         };
-        for (number, line) in text.lines().enumerate() {
-            let code = line.split("//").next().unwrap_or_default();
-            let place = format!("{file}:{}", number + 1);
-            for named in rooms_named(code) {
-                if named != room && !may_name.contains(&named) {
-                    found.push(format!("{place}: {room} may not name {named}"));
-                }
-                let converts = is_within(file, WIRE_IN_SERVER);
-                if room == "server" && named == "protocol" && !converts {
-                    found.push(format!("{place}: only {WIRE_IN_SERVER} may name protocol"));
-                }
-            }
-            for (package, places) in PACKAGES {
-                let belongs = places.iter().any(|place| is_within(file, place));
-                if names_package(code, package) && !belongs {
-                    found.push(format!("{place}: only {} may name {package}", places.join(", ")));
-                }
-            }
+        for scanner::Named { path, line } in scanner::paths(file, text) {
+            let path: Vec<&str> = path.iter().map(String::as_str).collect();
+            found.extend(
+                wrong_room(table, room, may_name, file, &path)
+                    .or_else(|| wrong_package(file, &path))
+                    .map(|wrong| format!("{file}:{line}: {wrong}")),
+            );
         }
     }
     found
 }
 
+fn wrong_room(
+    table: &Table,
+    room: &str,
+    may_name: &[String],
+    file: &str,
+    path: &[&str],
+) -> Option<String> {
+    let named = match path {
+        ["crate"] | ["crate", "*", ..] => {
+            return Some(format!("{room} may not name the whole crate"));
+        }
+        ["crate", named, ..] if table.contains_key(*named) => *named,
+        _ => return None,
+    };
+    if named != room && !may_name.iter().any(|other| other == named) {
+        return Some(format!("{room} may not name {named}"));
+    }
+    let converts = is_within(file, WIRE_IN_SERVER);
+    (room == "server" && named == "protocol" && !converts)
+        .then(|| format!("only {WIRE_IN_SERVER} may name protocol"))
+}
+
+fn wrong_package(file: &str, path: &[&str]) -> Option<String> {
+    let elsewhere = |places: &[&str]| !places.iter().any(|place| is_within(file, place));
+    let only = |places: &[&str], what: &str| format!("only {} may name {what}", places.join(", "));
+    if FILE_MODULES.iter().any(|module| path.starts_with(module)) && elsewhere(FILES) {
+        return Some(only(FILES, &path[..2].join("::")));
+    }
+    let (package, places) = PACKAGES.iter().find(|(package, _)| path.first() == Some(package))?;
+    elsewhere(places).then(|| only(places, package))
+}
+
 fn is_within(file: &str, place: &str) -> bool {
     file == place || file.strip_prefix(place).is_some_and(|rest| rest.starts_with(['/', '.']))
-}
-
-/// Rooms behind `crate::` in a line, `crate::{a, b}` included. rustfmt keeps a list of rooms on one
-/// line, since imports are written one room at a time.
-fn rooms_named(code: &str) -> Vec<&str> {
-    let after = code.match_indices("crate::").map(|(at, path)| &code[at + path.len()..]);
-    after
-        .flat_map(|rest| rest.trim_start_matches('{').split([',', '{', '}']))
-        .filter_map(|part| {
-            let word = part.trim().split(|c: char| !c.is_alphanumeric() && c != '_').next()?;
-            ROOMS.iter().find(|(room, _)| *room == word).map(|(room, _)| *room)
-        })
-        .collect()
-}
-
-fn names_package(code: &str, package: &str) -> bool {
-    code.match_indices(package).any(|(at, _)| {
-        let before = code[..at].chars().next_back();
-        let is_word = before.is_none_or(|c| !c.is_alphanumeric() && !"_\".".contains(c));
-        is_word && code[at + package.len()..].starts_with("::")
-    })
 }

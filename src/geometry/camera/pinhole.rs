@@ -48,24 +48,11 @@ impl Pinhole {
             self.fy * point_m.y / point_m.z + self.cy,
         )
     }
-
-    /// The camera-space direction, with z = 1, of a pixel position.
-    pub fn unproject(&self, pixel: DVec2) -> DVec3 {
-        DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn unproject_inverts_project() {
-        let pinhole = Pinhole { fx: 1800.0, fy: 1750.0, cx: 721.5, cy: 462.25 };
-        let point = DVec3::new(-1.25, 0.75, 8.0);
-        let ray = pinhole.unproject(pinhole.project(point));
-        assert!((ray * point.z - point).length() < 1e-12);
-    }
 
     #[test]
     fn absurd_intrinsics_are_named() {

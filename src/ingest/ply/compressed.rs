@@ -10,7 +10,7 @@ use std::io::BufRead;
 use crate::scene::{Gaussians, sh};
 
 use super::header::{Element, Header, Property, error};
-use super::{REPORT_EVERY, degree, file_name, rows};
+use super::{Body, degree, file_name};
 use crate::ingest::validate::{self, Field};
 use crate::ingest::{IngestError, Progress, check_count};
 
@@ -21,7 +21,7 @@ const MAX_LOGIT: f64 = 20.0;
 
 /// Reads the body; its size was checked.
 pub(super) fn read(
-    mut input: impl BufRead,
+    input: impl BufRead,
     header: &Header,
     file_bytes: u64,
     progress: Progress<'_>,
@@ -36,11 +36,11 @@ pub(super) fn read(
     let [position, rotation, scale, color] = [position?, rotation?, scale?, color?];
 
     let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
-    rows(&mut input, chunk, |row| chunks.push(extremes.value(row)))?;
+    let mut body = Body { input, done: header.bytes, file_bytes, progress };
+    body.rows(chunk, |row| chunks.push(extremes.value(row)))?;
     let coefficients = sh::coefficients(sh_degree);
     let mut gaussians = Gaussians::with_capacity(sh_degree, count);
-    let mut done = header.bytes;
-    rows(&mut input, vertex, |row| {
+    body.rows(vertex, |row| {
         let word = |property: &Property| property.value(row) as u32;
         let [low, high] = chunks[gaussians.len() / CHUNK];
         let between = |first: usize, unit: [f64; 3]| -> [f64; 3] {
@@ -57,10 +57,6 @@ pub(super) fn read(
         let dc = between(6, [r, g, b]).map(|c| ((c - 0.5) / sh::C0) as f32);
         gaussians.sh.extend(dc);
         gaussians.sh.extend(std::iter::repeat_n(0.0, 3 * (coefficients - 1)));
-        done += row.len() as u64;
-        if gaussians.len().is_multiple_of(REPORT_EVERY) {
-            progress(done, file_bytes);
-        }
     })?;
     if let Some(colour) = colour {
         let rest = (1..coefficients).flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
@@ -68,13 +64,12 @@ pub(super) fn read(
             .map(|field| colour.property(&file_name(field, sh_degree)).cloned())
             .collect::<Result<_, _>>()?;
         let mut sh = gaussians.sh.chunks_exact_mut(3 * coefficients);
-        rows(&mut input, colour, |row| {
+        body.rows(colour, |row| {
             for (value, property) in sh.next().into_iter().flat_map(|s| &mut s[3..]).zip(&rest) {
                 *value = unpack_coefficient(property.value(row)) as f32;
             }
         })?;
     }
-    progress(file_bytes, file_bytes);
     validate::check(&gaussians, &|field| file_name(field, sh_degree))?;
     Ok(gaussians)
 }

@@ -32,39 +32,46 @@ pub(super) fn read(
     let columns = Columns::find(vertex)?;
     let count = check_count(vertex.count)?;
     let mut gaussians = Gaussians::with_capacity(columns.sh_degree, count);
-    let mut done = header.bytes;
+    let mut body = Body { input, done: header.bytes, file_bytes, progress };
     for element in &header.elements {
-        rows(&mut input, element, |row| {
+        body.rows(element, |row| {
             if element.name == "vertex" {
                 columns.push(row, &mut gaussians);
             }
-            done += row.len() as u64;
-            if gaussians.len().is_multiple_of(REPORT_EVERY) {
-                progress(done, file_bytes);
-            }
         })?;
     }
-    progress(file_bytes, file_bytes);
     let sh_degree = columns.sh_degree;
     validate::check(&gaussians, &|field| file_name(field, sh_degree))?;
     Ok(gaussians)
 }
 
-/// Rows between two reports of progress.
-const REPORT_EVERY: usize = 16_384;
+/// The bytes after the header.
+struct Body<'a, R> {
+    input: R,
+    /// Bytes of the file that were read.
+    done: u64,
+    file_bytes: u64,
+    progress: Progress<'a>,
+}
 
-/// Hands the rows of an element to `take`, one after another.
-fn rows(
-    input: &mut impl Read,
-    element: &Element,
-    mut take: impl FnMut(&[u8]),
-) -> Result<(), IngestError> {
-    let mut row = vec![0; element.stride];
-    for _ in 0..if element.stride == 0 { 0 } else { element.count } {
-        input.read_exact(&mut row)?;
-        take(&row);
+/// Rows between two reports of progress.
+const REPORT_EVERY: u64 = 16_384;
+
+impl<R: Read> Body<'_, R> {
+    /// Hands the rows of the next element to `take`, one after another.
+    fn rows(&mut self, element: &Element, mut take: impl FnMut(&[u8])) -> Result<(), IngestError> {
+        let mut row = vec![0; element.stride];
+        for index in 0..if element.stride == 0 { 0 } else { element.count } {
+            self.input.read_exact(&mut row)?;
+            take(&row);
+            self.done += row.len() as u64;
+            if index % REPORT_EVERY == REPORT_EVERY - 1 {
+                (self.progress)(self.done, self.file_bytes);
+            }
+        }
+        (self.progress)(self.done, self.file_bytes);
+        Ok(())
     }
-    Ok(())
 }
 
 /// Where a vertex has what.

@@ -30,7 +30,7 @@ pub struct Cpu {
 }
 
 /// Instruction sets that can be asked for; the best one that the machine has is the default.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Simd {
     /// The best of the machine.
     #[default]
