@@ -104,6 +104,9 @@ pub const KEEPALIVE: (Duration, Duration, u32) =
 /// Longest line of an episode file: 256 image hashes of `observe` take 17 kB.
 pub const EPISODE_LINE_BYTES: usize = 1 << 20;
 
+/// Most render threads: above any machine's cores, below what exhausts a machine's processes.
+pub const RENDER_THREADS: usize = 1024;
+
 /// The rig of a session on a twin that has none, unless the session says otherwise.
 pub const RIG: &str = "vehicle6";
 

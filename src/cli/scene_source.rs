@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
+use crate::config;
 use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::cpu::{Cpu, Simd};
@@ -48,7 +49,7 @@ pub(super) struct Engine {
     backend: BackendName,
 
     /// Render threads; 0 for one per core. Pixels do not depend on it.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = threads)]
     threads: usize,
 
     /// Instruction set of the cpu backend.
@@ -102,6 +103,13 @@ impl Engine {
             }
             BackendName::Reference => Box::new(Reference),
         })
+    }
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(threads) if threads <= config::RENDER_THREADS => Ok(threads),
+        _ => Err(format!("expected 0 to {}", config::RENDER_THREADS)),
     }
 }
 
