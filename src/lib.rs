@@ -11,7 +11,7 @@
 //! | [`ingest`] | one file per outside format | scene |
 //! | [`store`] | twins on disk, versioned, content-addressed | geometry, scene, ingest |
 //! | [`residency`] | what is in memory now | geometry, scene, store |
-//! | [`render`] | six images per step: `cpu`, `reference` | geometry, scene |
+//! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | all above |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | protocol, store, session |

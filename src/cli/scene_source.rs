@@ -7,6 +7,7 @@ use anyhow::Context;
 use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::cpu::{Cpu, Simd};
+use crate::render::gpu::{AdapterChoice, Gpu, GpuError};
 use crate::render::reference::Reference;
 use crate::render::{Backend, View};
 use crate::residency::Cache;
@@ -51,6 +52,11 @@ pub(super) struct Engine {
     #[arg(long, default_value_t = 0)]
     threads: usize,
 
+    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name; the fastest
+    /// kind if not given.
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<String>,
+
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
     simd: Simd,
@@ -59,9 +65,11 @@ pub(super) struct Engine {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// The fastest of this machine.
+    /// The fastest of this machine: gpu if it has one that is not software, else cpu.
     #[default]
     Auto,
+    /// wgpu on Vulkan, `--device`.
+    Gpu,
     /// f32, SIMD, all cores.
     Cpu,
     /// f64 by definition: slow.
@@ -72,9 +80,35 @@ impl Engine {
     /// Makes the backend.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         Ok(match self.backend {
-            BackendName::Auto | BackendName::Cpu => Box::new(Cpu::new(self.threads, self.simd)?),
+            BackendName::Auto => self.fastest()?,
+            BackendName::Gpu => {
+                let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
+                Box::new(Gpu::new(&choice, self.threads)?)
+            }
+            BackendName::Cpu => Box::new(self.cpu()?),
             BackendName::Reference => Box::new(Reference),
         })
+    }
+
+    fn fastest(&self) -> anyhow::Result<Box<dyn Backend>> {
+        match Gpu::new(&AdapterChoice::Hardware, self.threads) {
+            Ok(gpu) => {
+                tracing::info!(device = gpu.usage().map(|usage| usage.name), "rendering on the gpu");
+                Ok(Box::new(gpu))
+            }
+            Err(GpuError::NoAdapter) => {
+                tracing::info!("no GPU but software: rendering on the cpu");
+                Ok(Box::new(self.cpu()?))
+            }
+            Err(error) => {
+                tracing::warn!(%error, "rendering on the cpu");
+                Ok(Box::new(self.cpu()?))
+            }
+        }
+    }
+
+    fn cpu(&self) -> anyhow::Result<Cpu> {
+        Ok(Cpu::new(self.threads, self.simd)?)
     }
 }
 

@@ -11,4 +11,9 @@ mod scene_files;
 #[path = "../support/streets.rs"]
 mod streets;
 
+mod determinism;
+mod devices;
+mod extremes;
 mod parity;
+mod slips;
+mod twins;

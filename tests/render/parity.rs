@@ -10,17 +10,7 @@ use wildcity::scene::{Gaussians, RenderProfile, Scene};
 use crate::data::real;
 use crate::images::{agree, cpu, look, render, render_one};
 use crate::scene_files::gaussians;
-use crate::streets::street;
-
-/// Views from within a street: along it, across it, and back.
-fn street_views() -> [View; 3] {
-    let at = DVec3::new(0.4, 0.0, 20.0);
-    [
-        look([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
-        look([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
-        look([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
-    ]
-}
+use crate::streets::{street, street_views};
 
 /// Compares all views, and returns the least agreement in dB.
 fn compare(scene: &Gaussians, profile: &RenderProfile, views: &[View]) -> f64 {

@@ -1,7 +1,10 @@
 //! Scenes with the shape of a street: flat things, thin things, near and far.
 
+use glam::DVec3;
+use wildcity::render::View;
 use wildcity::scene::{Gaussians, sh};
 
+use crate::images::look;
 use crate::scene_files::Random;
 
 /// `n` Gaussians of a road, two facades and clutter along +z, y down (a camera's own axes).
@@ -31,4 +34,14 @@ pub(crate) fn street(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
         g.sh.extend((3..3 * sh::coefficients(sh_degree)).map(|_| random.between(-0.3, 0.3)));
     }
     g
+}
+
+/// Views from within a street: along it, across it, and back.
+pub(crate) fn street_views() -> [View; 3] {
+    let at = DVec3::new(0.4, 0.0, 20.0);
+    [
+        look([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
+        look([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
+        look([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
+    ]
 }

@@ -74,7 +74,6 @@ pub(super) struct Drawn {
     /// Pixels, page by page.
     pub(super) pages: Vec<BufferView>,
     pub(super) tiles_per_page: u32,
-    pub(super) planes: Planes,
     pub(super) views: Vec<FrameView>,
     pub(super) stats: FrameStats,
 }
@@ -134,7 +133,7 @@ impl Chain {
                 let pages = read_back.pages()?;
                 let stats = self.stats(&counters, prepare_ms, &stages, &ticks, start.elapsed());
                 let views = gpu_frame.view[..frame.views.len()].to_vec();
-                return Ok(Drawn { read_back, pages, tiles_per_page, planes, views, stats });
+                return Ok(Drawn { read_back, pages, tiles_per_page, views, stats });
             }
             read_back.unmap();
             self.retries += 1;

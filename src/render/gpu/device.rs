@@ -1,6 +1,7 @@
 //! Which device, and what went wrong on it. Nothing here panics: a machine without a driver, a name
 //! that no adapter has and a device that dies are ordinary errors.
 
+use std::ops::RangeInclusive;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use futures_util::FutureExt;
@@ -55,12 +56,65 @@ pub enum AdapterChoice {
     Best,
     /// The fastest kind that is not software.
     Hardware,
-    /// Its number in [`adapters`], or a part of its name in any case.
+    /// Its number in [`devices`], or a part of its name in any case.
     Named(String),
 }
 
-/// The adapters of this machine, the fastest kind first, and in the driver's order within a kind.
-pub fn adapters() -> Vec<Adapter> {
+/// What a device is and can do, as its driver says.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DeviceInfo {
+    /// The driver's name for it.
+    pub name: String,
+    /// `discrete`, `integrated`, `virtual`, `other`, or `cpu` for software.
+    pub kind: &'static str,
+    /// The driver and its version.
+    pub driver: String,
+    /// Most bytes that a shader sees of one buffer.
+    pub binding_bytes: u64,
+    /// Most bytes of one buffer.
+    pub buffer_bytes: u64,
+    /// Most threads of a workgroup.
+    pub workgroup_threads: u32,
+    /// Memory of a workgroup, in bytes.
+    pub workgroup_bytes: u32,
+    /// Most workgroups of a dimension of a dispatch.
+    pub groups_per_dimension: u32,
+    /// Fewest and most threads of a subgroup.
+    pub subgroup_threads: RangeInclusive<u32>,
+    /// Whether the device times its stages itself.
+    pub has_clock: bool,
+}
+
+/// The devices of this machine, the fastest kind first, and in the driver's order within a kind.
+pub fn devices() -> Vec<DeviceInfo> {
+    adapters().iter().map(DeviceInfo::new).collect()
+}
+
+impl DeviceInfo {
+    fn new(adapter: &Adapter) -> Self {
+        let (info, limits) = (adapter.get_info(), adapter.limits());
+        Self {
+            kind: match info.device_type {
+                DeviceType::DiscreteGpu => "discrete",
+                DeviceType::IntegratedGpu => "integrated",
+                DeviceType::VirtualGpu => "virtual",
+                DeviceType::Other => "other",
+                DeviceType::Cpu => "cpu",
+            },
+            driver: format!("{} {}", info.driver, info.driver_info),
+            binding_bytes: limits.max_storage_buffer_binding_size,
+            buffer_bytes: limits.max_buffer_size,
+            workgroup_threads: limits.max_compute_invocations_per_workgroup,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size,
+            groups_per_dimension: limits.max_compute_workgroups_per_dimension,
+            subgroup_threads: info.subgroup_min_size..=info.subgroup_max_size,
+            has_clock: adapter.features().contains(Features::TIMESTAMP_QUERY),
+            name: info.name,
+        }
+    }
+}
+
+fn adapters() -> Vec<Adapter> {
     let instance = Instance::new(InstanceDescriptor {
         backends: Backends::VULKAN,
         // Every group count is computed by `plan.wgsl` within the limits that the validation would

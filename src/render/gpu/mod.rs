@@ -25,7 +25,7 @@ use std::time::Instant;
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
-pub use device::{AdapterChoice, GpuError, adapters};
+pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
 
 use self::chain::{Chain, Drawn};
 use self::device::Device;
