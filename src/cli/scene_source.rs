@@ -93,7 +93,10 @@ impl Engine {
     fn fastest(&self) -> anyhow::Result<Box<dyn Backend>> {
         match Gpu::new(&AdapterChoice::Hardware, self.threads) {
             Ok(gpu) => {
-                tracing::info!(device = gpu.usage().map(|usage| usage.name), "rendering on the gpu");
+                tracing::info!(
+                    device = gpu.usage().map(|usage| usage.name),
+                    "rendering on the gpu"
+                );
                 Ok(Box::new(gpu))
             }
             Err(GpuError::NoAdapter) => {

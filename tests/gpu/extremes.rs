@@ -123,11 +123,8 @@ fn t4_t5_close_to_around_and_behind_the_camera() {
         }
     }
     for z in [0.3, -1.0] {
-        let around = Blob {
-            mean_m: DVec3::new(0.1, 0.0, z),
-            sigma_m: DVec3::splat(2.0),
-            ..Blob::default()
-        };
+        let around =
+            Blob { mean_m: DVec3::new(0.1, 0.0, z), sigma_m: DVec3::splat(2.0), ..Blob::default() };
         let profile = RenderProfile::default();
         agreed(&gpu, &scene(&[around]), &profile, ahead([160, 120], 100.0), &format!("{z} m"));
     }

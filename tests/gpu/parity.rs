@@ -98,7 +98,12 @@ fn real_captures() {
         let Some(path) = real(file) else { return };
         let view = look([640, 480], 600.0, at, forward, down);
         let profile = RenderProfile { near: 0.2, alpha_cap: 0.999, ..RenderProfile::default() };
-        compare(&read(&path), &profile, &[view], file);
+        // Close surfaces: where one alpha lies at the cut, two backends may decide otherwise, and the
+        // depth behind a hundredth of a pixel's colour differs. Colour is what counts here.
+        let image = render_one(&gpu(), &read(&path), &profile, view);
+        let truth = render_one(&cpu(), &read(&path), &profile, view);
+        let (db, off) = (psnr(&image.rgba, &truth.rgba), max_difference(&image.rgba, &truth.rgba));
+        assert!(db >= 80.0 && off <= 2.0 / 255.0, "{file}: {db:.1} dB, off by {off}");
     }
 }
 

@@ -10,7 +10,13 @@ use crate::streets::{street, street_views};
 
 #[test]
 fn a_slip_in_any_stage_is_caught() {
-    let scene = Scene::from_gaussians(&street(30_000, 3, 41));
+    let mut street = street(30_000, 3, 41);
+    // And mist over more tiles than one thread emits.
+    for i in (0..street.len()).step_by(1_000) {
+        street.ln_scales[i] = [2.0; 3];
+        street.logit_opacities[i] = -3.0;
+    }
+    let scene = Scene::from_gaussians(&street);
     let (profile, views) = (RenderProfile::default(), street_views());
     let truths = render(&cpu(), &scene, &profile, &views);
     let caught = |backend: &dyn Backend| {
@@ -19,7 +25,11 @@ fn a_slip_in_any_stage_is_caught() {
     };
     assert!(!caught(&gpu()), "nothing is broken, and something was found");
     for (stage, part, slip) in [
-        ("project", "let clamped = clamp(slope, view.slope_min, view.slope_max);", "let clamped = slope * 0.9;"),
+        (
+            "project",
+            "let clamped = clamp(slope, view.slope_min, view.slope_max);",
+            "let clamped = slope * 0.9;",
+        ),
         ("project", "let l1 = -(b * l2)", "let l1 = (b * l2)"),
         ("project", "x.y + turn.z", "x.y - turn.z"),
         ("project", "(high & 0xFFu) << 12u", "(high & 0xFFu) << 11u"),
@@ -32,14 +42,22 @@ fn a_slip_in_any_stage_is_caught() {
         ("sort", "countOneBits(beside & (own_bit - 1u))", "countOneBits(beside & own_bit) - 1u"),
         ("sort", "place = next[digit(key)]", "place = offsets[digit(key)]"),
         ("bin", "last - first + 1u", "last - first"),
-        ("bin", "half_width(reach, right_dy) + EXTENT_SLACK_PX", "0.7 * half_width(reach, right_dy)"),
+        (
+            "bin",
+            "half_width(reach, right_dy) + EXTENT_SLACK_PX",
+            "0.7 * half_width(reach, right_dy)",
+        ),
         ("bin", "row_first_tile[holder] + i", "row_first_tile[holder]"),
         ("ranges", "ranges[tile].y = i + 1u", "ranges[tile].y = i"),
         ("rasterize", "after <= frame.stop", "after <= 50.0 * frame.stop"),
         ("rasterize", "instance_places[first + thread]", "instance_places[first + (thread ^ 1u)]"),
         ("rasterize", "rgb += weight * paints[k].rgb", "rgb += alpha * paints[k].rgb"),
         ("rasterize", "depth_sum / opacity", "depth_sum"),
-        ("rasterize", "saturate(vec4f(rgb, opacity)) * 255.0", "saturate(vec4f(rgb, opacity)) * 250.0"),
+        (
+            "rasterize",
+            "saturate(vec4f(rgb, opacity)) * 255.0",
+            "saturate(vec4f(rgb, opacity)) * 250.0",
+        ),
     ] {
         let broken = Shaders::default().with_slip(stage, part, slip);
         let broken = broken.unwrap_or_else(|| panic!("{part:?} is no longer in {stage}"));

@@ -11,6 +11,8 @@ pub(crate) fn gpu() -> Gpu {
 /// The same with other shaders.
 pub(crate) fn gpu_with(shaders: Shaders) -> Gpu {
     Gpu::with_shaders(&AdapterChoice::Best, 0, shaders).unwrap_or_else(|error| {
-        panic!("{error}\n(the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers)")
+        panic!(
+            "{error}\n(the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers)"
+        )
     })
 }

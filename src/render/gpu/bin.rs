@@ -32,8 +32,7 @@ pub(super) struct Bin {
 
 impl Bin {
     pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
-        let kernel =
-            |name, entry| Kernel::new(device, &module(device, shaders, name), entry, &[]);
+        let kernel = |name, entry| Kernel::new(device, &module(device, shaders, name), entry, &[]);
         let storage = BufferUsages::STORAGE;
         let growing = |label| Growing::new(device, label, storage);
         Self {

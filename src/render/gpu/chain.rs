@@ -137,7 +137,11 @@ impl Chain {
             }
             read_back.unmap();
             self.retries += 1;
-            tracing::debug!(splats = counters.splats, instances = counters.instances, "drawn again");
+            tracing::debug!(
+                splats = counters.splats,
+                instances = counters.instances,
+                "drawn again"
+            );
         }
     }
 
@@ -258,7 +262,8 @@ impl Chain {
             stages_ms,
             visible_pairs: counters.splats.into(),
             instances: counters.instances.into(),
-            evaluations: u64::from(counters.batches) * u64::from(super::layout::WORKGROUP)
+            evaluations: u64::from(counters.batches)
+                * u64::from(super::layout::WORKGROUP)
                 * u64::from(TILE_PX * TILE_PX),
         }
     }
@@ -326,10 +331,11 @@ impl ReadBack {
 }
 
 fn view(growing: &Growing) -> Result<BufferView, RenderError> {
-    growing.buffer().slice(..).get_mapped_range().map_err(|error| RenderError::Device {
-        device: String::new(),
-        reason: error.to_string(),
-    })
+    growing
+        .buffer()
+        .slice(..)
+        .get_mapped_range()
+        .map_err(|error| RenderError::Device { device: String::new(), reason: error.to_string() })
 }
 
 /// Bits of a number.

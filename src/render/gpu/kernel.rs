@@ -124,8 +124,9 @@ pub(super) const TICKS_BYTES: u64 = 2 * 8 * MAX_STAGES as u64;
 impl Recorder {
     /// An empty frame.
     pub(super) fn new(device: &Device) -> Self {
-        let encoder =
-            device.device.create_command_encoder(&CommandEncoderDescriptor { label: Some("frame") });
+        let encoder = device
+            .device
+            .create_command_encoder(&CommandEncoderDescriptor { label: Some("frame") });
         let clock = device.tick_ns().map(|_| {
             device.device.create_query_set(&QuerySetDescriptor {
                 label: Some("stages"),

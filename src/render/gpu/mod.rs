@@ -134,8 +134,7 @@ impl Backend for Gpu {
                 device: "the GPU".to_owned(),
                 reason: format!("its memory cannot be read: {error}"),
             })?;
-            let pixels =
-                Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
+            let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
                 pixels.deliver(view, target);

@@ -62,8 +62,7 @@ impl Sort {
             ];
             histogram.run(device, pass, Groups::Job(jobs, sort), &counts);
             scan.run(device, pass, (jobs, digits), self.offsets.buffer());
-            let moved =
-                [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];
+            let moved = [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];
             let all: Vec<_> = counts.into_iter().chain(moved).collect();
             scatter.run(device, pass, Groups::Job(jobs, sort), &all);
             from = to;
