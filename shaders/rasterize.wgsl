@@ -1,5 +1,6 @@
-// Stage rasterize: each tile blends its splats from the nearest, one workgroup per tile, one thread
-// per pixel. Batches of splats travel through workgroup memory.
+// Stage rasterize: each tile blends its splats from the nearest, one workgroup per tile, four pixels
+// of a row per thread: what is read of a splat serves four, and so does what depends on the row.
+// Batches of splats travel through workgroup memory.
 //
 // Twin of `src/render/cpu/rasterize.rs`.
 
@@ -16,15 +17,19 @@
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
 @group(0) @binding(6) var<storage, read_write> counters: Counters;
 
-var<workgroup> means: array<vec2f, WORKGROUP>;
-// The factor, and the base-2 logarithm of the peak opacity.
-var<workgroup> factors: array<vec4f, WORKGROUP>;
-// Colour and depth.
-var<workgroup> paints: array<vec4f, WORKGROUP>;
-var<workgroup> done_count: atomic<u32>;
-var<workgroup> done_pixels: u32;
+// 64 threads of 4 pixels, and 40 B for each splat of a batch: 5 KiB, so that a multiprocessor holds
+// as many workgroups as it can.
+const THREADS: u32 = TILE_PX * TILE_PX / 4;
 
-@compute @workgroup_size(WORKGROUP)
+var<workgroup> means: array<vec2f, RASTER_BATCH>;
+// The factor, and the base-2 logarithm of the peak opacity.
+var<workgroup> factors: array<vec4f, RASTER_BATCH>;
+// Colour and depth.
+var<workgroup> paints: array<vec4f, RASTER_BATCH>;
+var<workgroup> done_count: atomic<u32>;
+var<workgroup> done_threads: u32;
+
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) group: vec3u,
     @builtin(num_workgroups) groups: vec3u,
@@ -38,63 +43,67 @@ fn main(
     let view = view_of(tile);
     let tile_of_view = tile - view.first_tile;
     let corner = vec2u(tile_of_view % view.columns, tile_of_view / view.columns) * TILE_PX;
-    let pixel = pixel_of(thread);
-    let at_px = vec2f(corner + pixel) + 0.5;
+    let first_pixel = vec2u(thread % 4u * 4u, thread / 4u);
+    let at_px = vec2f(corner + first_pixel) + 0.5;
 
     if thread == 0u {
         atomicStore(&done_count, 0u);
     }
     workgroupBarrier();
     // Images need not be multiples of 16 px.
-    var done = any(corner + pixel >= view.size_px);
+    var sums = Sums(vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(1.0));
+    // Runs on after a pixel has stopped: it only falls, so that a pixel stays stopped.
+    var running = vec4f(1.0);
+    var done = any(corner + first_pixel >= view.size_px);
     if done {
         atomicAdd(&done_count, 1u);
     }
-    var rgb = vec3f(0.0);
-    var depth_sum = 0.0;
-    var transmittance = 1.0;
     var batches = 0u;
     let range = ranges[tile];
-    for (var first = range.x; first < range.y; first += WORKGROUP) {
+    for (var first = range.x; first < range.y; first += RASTER_BATCH) {
         workgroupBarrier();
         if thread == 0u {
-            done_pixels = atomicLoad(&done_count);
+            done_threads = atomicLoad(&done_count);
         }
-        if workgroupUniformLoad(&done_pixels) == WORKGROUP {
+        if workgroupUniformLoad(&done_threads) == THREADS {
             break;
         }
         batches++;
-        let count = min(range.y - first, WORKGROUP);
-        if thread < count {
-            let place = instance_places[first + thread];
+        let count = min(range.y - first, RASTER_BATCH);
+        for (var k = thread; k < count; k += THREADS) {
+            let place = instance_places[first + k];
             let shape = shapes[place];
             let color = colors[place];
-            means[thread] = shape.mean_px;
-            factors[thread] = vec4f(shape.factor, shape.log2_opacity);
-            paints[thread] = vec4f(color.rgb, color.depth_m);
+            means[k] = shape.mean_px;
+            factors[k] = vec4f(shape.factor, shape.log2_opacity);
+            paints[k] = vec4f(color.rgb, color.depth_m);
         }
         workgroupBarrier();
         let was_done = done;
         for (var k = 0u; k < count && !done; k++) {
             let factor = factors[k];
             let d = at_px - means[k];
-            let u = factor.x * d.x + factor.y * d.y;
             let v = factor.z * d.y;
-            let exponent = factor.w - u * u - v * v;
-            if exponent >= frame.log2_alpha_cut {
-                let alpha = min(exp2(exponent), frame.alpha_cap);
-                let after = transmittance - alpha * transmittance;
+            let u = factor.x * d.x + factor.y * d.y + factor.x * vec4f(0.0, 1.0, 2.0, 3.0);
+            let exponent = factor.w - v * v - u * u;
+            let touched = exponent >= vec4f(frame.log2_alpha_cut);
+            if any(touched) {
+                let alpha =
+                    select(vec4f(0.0), min(exp2(exponent), vec4f(frame.alpha_cap)), touched);
+                let after = running - alpha * running;
                 // The Gaussian that would bring the transmittance to the stop is left out.
-                if after <= frame.stop {
-                    done = true;
-                    break;
-                }
-                let weight = alpha * transmittance;
-                rgb += weight * paints[k].rgb;
+                let counts = after > vec4f(frame.stop);
+                let weight = select(vec4f(0.0), alpha * running, counts);
+                let paint = paints[k];
+                sums.red += weight * paint.r;
+                sums.green += weight * paint.g;
+                sums.blue += weight * paint.b;
                 if DEPTH {
-                    depth_sum += weight * paints[k].w;
+                    sums.depth += weight * paint.w;
                 }
-                transmittance = after;
+                sums.transmittance = select(sums.transmittance, after, counts);
+                running = after;
+                done = !any(counts);
             }
         }
         if done && !was_done {
@@ -104,7 +113,7 @@ fn main(
     if thread == 0u {
         atomicAdd(&counters.batches, batches);
     }
-    resolve(index, pixel.y * TILE_PX + pixel.x, rgb, transmittance, depth_sum);
+    resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 
 fn view_of(tile: u32) -> FrameView {
@@ -113,11 +122,4 @@ fn view_of(tile: u32) -> FrameView {
         view++;
     }
     return frame.view[view];
-}
-
-// 32 threads in a row cover 8 x 4 pixels, so that they tend to need the same splats.
-fn pixel_of(thread: u32) -> vec2u {
-    let x = (thread & 7u) | ((thread >> 2u) & 8u);
-    let y = ((thread >> 3u) & 3u) | ((thread >> 4u) & 12u);
-    return vec2u(x, y);
 }

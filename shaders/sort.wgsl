@@ -51,7 +51,8 @@ var<workgroup> holders: array<atomic<u32>, DIGITS * MASK_WORDS>;
 var<workgroup> next: array<u32, DIGITS>;
 
 // A key's rank among the equal digits of its round is the number of holders before its thread:
-// stable for subgroups of any size, whatever the order in which the bits were set.
+// stable for subgroups of any size, whatever the order in which the bits were set. The last holder
+// moves the digit's place on, and each clears the word that it set a bit of.
 @compute @workgroup_size(WORKGROUP)
 fn scatter(
     @builtin(workgroup_id) group: vec3u,
@@ -80,21 +81,27 @@ fn scatter(
             atomicOr(&holders[own_word * DIGITS + digit(key)], own_bit);
         }
         workgroupBarrier();
+        var place = 0u;
+        var is_last = false;
         if held {
-            var place = next[digit(key)];
-            for (var word = 0u; word < own_word; word++) {
-                place += countOneBits(atomicLoad(&holders[word * DIGITS + digit(key)]));
-            }
             let beside = atomicLoad(&holders[own_word * DIGITS + digit(key)]);
-            place += countOneBits(beside & (own_bit - 1u));
+            place = next[digit(key)] + countOneBits(beside & (own_bit - 1u));
+            var after = beside & ~(own_bit | (own_bit - 1u));
+            for (var word = 0u; word < MASK_WORDS; word++) {
+                let others = atomicLoad(&holders[word * DIGITS + digit(key)]);
+                place += select(0u, countOneBits(others), word < own_word);
+                after |= select(0u, others, word > own_word);
+            }
+            is_last = after == 0u;
             sorted_keys[place] = key;
             sorted_values[place] = values[i];
         }
         workgroupBarrier();
-        // Thread and digit are one number here.
-        for (var word = 0u; word < MASK_WORDS; word++) {
-            next[thread] += countOneBits(atomicLoad(&holders[word * DIGITS + thread]));
-            atomicStore(&holders[word * DIGITS + thread], 0u);
+        if held {
+            atomicStore(&holders[own_word * DIGITS + digit(key)], 0u);
+            if is_last {
+                next[digit(key)] = place + 1u;
+            }
         }
     }
 }

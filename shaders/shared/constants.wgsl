@@ -17,3 +17,4 @@ const SORT_BLOCK: u32 = 4096;
 const DIGITS: u32 = 256;
 const MAX_GROUPS: u32 = 65535;
 const BIG_SPLAT_TILES: u32 = 64;
+const RASTER_BATCH: u32 = 128;

@@ -41,6 +41,7 @@ fn a_slip_in_any_stage_is_caught() {
         ("scan", "block_sums[count] = before;", "block_sums[count] = before / 2u;"),
         ("sort", "countOneBits(beside & (own_bit - 1u))", "countOneBits(beside & own_bit) - 1u"),
         ("sort", "place = next[digit(key)]", "place = offsets[digit(key)]"),
+        ("sort", "is_last = after == 0u", "is_last = beside == own_bit"),
         ("bin", "last - first + 1u", "last - first"),
         (
             "bin",
@@ -49,15 +50,12 @@ fn a_slip_in_any_stage_is_caught() {
         ),
         ("bin", "row_first_tile[holder] + i", "row_first_tile[holder]"),
         ("ranges", "ranges[tile].y = i + 1u", "ranges[tile].y = i"),
-        ("rasterize", "after <= frame.stop", "after <= 50.0 * frame.stop"),
-        ("rasterize", "instance_places[first + thread]", "instance_places[first + (thread ^ 1u)]"),
-        ("rasterize", "rgb += weight * paints[k].rgb", "rgb += alpha * paints[k].rgb"),
-        ("rasterize", "depth_sum / opacity", "depth_sum"),
-        (
-            "rasterize",
-            "saturate(vec4f(rgb, opacity)) * 255.0",
-            "saturate(vec4f(rgb, opacity)) * 250.0",
-        ),
+        ("rasterize", "after > vec4f(frame.stop)", "after > vec4f(50.0 * frame.stop)"),
+        ("rasterize", "instance_places[first + k]", "instance_places[first + (k ^ 1u)]"),
+        ("rasterize", "sums.green += weight", "sums.green += alpha"),
+        ("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)"),
+        ("rasterize", "sums.depth / select", "sums.depth * select"),
+        ("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0"),
     ] {
         let broken = Shaders::default().with_slip(stage, part, slip);
         let broken = broken.unwrap_or_else(|| panic!("{part:?} is no longer in {stage}"));

@@ -34,6 +34,7 @@ fn constants_are_the_same() {
         ("SORT_BLOCK", Literal::U32(layout::SORT_BLOCK)),
         ("DIGITS", Literal::U32(layout::DIGITS)),
         ("MAX_GROUPS", Literal::U32(layout::MAX_GROUPS)),
+        ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
         ("BIG_SPLAT_TILES", Literal::U32(layout::BIG_SPLAT_TILES)),
     ]);
     let module = shared();

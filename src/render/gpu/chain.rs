@@ -263,7 +263,7 @@ impl Chain {
             visible_pairs: counters.splats.into(),
             instances: counters.instances.into(),
             evaluations: u64::from(counters.batches)
-                * u64::from(super::layout::WORKGROUP)
+                * u64::from(super::layout::RASTER_BATCH)
                 * u64::from(TILE_PX * TILE_PX),
         }
     }

@@ -18,6 +18,8 @@ pub const DIGITS: u32 = 256;
 pub const MAX_GROUPS: u32 = 65_535;
 /// Splats over more tiles are emitted by a whole workgroup.
 pub const BIG_SPLAT_TILES: u32 = 64;
+/// Splats that a tile blends at a time.
+pub const RASTER_BATCH: u32 = 128;
 /// Words before a cluster's columns: two are used, 128 B keep the columns aligned.
 pub const CLUSTER_HEADER_WORDS: u32 = 32;
 /// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
@@ -179,7 +181,7 @@ pub struct Counters {
     pub splats: u32,
     /// (Gaussian, tile) pairs, whether or not they fit; 2^32 - 1 stands for more.
     pub instances: u32,
-    /// Batches of 256 splats that tiles blended.
+    /// Batches of [`RASTER_BATCH`] splats that tiles blended.
     pub batches: u32,
     /// Zero.
     pub pad: u32,
