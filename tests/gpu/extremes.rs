@@ -256,11 +256,12 @@ fn t19_the_stop_rule_exactly() {
     }
     assert!((center(10_000, 0.9999e-4) - 1e-4).abs() < 1e-6);
 
-    // Once stopped, a pixel stays stopped, though what follows would fit.
+    // Once stopped, a pixel stays stopped, though what follows would fit, and its neighbours go on.
+    let dot = |i| Blob { sigma_m: DVec3::splat(0.015), ..layer(i) };
     let thin = |i| Blob { opacity: 0.1, ..layer(10 + i) };
-    let layers: Vec<Blob> = (0..4).map(layer).chain((0..50).map(thin)).collect();
+    let layers: Vec<Blob> = (0..4).map(dot).chain((0..50).map(thin)).collect();
     let profile = RenderProfile { stop: 1.0001e-4, ..RenderProfile::default() };
     let image = agreed(&gpu, &scene(&layers), &profile, ahead([9, 9], 1000.0), "thin layers");
     let transmittance = 1.0 - image.opacity[4 * 9 + 4];
-    assert!((transmittance - 1e-3).abs() < 1e-6, "{transmittance:e}");
+    assert!((transmittance - 1e-3).abs() < 1e-5, "{transmittance:e}");
 }
