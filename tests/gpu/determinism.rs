@@ -62,6 +62,21 @@ fn a_frame_leaves_nothing_for_the_next() {
     assert!(render(&backend, &street, &profile, &views()) == fresh);
 }
 
+/// Lavapipe takes the width of its subgroups from the environment: 4, 8 and 16 threads. On other
+/// devices the variable does nothing. A process of its own, since a driver reads it once.
+#[test]
+fn subgroups_of_any_size() {
+    for width in ["128", "256", "512"] {
+        let output = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "parity::streets_of_every_sh_degree"])
+            .env("LP_NATIVE_VECTOR_WIDTH", width)
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.success() && said.contains("1 passed"), "{width}: {said}");
+    }
+}
+
 #[test]
 fn memory_is_what_is_resident() {
     let (backend, profile) = (gpu(), RenderProfile::default());

@@ -4,12 +4,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
+use wgpu::{BufferUsages, BufferView, MapMode, PollType, QuerySet, SubmissionIndex};
 
 use super::bin::Bin;
 use super::device::Device;
 use super::growing::Growing;
-use super::kernel::{Recorder, TICKS_BYTES};
+use super::kernel::{Recorder, TICKS_BYTES, clock};
 use super::layout::{Counters, Frame as GpuFrame, FrameView};
 use super::mirror::Mirror;
 use super::plan::{Plan, job};
@@ -42,6 +42,7 @@ pub(super) struct Chain {
     bin: Bin,
     rasterize: Rasterize,
     splats: Splats,
+    clock: Option<QuerySet>,
     /// Resolved ticks, on their way to the host.
     ticks: Growing,
     /// Read-back buffers that nobody reads.
@@ -93,6 +94,7 @@ impl Chain {
             bin: Bin::new(&device, shaders),
             rasterize: Rasterize::new(&device, shaders),
             splats: Splats::new(&device),
+            clock: clock(&device),
             ticks: Growing::new(
                 &device,
                 "ticks",
@@ -195,7 +197,7 @@ impl Chain {
         let Self { device, plan, scan, splats, .. } = self;
         let (device, plan, scan) = (&*device, &*plan, &*scan);
         plan.start(device, frame, work.items());
-        let mut recorder = Recorder::new(device);
+        let mut recorder = Recorder::new(device, self.clock.clone());
         recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
 
         let mut pass = recorder.stage("project");

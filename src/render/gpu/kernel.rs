@@ -121,19 +121,23 @@ pub(super) const MAX_STAGES: u32 = 8;
 /// Bytes of all ticks: before and after each stage.
 pub(super) const TICKS_BYTES: u64 = 2 * 8 * MAX_STAGES as u64;
 
+/// A clock for all stages of a frame, where the device has one.
+pub(super) fn clock(device: &Device) -> Option<QuerySet> {
+    device.tick_ns().map(|_| {
+        device.device.create_query_set(&QuerySetDescriptor {
+            label: Some("stages"),
+            ty: QueryType::Timestamp,
+            count: 2 * MAX_STAGES,
+        })
+    })
+}
+
 impl Recorder {
-    /// An empty frame.
-    pub(super) fn new(device: &Device) -> Self {
+    /// An empty frame, timed by `clock` where the device has one.
+    pub(super) fn new(device: &Device, clock: Option<QuerySet>) -> Self {
         let encoder = device
             .device
             .create_command_encoder(&CommandEncoderDescriptor { label: Some("frame") });
-        let clock = device.tick_ns().map(|_| {
-            device.device.create_query_set(&QuerySetDescriptor {
-                label: Some("stages"),
-                ty: QueryType::Timestamp,
-                count: 2 * MAX_STAGES,
-            })
-        });
         Self { encoder, clock, stages: Vec::new() }
     }
 

@@ -203,7 +203,7 @@ impl Page {
     }
 
     fn is_unused(&self) -> bool {
-        self.free == [0..self.clusters]
+        self.free.first() == Some(&(0..self.clusters))
     }
 }
 

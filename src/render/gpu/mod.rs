@@ -150,3 +150,34 @@ impl Backend for Gpu {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Pinhole;
+    use crate::geometry::{Camera, Pose};
+    use crate::render::View;
+    use crate::scene::{RenderProfile, Scene};
+
+    #[test]
+    fn a_lost_device_fails_its_frame_and_not_the_next() {
+        let gpu = Gpu::new(&AdapterChoice::Best, 1)
+            .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
+        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
+        let camera = Camera { width_px: 16, height_px: 16, pinhole };
+        let views = [View { camera, world_from_camera: Pose::IDENTITY }];
+        let (scene, profile) = (Scene::default(), RenderProfile::default());
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let mut image = vec![77; 3 * 256];
+        let mut render = || {
+            let target = Target { rgb8: Some(&mut image), ..Target::default() };
+            gpu.render(&frame, &mut [target], &|_, _| {}).map(|_| image[0])
+        };
+        assert_eq!(render(), Ok(0));
+        gpu.chain.lock().unwrap().as_ref().unwrap().device.device.destroy();
+        let lost = render();
+        assert!(matches!(lost, Err(RenderError::Device { .. })), "{lost:?}");
+        assert_eq!(gpu.usage(), None);
+        assert_eq!(render(), Ok(0));
+    }
+}

@@ -10,15 +10,15 @@ use super::shaders::Shaders;
 
 /// Slots of the jobs, as `plan.wgsl` names them.
 pub(super) mod job {
-    pub(in crate::render::gpu) const ITEMS: u64 = 0;
-    pub(in crate::render::gpu) const SPLATS: u64 = 1;
-    pub(in crate::render::gpu) const SPLATS_SCAN: u64 = 2;
-    pub(in crate::render::gpu) const SPLATS_SORT: u64 = 3;
-    pub(in crate::render::gpu) const SPLATS_DIGITS: u64 = 4;
-    pub(in crate::render::gpu) const INSTANCES: u64 = 5;
-    pub(in crate::render::gpu) const INSTANCES_SORT: u64 = 6;
-    pub(in crate::render::gpu) const INSTANCES_DIGITS: u64 = 7;
-    pub(in crate::render::gpu) const COUNT: usize = 8;
+    pub(crate) const ITEMS: u64 = 0;
+    pub(crate) const SPLATS: u64 = 1;
+    pub(crate) const SPLATS_SCAN: u64 = 2;
+    pub(crate) const SPLATS_SORT: u64 = 3;
+    pub(crate) const SPLATS_DIGITS: u64 = 4;
+    pub(crate) const INSTANCES: u64 = 5;
+    pub(crate) const INSTANCES_SORT: u64 = 6;
+    pub(crate) const INSTANCES_DIGITS: u64 = 7;
+    pub(crate) const COUNT: usize = 8;
 }
 
 /// What a frame is, what it counts, and what is to do.
