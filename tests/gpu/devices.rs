@@ -40,3 +40,24 @@ fn a_shader_that_does_not_compile_is_an_error() {
     let error = Gpu::with_shaders(&AdapterChoice::Best, 1, broken).unwrap_err();
     assert!(error.to_string().contains("nothing"), "{error}");
 }
+
+/// Processes of their own, whose loader finds no driver.
+#[test]
+fn without_a_driver_it_is_an_ordinary_error() {
+    let without = |program: &str, arguments: &[&str]| {
+        let mut command = std::process::Command::new(program);
+        command.args(arguments);
+        for name in ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"] {
+            command.env(name, "/nonexistent");
+        }
+        let output = command.output().unwrap();
+        (output.status.success(), String::from_utf8_lossy(&output.stdout).into_owned())
+    };
+    let (listed, said) = without(env!("CARGO_BIN_EXE_wildcity"), &["devices"]);
+    assert!(listed && said.contains("mesa-vulkan-drivers"), "{said}");
+    // Here `software_is_not_taken_for_hardware` sees no device at all.
+    let this = std::env::current_exe().unwrap();
+    let test = "devices::software_is_not_taken_for_hardware";
+    let (passed, said) = without(&this.to_string_lossy(), &["--exact", test]);
+    assert!(passed && said.contains("1 passed"), "{said}");
+}
