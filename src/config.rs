@@ -18,8 +18,8 @@ pub const INBOUND_MESSAGE_BYTES: usize = 1 << 20;
 /// six 1440x928 raw images with both are 88 MB.
 pub const OBSERVATION_BYTES: usize = 1 << 30;
 
-/// Largest header of an observation: 16 poses of 16 cameras are 256 images of 0.7 kB of metadata
-/// and 0.3 kB of tensor table, a quarter of this.
+/// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
+/// of at most 1.5 kB, together 0.4 MB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
 /// Connections at once, WebSocket and HTTP together.

@@ -154,7 +154,7 @@ impl Drive {
     fn keep(&mut self, seen: &Observation, out: &Path) -> anyhow::Result<()> {
         let step = seen.metadata().step;
         if step.is_multiple_of(MOSAIC_STEPS) {
-            let name = format!("step_{step:04}.jpg");
+            let name = format!("step_{step:04}.png");
             mosaic::write(seen, &out.join(&name))?;
             self.mosaics.push(name);
         }

@@ -1,6 +1,6 @@
 //! `wildcity serve`.
 
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -47,7 +47,11 @@ impl Serve {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let log = self.log.or_else(|| std::env::var("RUST_LOG").ok());
         let filter = EnvFilter::try_new(log.as_deref().unwrap_or("info"))?;
-        tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
+        tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(io::stderr)
+            .with_ansi(io::stderr().is_terminal())
+            .init();
         let config = server::Config {
             listen: self.listen,
             twins: self.twins.dir()?,
@@ -55,7 +59,7 @@ impl Serve {
             backend: Arc::from(self.engine.backend()?),
             limits: Limits::default(),
         };
-        tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display());
+        tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         runtime.block_on(async {
             let running = server::start(config).await?;

@@ -28,7 +28,7 @@ pub(super) struct Connection {
 #[derive(Debug)]
 pub(super) enum Incoming {
     Answer(Answer),
-    Observation(Observation),
+    Observation(Box<Observation>),
 }
 
 impl Connection {
@@ -106,7 +106,7 @@ impl Connection {
 }
 
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
-    Ok(Incoming::Observation(Observation::decode(frame)?))
+    Ok(Incoming::Observation(Box::new(Observation::decode(frame)?)))
 }
 
 impl Incoming {

@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use crate::config;
 use crate::protocol::PROTOCOL;
+use crate::protocol::error::Code;
 use crate::protocol::message::{
     Answer, ClientInfo, Limits, Open, Opened, Pose, Request, ServerInfo, Start, Summary, TwinInfo,
 };
@@ -108,7 +109,7 @@ impl Client {
     /// was carried out already its answer comes again, byte for byte.
     ///
     /// # Errors
-    /// As [`Client::resume`].
+    /// As [`Client::resume`]. After `unknown_session` another session can be opened.
     pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
         self.connection = None;
         let mut connection = Connection::open(&self.url).await?;
@@ -203,7 +204,7 @@ impl Client {
 
     async fn observation(&mut self, request: &Request) -> Result<Observation, ClientError> {
         match self.exchange(request).await? {
-            Incoming::Observation(observation) => Ok(observation),
+            Incoming::Observation(observation) => Ok(*observation),
             other => Err(self.break_off("an observation", &other)),
         }
     }
@@ -230,7 +231,17 @@ impl Client {
         let mut connection =
             self.connection.take().ok_or_else(|| ClientError::Disconnected(self.reason()))?;
         let request = Request::Resume { seq: 1, session: session.to_owned(), last_seq };
-        match connection.exchange(&request, 1, self.answer_timeout).await? {
+        let incoming = match connection.exchange(&request, 1, self.answer_timeout).await {
+            Ok(incoming) => incoming,
+            Err(error) => {
+                if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
+                    // Gone for good; a new one can be opened here, with the number of this try.
+                    (self.session, self.next_seq, self.connection) = (None, 1, Some(connection));
+                }
+                return Err(error);
+            }
+        };
+        match incoming {
             // One request at a time: the session is where this client is, or one answer ahead.
             Incoming::Answer(Answer::Resumed { last_seq: done, step, time_us, .. })
                 if done == last_seq || done == last_seq + 1 =>

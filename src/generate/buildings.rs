@@ -40,9 +40,16 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
             let main = name.starts_with("main");
             let style = style(&mut random, main);
             let (s_m, _) = route.project(front.at(0.5 * front.width_m, 0.0, 0.0));
-            let driven = main && (-5.0..route.length_m + 5.0).contains(&s_m);
-            let spacing = if driven { 1.0 } else { 2.5 };
-            let style = Style { near: driven, ..style };
+            let beyond_m = route.beyond_m(s_m);
+            let near = main && beyond_m < 32.0;
+            let spacing = if main && beyond_m < 6.0 {
+                1.0
+            } else if near {
+                1.4
+            } else {
+                2.5
+            };
+            let style = Style { near, ..style };
             let last = index + 2 == breaks_m.len();
             buildings.push(Building {
                 front,
@@ -127,8 +134,8 @@ impl Building {
             Wall::between(at(0.0, -DEPTH_M), at(0.0, 0.0)),
             Wall::between(at(width_m, 0.0), at(width_m, -DEPTH_M)),
         ];
-        for side in 0..2 {
-            let (wall, top_m) = (walls[side], self.style.height_m());
+        let top_m = self.style.height_m();
+        for (side, wall) in walls.into_iter().enumerate() {
             if self.open_sides[side] {
                 let style =
                     Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };

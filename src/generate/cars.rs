@@ -1,99 +1,11 @@
-//! Parked cars: one body, lofted through outlines that each kind gives as a table.
+//! Parked cars: one body, lofted through the outline of its kind.
 
 use glam::{DMat3, DQuat, DVec3};
 
+use super::car_kinds::{HATCHBACK, Kind, SEDAN, VAN, WAGON};
 use super::light::Occluder;
 use super::random::{Random, smooth};
 use super::surface::{Paint, Painter};
-
-/// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
-///
-/// Every knot is (x, belt, top): where along the car, the height of the body's side and the height
-/// of the middle line, in metres. Between knots both run straight.
-#[derive(Clone, Copy, Debug)]
-struct Kind {
-    length_m: f64,
-    width_m: f64,
-    knots: &'static [(f64, f64, f64)],
-    /// Glass of the sides, from tail to nose in parts of the length: between them stand pillars.
-    side_glass: &'static [[f64; 2]],
-    /// Rear window and windscreen, as [low end, high end] along the car.
-    rear_glass: [f64; 2],
-    windscreen: [f64; 2],
-}
-
-const HATCHBACK: Kind = Kind {
-    length_m: 4.1,
-    width_m: 1.76,
-    knots: &[
-        (0.00, 0.72, 0.74),
-        (0.03, 0.94, 0.98),
-        (0.14, 0.96, 1.42),
-        (0.45, 0.94, 1.50),
-        (0.56, 0.93, 1.44),
-        (0.75, 0.90, 0.97),
-        (0.94, 0.74, 0.80),
-        (1.00, 0.58, 0.60),
-    ],
-    side_glass: &[[0.12, 0.22], [0.25, 0.44], [0.465, 0.67]],
-    rear_glass: [0.04, 0.135],
-    windscreen: [0.57, 0.735],
-};
-
-const SEDAN: Kind = Kind {
-    length_m: 4.7,
-    width_m: 1.82,
-    knots: &[
-        (0.00, 0.70, 0.72),
-        (0.02, 0.90, 0.98),
-        (0.15, 0.94, 1.03),
-        (0.30, 0.94, 1.37),
-        (0.48, 0.93, 1.45),
-        (0.57, 0.92, 1.40),
-        (0.74, 0.89, 0.96),
-        (0.95, 0.74, 0.78),
-        (1.00, 0.56, 0.58),
-    ],
-    side_glass: &[[0.21, 0.31], [0.325, 0.465], [0.485, 0.66]],
-    rear_glass: [0.165, 0.29],
-    windscreen: [0.58, 0.725],
-};
-
-const WAGON: Kind = Kind {
-    length_m: 4.5,
-    width_m: 1.86,
-    knots: &[
-        (0.00, 0.80, 0.82),
-        (0.02, 1.04, 1.10),
-        (0.09, 1.06, 1.56),
-        (0.30, 1.05, 1.66),
-        (0.54, 1.03, 1.60),
-        (0.72, 1.00, 1.10),
-        (0.95, 0.86, 0.93),
-        (1.00, 0.66, 0.68),
-    ],
-    side_glass: &[[0.09, 0.24], [0.265, 0.43], [0.45, 0.64]],
-    rear_glass: [0.025, 0.085],
-    windscreen: [0.55, 0.705],
-};
-
-const VAN: Kind = Kind {
-    length_m: 5.1,
-    width_m: 1.94,
-    knots: &[
-        (0.00, 1.02, 1.04),
-        (0.01, 1.18, 1.80),
-        (0.04, 1.20, 1.96),
-        (0.60, 1.18, 1.98),
-        (0.68, 1.16, 1.90),
-        (0.85, 1.10, 1.20),
-        (0.97, 0.92, 0.98),
-        (1.00, 0.70, 0.72),
-    ],
-    side_glass: &[[0.58, 0.78]],
-    rear_glass: [0.012, 0.035],
-    windscreen: [0.69, 0.84],
-};
 
 /// Height of the sills, in metres.
 const SILL_M: f64 = 0.24;
@@ -147,7 +59,7 @@ impl Car {
                 size_m: DVec3::new(half_m, half_width_m, high_m - low_m),
             }
         };
-        let top_m = self.middle_line_m(0.45);
+        let top_m = self.kind.middle_line_m(0.45);
         [
             block(0.02, 0.97, 0.10, 0.60, 0.5 * width_m - 0.06),
             block(0.16, 0.62, 0.60, top_m - 0.12, 0.5 * width_m - 0.22),
@@ -192,14 +104,8 @@ impl Car {
     /// Break points along the car, in metres from the tail: at every feature, and evenly between.
     fn lengthwise(&self, painter: &Painter) -> Vec<f64> {
         let kind = self.kind;
-        let mut features: Vec<f64> = kind.knots.iter().map(|knot| knot.0).collect();
-        features.extend(kind.side_glass.iter().flatten());
-        features.extend(kind.rear_glass);
-        features.extend(kind.windscreen);
-        features.sort_by(f64::total_cmp);
-        features.dedup_by(|b, a| *b - *a < 0.012);
         let mut xs = vec![0.0];
-        for pair in features.windows(2) {
+        for pair in kind.features().windows(2) {
             let steps = painter.even(pair[0] * kind.length_m, pair[1] * kind.length_m, 0.14);
             xs.extend(&steps[1..]);
         }
@@ -210,16 +116,6 @@ impl Car {
     fn half_width_m(&self, x: f64) -> f64 {
         let taper = |from_end: f64| 1.0 - smooth(from_end / 0.16);
         0.5 * self.kind.width_m * (1.0 - 0.10 * taper(1.0 - x) - 0.07 * taper(x))
-    }
-
-    /// Height of the body's shoulder at a part of the length, in metres.
-    fn belt_m(&self, x: f64) -> f64 {
-        knotted(self.kind.knots, x, |knot| knot.1)
-    }
-
-    /// Height of bonnet, glass and roof on the middle line, in metres.
-    fn middle_line_m(&self, x: f64) -> f64 {
-        knotted(self.kind.knots, x, |knot| knot.2)
     }
 
     fn place(&self, x_m: f64, y_m: f64, z_m: f64) -> DVec3 {
@@ -233,7 +129,7 @@ impl Car {
         let place = |x_m: f64, v: f64| {
             let x = x_m / length_m;
             let belly = 1.0 - 0.10 * (1.0 - v) * (1.0 - v) - 0.03 * v * v;
-            let z_m = SILL_M + v * (self.belt_m(x) - SILL_M);
+            let z_m = SILL_M + v * (self.kind.belt_m(x) - SILL_M);
             self.place(x_m, side * belly * self.half_width_m(x), z_m)
         };
         // Outwards is left × ... : on the left side u runs to the tail.
@@ -245,7 +141,7 @@ impl Car {
             |u, v| place(-side * u, v),
             |u, v| {
                 let x_m = -side * u;
-                let z_m = SILL_M + v * (self.belt_m(x_m / length_m) - SILL_M);
+                let z_m = SILL_M + v * (self.kind.belt_m(x_m / length_m) - SILL_M);
                 let arch = WHEELS.iter().any(|wheel| {
                     let dx_m = x_m - wheel * length_m;
                     dx_m * dx_m + (z_m - TYRE_M).powi(2) < (TYRE_M + 0.07).powi(2)
@@ -276,7 +172,7 @@ impl Car {
         vs.extend(painter.even(1.0, 2.0, 0.34).into_iter().skip(1));
         let section = |x_m: f64, v: f64| {
             let x = x_m / length_m;
-            let (belt_m, top_m) = (self.belt_m(x), self.middle_line_m(x));
+            let (belt_m, top_m) = (self.kind.belt_m(x), self.kind.middle_line_m(x));
             let half_m = 0.97 * self.half_width_m(x);
             // The cabin leans in by a quarter of its height above the shoulder; the roof's crown
             // is 6 cm above its edge.
@@ -300,7 +196,7 @@ impl Car {
             |u, v| section(-side * u, v),
             |u, v| {
                 let x = -side * u / length_m;
-                let cabin_m = self.middle_line_m(x) - self.belt_m(x);
+                let cabin_m = self.kind.middle_line_m(x) - self.kind.belt_m(x);
                 let side_glass = (0.12..0.86).contains(&v)
                     && cabin_m > 0.14
                     && self.kind.side_glass.iter().any(|&glass| within(x, glass));
@@ -315,7 +211,7 @@ impl Car {
     fn end(&self, painter: &mut Painter, x: f64) {
         let nose = x > 0.5;
         let outwards = if nose { 1.0 } else { -1.0 };
-        let (half_m, top_m) = (0.97 * self.half_width_m(x), self.belt_m(x) + 0.01);
+        let (half_m, top_m) = (0.97 * self.half_width_m(x), self.kind.belt_m(x) + 0.01);
         // As seen from outside, u runs to the right: the car's left when one looks at its nose.
         let ys = painter.graded(-half_m, half_m, 0.10, 0.14);
         let zs = painter.even(SILL_M - 0.02, top_m, 0.08);
@@ -371,7 +267,7 @@ impl Car {
             let spoke = (angle_rad.abs() * 5.0 / std::f64::consts::TAU).fract() < 0.55;
             Some(if r > 0.68 {
                 Paint::matt(0.14, 0.14, 0.15)
-            } else if spoke || r < 0.22 || r > 0.6 {
+            } else if spoke || !(0.22..0.6).contains(&r) {
                 rim
             } else {
                 Paint::matt(0.16, 0.16, 0.17)
@@ -391,7 +287,7 @@ impl Car {
     /// A door mirror: a small box with glass towards the tail.
     fn mirror(&self, painter: &mut Painter, side: f64) {
         let x = self.kind.windscreen[1] - 0.055;
-        let (x_m, z_m) = (x * self.kind.length_m, self.belt_m(x) + 0.03);
+        let (x_m, z_m) = (x * self.kind.length_m, self.kind.belt_m(x) + 0.03);
         let inner_m = self.half_width_m(x) - 0.04;
         let ys = [0.0, 0.06, 0.12, 0.18];
         let zs = [0.0, 0.06, 0.12];
@@ -425,14 +321,6 @@ impl Car {
             },
         );
     }
-}
-
-/// A column of the knots at `x`, straight between them.
-fn knotted(knots: &[(f64, f64, f64)], x: f64, column: fn(&(f64, f64, f64)) -> f64) -> f64 {
-    let after = knots.iter().position(|knot| knot.0 >= x).unwrap_or(knots.len() - 1).max(1);
-    let (low, high) = (&knots[after - 1], &knots[after]);
-    let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);
-    column(low) + t * (column(high) - column(low))
 }
 
 /// Break points run forwards for `sign` 1; for -1 mirrored, so that they still increase.

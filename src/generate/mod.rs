@@ -1,15 +1,29 @@
 //! The demo twin: a few hundred metres of a street, made from a seed.
 //!
-//! Surfaces are tiled with flat Gaussians ([`surface`]) whose colours carry the light of one sun
-//! ([`light`]). World: ENU in metres, z up, the road at z = 0, the street running east from the
+//! Surfaces are tiled with flat Gaussians (`surface.rs`) whose colours carry the light of one sun
+//! (`light.rs`). World: ENU in metres, z up, the road at z = 0, the street running east from the
 //! origin. The same settings give the same bytes: there is no clock, no thread, and one stream of
-//! random numbers per thing ([`random`]).
+//! random numbers per thing (`random.rs`).
+//!
+//! Where the 439,000 Gaussians of the default settings go, and how far apart they are before
+//! [`StreetSettings::density`] (0.8: 12 % wider):
+//!
+//! | what | thousands | spacing |
+//! |---|---|---|
+//! | road, parking, kerbs, pavements | 72 | lines 6 cm, asphalt 30 x 43 cm, slabs 45 cm |
+//! | houses | 190 | windows 7 to 27 cm, walls 15 to 60 cm, 2.5 times that where nobody drives |
+//! | 65 parked cars | 91 | 8 to 16 cm |
+//! | 44 trees | 59 | leaves of 6 cm |
+//! | lamps, lights, signs, bins, planters | 15 | 4 to 40 cm |
+//! | sky, skyline, land | 12 | 1.5° of sky |
 
 mod backdrop;
 mod buildings;
+mod car_kinds;
 mod cars;
 mod facade;
 mod furniture;
+mod ground_floor;
 mod light;
 mod plants;
 mod random;
@@ -23,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use crate::scene::{Gaussians, Trajectory};
 
 /// Counts the generator's changes: a demo twin of another revision is built again.
-pub const REVISION: u32 = 1;
+pub const REVISION: u32 = 2;
 
 /// What the street is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,7 +49,7 @@ pub struct StreetSettings {
     pub length_m: f64,
     /// Where a side street crosses, in metres from the start: at least 40 from both ends.
     pub crossing_m: f64,
-    /// Gaussians as a part of the default, 0.1 to 4: spacing goes with its square root.
+    /// Gaussians per Gaussian of the spacings in the source, 0.1 to 4: spacing goes with its root.
     pub density: f64,
 }
 
@@ -64,7 +78,7 @@ pub enum StreetError {
     },
 }
 
-/// Makes the street: about 400,000 Gaussians at the default settings, in about a second.
+/// Makes the street: 439,000 Gaussians at the default settings, in a fraction of a second.
 ///
 /// # Errors
 /// Names the first setting out of range.

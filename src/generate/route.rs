@@ -79,6 +79,11 @@ impl Route {
         Station { point_m, forward, left: DVec3::new(-forward.y, forward.x, 0.0) }
     }
 
+    /// How far beyond the driven part a station lies, in metres; 0 on it.
+    pub(super) fn beyond_m(&self, s_m: f64) -> f64 {
+        (s_m - s_m.clamp(0.0, self.length_m)).abs()
+    }
+
     /// The arc length whose cross-section holds a point, and how far left of the centre line the
     /// point lies there, both in metres. For points within about 100 m of the line.
     pub(super) fn project(&self, point_m: DVec3) -> (f64, f64) {

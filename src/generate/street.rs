@@ -55,7 +55,7 @@ fn park(route: &Route, settings: &StreetSettings) -> Vec<Car> {
     let mut cars = Vec::new();
     for (side, name) in [(-1.0, "car, right"), (1.0, "car, left")] {
         for (index, s_m) in along(route, BAY_M).enumerate() {
-            let beyond_m = (s_m - s_m.clamp(0.0, route.length_m)).abs();
+            let beyond_m = route.beyond_m(s_m);
             let mut random = Random::new(settings.seed, name, index);
             let free = random.chance(0.34)
                 || beyond_m > 45.0
@@ -66,7 +66,7 @@ fn park(route: &Route, settings: &StreetSettings) -> Vec<Car> {
             let station = route.at(s_m + random.range(-0.3, 0.3));
             let middle_m = station.beside(side * (BAY_T_M + random.range(-0.06, 0.08)), 0.0);
             let forward = if side < 0.0 { station.forward } else { -station.forward };
-            let spacing = if is_driven(route, s_m) { 1.0 } else { 1.9 };
+            let spacing = if beyond_m < 10.0 { 1.0 } else { 1.8 };
             cars.push(Car::new(middle_m, forward, spacing, random));
         }
     }
@@ -85,7 +85,7 @@ fn plant(route: &Route, settings: &StreetSettings) -> Vec<Tree> {
                 continue;
             }
             let foot_m = route.at(s_m).beside(side * FURNITURE_T_M, PAVEMENT_M);
-            trees.push(Tree::new(foot_m, is_driven(route, s_m), random));
+            trees.push(Tree::new(foot_m, route.beyond_m(s_m) < 18.0, random));
         }
     }
     trees
@@ -131,11 +131,6 @@ fn furnish(painter: &mut Painter, route: &Route, settings: &StreetSettings) {
             furniture::bollard(painter, at(10.9 + 1.4 * f64::from(post + 1), t_m));
         }
     }
-}
-
-/// Whether the drive comes by.
-fn is_driven(route: &Route, s_m: f64) -> bool {
-    (-4.0..route.length_m + 4.0).contains(&s_m)
 }
 
 /// Stations along the whole street, `step_m` apart.

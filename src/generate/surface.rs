@@ -80,7 +80,7 @@ pub(super) struct Painter<'a> {
 }
 
 impl<'a> Painter<'a> {
-    /// An empty canvas. `density` is Gaussians per Gaussian of the default street.
+    /// An empty canvas. `density` is [`super::StreetSettings::density`].
     pub(super) fn new(light: &'a Light, density: f64) -> Self {
         Self {
             gaussians: Gaussians { sh_degree: 1, ..Gaussians::default() },

@@ -17,7 +17,9 @@ pub struct Pose {
 
 /// What a client sends. Every request gets exactly one answer with the same `seq`.
 ///
-/// `seq` counts the requests of a session from 0 without gaps, through `resume` as well.
+/// `seq` counts the requests of a connection from 0 without gaps; after `resume` it goes on from the
+/// session's. A request that was carried out is never carried out again: its number brings the same
+/// answer again. One that was refused can be sent again under its number, or under the next.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {

@@ -17,13 +17,16 @@ pub struct Resident {
     pub scene: Scene,
 }
 
-/// Loads twin versions and shares them between sessions for as long as one holds them.
+/// Loads twin versions and shares them between sessions for as long as one holds them; the one that
+/// was opened last stays for the next session, so that episodes in a row load once.
 #[derive(Debug)]
 pub struct Cache {
     catalog: Catalog,
-    /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is held while loading, so that others wait for the result
-    /// rather than load again; a failed load leaves an empty slot, and the next one tries.
+    /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is
+    /// held while loading, so that others wait for the result rather than load again; a failed load
+    /// leaves an empty slot, and the next one tries.
     slots: Mutex<BTreeMap<(String, u64), Slot>>,
+    last: Mutex<Option<Arc<Resident>>>,
 }
 
 type Slot = Arc<Mutex<Weak<Resident>>>;
@@ -31,7 +34,7 @@ type Slot = Arc<Mutex<Weak<Resident>>>;
 impl Cache {
     /// Nothing in memory yet.
     pub fn new(catalog: Catalog) -> Self {
-        Self { catalog, slots: Mutex::default() }
+        Self { catalog, slots: Mutex::default(), last: Mutex::default() }
     }
 
     /// The twins that can be opened.
@@ -50,11 +53,16 @@ impl Cache {
         let version = self.catalog.version(name, number)?;
         let slot = self.slot(&version);
         let mut held = lock(&slot);
-        if let Some(resident) = held.upgrade() {
-            return Ok(resident);
-        }
-        let resident = Arc::new(self.load(version)?);
+        let resident = match held.upgrade() {
+            Some(resident) => resident,
+            None => {
+                // Let go first: never two twins in memory for one session's sake.
+                *lock(&self.last) = None;
+                Arc::new(self.load(version)?)
+            }
+        };
         *held = Arc::downgrade(&resident);
+        *lock(&self.last) = Some(resident.clone());
         Ok(resident)
     }
 

@@ -51,6 +51,11 @@ impl Running {
         self.server.sessions.count()
     }
 
+    /// WebSocket connections at this moment.
+    pub fn connections(&self) -> usize {
+        self.server.limits.connections - self.server.agents.available_permits()
+    }
+
     /// Accepts nobody any more, lets running steps finish, tells every client, ends every session.
     pub async fn stop(self) {
         // Every receiver may be gone already: nobody is left to be told.

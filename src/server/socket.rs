@@ -8,7 +8,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_tungstenite::WebSocketStream;
-use tokio_tungstenite::tungstenite::error::CapacityError;
+use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message};
 
@@ -73,6 +73,8 @@ impl Socket {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
                     Lost::Fault(Fault::MessageTooLarge { bytes: size, limit: max_size })
                 }
+                // The end of the stream, in a library's words.
+                Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Lost::Gone,
                 Error::Protocol(_) | Error::Utf8(_) | Error::Capacity(_) => {
                     Lost::Fault(Fault::BrokenFrame(error.to_string()))
                 }

@@ -198,3 +198,21 @@ impl Drop for Hold {
         self.answers.0.fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_budget_for_answers_comes_back() {
+        let answers = Answers::default();
+        for _ in 0..3 {
+            let mut half = answers.hold(config::ANSWERS_BYTES / 2).unwrap();
+            half.join(answers.hold(config::ANSWERS_BYTES / 2).unwrap());
+            assert!(matches!(answers.hold(2), Err(SessionError::Busy { .. })));
+        }
+        assert!(answers.hold(config::ANSWERS_BYTES).is_ok());
+        assert!(answers.hold(config::ANSWERS_BYTES + 1).is_err());
+        assert!(answers.hold(u64::MAX).is_err());
+    }
+}

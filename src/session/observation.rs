@@ -13,15 +13,15 @@ use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use serde::{Deserialize, Serialize};
-
 use crate::config;
 use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, Target, View};
 use crate::residency::Resident;
 use crate::scene::rig::RigCamera;
 
-use super::engine::{Answers, Hold, Scratch};
+use super::buffer::Buffer;
+use super::encode::{Drawn, Encoding, encode};
+use super::engine::{Answers, Scratch};
 use super::{Episode, History, SessionError};
 
 /// The length of the header, little-endian, stands before it.
@@ -34,18 +34,6 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// Room for what the header says per image: three tensors of at most 190 bytes, and 11 numbers of
 /// at most 24 digits, two names and a hash with their escaped keys: below 1,400 bytes.
 const HEADER_IMAGE_BYTES: usize = 1536;
-
-/// How colour images travel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Encoding {
-    /// JPEG, 4:2:0, of a quality from 1 to 100.
-    Jpeg(u8),
-    /// PNG.
-    Png,
-    /// Pixels as they are.
-    Raw,
-}
 
 /// What every observation of a session looks like.
 #[derive(Debug)]
@@ -134,15 +122,6 @@ pub struct Timings {
     pub stages_ms: Vec<(&'static str, f64)>,
 }
 
-/// Bytes at an address that is a multiple of 8, counted against the budget for answers.
-#[derive(Debug)]
-pub struct Buffer {
-    words: Vec<u64>,
-    len: usize,
-    header: usize,
-    hold: Hold,
-}
-
 /// A frame in the making.
 pub(super) struct Assembly {
     layout: Arc<Layout>,
@@ -152,14 +131,6 @@ pub(super) struct Assembly {
     poses: usize,
     drawn: Vec<Drawn>,
     timings: Timings,
-}
-
-/// One image as the worker thread left it.
-struct Drawn {
-    hash: blake3::Hash,
-    /// The file, unless the pixels are in the buffer already.
-    file: Vec<u8>,
-    took: Duration,
 }
 
 impl Layout {
@@ -301,7 +272,7 @@ impl Assembly {
         let layout = &self.layout;
         let pose = self.drawn.len() / layout.cameras.len();
         let (floats, raw) = layout.pose_bytes();
-        let tail = self.buffer.len - self.poses * (floats + raw);
+        let tail = self.buffer.bytes().len() - self.poses * (floats + raw);
         let (float_part, raw_part) =
             self.buffer.bytes_mut()[tail..].split_at_mut(self.poses * floats);
         let mut float_part = &mut float_part[pose * floats..(pose + 1) * floats];
@@ -388,36 +359,6 @@ pub(super) fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::
     hasher.finalize()
 }
 
-/// Hashes the pixels of an image, and encodes them. Runs on a render thread, while other images
-/// are still drawn.
-fn encode(rgb8: &[u8], width: u32, height: u32, encoding: Encoding) -> Result<Drawn, String> {
-    let started = Instant::now();
-    let hash = blake3::hash(rgb8);
-    let mut file = Vec::new();
-    match encoding {
-        Encoding::Raw => {}
-        Encoding::Jpeg(quality) => {
-            let side = |px| u16::try_from(px).map_err(|_| format!("{px} px is beyond JPEG"));
-            // An eighth of the pixel bytes is what street scenes take at quality 90.
-            file.reserve(rgb8.len() / 8);
-            let mut encoder = jpeg_encoder::Encoder::new(&mut file, quality);
-            encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_2_2);
-            encoder
-                .encode(rgb8, side(width)?, side(height)?, jpeg_encoder::ColorType::Rgb)
-                .map_err(|error| error.to_string())?;
-        }
-        Encoding::Png => {
-            use image::ImageEncoder as _;
-            use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-            // `Fast` takes 13 ms for 1440x928, the default 30 times as long for 5 % less.
-            PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
-                .write_image(rgb8, width, height, image::ExtendedColorType::Rgb8)
-                .map_err(|error| error.to_string())?;
-        }
-    }
-    Ok(Drawn { hash, file, took: started.elapsed() })
-}
-
 /// Tensors one after the other.
 struct Tensors {
     list: Vec<Tensor>,
@@ -439,42 +380,6 @@ impl DType {
             Self::F32 => 4,
             Self::U8 => 1,
         }
-    }
-}
-
-impl Buffer {
-    fn zeroed(answers: &Answers, len: usize, header: usize) -> Result<Self, SessionError> {
-        let hold = answers.hold(len as u64)?;
-        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, hold })
-    }
-
-    /// The header's room, its length prefix included, and everything behind it.
-    pub fn bytes(&self) -> &[u8] {
-        &bytemuck::cast_slice(&self.words)[..self.len]
-    }
-
-    /// The header's room, its length prefix included.
-    pub fn header_mut(&mut self) -> &mut [u8] {
-        let header = self.header;
-        &mut self.bytes_mut()[..header]
-    }
-
-    fn bytes_mut(&mut self) -> &mut [u8] {
-        &mut bytemuck::cast_slice_mut(&mut self.words)[..self.len]
-    }
-
-    fn append(&mut self, answers: &Answers, parts: &[&[u8]]) -> Result<(), SessionError> {
-        let mut start = self.len;
-        let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
-        let more = answers.hold((len - start) as u64)?;
-        self.hold.join(more);
-        self.words.resize(len.div_ceil(8), 0);
-        self.len = len;
-        for part in parts {
-            self.bytes_mut()[start..start + part.len()].copy_from_slice(part);
-            start += part.len();
-        }
-        Ok(())
     }
 }
 

@@ -9,6 +9,7 @@ mod fake_server;
 mod frames;
 mod messages;
 mod observations;
+mod page;
 mod schema;
 mod talking;
 

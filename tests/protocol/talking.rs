@@ -11,6 +11,9 @@ use wildcity::protocol::message::{Open, Outcome, Pose, Request};
 use super::fake_server::{FakeServer, Reply, seq_of};
 use super::read;
 
+/// Whether an error is the right one.
+type Refusal = fn(&ClientError) -> bool;
+
 const HERE: Pose = Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] };
 
 const HELLO: Reply = Reply::Golden("welcome");
@@ -95,6 +98,24 @@ async fn a_lost_answer_is_fetched_after_reconnecting() {
 }
 
 #[tokio::test]
+async fn a_new_session_can_follow_one_that_is_gone() {
+    let gone = r#"{"type":"error","seq":1,"code":"unknown_session","message":"","fatal":false}"#;
+    let second = vec![HELLO, Reply::Text(gone.into()), OPEN, SEEN];
+    let (server, mut client) = opened(vec![vec![HELLO, OPEN, SEEN, Reply::HangUp], second]).await;
+    client.step(HERE).await.unwrap();
+    client.step(HERE).await.unwrap_err();
+    let refused = client.reconnect().await;
+    assert!(
+        matches!(refused, Err(ClientError::Refused { code: Code::UnknownSession, .. })),
+        "{refused:?}"
+    );
+    client.open(Open::twin("street")).await.unwrap();
+    client.step(HERE).await.unwrap();
+    drop(client);
+    assert_eq!(seqs(&server.requests().await[1]), [0, 1, 1, 2]);
+}
+
+#[tokio::test]
 async fn another_client_can_take_a_session_over() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed"), SEEN]]).await;
     let (mut client, resumed) = Client::resume(&server.url, "test", "run-17", 4).await.unwrap();
@@ -130,7 +151,7 @@ async fn a_dropped_call_gives_the_connection_up() {
 #[tokio::test]
 async fn what_is_no_answer_is_named() {
     let damaged = read("vectors/damaged/overlap.bin");
-    let cases: [(Reply, fn(&ClientError) -> bool); 5] = [
+    let cases: [(Reply, Refusal); 5] = [
         (Reply::Observation(1), |e| {
             matches!(e, ClientError::SeqMismatch { expected: 2, got: Some(3) })
         }),

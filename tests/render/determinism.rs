@@ -100,5 +100,8 @@ fn targets_of_another_size_are_refused() {
         cpu().render(&frame, &mut [target], &|_, _| {}),
         Err(RenderError::TargetSize { view: 0, buffer: "rgb8", given: 10, wanted })
     );
-    assert_eq!(cpu().render(&frame, &mut [], &|_, _| {}), Err(RenderError::Views { count: 1 }));
+    let targets_of_none = RenderError::Targets { targets: 0, views: 1 };
+    assert_eq!(cpu().render(&frame, &mut [], &|_, _| {}), Err(targets_of_none));
+    let nothing = Frame { views: &[], ..frame };
+    assert_eq!(cpu().render(&nothing, &mut [], &|_, _| {}), Err(RenderError::Views { count: 0 }));
 }

@@ -18,7 +18,7 @@ fn sessions_share_one_resident_twin() {
         opens.into_iter().map(|open| open.join().unwrap()).collect()
     });
     assert!(held.iter().all(|resident| Arc::ptr_eq(resident, &held[0])), "loaded once");
-    assert_eq!(Arc::strong_count(&held[0]), 8);
+    assert_eq!(Arc::strong_count(&held[0]), 8 + 1, "and the cache's own, for the next session");
     assert_eq!(held[0].scene.gaussians(), 20_000);
     assert_eq!(held[0].version.number, 1);
 
@@ -29,10 +29,14 @@ fn sessions_share_one_resident_twin() {
     let old = cache.open("street", Some(1)).unwrap();
     assert!(Arc::ptr_eq(&old, &held[0]));
 
-    // With the last session the memory goes.
-    let gone = Arc::downgrade(&held[0]);
-    drop((held, old));
-    assert!(gone.upgrade().is_none());
+    // What was opened last stays for the next session, until another twin is opened.
+    let first = Arc::downgrade(&held[0]);
+    drop((held, old, latest));
+    let again = cache.open("street", Some(1)).unwrap();
+    assert!(std::ptr::eq(first.as_ptr(), &*again), "loaded again");
+    drop(again);
+    assert_eq!(cache.open("street", Some(2)).unwrap().scene.gaussians(), 10);
+    assert!(first.upgrade().is_none(), "nobody holds it, and another was opened since");
     assert_eq!(cache.open("street", Some(1)).unwrap().scene.gaussians(), 20_000);
     assert_eq!(cache.twins().unwrap().len(), 1);
 }

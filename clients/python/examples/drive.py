@@ -23,7 +23,7 @@ def main(url: str, twin: str, out: Path) -> None:
             position = (x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z)
             seen = session.step(Pose(position, (qw, qx, qy, qz)))
             camera, image = next(iter(seen.images.items()))
-            print(f"{seen}: {camera} {image.shape}, nearest {seen.depth[camera].min():.1f} m")
+            print(f"{seen}: {camera} {image.shape}, farthest {seen.depth[camera].max():.1f} m")
             if step % 10 == 0:
                 for camera, image in seen.images.items():
                     Image.fromarray(image).save(out / f"{step:03}_{camera}.png")

@@ -103,6 +103,21 @@ def test_a_lost_answer_is_fetched_after_resuming(connect: Connect) -> None:
     assert seqs(server.requests[1]) == [0, 1, 4, 5]
 
 
+def test_a_new_session_can_follow_one_that_is_gone(connect: Connect) -> None:
+    gone = '{"type":"error","seq":1,"code":"unknown_session","message":"","fatal":false}'
+    second: list[str | bytes] = ["welcome", gone, "opened", SEEN]
+    with FakeServer(["welcome", "opened", SEEN, HANG_UP], second) as server:
+        client = connect(server.url)
+        session = client.open("street")
+        session.step(HERE)
+        with pytest.raises(Disconnected):
+            session.step(HERE)
+        with pytest.raises(Refused, match="unknown_session"):
+            session.resume()
+        client.open("street").step(HERE)
+    assert seqs(server.requests[1]) == [0, 1, 1, 2]
+
+
 def test_another_client_can_take_a_session_over(connect: Connect) -> None:
     with FakeServer(["welcome", "resumed", SEEN]) as server:
         session = connect(server.url).resume("run-17", 4)

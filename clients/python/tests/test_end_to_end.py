@@ -1,4 +1,4 @@
-"""Against the real server, on a twin made here: 4,000 Gaussians on the walls of a corridor."""
+"""Against the real server, on a twin made here: 40,000 Gaussians on the walls of a corridor."""
 
 from __future__ import annotations
 
@@ -57,6 +57,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
+    serving += ["--episodes", str(folder / "episodes")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
         try:
             yield Server(listening_url(process))
@@ -239,7 +240,7 @@ def test_http_routes(server: Server) -> None:
     status, body = server.get("/v1/twins")
     assert status == 200
     (twin,) = json.loads(body)["twins"]
-    assert (twin["name"], twin["gaussians"]) == ("corridor", 4000)
+    assert (twin["name"], twin["gaussians"]) == ("corridor", 40_000)
 
 
 def check(seen: Observation, step: int) -> None:
@@ -274,7 +275,9 @@ def listening_url(process: subprocess.Popen[str]) -> str:
 
 def write_corridor(path: Path) -> None:
     """Walls 2 m to each side of the x axis, 3 m high: red on the left (y > 0), green right."""
-    count = 4000
+    # 90 m² a wall: one Gaussian per 7 cm square. A pixel's depth is that of the first centres around
+    # its ray, so sigmas of 6 cm bring it nearer by about that much.
+    count = 40_000
     numbers = np.random.default_rng(1)
     x, z = numbers.uniform(-5, 25, count), numbers.uniform(0, 3, count)
     left = np.arange(count) < count // 2
@@ -283,7 +286,7 @@ def write_corridor(path: Path) -> None:
     bright, dark = (0.9 - 0.5) / 0.2820948, (0.05 - 0.5) / 0.2820948
     dc = np.where(left[:, None], [bright, dark, dark], [dark, bright, dark])
     opacity = np.full(count, 4.0)  # logit: 0.98
-    scale = np.log(np.broadcast_to([0.2, 0.02, 0.2], (count, 3)))
+    scale = np.log(np.broadcast_to([0.06, 0.006, 0.06], (count, 3)))
     rotation = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (count, 4))
     names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     columns = np.column_stack([x, y, z, dc, opacity, scale, rotation]).astype("<f4")

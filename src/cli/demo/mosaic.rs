@@ -1,15 +1,12 @@
 //! One picture of all cameras, where they look: the front ones above, the others below.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::Context;
-use image::RgbImage;
 use image::imageops::{self, FilterType};
+use image::{ImageFormat, RgbImage};
 
 use crate::client::{ImageView, Observation};
-use crate::config;
 
 /// Cameras of the demo's rig from left to right, row by row.
 const ROWS: [[&str; 3]; 2] = [["front_left", "front", "front_right"], ["left", "rear", "right"]];
@@ -18,7 +15,7 @@ const CELL_PX: [u32; 2] = [480, 310];
 /// Pixels between cells.
 const GAP_PX: u32 = 4;
 
-/// Writes a JPEG of the six images.
+/// Writes a PNG of the six images.
 pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
     let [width, height] = CELL_PX.map(|side| side + GAP_PX);
     let mut mosaic = RgbImage::new(3 * width - GAP_PX, 2 * height - GAP_PX);
@@ -31,11 +28,7 @@ pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
             imageops::replace(&mut mosaic, &cell, x.into(), y.into());
         }
     }
-    let out = BufWriter::new(File::create(path).with_context(|| format!("{}", path.display()))?);
-    let encoder = jpeg_encoder::Encoder::new(out, config::JPEG_QUALITY);
-    let (width, height) = (mosaic.width() as u16, mosaic.height() as u16);
-    encoder.encode(mosaic.as_raw(), width, height, jpeg_encoder::ColorType::Rgb)?;
-    Ok(())
+    mosaic.save_with_format(path, ImageFormat::Png).with_context(|| format!("{}", path.display()))
 }
 
 /// The whole image, as large as a cell allows.

@@ -106,12 +106,13 @@ impl Backend for Cpu {
             let mut clock = Clock { start: Instant::now(), stages_ms: Vec::with_capacity(4) };
             projected.project(level, frame, &cutoffs);
             clock.stage("project");
-            sorted.sort(projected);
+            sorted.sort(projected, &cutoffs);
             clock.stage("sort");
             bins.bin(level, projected, sorted, frame.views, &cutoffs)?;
             clock.stage("bin");
-            let evaluations =
-                rasterize::rasterize(level, bins, frame.views, targets, &cutoffs, finished);
+            let views = frame.views;
+            let input = rasterize::Input { projected, bins, views, cutoffs: &cutoffs };
+            let evaluations = rasterize::rasterize(level, input, targets, finished);
             clock.stage("rasterize");
             Ok(FrameStats {
                 stages_ms: clock.stages_ms,

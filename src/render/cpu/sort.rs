@@ -3,6 +3,8 @@
 use rayon::prelude::*;
 
 use super::project::Projected;
+use crate::render::constants::DEPTH_BITS;
+use crate::render::layout::Cutoffs;
 
 /// The order of a frame's splats.
 #[derive(Debug, Default)]
@@ -14,9 +16,25 @@ pub(super) struct Sorted {
 impl Sorted {
     /// Sorts what the projection left. Keys differ by their place, so any sort gives one order,
     /// and the place counts through (view, global id): equal depths keep the order of ids.
-    pub(super) fn sort(&mut self, projected: &Projected) {
+    pub(super) fn sort(&mut self, projected: &Projected, cutoffs: &Cutoffs) {
+        let near = cutoffs.near_m.to_bits();
+        let len = projected.len();
         self.keys.clear();
-        self.keys.extend(projected.units().iter().flat_map(|unit| &unit.keys));
+        self.keys.reserve_exact(len);
+        self.keys.resize(len, 0);
+        let mut rest = self.keys.as_mut_slice();
+        let units = projected.units().iter().map(|unit| {
+            let (keys, after) = std::mem::take(&mut rest).split_at_mut(unit.len);
+            rest = after;
+            (unit, keys)
+        });
+        units.collect::<Vec<_>>().into_par_iter().for_each(|(unit, keys)| {
+            let view = (unit.view as u64) << (DEPTH_BITS + 32);
+            for (key, (place, splat)) in keys.iter_mut().zip(projected.unit(unit)) {
+                let depth = (splat.depth_m.to_bits() - near).min((1 << DEPTH_BITS) - 1);
+                *key = view | u64::from(depth) << 32 | u64::from(place);
+            }
+        });
         self.keys.par_sort_unstable();
     }
 
@@ -25,9 +43,10 @@ impl Sorted {
         self.keys.len()
     }
 
-    /// Places of one view's splats in the projection, from the nearest.
+    /// Keys of one view's splats, from the nearest; the low half is the place in the projection.
     pub(super) fn view(&self, view: usize) -> &[u64] {
-        let first = |view: u64| self.keys.partition_point(|&key| key >> 60 < view);
+        let shift = DEPTH_BITS + 32;
+        let first = |view: u64| self.keys.partition_point(|&key| key >> shift < view);
         &self.keys[first(view as u64)..first(view as u64 + 1)]
     }
 }

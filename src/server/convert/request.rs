@@ -81,11 +81,16 @@ pub(in crate::server) fn parse(text: &str) -> Parsed {
     if let Some((seq, field)) = not_finite(text) {
         return Parsed { seq, command: Err(Fault::NotFinite { field }) };
     }
-    match error.classify() {
-        Category::Data => {
+    // An error of the data stops the parser: the rest may still not be JSON.
+    let rest = serde_json::from_str::<serde::de::IgnoredAny>(text).err();
+    match (error.classify(), rest) {
+        (Category::Data, None) => {
             Parsed { seq: seq_of(text), command: Err(Fault::InvalidRequest(error.to_string())) }
         }
-        _ => Parsed { seq: None, command: Err(Fault::MalformedJson(error.to_string())) },
+        (_, rest) => {
+            let reason = rest.unwrap_or(error).to_string();
+            Parsed { seq: None, command: Err(Fault::MalformedJson(reason)) }
+        }
     }
 }
 

@@ -112,7 +112,13 @@ class Conversation:
     def resume(self, session: str, last_seq: int) -> Exchange[Resumed]:
         """Continues a session on a new connection, where hello was 0 and this is 1."""
         fields = {"session": session, "last_seq": last_seq}
-        resumed = yield from self._ask("resume", 1, Resumed, fields)
+        try:
+            resumed = yield from self._ask("resume", 1, Resumed, fields)
+        except Refused as refused:
+            if refused.code == "unknown_session":
+                # Gone for good; a new one can be opened here, with the number of this try.
+                self.session, self.next_seq = None, 1
+            raise
         # One request at a time: the session is where the client is, or one answer ahead.
         if resumed.last_seq not in (last_seq, last_seq + 1):
             raise ProtocolError(f"the session is at {resumed.last_seq}, not at {last_seq}")

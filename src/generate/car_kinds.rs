@@ -1,0 +1,122 @@
+//! Outlines of cars, as tables.
+
+/// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
+///
+/// Every knot is (x, belt, top): where along the car, the height of the body's side and the height
+/// of the middle line, in metres. Between knots both run straight.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Kind {
+    pub(super) length_m: f64,
+    pub(super) width_m: f64,
+    knots: &'static [(f64, f64, f64)],
+    /// Glass of the sides, from tail to nose in parts of the length: between them stand pillars.
+    pub(super) side_glass: &'static [[f64; 2]],
+    /// Rear window and windscreen, as [low end, high end] along the car.
+    pub(super) rear_glass: [f64; 2],
+    pub(super) windscreen: [f64; 2],
+}
+
+impl Kind {
+    /// Height of the body's shoulder at a part of the length, in metres.
+    pub(super) fn belt_m(&self, x: f64) -> f64 {
+        self.knotted(x, |knot| knot.1)
+    }
+
+    /// Height of bonnet, glass and roof on the middle line, in metres.
+    pub(super) fn middle_line_m(&self, x: f64) -> f64 {
+        self.knotted(x, |knot| knot.2)
+    }
+
+    /// The parts of the length at which something begins or ends, in increasing order.
+    pub(super) fn features(&self) -> Vec<f64> {
+        let mut features: Vec<f64> = self.knots.iter().map(|knot| knot.0).collect();
+        features.extend(self.side_glass.iter().flatten());
+        features.extend(self.rear_glass);
+        features.extend(self.windscreen);
+        features.sort_by(f64::total_cmp);
+        features.dedup_by(|b, a| *b - *a < 0.012);
+        features
+    }
+
+    /// A column of the knots at `x`, straight between them.
+    fn knotted(&self, x: f64, column: fn(&(f64, f64, f64)) -> f64) -> f64 {
+        let last = self.knots.len() - 1;
+        let after = self.knots.iter().position(|knot| knot.0 >= x).unwrap_or(last).max(1);
+        let (low, high) = (&self.knots[after - 1], &self.knots[after]);
+        let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);
+        column(low) + t * (column(high) - column(low))
+    }
+}
+
+pub(super) const HATCHBACK: Kind = Kind {
+    length_m: 4.1,
+    width_m: 1.76,
+    knots: &[
+        (0.00, 0.72, 0.74),
+        (0.03, 0.94, 0.98),
+        (0.14, 0.96, 1.42),
+        (0.45, 0.94, 1.50),
+        (0.56, 0.93, 1.44),
+        (0.75, 0.90, 0.97),
+        (0.94, 0.74, 0.80),
+        (1.00, 0.58, 0.60),
+    ],
+    side_glass: &[[0.12, 0.22], [0.25, 0.44], [0.465, 0.67]],
+    rear_glass: [0.04, 0.135],
+    windscreen: [0.57, 0.735],
+};
+
+pub(super) const SEDAN: Kind = Kind {
+    length_m: 4.7,
+    width_m: 1.82,
+    knots: &[
+        (0.00, 0.70, 0.72),
+        (0.02, 0.90, 0.98),
+        (0.15, 0.94, 1.03),
+        (0.30, 0.94, 1.37),
+        (0.48, 0.93, 1.45),
+        (0.57, 0.92, 1.40),
+        (0.74, 0.89, 0.96),
+        (0.95, 0.74, 0.78),
+        (1.00, 0.56, 0.58),
+    ],
+    side_glass: &[[0.21, 0.31], [0.325, 0.465], [0.485, 0.66]],
+    rear_glass: [0.165, 0.29],
+    windscreen: [0.58, 0.725],
+};
+
+pub(super) const WAGON: Kind = Kind {
+    length_m: 4.5,
+    width_m: 1.86,
+    knots: &[
+        (0.00, 0.80, 0.82),
+        (0.02, 1.04, 1.10),
+        (0.09, 1.06, 1.56),
+        (0.30, 1.05, 1.66),
+        (0.54, 1.03, 1.60),
+        (0.72, 1.00, 1.10),
+        (0.95, 0.86, 0.93),
+        (1.00, 0.66, 0.68),
+    ],
+    side_glass: &[[0.09, 0.24], [0.265, 0.43], [0.45, 0.64]],
+    rear_glass: [0.025, 0.085],
+    windscreen: [0.55, 0.705],
+};
+
+pub(super) const VAN: Kind = Kind {
+    length_m: 5.1,
+    width_m: 1.94,
+    knots: &[
+        (0.00, 1.02, 1.04),
+        (0.01, 1.18, 1.80),
+        (0.04, 1.20, 1.96),
+        (0.60, 1.18, 1.98),
+        (0.68, 1.16, 1.90),
+        (0.85, 1.10, 1.20),
+        (0.97, 0.92, 0.98),
+        (1.00, 0.70, 0.72),
+    ],
+    side_glass: &[[0.58, 0.78]],
+    rear_glass: [0.012, 0.035],
+    windscreen: [0.69, 0.84],
+};

@@ -1,0 +1,59 @@
+//! The bytes of an observation.
+
+use super::SessionError;
+use super::engine::{Answers, Hold};
+
+/// Bytes at an address that is a multiple of 8, counted against the budget for answers.
+#[derive(Debug)]
+pub struct Buffer {
+    words: Vec<u64>,
+    len: usize,
+    header: usize,
+    hold: Hold,
+}
+
+impl Buffer {
+    /// `len` zeros, the first `header` of which are the header's.
+    pub(super) fn zeroed(
+        answers: &Answers,
+        len: usize,
+        header: usize,
+    ) -> Result<Self, SessionError> {
+        let hold = answers.hold(len as u64)?;
+        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, hold })
+    }
+
+    /// The header's room, its length prefix included, and everything behind it.
+    pub fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.words)[..self.len]
+    }
+
+    /// The header's room, its length prefix included.
+    pub fn header_mut(&mut self) -> &mut [u8] {
+        let header = self.header;
+        &mut self.bytes_mut()[..header]
+    }
+
+    pub(super) fn bytes_mut(&mut self) -> &mut [u8] {
+        &mut bytemuck::cast_slice_mut(&mut self.words)[..self.len]
+    }
+
+    /// Makes room behind and copies parts there, one after the other.
+    pub(super) fn append(
+        &mut self,
+        answers: &Answers,
+        parts: &[&[u8]],
+    ) -> Result<(), SessionError> {
+        let mut start = self.len;
+        let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
+        let more = answers.hold((len - start) as u64)?;
+        self.hold.join(more);
+        self.words.resize(len.div_ceil(8), 0);
+        self.len = len;
+        for part in parts {
+            self.bytes_mut()[start..start + part.len()].copy_from_slice(part);
+            start += part.len();
+        }
+        Ok(())
+    }
+}

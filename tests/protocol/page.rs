@@ -1,0 +1,80 @@
+//! `protocol/README.md` shows messages and bytes that are really so.
+
+use schemars::schema_for;
+use serde::de::DeserializeOwned;
+use wildcity::protocol::error::Code;
+use wildcity::protocol::message::{Answer, Request};
+use wildcity::protocol::observation::Observation;
+
+use super::read;
+
+#[test]
+fn every_json_example_is_a_message() {
+    let page = page();
+    let is = |text: &str, kind: &str| match kind {
+        "request" => parses::<Request>(text),
+        "answer" => parses::<Answer>(text),
+        _ => parses::<Observation>(text),
+    };
+    let mut counts = [0; 3];
+    for example in blocks(&page, "json") {
+        let kinds = ["request", "answer", "observation"].map(|kind| is(example, kind));
+        let matches = kinds.iter().filter(|errors| errors.is_none()).count();
+        assert_eq!(matches, 1, "{example}\nas request, answer, observation: {kinds:#?}");
+        for (count, errors) in counts.iter_mut().zip(kinds) {
+            *count += usize::from(errors.is_none());
+        }
+    }
+    // Each request but the two of `open` once, each answer once.
+    assert_eq!(counts, [8, 5, 1]);
+}
+
+#[test]
+fn the_hex_example_is_the_golden_frame() {
+    let (page, frame) = (page(), read("vectors/observations/raw.bin"));
+    let dump: Vec<&str> = blocks(&page, "hex").flat_map(str::lines).collect();
+    assert_eq!(dump.len(), 6);
+    for line in dump {
+        let (offset, bytes) = line.split_once(": ").expect(line);
+        let offset = usize::from_str_radix(offset, 16).unwrap();
+        let bytes: Vec<u8> =
+            bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+        assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
+    }
+    assert!(page.contains("(3,112 bytes) has N = 0x818 = 2,072"));
+    assert_eq!((frame.len(), &frame[..8]), (3112, &2072_u64.to_le_bytes()[..]));
+}
+
+/// Every code is explained, and no other.
+#[test]
+fn every_error_code_has_its_row() {
+    let page = page();
+    let section = page.split("\n## Errors").nth(1).expect("a section on errors");
+    let section = section.split("\n## ").next().expect("split gives at least one");
+    let mut rows: Vec<&str> =
+        section.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+    let schema = serde_json::to_value(schema_for!(Code)).unwrap();
+    let variants = schema["oneOf"].as_array().expect("one variant per code");
+    let mut codes: Vec<&str> = variants.iter().map(|v| v["const"].as_str().unwrap()).collect();
+    codes.sort_unstable();
+    rows.sort_unstable();
+    assert_eq!(rows, codes);
+}
+
+fn page() -> String {
+    String::from_utf8(read("README.md")).unwrap()
+}
+
+/// The fenced blocks of a language.
+fn blocks<'a>(page: &'a str, language: &str) -> impl Iterator<Item = &'a str> {
+    let fence = format!("```{language}\n");
+    page.split("\n```")
+        .zip(page.split("\n```").skip(1))
+        .map(|(_, block)| block)
+        .filter_map(move |block| block.strip_prefix(&fence[3..]))
+}
+
+/// What keeps a text from being of a type.
+fn parses<T: DeserializeOwned>(text: &str) -> Option<String> {
+    serde_json::from_str::<T>(text).err().map(|error| error.to_string())
+}

@@ -1,0 +1,82 @@
+//! HTTP: health, twins, and who may upgrade.
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use wildcity::server::{self, Config, Limits, ServerError};
+
+use crate::support::TestServer;
+
+/// Sends a request as it is, and reads until the server closes or the answer is there.
+async fn request(server: &TestServer, text: &str) -> (u16, String) {
+    let mut stream = TcpStream::connect(server.address()).await.unwrap();
+    stream.write_all(text.replace('\n', "\r\n").as_bytes()).await.unwrap();
+    let mut answer = vec![0; 65536];
+    let length = stream.read(&mut answer).await.unwrap();
+    let answer = String::from_utf8_lossy(&answer[..length]).into_owned();
+    let status = answer.split(' ').nth(1).expect("a status").parse().unwrap();
+    (status, answer)
+}
+
+async fn get(server: &TestServer, path: &str) -> (u16, String) {
+    request(server, &format!("GET {path} HTTP/1.1\nHost: localhost\n\n")).await
+}
+
+async fn upgrade(server: &TestServer, more: &str) -> u16 {
+    let upgrade = "GET /v1/session HTTP/1.1\nHost: localhost\nConnection: keep-alive, Upgrade\n\
+                   Upgrade: websocket\nSec-WebSocket-Version: 13\n\
+                   Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n";
+    request(server, &format!("{upgrade}{more}\n")).await.0
+}
+
+#[tokio::test]
+async fn health_and_twins() {
+    let server = TestServer::start().await;
+    assert_eq!(get(&server, "/healthz").await.0, 200);
+    assert_eq!(get(&server, "/readyz").await.0, 200);
+    let (status, answer) = get(&server, "/v1/twins").await;
+    assert_eq!(status, 200);
+    assert!(answer.contains("application/json"), "{answer}");
+    let body: serde_json::Value =
+        serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
+    assert_eq!(body["twins"][0]["name"], "test");
+    assert_eq!(get(&server, "/nothing").await.0, 404);
+    assert_eq!(get(&server, "/v1/session").await.0, 426);
+    assert_eq!(request(&server, "rubbish\n\n").await.0, 400);
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn only_local_pages_and_agents_may_drive() {
+    let server = TestServer::start().await;
+    let subprotocol = "Sec-WebSocket-Protocol: other, wildcity.v1\n";
+    assert_eq!(upgrade(&server, subprotocol).await, 101);
+    assert_eq!(upgrade(&server, "").await, 400);
+    assert_eq!(upgrade(&server, "Sec-WebSocket-Protocol: other\n").await, 400);
+    for (origin, status) in [
+        ("http://localhost:3000", 101),
+        ("http://127.0.0.1", 101),
+        ("http://[::1]:8080", 101),
+        ("https://example.org", 403),
+        ("null", 403),
+    ] {
+        let found = upgrade(&server, &format!("{subprotocol}Origin: {origin}\n")).await;
+        assert_eq!(found, status, "{origin}");
+    }
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn public_addresses_are_refused() {
+    let server = TestServer::start().await;
+    let config = Config {
+        listen: "0.0.0.0:0".parse().unwrap(),
+        twins: server.twins.path().to_owned(),
+        episodes: server.episodes.path().to_owned(),
+        backend: server.painter.clone(),
+        limits: Limits::default(),
+    };
+    let refused = server::start(config.clone()).await.unwrap_err();
+    assert!(matches!(refused, ServerError::PublicAddress { .. }), "{refused}");
+    let taken = server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
+    assert!(matches!(taken, ServerError::Listen { .. }), "{taken}");
+}

@@ -1,0 +1,11 @@
+//! The server from outside: bytes on a socket in, bytes on a socket out.
+
+#[path = "../support/server.rs"]
+mod support;
+
+mod http;
+mod load;
+mod observation;
+mod refused;
+mod resume;
+mod shutdown;

@@ -1,0 +1,275 @@
+//! What an agent gets: every byte of an observation.
+
+use std::collections::BTreeMap;
+
+use serde_json::json;
+use wildcity::geometry::Pose;
+
+use crate::support::{Agent, Painter, Seen, TestServer, pose, rig};
+
+fn world_from_rig(x_m: f64) -> Pose {
+    Pose { position_m: glam::DVec3::new(x_m, 0.0, 0.0), ..Pose::IDENTITY }
+}
+
+fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+}
+
+async fn open(server: &TestServer, outputs: serde_json::Value) -> Agent {
+    let mut agent = server.agent().await;
+    agent.open(json!({ "outputs": outputs })).await;
+    agent
+}
+
+#[tokio::test]
+async fn nothing_of_what_was_opened_is_implicit() {
+    let server = TestServer::start().await;
+    let mut agent = Agent::connect(server.address()).await;
+    let welcome = agent.hello().await;
+    assert_eq!(welcome["type"], "welcome");
+    assert_eq!(welcome["protocol"], "wildcity.v1");
+    assert_eq!(welcome["backend"], "painter");
+    assert_eq!(welcome["limits"]["message_bytes"], 1 << 20);
+    let twin = &welcome["twins"][0];
+    assert_eq!((&twin["name"], &twin["gaussians"]), (&json!("test"), &json!(64)));
+    assert_eq!(twin["trajectories"][0], json!({ "name": "log", "length_m": 9.0, "keyframes": 10 }));
+
+    let opened = agent.open(json!({ "seed": 5 })).await;
+    assert_eq!(opened["seq"], 1);
+    assert_eq!(opened["version"], 1);
+    assert_eq!(opened["version_hash"], twin["version_hash"]);
+    assert_eq!(opened["profile"]["alpha_cap"], 0.99);
+    assert_eq!((&opened["seed"], &opened["dt_us"]), (&json!(5), &json!(100_000)));
+    assert_eq!(opened["deadline_ms"], 60_000);
+    assert_eq!(opened["start"], pose(0.0));
+    let cameras = opened["cameras"].as_array().unwrap();
+    assert_eq!(cameras.len(), 2);
+    assert_eq!((&cameras[0]["name"], &cameras[0]["width"]), (&json!("front"), &json!(8)));
+    let outputs = json!({
+        "cameras": ["front", "rear"], "encoding": "jpeg", "quality": 90,
+        "depth": false, "opacity": false,
+    });
+    assert_eq!(opened["outputs"], outputs);
+    assert!(opened["resident_bytes"].as_u64().unwrap() > 64 * 11 * 4);
+    assert_eq!(agent.ask(json!({ "type": "close" })).await["summary"]["steps"], 0);
+}
+
+#[tokio::test]
+async fn raw_pixels_depth_and_opacity_are_the_renderers() {
+    let server = TestServer::start().await;
+    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true });
+    let mut agent = open(&server, outputs).await;
+    let seen = agent.step(2.0).await;
+    let tensors = seen.tensors();
+    for (k, camera) in rig().cameras.iter().enumerate() {
+        let (w, h) = (camera.camera.width_px as usize, camera.camera.height_px as usize);
+        let rgb = tensors.tensor(&format!("camera/{}/rgb", camera.name)).unwrap();
+        assert_eq!(rgb.shape(), [h, w, 3]);
+        let expected =
+            Painter::image(&(world_from_rig(2.0) * camera.rig_from_camera), &camera.camera);
+        assert_eq!(rgb.data(), expected);
+        let depth = tensors.tensor(&format!("camera/{}/depth", camera.name)).unwrap();
+        assert_eq!(depth.shape(), [h, w]);
+        assert_eq!(floats(depth.data()), vec![1.5 + k as f32; w * h]);
+        let opacity = tensors.tensor(&format!("camera/{}/opacity", camera.name)).unwrap();
+        assert_eq!(floats(opacity.data()), vec![0.25; w * h]);
+
+        let image = &seen.meta["images"][k];
+        assert_eq!(image["hash"], blake3::hash(&expected).to_hex().as_str());
+        assert_eq!(image["tensor"], format!("camera/{}/rgb", camera.name));
+        assert_eq!((&image["index"], &image["pose"]), (&json!(k), &json!(0)));
+        assert_eq!((&image["width"], &image["fx"]), (&json!(w), &json!(10.0)));
+        assert_eq!(image["shutter_end_us"], 100_000);
+    }
+    assert_eq!(tensors.len(), 8);
+    assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
+}
+
+#[tokio::test]
+async fn floats_can_be_read_in_place() {
+    let server = TestServer::start().await;
+    // 5 x 4 px: 60 raw bytes, and a JPEG of whatever length.
+    for encoding in ["raw", "jpeg", "png"] {
+        let outputs = json!({ "encoding": encoding, "depth": true, "opacity": true });
+        let seen = open(&server, outputs).await.step(1.0).await;
+        let header = u64::from_le_bytes(seen.bytes[..8].try_into().unwrap()) as usize;
+        let (_, layout) = safetensors::SafeTensors::read_metadata(&seen.bytes).unwrap();
+        for (name, info) in layout.tensors().into_iter().collect::<BTreeMap<_, _>>() {
+            let at = 8 + header + info.data_offsets.0;
+            let is_aligned = at.is_multiple_of(4);
+            assert!(is_aligned || name.ends_with("/rgb"), "{encoding}: {name} at {at}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn frame_hashes_chain_the_images() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let seen = agent.step(1.0).await;
+    let mut hasher = blake3::Hasher::new();
+    for image in seen.meta["images"].as_array().unwrap() {
+        hasher.update(blake3::Hash::from_hex(image["hash"].as_str().unwrap()).unwrap().as_bytes());
+    }
+    assert_eq!(seen.frame_hash(), hasher.finalize().to_hex().as_str());
+    assert_ne!(agent.step(1.5).await.frame_hash(), seen.frame_hash());
+}
+
+#[tokio::test]
+async fn png_is_lossless_and_jpeg_is_near() {
+    let server = TestServer::start().await;
+    let camera = &rig().cameras[0];
+    let truth = Painter::image(&(world_from_rig(1.0) * camera.rig_from_camera), &camera.camera);
+    let decode = |seen: &Seen| {
+        let tensors = seen.tensors();
+        let file = tensors.tensor("camera/front/rgb").unwrap();
+        assert_eq!(file.shape(), [file.data().len()]);
+        image::load_from_memory(file.data()).unwrap().into_rgb8()
+    };
+    let png = open(&server, json!({ "encoding": "png" })).await.step(1.0).await;
+    assert_eq!(decode(&png).into_raw(), truth);
+    let best = open(&server, json!({ "encoding": "jpeg", "quality": 100 })).await.step(1.0).await;
+    let worst = open(&server, json!({ "encoding": "jpeg", "quality": 1 })).await.step(1.0).await;
+    let error = |seen: &Seen| -> u64 {
+        let pixels = decode(seen).into_raw();
+        assert_eq!(pixels.len(), truth.len());
+        pixels.iter().zip(&truth).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2)).sum()
+    };
+    assert!(error(&best) < error(&worst), "{} {}", error(&best), error(&worst));
+    // The hash is of the pixels, whatever became of them on the way.
+    assert_eq!(png.frame_hash(), best.frame_hash());
+    assert_eq!(png.frame_hash(), worst.frame_hash());
+}
+
+#[tokio::test]
+async fn time_motion_and_history_advance_with_steps() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    agent.open(json!({ "dt_us": 50_000, "outputs": { "encoding": "raw" } })).await;
+    let start = agent.look(json!({ "type": "reset", "seed": 9 })).await;
+    assert_eq!((&start.meta["step"], &start.meta["time_us"]), (&json!(0), &json!(0)));
+    assert_eq!(start.meta["ego"]["velocity"], json!([0.0, 0.0, 0.0]));
+    assert_eq!(start.meta["ego"]["history_count"], 1);
+    let mut last = start;
+    for step in 1..=10 {
+        last = agent.step(f64::from(step) * 0.5).await;
+    }
+    assert_eq!((&last.meta["step"], &last.meta["time_us"]), (&json!(10), &json!(500_000)));
+    assert_eq!(last.meta["seed"], 9);
+    assert_eq!(last.meta["ego"]["velocity"], json!([10.0, 0.0, 0.0]));
+    assert_eq!(last.meta["ego"]["pose"], pose(5.0));
+    assert_eq!(last.meta["ego"]["history_count"], 6);
+    let tensors = last.tensors();
+    let xyz = floats(tensors.tensor("ego.history_xyz").unwrap().data());
+    assert_eq!(xyz[45..], [0.0; 3]);
+    assert!((xyz[42] + 1.0).abs() < 1e-6, "{xyz:?}");
+    assert!((xyz[0] + 5.0).abs() < 1e-6, "{xyz:?}");
+    let rotation = floats(tensors.tensor("ego.history_rot").unwrap().data());
+    assert_eq!(rotation[135..], [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+
+    let over = agent.look(json!({ "type": "step", "pose": pose(6.0), "terminate": true })).await;
+    assert_eq!(over.meta["terminated"], true);
+    let refused = agent.ask(json!({ "type": "step", "pose": pose(7.0) })).await;
+    crate::support::refused(&refused, "session_state");
+    let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
+    let expected = json!({
+        "outcome": "completed", "steps": 11, "time_us": 550_000, "distance_m": 6.0,
+    });
+    assert_eq!(*summary, expected);
+}
+
+#[tokio::test]
+async fn observe_shows_several_places_and_moves_nothing() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    agent.step(1.0).await;
+    let poses = [pose(4.0), pose(5.0), pose(6.0)];
+    let seen = agent.look(json!({ "type": "observe", "poses": poses })).await;
+    assert_eq!((&seen.meta["step"], &seen.meta["ego"]["pose"]), (&json!(1), &pose(1.0)));
+    let images = seen.meta["images"].as_array().unwrap();
+    assert_eq!(images.len(), 6);
+    let tensors = seen.tensors();
+    for (k, x_m) in [4.0, 5.0, 6.0].into_iter().enumerate() {
+        for (c, camera) in rig().cameras.iter().enumerate() {
+            let image = &images[2 * k + c];
+            let name = format!("pose/{k}/camera/{}/rgb", camera.name);
+            assert_eq!((&image["tensor"], &image["pose"]), (&json!(name), &json!(k)));
+            let expected =
+                Painter::image(&(world_from_rig(x_m) * camera.rig_from_camera), &camera.camera);
+            assert_eq!(tensors.tensor(&name).unwrap().data(), expected);
+        }
+    }
+    let one = agent.look(json!({ "type": "observe", "poses": [pose(4.0)] })).await;
+    assert_eq!(one.meta["images"][0]["tensor"], "camera/front/rgb");
+    assert_eq!(agent.step(2.0).await.meta["step"], 2);
+}
+
+#[tokio::test]
+async fn cameras_are_chosen_and_ordered_by_the_agent() {
+    let server = TestServer::start().await;
+    let outputs = json!({ "encoding": "raw", "cameras": ["rear"] });
+    let mut agent = server.agent().await;
+    let opened = agent.open(json!({ "outputs": outputs })).await;
+    assert_eq!(opened["cameras"][0]["name"], "rear");
+    let seen = agent.step(1.0).await;
+    assert_eq!(seen.meta["images"].as_array().unwrap().len(), 1);
+    assert_eq!((&seen.meta["images"][0]["index"], seen.tensors().len()), (&json!(0), 3));
+
+    let mut agent = server.agent().await;
+    let preset = agent.open(json!({ "rig": "vehicle6" })).await;
+    assert_eq!(preset["cameras"].as_array().unwrap().len(), 6);
+    let station = json!({ "trajectory": "log", "station_m": 2.5 });
+    let start = agent.look(json!({ "type": "reset", "start": station })).await;
+    assert_eq!(start.meta["ego"]["pose"], pose(2.5));
+    assert_eq!(start.meta["images"].as_array().unwrap().len(), 6);
+}
+
+/// The header's room is reserved before the header is known: the longest one must fit.
+#[tokio::test]
+async fn the_longest_header_fits() {
+    let server = TestServer::start().await;
+    let ugly = -1.234_567_890_123_456_7e-300;
+    let cameras: Vec<_> = (0..16)
+        .map(|k| {
+            json!({
+                "name": format!("{k:x}{}", "c".repeat(63)),
+                "width": 1, "height": 1,
+                "fx": 123_456.789_012_345_67, "fy": 123_456.789_012_345_67,
+                "cx": ugly, "cy": ugly,
+                "camera_to_rig": { "xyz": [ugly, ugly, ugly], "q": [1.0, ugly, ugly, ugly] },
+            })
+        })
+        .collect();
+    let mut agent = server.agent().await;
+    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true });
+    let rig = json!({ "name": "r", "cameras": cameras });
+    agent
+        .open(
+            json!({ "rig": rig, "outputs": outputs, "session": "s".repeat(64), "seed": u64::MAX }),
+        )
+        .await;
+    let poses: Vec<_> = (0..16)
+        .map(|_| json!({ "xyz": [ugly, ugly, ugly], "q": [1.0, ugly, ugly, ugly] }))
+        .collect();
+    let seen = agent.look(json!({ "type": "observe", "poses": poses })).await;
+    assert_eq!(seen.meta["images"].as_array().unwrap().len(), 256);
+    assert_eq!(seen.tensors().len(), 2 + 3 * 256);
+}
+
+#[tokio::test]
+async fn sessions_side_by_side_see_what_they_would_see_alone() {
+    let server = TestServer::start().await;
+    let mut alone = Vec::new();
+    let mut agent = server.driver("alone").await;
+    for step in 0..20 {
+        alone.push(agent.step(f64::from(step)).await.frame_hash().to_owned());
+    }
+    let mut one = server.driver("one").await;
+    let mut two = server.driver("two").await;
+    for (step, expected) in alone.iter().enumerate() {
+        let back = alone.len() - 1 - step;
+        let (a, b) = tokio::join!(one.step(step as f64), two.step(back as f64));
+        assert_eq!((a.frame_hash(), b.frame_hash()), (&**expected, &*alone[back]));
+    }
+    assert_eq!(server.running.sessions(), 3);
+}

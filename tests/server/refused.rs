@@ -1,0 +1,344 @@
+//! Bad input: each has its own error, nothing is lost, and the server serves the next client.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use futures_util::SinkExt;
+use serde_json::{Value, json};
+use tokio::io::AsyncWriteExt;
+use tokio_tungstenite::tungstenite::Message;
+use wildcity::server::Limits;
+
+use crate::support::{Agent, Reply, TestServer, pose, refused};
+
+async fn answer(agent: &mut Agent) -> Value {
+    match agent.receive().await {
+        Reply::Text(value) => value,
+        other => panic!("not text: {other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn what_is_not_a_request() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    for (text, code) in [
+        ("", "malformed_json"),
+        ("{", "malformed_json"),
+        ("hello", "malformed_json"),
+        ("{\"type\":\"close\",\"seq\":2}}", "malformed_json"),
+        ("[]", "invalid_request"),
+        ("{}", "invalid_request"),
+        ("{\"type\":\"fly\",\"seq\":2}", "invalid_request"),
+        ("{\"type\":\"close\"}", "invalid_request"),
+        ("{\"type\":\"close\",\"seq\":-1}", "invalid_request"),
+        ("{\"type\":\"close\",\"seq\":2,\"now\":true}", "invalid_request"),
+        (
+            "{\"type\":\"step\",\"seq\":2,\"pose\":{\"xyz\":[0,0],\"q\":[1,0,0,0]}}",
+            "invalid_request",
+        ),
+        ("{\"type\":\"observe\",\"seq\":2,\"poses\":7}", "invalid_request"),
+    ] {
+        agent.send_text(text).await;
+        let answer = answer(&mut agent).await;
+        refused(&answer, code);
+        assert_eq!(answer["fatal"], false, "{text}");
+    }
+    agent.send_text(&"[".repeat(200_000)).await;
+    refused(&answer(&mut agent).await, "malformed_json");
+    agent.socket.send(Message::binary(vec![0; 100])).await.unwrap();
+    refused(&answer(&mut agent).await, "unexpected_binary");
+    assert_eq!(agent.step(1.0).await.meta["step"], 1, "the session went on");
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn poses_that_are_none() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let step = |pose: &str| format!(r#"{{"type":"step","seq":2,"pose":{pose}}}"#);
+    for (pose, code, field) in [
+        (r#"{"xyz":[NaN,0,0],"q":[1,0,0,0]}"#, "pose_not_finite", "pose.xyz[0]"),
+        (r#"{"xyz":[0,0,0],"q":[1,0,-Infinity,0]}"#, "pose_not_finite", "pose.q[2]"),
+        (r#"{"xyz":[0,null,0],"q":[1,0,0,0]}"#, "pose_not_finite", "pose.xyz[1]"),
+        (r#"{"xyz":[0,0,1e999],"q":[1,0,0,0]}"#, "pose_not_finite", "pose.xyz[2]"),
+        (r#"{"xyz":[0,0,0],"q":[0,0,0,0]}"#, "pose_invalid", "pose.q"),
+        (r#"{"xyz":[0,0,0],"q":[2,0,0,0]}"#, "pose_invalid", "pose.q"),
+        (r#"{"xyz":[1e12,0,0],"q":[1,0,0,0]}"#, "pose_invalid", "pose.xyz[0]"),
+    ] {
+        agent.send_text(&step(pose)).await;
+        let answer = answer(&mut agent).await;
+        refused(&answer, code);
+        assert_eq!((&answer["field"], &answer["seq"]), (&json!(field), &json!(2)), "{answer}");
+    }
+    // A refused step changes nothing and can be sent again, or be followed by the next number.
+    agent.send_text(&step(r#"{"xyz":[1,0,0],"q":[1,0,0,0]}"#)).await;
+    assert_eq!(agent.seen().await.meta["step"], 1);
+    agent.seq = 3;
+    let poses = json!([pose(0.0), { "xyz": [0, 0, 0], "q": [1, 1, 0, 0] }]);
+    let answer = agent.ask(json!({ "type": "observe", "poses": poses })).await;
+    refused(&answer, "pose_invalid");
+    assert_eq!(answer["field"], "poses[1].q");
+    assert_eq!(agent.step(2.0).await.meta["step"], 2);
+}
+
+#[tokio::test]
+async fn requests_in_the_wrong_order() {
+    let server = TestServer::start().await;
+    let mut agent = Agent::connect(server.address()).await;
+    refused(&agent.try_open(json!({})).await, "wrong_order");
+    let answer = agent
+        .ask(json!({
+            "type": "hello",
+            "client": { "name": "x", "version": "1" },
+            "protocols": ["wildcity.v9"],
+        }))
+        .await;
+    refused(&answer, "unsupported_protocol");
+    agent.hello().await;
+    refused(&agent.hello().await, "wrong_order");
+    let step = || json!({ "type": "step", "pose": pose(0.0) });
+    refused(&agent.ask(step()).await, "session_state");
+    refused(&agent.ask(json!({ "type": "close" })).await, "session_state");
+    agent.open(json!({ "session": "a" })).await;
+    refused(&agent.try_open(json!({})).await, "session_state");
+    agent.seq += 1;
+    let answer = agent.ask(step()).await;
+    refused(&answer, "seq_out_of_order");
+    assert_eq!(answer["field"], "seq");
+    agent.seq -= 2;
+    agent.step(1.0).await;
+    refused(&server.agent().await.try_open(json!({ "session": "a" })).await, "session_exists");
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn sessions_that_cannot_be_opened() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    let camera = |more: Value| {
+        let mut camera = json!({
+            "name": "c", "width": 8, "height": 8, "fx": 8.0, "fy": 8.0, "cx": 4.0, "cy": 4.0,
+            "camera_to_rig": pose(0.0),
+        });
+        camera.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        camera
+    };
+    let rig = |cameras: Vec<Value>| json!({ "rig": { "name": "r", "cameras": cameras } });
+    let one = |more: Value| rig(vec![camera(json!({ "name": "other" })), camera(more)]);
+    let large = json!({ "width": 16_384, "height": 16_384 });
+    for (open, code, field) in [
+        (json!({ "twin": "nope" }), "unknown_twin", "twin"),
+        (json!({ "twin": "../etc" }), "invalid_name", "twin"),
+        (json!({ "version": 99 }), "unknown_version", "version"),
+        (json!({ "session": "A b" }), "invalid_name", "session"),
+        (json!({ "dt_us": 0 }), "out_of_range", "dt_us"),
+        (json!({ "dt_us": 1_000_000_000 }), "out_of_range", "dt_us"),
+        (json!({ "deadline_ms": 0 }), "out_of_range", "deadline_ms"),
+        (json!({ "deadline_ms": 1_000_000_000 }), "out_of_range", "deadline_ms"),
+        (json!({ "rig": "vehicle7" }), "unknown_rig", "rig"),
+        (
+            json!({ "outputs": { "cameras": ["front", "top"] } }),
+            "unknown_camera",
+            "outputs.cameras[1]",
+        ),
+        (
+            json!({ "outputs": { "cameras": ["rear", "rear"] } }),
+            "out_of_range",
+            "outputs.cameras[1]",
+        ),
+        (json!({ "outputs": { "cameras": [] } }), "out_of_range", "outputs.cameras"),
+        (json!({ "outputs": { "quality": 0 } }), "out_of_range", "outputs.quality"),
+        (json!({ "start": { "trajectory": "x" } }), "unknown_trajectory", "start.trajectory"),
+        (
+            json!({ "start": { "trajectory": "log", "station_m": 9.1 } }),
+            "out_of_range",
+            "start.station_m",
+        ),
+        (
+            json!({ "start": { "pose": { "xyz": [0, 0, 0], "q": [0, 0, 0, 0] } } }),
+            "pose_invalid",
+            "start.pose.q",
+        ),
+        (one(json!({ "width": 0 })), "camera_invalid", "rig.cameras[1].width"),
+        (one(json!({ "height": 1_000_000_000 })), "camera_invalid", "rig.cameras[1].height"),
+        (one(json!({ "fx": -1.0 })), "camera_invalid", "rig.cameras[1].fx"),
+        (one(json!({ "name": "other" })), "invalid_name", "rig.cameras"),
+        (rig(vec![]), "out_of_range", "rig.cameras"),
+        (rig(vec![camera(json!({})); 17]), "out_of_range", "rig.cameras"),
+    ] {
+        let answer = agent.try_open(open).await;
+        refused(&answer, code);
+        assert_eq!(answer["field"], field, "{answer}");
+    }
+    refused(&agent.try_open(one(large)).await, "answer_too_large");
+    assert_eq!(server.running.sessions(), 0);
+    agent.open(json!({})).await;
+    for poses in [vec![], vec![pose(0.0); 17], vec![pose(0.0); 10_000]] {
+        let answer = agent.ask(json!({ "type": "observe", "poses": poses })).await;
+        refused(&answer, "out_of_range");
+    }
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn a_message_of_100_mib_is_refused_unread() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    // A masked text frame that announces 100 MiB (RFC 6455, section 5.2), and its first bytes.
+    let mut header = vec![0x81, 0x80 | 127];
+    header.extend((100_u64 << 20).to_be_bytes());
+    header.extend([0; 4]);
+    agent.tcp().write_all(&header).await.unwrap();
+    let answer = answer(&mut agent).await;
+    refused(&answer, "message_too_large");
+    assert_eq!(answer["fatal"], true);
+    server.still_serves().await;
+    // Sent whole, by a client that only reads when it has sent everything.
+    let mut agent = server.driver("b").await;
+    agent.tcp().write_all(&header).await.unwrap();
+    let block = vec![b' '; 1 << 20];
+    for _ in 0..100 {
+        agent.tcp().write_all(&block).await.unwrap();
+    }
+    refused(&self::answer(&mut agent).await, "message_too_large");
+    agent.closed().await;
+    // In pieces that are each small enough.
+    let mut agent = server.driver("c").await;
+    let piece = vec![b' '; 1 << 19];
+    for opcode in [0x01, 0x00, 0x00] {
+        let mut header = vec![opcode, 0x80 | 127];
+        header.extend((piece.len() as u64).to_be_bytes());
+        header.extend([0; 4]);
+        agent.tcp().write_all(&header).await.unwrap();
+        agent.tcp().write_all(&piece).await.unwrap();
+    }
+    refused(&self::answer(&mut agent).await, "message_too_large");
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn bytes_that_are_not_websocket() {
+    let server = TestServer::start().await;
+    for bytes in [
+        // Unmasked, a reserved opcode, text that is not UTF-8, a control frame of 126 bytes.
+        vec![0x81, 0x01, b'x'],
+        vec![0x83, 0x80, 0, 0, 0, 0],
+        vec![0x81, 0x82, 0, 0, 0, 0, 0xC3, 0x28],
+        [&[0x89, 0x80 | 126, 0, 126, 0, 0, 0, 0][..], &[0; 126]].concat(),
+    ] {
+        let mut agent = server.agent().await;
+        agent.tcp().write_all(&bytes).await.unwrap();
+        let answer = answer(&mut agent).await;
+        refused(&answer, "malformed_json");
+        assert_eq!(answer["fatal"], true);
+        agent.closed().await;
+    }
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn silence_ends_a_connection() {
+    let short = Duration::from_millis(200);
+    let limits = Limits { hello: short, idle: short, resume_grace: short, ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    // Never says hello; never says anything but hello; goes silent within a session.
+    let mut silent = Agent::connect(server.address()).await;
+    refused(&answer(&mut silent).await, "timed_out");
+    silent.closed().await;
+    let mut greeter = server.agent().await;
+    refused(&answer(&mut greeter).await, "timed_out");
+    let mut driver = server.driver("a").await;
+    driver.step(1.0).await;
+    refused(&answer(&mut driver).await, "timed_out");
+    server.sessions_become(0).await;
+    let last = std::fs::read_to_string(&server.recorded()[0]).unwrap();
+    assert!(last.lines().last().unwrap().contains("agent_timeout"), "{last}");
+    // Opens a TCP connection and speaks no HTTP at all.
+    let mut half_open = tokio::net::TcpStream::connect(server.address()).await.unwrap();
+    let mut rest = Vec::new();
+    let reading = tokio::io::AsyncReadExt::read_to_end(&mut half_open, &mut rest);
+    tokio::time::timeout(Duration::from_secs(5), reading).await.expect("closed").unwrap();
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn pings_are_answered_and_count_as_life() {
+    let idle = Duration::from_millis(400);
+    let server = TestServer::with(Limits { idle, ..Limits::default() }).await;
+    let mut agent = server.driver("a").await;
+    for _ in 0..8 {
+        tokio::time::sleep(idle / 4).await;
+        agent.socket.send(Message::Ping("x".into())).await.unwrap();
+        let pong = futures_util::StreamExt::next(&mut agent.socket).await;
+        assert!(matches!(pong, Some(Ok(Message::Pong(_)))), "{pong:?}");
+    }
+    assert_eq!(agent.step(1.0).await.meta["step"], 1);
+}
+
+#[tokio::test]
+async fn a_deadline_that_passes_changes_nothing() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    agent.open(json!({ "deadline_ms": 100, "outputs": { "encoding": "raw" } })).await;
+    server.painter.slow_ms.store(400, Ordering::SeqCst);
+    let step = json!({ "type": "step", "pose": pose(1.0) });
+    refused(&agent.ask(step.clone()).await, "deadline_exceeded");
+    // Queued behind the late frame, it is never drawn.
+    refused(&agent.ask(step.clone()).await, "deadline_exceeded");
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    assert_eq!(server.painter.begun.load(Ordering::SeqCst), 1);
+    server.painter.slow_ms.store(0, Ordering::SeqCst);
+    assert_eq!(agent.look(step).await.meta["step"], 1);
+}
+
+#[tokio::test]
+async fn a_crash_of_the_renderer_is_one_refused_step() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    server.painter.crash.store(true, Ordering::SeqCst);
+    refused(&agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await, "internal");
+    assert_eq!(agent.step(1.0).await.meta["step"], 1);
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn what_cannot_be_recorded_is_not_answered() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let episodes = server.episodes.path();
+    std::fs::remove_dir(episodes).unwrap();
+    std::fs::write(episodes, "in the way").unwrap();
+    let answer = agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await;
+    refused(&answer, "internal");
+    assert!(answer["message"].as_str().unwrap().contains("record"), "{answer}");
+    std::fs::remove_file(episodes).unwrap();
+    assert_eq!(agent.step(1.0).await.meta["step"], 1);
+}
+
+#[tokio::test]
+async fn a_damaged_twin_is_refused_and_hides_no_other() {
+    let server = TestServer::start().await;
+    let chunks = server.twins.path().join("test/objects");
+    let mut damaged = 0;
+    for dir in std::fs::read_dir(chunks).unwrap() {
+        for object in std::fs::read_dir(dir.unwrap().path()).unwrap() {
+            let path = object.unwrap().path();
+            let mut bytes = std::fs::read(&path).unwrap();
+            // Manifests are JSON; chunks are not.
+            if bytes[0] != b'{' {
+                *bytes.last_mut().unwrap() ^= 1;
+                let mut permissions = std::fs::metadata(&path).unwrap().permissions();
+                std::os::unix::fs::PermissionsExt::set_mode(&mut permissions, 0o644);
+                std::fs::set_permissions(&path, permissions).unwrap();
+                std::fs::write(&path, bytes).unwrap();
+                damaged += 1;
+            }
+        }
+    }
+    assert!(damaged > 0);
+    let mut agent = server.agent().await;
+    let answer = agent.try_open(json!({})).await;
+    refused(&answer, "twin_damaged");
+    assert_eq!((&answer["field"], server.running.sessions()), (&json!("twin"), 0));
+}

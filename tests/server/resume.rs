@@ -1,0 +1,138 @@
+//! Connections that are lost, and sessions that are not.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use serde_json::json;
+use wildcity::server::Limits;
+
+use crate::support::{Agent, Reply, TestServer, pose, refused};
+
+/// Resumes a session on a new connection, whose numbers go on after `last_seq` then.
+async fn resume(server: &TestServer, name: &str, last_seq: u64) -> (Agent, serde_json::Value) {
+    let mut agent = server.agent().await;
+    let request = json!({ "type": "resume", "session": name, "last_seq": last_seq });
+    let answer = agent.ask(request).await;
+    if let Some(last) = answer["last_seq"].as_u64() {
+        agent.seq = last + 1;
+    }
+    (agent, answer)
+}
+
+#[tokio::test]
+async fn a_repeated_number_brings_the_same_bytes() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let first = agent.step(1.0).await;
+    let begun = server.painter.begun.load(Ordering::SeqCst);
+    for _ in 0..3 {
+        agent.seq -= 1;
+        assert_eq!(agent.step(1.0).await.bytes, first.bytes);
+    }
+    assert_eq!(server.painter.begun.load(Ordering::SeqCst), begun, "nothing was drawn again");
+    assert_eq!(agent.step(2.0).await.meta["step"], 2);
+    let close = json!({ "type": "close" });
+    let closed = agent.ask(close.clone()).await;
+    agent.seq -= 1;
+    assert_eq!(agent.ask(close).await, closed);
+}
+
+#[tokio::test]
+async fn a_session_outlives_its_connection() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    agent.step(1.0).await;
+    let last = agent.step(2.0).await;
+    let last_seq = agent.seq - 1;
+    drop(agent);
+    let (mut agent, resumed) = resume(&server, "a", last_seq).await;
+    let expected = json!({
+        "type": "resumed", "seq": 1, "session": "a",
+        "last_seq": last_seq, "step": 2, "time_us": 200_000,
+    });
+    assert_eq!(resumed, expected);
+    agent.seq = last_seq;
+    assert_eq!(agent.step(2.0).await.bytes, last.bytes);
+    assert_eq!(agent.step(3.0).await.meta["step"], 3);
+    assert_eq!(server.running.sessions(), 1);
+}
+
+#[tokio::test]
+async fn an_agent_killed_in_mid_step_finds_its_answer() {
+    let server = TestServer::start().await;
+    for reset in [false, true] {
+        let name = if reset { "reset" } else { "gone" };
+        let mut agent = server.driver(name).await;
+        agent.step(1.0).await;
+        server.painter.slow_ms.store(300, Ordering::SeqCst);
+        agent.send(json!({ "type": "step", "pose": pose(2.0) })).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let last_seq = agent.seq - 2;
+        if reset {
+            // What the kernel does for a killed process that left bytes unread.
+            let socket = socket2::SockRef::from(&*agent.tcp()).set_linger(Some(Duration::ZERO));
+            socket.unwrap();
+        }
+        drop(agent);
+        // Resumed while the step still runs: it is finished first.
+        let (mut agent, resumed) = resume(&server, name, last_seq).await;
+        assert_eq!((&resumed["last_seq"], &resumed["step"]), (&json!(last_seq + 1), &json!(2)));
+        let begun = server.painter.begun.load(Ordering::SeqCst);
+        agent.seq = last_seq + 1;
+        assert_eq!(agent.step(2.0).await.meta["step"], 2);
+        assert_eq!(server.painter.begun.load(Ordering::SeqCst), begun);
+        server.painter.slow_ms.store(0, Ordering::SeqCst);
+        assert_eq!(agent.step(3.0).await.meta["step"], 3);
+    }
+    server.still_serves().await;
+}
+
+/// After a network failure the client is back before the server knows that it was gone.
+#[tokio::test]
+async fn resuming_takes_over_from_a_dead_connection() {
+    let server = TestServer::start().await;
+    let mut old = server.driver("a").await;
+    old.step(1.0).await;
+    let (mut new, resumed) = resume(&server, "a", old.seq - 1).await;
+    assert_eq!(resumed["type"], "resumed", "{resumed}");
+    let Reply::Text(told) = old.receive().await else { panic!("no word") };
+    refused(&told, "session_state");
+    old.closed().await;
+    assert_eq!(new.step(2.0).await.meta["step"], 2);
+    drop(old);
+    assert_eq!(new.step(3.0).await.meta["step"], 3);
+}
+
+#[tokio::test]
+async fn what_cannot_be_resumed() {
+    let server = TestServer::start().await;
+    refused(&resume(&server, "nobody", 0).await.1, "unknown_session");
+    refused(&resume(&server, "../x", 0).await.1, "invalid_name");
+    let agent = server.driver("a").await;
+    refused(&resume(&server, "a", agent.seq + 5).await.1, "seq_out_of_order");
+    agent.closed_after_takeover().await;
+    let (mut agent, _) = resume(&server, "a", 1).await;
+    agent.ask(json!({ "type": "close" })).await;
+    refused(&resume(&server, "a", 2).await.1, "unknown_session");
+    server.still_serves().await;
+}
+
+#[tokio::test]
+async fn nobody_waits_for_ever() {
+    let resume_grace = Duration::from_millis(200);
+    let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
+    let mut agent = server.driver("a").await;
+    agent.step(1.0).await;
+    drop(agent);
+    server.sessions_become(0).await;
+    refused(&resume(&server, "a", 2).await.1, "unknown_session");
+    let text = std::fs::read_to_string(&server.recorded()[0]).unwrap();
+    assert!(text.lines().last().unwrap().contains("agent_lost"), "{text}");
+}
+
+impl Agent {
+    async fn closed_after_takeover(mut self) {
+        let Reply::Text(told) = self.receive().await else { panic!("no word") };
+        refused(&told, "session_state");
+    }
+}

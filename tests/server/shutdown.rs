@@ -1,0 +1,41 @@
+//! Stopping: running steps are finished, everybody is told, every episode has an end.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use serde_json::json;
+
+use crate::support::{Agent, Reply, TestServer, pose, refused};
+
+async fn told(agent: &mut Agent) {
+    let Reply::Text(answer) = agent.receive().await else { panic!("no word") };
+    refused(&answer, "shutting_down");
+    assert_eq!(answer["fatal"], true);
+    agent.closed().await;
+}
+
+#[tokio::test]
+async fn running_steps_are_answered_and_waiting_clients_told() {
+    let server = TestServer::start().await;
+    let mut waiting = server.driver("waiting").await;
+    waiting.step(1.0).await;
+    let mut running = server.driver("running").await;
+    let mut parked = server.driver("parked").await;
+    parked.step(1.0).await;
+    drop(parked);
+    server.painter.slow_ms.store(300, Ordering::SeqCst);
+    running.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+
+    let TestServer { running: server, episodes, .. } = server;
+    let stopping = tokio::spawn(server.stop());
+    assert_eq!(running.seen().await.meta["step"], 1);
+    told(&mut running).await;
+    told(&mut waiting).await;
+    tokio::time::timeout(Duration::from_secs(8), stopping).await.expect("stopped").unwrap();
+    for name in ["waiting", "running", "parked"] {
+        let text =
+            std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
+        assert!(text.lines().last().unwrap().contains("server_error"), "{name}: {text}");
+    }
+}

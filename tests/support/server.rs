@@ -1,0 +1,371 @@
+//! A server with a painted world, and an agent that speaks raw WebSocket.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use glam::{DQuat, DVec3};
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::tungstenite::{Bytes, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+use wildcity::geometry::camera::Pinhole;
+use wildcity::geometry::{Camera, Pose};
+use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity::scene::manifest::Provenance;
+use wildcity::scene::rig::{Rig, RigCamera};
+use wildcity::scene::trajectory::{Keyframe, Trajectory};
+use wildcity::scene::{Gaussians, RenderProfile};
+use wildcity::server::{self, Config, Limits, Running};
+use wildcity::store::{Catalog, NewVersion};
+
+/// How long a test waits for anything before it fails.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Paints a pattern that is a function of where the camera stands, and nothing else.
+#[derive(Debug, Default)]
+pub(crate) struct Painter {
+    /// Milliseconds that a frame takes.
+    pub(crate) slow_ms: AtomicU64,
+    /// Whether the next frame crashes.
+    pub(crate) crash: AtomicBool,
+    /// Frames begun.
+    pub(crate) begun: AtomicU64,
+}
+
+impl Painter {
+    /// The colour of one byte of an image.
+    pub(crate) fn paint(world_from_camera: &Pose, index: usize) -> u8 {
+        let p = world_from_camera.position_m;
+        let key = p.x.to_bits() ^ p.y.to_bits().rotate_left(17) ^ p.z.to_bits().rotate_left(31);
+        let key = key ^ world_from_camera.rotation.z.to_bits().rotate_left(43);
+        let mixed = (key ^ index as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        (mixed >> 56) as u8
+    }
+
+    /// What the image of a camera must be.
+    pub(crate) fn image(world_from_camera: &Pose, camera: &Camera) -> Vec<u8> {
+        (0..3 * camera.pixels()).map(|index| Self::paint(world_from_camera, index)).collect()
+    }
+}
+
+impl Backend for Painter {
+    fn name(&self) -> &'static str {
+        "painter"
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        frame.check(targets)?;
+        self.begun.fetch_add(1, Ordering::SeqCst);
+        assert!(!self.crash.swap(false, Ordering::SeqCst), "a crash was asked for");
+        std::thread::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst)));
+        for (k, (view, target)) in frame.views.iter().zip(targets).enumerate() {
+            if let Some(rgb8) = target.rgb8.as_deref_mut() {
+                for (index, byte) in rgb8.iter_mut().enumerate() {
+                    *byte = Self::paint(&view.world_from_camera, index);
+                }
+            }
+            if let Some(depth_m) = target.depth_m.as_deref_mut() {
+                depth_m.fill(1.5 + k as f32);
+            }
+            if let Some(opacity) = target.opacity.as_deref_mut() {
+                opacity.fill(0.25);
+            }
+            finished(k, target);
+        }
+        Ok(FrameStats { stages_ms: vec![("paint", 0.5)], ..FrameStats::default() })
+    }
+}
+
+/// A directory with the twin `test`: a few Gaussians, two small cameras, 9 m of road.
+pub(crate) fn twins() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    commit_twin(dir.path());
+    dir
+}
+
+/// Commits a version of the twin `test`.
+pub(crate) fn commit_twin(dir: &Path) {
+    let gaussians = Gaussians {
+        sh_degree: 0,
+        means_m: (0..64).map(|i| [f64::from(i), f64::from(i % 5) - 2.0, 1.0]).collect(),
+        quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 64],
+        ln_scales: vec![[-1.0; 3]; 64],
+        logit_opacities: vec![2.0; 64],
+        sh: (0..64 * 3).map(|i| (i % 7) as f32 * 0.3 - 0.9).collect(),
+    };
+    let keyframe = |i: i64| Keyframe {
+        time_us: 100_000 * i,
+        world_from_rig: Pose {
+            position_m: DVec3::new(i as f64, 0.0, 0.0),
+            rotation: DQuat::IDENTITY,
+        },
+    };
+    let log = Trajectory { name: "log".to_owned(), keyframes: (0..10).map(keyframe).collect() };
+    let new = NewVersion {
+        name: "test",
+        gaussians: &gaussians,
+        profile: RenderProfile::default(),
+        rig: Some(rig()),
+        trajectories: vec![log],
+        provenance: Provenance {
+            source: "test".to_owned(),
+            builder: "test".to_owned(),
+            options: vec![],
+        },
+    };
+    Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
+}
+
+/// The cameras of the twin `test`: `front`, 8 x 6 px, and `rear`, 5 x 4 px.
+pub(crate) fn rig() -> Rig {
+    let camera = |name: &str, width_px, height_px, yaw_rad: f64| {
+        // Camera axes are x right, y down, z forward; rig axes x forward, y left, z up.
+        let forward = DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
+        RigCamera {
+            name: name.to_owned(),
+            camera: Camera {
+                width_px,
+                height_px,
+                pinhole: Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 },
+            },
+            rig_from_camera: Pose {
+                position_m: DVec3::new(0.5, 0.0, 1.5),
+                rotation: DQuat::from_rotation_z(yaw_rad) * forward,
+            },
+        }
+    };
+    let cameras = vec![camera("front", 8, 6, 0.0), camera("rear", 5, 4, std::f64::consts::PI)];
+    Rig { name: "pair".to_owned(), cameras }
+}
+
+/// A server in this process.
+pub(crate) struct TestServer {
+    pub(crate) running: Running,
+    pub(crate) painter: Arc<Painter>,
+    pub(crate) twins: tempfile::TempDir,
+    pub(crate) episodes: tempfile::TempDir,
+}
+
+impl TestServer {
+    pub(crate) async fn start() -> Self {
+        Self::with(Limits::default()).await
+    }
+
+    pub(crate) async fn with(limits: Limits) -> Self {
+        let (twins, painter) = (twins(), Arc::new(Painter::default()));
+        let episodes = tempfile::tempdir().expect("a temporary directory");
+        let config = Config {
+            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
+            twins: twins.path().to_owned(),
+            episodes: episodes.path().to_owned(),
+            backend: painter.clone(),
+            limits,
+        };
+        let running = server::start(config).await.expect("a server");
+        Self { running, painter, twins, episodes }
+    }
+
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.running.address()
+    }
+
+    /// Connected, welcomed.
+    pub(crate) async fn agent(&self) -> Agent {
+        let mut agent = Agent::connect(self.address()).await;
+        agent.hello().await;
+        agent
+    }
+
+    /// Connected, welcomed, with a session of that name; raw images.
+    pub(crate) async fn driver(&self, name: &str) -> Agent {
+        let mut agent = self.agent().await;
+        agent.open(json!({ "session": name, "outputs": { "encoding": "raw" } })).await;
+        agent
+    }
+
+    /// Proves that the server still serves: a whole session of a client of its own.
+    pub(crate) async fn still_serves(&self) {
+        let mut agent = self.driver("still-serves").await;
+        assert_eq!(agent.step(3.0).await.meta["step"], 1);
+        let closed = agent.ask(json!({ "type": "close" })).await;
+        assert_eq!(closed["type"], "closed", "{closed}");
+    }
+
+    /// The recorded episodes, in order of name.
+    pub(crate) fn recorded(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.episodes.path()).expect("episodes");
+        let mut paths: Vec<_> = entries.map(|entry| entry.expect("an entry").path()).collect();
+        paths.sort();
+        paths
+    }
+
+    /// Waits until the server holds that many sessions.
+    pub(crate) async fn sessions_become(&self, count: usize) {
+        let reached = async {
+            while self.running.sessions() != count {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        let waited = tokio::time::timeout(PATIENCE, reached).await;
+        assert!(waited.is_ok(), "{} sessions, not {count}", self.running.sessions());
+    }
+}
+
+/// A client without a library: what it sends is what the test says.
+pub(crate) struct Agent {
+    pub(crate) socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+    pub(crate) seq: u64,
+}
+
+/// What came back.
+#[derive(Clone, Debug)]
+pub(crate) enum Reply {
+    Text(Value),
+    Binary(Bytes),
+    Closed,
+}
+
+/// An observation, decoded with the safetensors crate.
+#[derive(Clone, Debug)]
+pub(crate) struct Seen {
+    pub(crate) meta: Value,
+    pub(crate) bytes: Bytes,
+}
+
+/// Room for every observation.
+pub(crate) fn client_limits() -> Option<WebSocketConfig> {
+    let bytes = Some(wildcity::config::OBSERVATION_BYTES);
+    Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
+}
+
+impl Agent {
+    pub(crate) async fn connect(address: SocketAddr) -> Self {
+        let mut request =
+            format!("ws://{address}/v1/session").into_client_request().expect("a request");
+        let subprotocol = "wildcity.v1".parse().expect("a header");
+        request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
+        let limits = client_limits();
+        let connected = tokio_tungstenite::connect_async_with_config(request, limits, true).await;
+        Self { socket: connected.expect("a connection").0, seq: 0 }
+    }
+
+    pub(crate) async fn hello(&mut self) -> Value {
+        let client = json!({ "name": "test", "version": "1" });
+        self.ask(json!({ "type": "hello", "client": client, "protocols": ["wildcity.v1"] })).await
+    }
+
+    /// Opens a session on the twin `test`; `more` replaces or adds fields.
+    pub(crate) async fn open(&mut self, more: Value) -> Value {
+        let opened = self.try_open(more).await;
+        assert_eq!(opened["type"], "opened", "{opened}");
+        opened
+    }
+
+    pub(crate) async fn try_open(&mut self, more: Value) -> Value {
+        let mut request = json!({ "type": "open", "twin": "test" });
+        let fields = request.as_object_mut().expect("an object");
+        fields.extend(more.as_object().expect("an object").clone());
+        self.ask(request).await
+    }
+
+    /// Steps to a place on the x axis.
+    pub(crate) async fn step(&mut self, x_m: f64) -> Seen {
+        self.look(json!({ "type": "step", "pose": pose(x_m) })).await
+    }
+
+    /// Sends a request with the next number; its answer is text.
+    pub(crate) async fn ask(&mut self, request: Value) -> Value {
+        self.send(request).await;
+        match self.receive().await {
+            Reply::Text(value) => value,
+            other => panic!("not text: {other:?}"),
+        }
+    }
+
+    /// Sends a request with the next number; its answer is an observation.
+    pub(crate) async fn look(&mut self, request: Value) -> Seen {
+        self.send(request).await;
+        self.seen().await
+    }
+
+    pub(crate) async fn seen(&mut self) -> Seen {
+        match self.receive().await {
+            Reply::Binary(bytes) => Seen::decode(bytes),
+            other => panic!("not an observation: {other:?}"),
+        }
+    }
+
+    pub(crate) async fn send(&mut self, mut request: Value) {
+        request["seq"] = self.seq.into();
+        self.seq += 1;
+        self.send_text(&request.to_string()).await;
+    }
+
+    pub(crate) async fn send_text(&mut self, text: &str) {
+        self.socket.send(Message::text(text)).await.expect("sent");
+    }
+
+    pub(crate) async fn receive(&mut self) -> Reply {
+        let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+        match next.expect("an answer in time") {
+            Some(Ok(Message::Text(text))) => {
+                Reply::Text(serde_json::from_str(&text).expect("JSON"))
+            }
+            Some(Ok(Message::Binary(bytes))) => Reply::Binary(bytes),
+            None | Some(Ok(Message::Close(_)) | Err(_)) => Reply::Closed,
+            Some(Ok(other)) => panic!("{other:?}"),
+        }
+    }
+
+    /// Asserts that the connection ends.
+    pub(crate) async fn closed(&mut self) {
+        let reply = self.receive().await;
+        assert!(matches!(reply, Reply::Closed), "{reply:?}");
+    }
+
+    /// The TCP connection, for what WebSocket has no word for.
+    pub(crate) fn tcp(&mut self) -> &mut TcpStream {
+        match self.socket.get_mut() {
+            MaybeTlsStream::Plain(stream) => stream,
+            _ => unreachable!("no TLS here"),
+        }
+    }
+}
+
+impl Seen {
+    pub(crate) fn decode(bytes: Bytes) -> Self {
+        let (_, metadata) = safetensors::SafeTensors::read_metadata(&bytes).expect("a header");
+        let metadata = metadata.metadata().clone().expect("metadata");
+        let meta = serde_json::from_str(&metadata["observation"]).expect("JSON");
+        Self { meta, bytes }
+    }
+
+    pub(crate) fn tensors(&self) -> safetensors::SafeTensors<'_> {
+        safetensors::SafeTensors::deserialize(&self.bytes).expect("safetensors")
+    }
+
+    pub(crate) fn frame_hash(&self) -> &str {
+        self.meta["frame_hash"].as_str().expect("a hash")
+    }
+}
+
+/// The wire's pose of a rig on the x axis.
+pub(crate) fn pose(x_m: f64) -> Value {
+    json!({ "xyz": [x_m, 0.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0] })
+}
+
+/// Asserts that an answer is an error of a code.
+pub(crate) fn refused(answer: &Value, code: &str) {
+    assert_eq!((&answer["type"], &answer["code"]), (&"error".into(), &code.into()), "{answer}");
+}
