@@ -102,12 +102,30 @@ struct Projected {
     depth_m: f32,
 }
 
+// Camera-space z, as if computed exactly and rounded once: splats are blended in order of it, and
+// surfels of one facade must not be ordered by rounding errors. Products and sums carry what their
+// rounding loses (Dekker 1971; two-sum by Knuth); where `fma` rounds twice, what products lose is lost.
+fn depth(mean: vec3f, view: ChunkView) -> f32 {
+    var sum = view.forward_high.w;
+    var lost = view.forward_low.w;
+    for (var axis = 0; axis < 3; axis++) {
+        let product = mean[axis] * view.forward_high[axis];
+        lost += fma(mean[axis], view.forward_high[axis], -product);
+        lost += mean[axis] * view.forward_low[axis];
+        let next = sum + product;
+        let part = next - sum;
+        lost += (sum - (next - part)) + (product - part);
+        sum = next;
+    }
+    return sum + lost;
+}
+
 fn project_shape(own: Geometry, view: ChunkView) -> Projected {
     // Camera space: in range?
     let mean = vec4f(own.mean_m, 1.0);
     let x = dot(view.camera_from_chunk[0], mean);
     let y = dot(view.camera_from_chunk[1], mean);
-    let z = dot(view.camera_from_chunk[2], mean);
+    let z = depth(own.mean_m, view);
     let in_range = z >= frame.near_m && z <= frame.far_m
         && own.log2_opacity >= frame.log2_alpha_cut;
     if !in_range {

@@ -24,6 +24,8 @@ struct Frame {
 
 struct ChunkView {
     camera_from_chunk: array<vec4f, 3>,
+    forward_high: vec4f,
+    forward_low: vec4f,
     camera_m: vec3f,
     view: u32,
     focal_px: vec2f,

@@ -15,7 +15,7 @@ use crate::data::real;
 use crate::gpu::gpu;
 use crate::images::{agree, cpu, look, max_difference, psnr, render, render_one};
 use crate::scene_files::gaussians;
-use crate::streets::{street, street_views};
+use crate::streets::{demo_street, street, street_views};
 
 /// Compares all views on both backends.
 fn compare(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
@@ -27,16 +27,31 @@ fn compare(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
     }
 }
 
+/// How far two images may be apart.
+struct Bound {
+    least_db: f64,
+    most_off: f32,
+}
+
+const CAPTURE: Bound = Bound { least_db: 80.0, most_off: 0.01 };
+
 /// Compares colour and opacity alone. In dense scenes, where one alpha lies at the cut or one
 /// transmittance at the stop, two backends may decide otherwise: a hundredth of a pixel's colour,
 /// but the depth that is behind it may be anything.
-fn compare_colors(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
+fn compare_colors(
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+    bound: Bound,
+    what: &str,
+) {
     let images = render(&gpu(), scene, profile, views);
     let truths = render(&cpu(), scene, profile, views);
     for (view, (image, truth)) in images.iter().zip(&truths).enumerate() {
         let (db, off) = (psnr(&image.rgba, &truth.rgba), max_difference(&image.rgba, &truth.rgba));
         assert!(truth.opacity.iter().any(|&o| o > 0.5), "{what}: view {view} is empty");
-        assert!(db >= 80.0 && off <= 0.01, "{what}, view {view}: {db:.1} dB, off by {off}");
+        let close = db >= bound.least_db && off <= bound.most_off;
+        assert!(close, "{what}, view {view}: {db:.1} dB, off by {off}");
     }
 }
 
@@ -53,6 +68,16 @@ fn streets_of_every_sh_degree() {
 }
 
 #[test]
+fn the_demo_street_from_its_own_cameras() {
+    let (street, views) = demo_street();
+    let scene = Scene::from_gaussians(&street);
+    // Surfels of one plane whose depths differ in the last bit of f32: the mirror's 16-bit colours
+    // and its own last bits swap a few of them.
+    let bound = Bound { least_db: 60.0, most_off: 0.1 };
+    compare_colors(&scene, &RenderProfile::default(), &views, bound, "the demo street");
+}
+
+#[test]
 fn every_field_of_the_profile() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 6));
     for setting in [
@@ -61,7 +86,7 @@ fn every_field_of_the_profile() {
         "blur=0.1",
         "antialiased=true",
         "alpha_cap=0.999",
-        "alpha_cut=0.02",
+        "alpha_cut=0.007",
         "stop=0.01",
     ] {
         let mut profile = RenderProfile::default();
@@ -99,7 +124,7 @@ fn sixteen_views_of_sizes_that_are_no_multiple_of_a_tile() {
 #[test]
 fn a_scene_of_several_pages() {
     let scene = Scene::from_gaussians(&street(1_200_000, 3, 10));
-    compare_colors(&scene, &RenderProfile::default(), &street_views(), "pages");
+    compare_colors(&scene, &RenderProfile::default(), &street_views(), CAPTURE, "pages");
 }
 
 #[test]
@@ -118,7 +143,7 @@ fn real_captures() {
         let Some(path) = real(file) else { return };
         let view = look([640, 480], 600.0, at, forward, down);
         let profile = RenderProfile { near: 0.2, alpha_cap: 0.999, ..RenderProfile::default() };
-        compare_colors(&read(&path), &profile, &[view], file);
+        compare_colors(&read(&path), &profile, &[view], CAPTURE, file);
     }
 }
 

@@ -75,7 +75,7 @@ fn layouts_are_the_same() {
             alpha_cap, log2_alpha_cut, stop, pad, view,
         }
         ChunkView {
-            camera_from_chunk, camera_m, view, focal_px, center_px, slope_min, slope_max,
+            camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
         }
         Item { cluster, chunk_view }
         Span { first, count }

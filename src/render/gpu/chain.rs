@@ -177,9 +177,8 @@ impl Chain {
             ("(Gaussian, tile) pairs", counters.instances, instances),
         ];
         for (what, needed, limit) in checks {
-            let needed = u64::from(needed);
-            if needed > limit {
-                return Err(RenderError::TooMany { what, needed, limit });
+            if u64::from(needed) > limit {
+                return Err(RenderError::TooMany { what, limit });
             }
         }
         self.high_water.splats = self.high_water.splats.max(counters.splats.into());

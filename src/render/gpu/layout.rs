@@ -94,12 +94,16 @@ impl Frame {
     }
 }
 
-/// A pinhole view relative to one chunk (96 bytes): what `render::layout::ChunkView` holds.
+/// A pinhole view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct ChunkView {
     /// Rows of the rigid transform, translation last, in metres.
     pub camera_from_chunk: [[f32; 4]; 3],
+    /// The camera's forward axis in the chunk and the chunk's origin along it, rounded to f32, ...
+    pub forward_high: [f32; 4],
+    /// ... and what the rounding left over: depth is computed from both.
+    pub forward_low: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
     /// Index of the view.
@@ -123,6 +127,8 @@ impl ChunkView {
         };
         Self {
             camera_from_chunk: [row(0), row(1), row(2)],
+            forward_high: from.forward.map(|high| high as f32),
+            forward_low: from.forward.map(|exact| (exact - f64::from(exact as f32)) as f32),
             camera_m: from.camera_m,
             view,
             focal_px: from.focal_px,
