@@ -24,7 +24,7 @@
 //! # Invariants
 //!
 //! 1. `protocol` is a leaf; only `server` and `client` name it, `server` in `convert.rs`.
-//! 2. Only `store/objects.rs` opens files of a twin; only `server` names axum.
+//! 2. Only `store/objects.rs` opens files of a twin; only `server` names axum; only `render/gpu` wgpu.
 //! 3. `render` and `scene` are pure: the same input, the same bytes, whatever the thread count.
 //! 4. Scene data is checked once, at import. Poses and cameras are checked once, at the wire.
 //! 5. An image is a function of (scene version, render profile, poses, cameras).
