@@ -108,13 +108,6 @@ struct Entry {
     rotation: [[f64; 3]; 3],
 }
 
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum List {
-    Many(Vec<Entry>),
-    One(Box<Entry>),
-}
-
 /// Reads a camera list.
 ///
 /// A camera's axes are x right, y down, z forward: `p_camera = R_world_to_cam (p - position)`.
@@ -128,9 +121,9 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     if text.len() as u64 > config::CAMERA_LIST_BYTES {
         return Err(CamerasError::TooLarge);
     }
-    let entries = match serde_json::from_slice(&text)? {
-        List::Many(entries) => entries,
-        List::One(entry) => vec![*entry],
+    let entries: Vec<Entry> = match text.trim_ascii_start().first() {
+        Some(b'{') => vec![serde_json::from_slice(&text)?],
+        _ => serde_json::from_slice(&text)?,
     };
     if entries.is_empty() {
         return Err(CamerasError::Empty);

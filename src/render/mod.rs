@@ -119,6 +119,11 @@ pub trait Backend: Send + Sync {
     /// The name, as `--backend` and observations spell it.
     fn name(&self) -> &'static str;
 
+    /// What else the last bit of a pixel depends on, as `Avx512`; nothing for most.
+    fn detail(&self) -> String {
+        String::new()
+    }
+
     /// Renders all views into their targets, `targets[i]` for `views[i]`.
     ///
     /// # Errors

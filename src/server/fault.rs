@@ -11,8 +11,13 @@ pub(super) enum Fault {
     #[error("not JSON: {0}")]
     MalformedJson(String),
     /// JSON, but not a request.
-    #[error("not a request: {0}")]
-    InvalidRequest(String),
+    #[error("not a request: {reason}")]
+    InvalidRequest {
+        /// The field at fault, as `rig.cameras[2].width`, if one is.
+        field: Option<String>,
+        /// What is wrong.
+        reason: String,
+    },
     /// A binary message.
     #[error("requests are JSON text frames; only the server sends binary ones")]
     UnexpectedBinary,

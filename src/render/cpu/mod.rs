@@ -102,6 +102,12 @@ impl Backend for Cpu {
         "cpu"
     }
 
+    fn detail(&self) -> String {
+        // Four lanes have no fused multiply-add, so instruction sets differ in the last bit.
+        let token = format!("{:?}", self.level);
+        token.split('(').next().unwrap_or_default().to_owned()
+    }
+
     fn render(
         &self,
         frame: &Frame<'_>,

@@ -2,6 +2,7 @@
 
 use crate::geometry::PoseError;
 use crate::protocol::error::Code;
+use crate::render::RenderError;
 use crate::scene::rig::RigError;
 use crate::server::fault::Fault;
 use crate::session::SessionError;
@@ -12,7 +13,7 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
     let field = |text: &str| Some(text.to_owned());
     match fault {
         Fault::MalformedJson(_) | Fault::BrokenFrame(_) => (Code::MalformedJson, None),
-        Fault::InvalidRequest(_) => (Code::InvalidRequest, None),
+        Fault::InvalidRequest { field, .. } => (Code::InvalidRequest, field.clone()),
         Fault::UnexpectedBinary => (Code::UnexpectedBinary, None),
         Fault::MessageTooLarge { .. } => (Code::MessageTooLarge, None),
         Fault::SeqOutOfOrder { .. } => (Code::SeqOutOfOrder, field("seq")),
@@ -69,7 +70,9 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
             (Code::UnknownTrajectory, field("start.trajectory"))
         }
         SessionError::OutOfRange { field, .. } => (Code::OutOfRange, Some((*field).to_owned())),
-        SessionError::AnswerTooLarge { .. } => (Code::AnswerTooLarge, None),
+        SessionError::AnswerTooLarge { .. } | SessionError::Render(RenderError::TooMany { .. }) => {
+            (Code::AnswerTooLarge, None)
+        }
         SessionError::EpisodeOver { .. } => (Code::SessionState, None),
         SessionError::Busy { .. } => (Code::Busy, None),
         SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),
