@@ -6,6 +6,7 @@ mod bench;
 mod demo;
 mod import;
 mod inspect;
+mod output;
 mod places;
 mod progress;
 mod render;

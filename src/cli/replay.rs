@@ -1,6 +1,5 @@
 //! `wildcity replay`.
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -11,8 +10,8 @@ use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
 use crate::store::Catalog;
 
 use super::places::Twins;
-use super::progress;
 use super::scene_source::Engine;
+use super::{output, progress};
 
 /// Show a recorded episode, render it again, and compare every frame.
 ///
@@ -55,7 +54,7 @@ impl Replay {
             return Ok(());
         }
         if let Some(dir) = &self.out {
-            fs::create_dir_all(dir).with_context(|| format!("{}", dir.display()))?;
+            output::make_dir(dir)?;
         }
         let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
         let header = &recording.header;
@@ -125,6 +124,5 @@ fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
     let (width, height) = (camera.camera.width_px, camera.camera.height_px);
     let file = session::png(rgb8, width, height).map_err(anyhow::Error::msg);
-    file.and_then(|file| Ok(fs::write(&path, file)?))
-        .with_context(|| format!("cannot write {}", path.display()))
+    output::write(&path, &file.with_context(|| format!("cannot write {}", path.display()))?)
 }
