@@ -224,7 +224,7 @@ fn built(
         Ok(version) => version,
         Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
         Err(StoreError::Damaged { .. } | StoreError::Format { .. }) => return Ok(Err(DAMAGED)),
-        Err(StoreError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {
+        Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
             return Ok(Err(DAMAGED));
         }
         Err(error) => return Err(error.into()),

@@ -80,14 +80,20 @@ impl Replay {
         match &report.difference {
             None => {
                 writeln!(out, "verified    {} images, all as recorded", report.images)?;
-                Ok(())
             }
             Some(difference) if self.verify => anyhow::bail!("differs at {difference}"),
             Some(difference) => {
                 writeln!(out, "differs     {difference}")?;
-                Ok(())
             }
         }
+        // Nothing, or the beginning of something, is no proof of the whole.
+        let missing = match (recording.frames.is_empty(), &recording.end) {
+            (true, _) => "has no frames",
+            (false, None) => "has no end: the episode still runs, or was cut off",
+            (false, Some(_)) => return Ok(()),
+        };
+        anyhow::ensure!(!self.verify, "the recording is incomplete: it {missing}");
+        Ok(())
     }
 }
 

@@ -37,7 +37,7 @@ pub enum CamerasError {
         "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
          fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
     )]
-    Json(#[from] serde_json::Error),
+    Json(serde_json::Error),
     /// There is no camera in it.
     #[error("the camera list is empty")]
     Empty,
@@ -77,20 +77,20 @@ pub enum CamerasError {
         determinant: f64,
     },
     /// The position cannot be used.
-    #[error("camera {name:?}: {source}")]
+    #[error("camera {name:?}: {cause}")]
     Pose {
         /// The camera.
         name: String,
         /// What is wrong.
-        source: PoseError,
+        cause: PoseError,
     },
     /// The size or an intrinsic cannot be used.
-    #[error("camera {name:?}: {source}")]
+    #[error("camera {name:?}: {cause}")]
     Camera {
         /// The camera.
         name: String,
         /// What is wrong.
-        source: CameraError,
+        cause: CameraError,
     },
 }
 
@@ -128,7 +128,7 @@ enum List {
 /// Names the camera and the field at fault.
 pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     let text = file::read_whole(path, config::CAMERA_LIST_BYTES)?;
-    let entries = match serde_json::from_slice(&text)? {
+    let entries = match serde_json::from_slice(&text).map_err(CamerasError::Json)? {
         List::Many(entries) => entries,
         List::One(entry) => vec![*entry],
     };
@@ -174,8 +174,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let q = [rotation.w, rotation.x, rotation.y, rotation.z];
     let pose = Pose::checked(position, q);
     let world_from_camera =
-        pose.map_err(|source| CamerasError::Pose { name: name.clone(), source })?;
+        pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
     let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy })
-        .map_err(|source| CamerasError::Camera { name: name.clone(), source })?;
+        .map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near })
 }

@@ -110,6 +110,16 @@ pub trait Backend: Send + Sync {
     /// The name, as `--backend` and observations spell it.
     fn name(&self) -> &'static str;
 
+    /// What else the last bit of a pixel depends on, as `Avx512`; nothing for most.
+    fn detail(&self) -> String {
+        String::new()
+    }
+
+    /// Threads that it renders with. Pixels do not depend on it.
+    fn threads(&self) -> usize {
+        1
+    }
+
     /// Renders all views into their targets, `targets[i]` for `views[i]`.
     ///
     /// # Errors
