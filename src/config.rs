@@ -92,6 +92,10 @@ const _: () = assert!(OBSERVATION_BYTES as u64 <= ANSWERS_BYTES);
 /// Pongs that a client has not read, and the goodbye, of at most 129 bytes each.
 pub const PONGS_BYTES: usize = 4 << 10;
 
+/// Largest image, in bytes of RGB, whose room the renderer keeps for the next frame: 3840x2160.
+/// 16 of them are 400 MB.
+pub const SCRATCH_IMAGE_BYTES: usize = 3 * (8 << 20);
+
 /// How long a refused client's last bytes are read and thrown away, so that it can read why.
 pub const LINGER: Duration = Duration::from_secs(2);
 

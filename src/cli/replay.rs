@@ -24,7 +24,8 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again and fail with exit code 1 if one differs; without --out, at once.
+    /// Render every frame again and fail with exit code 1 if one differs (without --out, at once) or
+    /// the recording is incomplete.
     #[arg(long)]
     verify: bool,
 

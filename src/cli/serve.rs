@@ -73,9 +73,11 @@ impl Serve {
         tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         runtime.block_on(async {
+            // Before anybody is told of the server: they may tell it to stop at once.
+            let stop = server::stop_signal()?;
             let running = server::start(config).await?;
             writeln!(io::stdout(), "listening on {}", running.url())?;
-            server::stop_signal().await?;
+            stop.await;
             tracing::info!("stopping");
             running.stop().await;
             Ok(())

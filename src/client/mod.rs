@@ -99,7 +99,7 @@ impl Client {
     ) -> Result<(Self, Resumed), ClientError> {
         let mut client = Self::connect(url, name).await?;
         client.session = Some(session.to_owned());
-        client.next_seq = last_seq + 1;
+        client.next_seq = last_seq.saturating_add(1);
         let resumed = client.take_up(session, last_seq).await?;
         Ok((client, resumed))
     }
@@ -238,6 +238,8 @@ impl Client {
                 if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
                     // Gone for good; a new one can be opened here, with the number of this try.
                     (self.session, self.next_seq, self.connection) = (None, 1, Some(connection));
+                } else {
+                    self.lost_because = error.to_string();
                 }
                 return Err(error);
             }
@@ -245,7 +247,7 @@ impl Client {
         match incoming {
             // One request at a time: the session is where this client is, or one answer ahead.
             Incoming::Answer(Answer::Resumed { last_seq: done, step, time_us, .. })
-                if done == last_seq || done == last_seq + 1 =>
+                if done == last_seq || Some(done) == last_seq.checked_add(1) =>
             {
                 self.connection = Some(connection);
                 Ok(Resumed { last_seq: done, step, time_us })

@@ -113,13 +113,6 @@ struct Entry {
     rotation: [[f64; 3]; 3],
 }
 
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum List {
-    Many(Vec<Entry>),
-    One(Box<Entry>),
-}
-
 /// Reads a camera list.
 ///
 /// A camera's axes are x right, y down, z forward: `p_camera = R_world_to_cam (p - position)`.
@@ -128,10 +121,11 @@ enum List {
 /// Names the camera and the field at fault.
 pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     let text = file::read_whole(path, config::CAMERA_LIST_BYTES)?;
-    let entries = match serde_json::from_slice(&text).map_err(CamerasError::Json)? {
-        List::Many(entries) => entries,
-        List::One(entry) => vec![*entry],
+    let one_or_many = match text.trim_ascii_start().first() {
+        Some(b'{') => serde_json::from_slice(&text).map(|entry| vec![entry]),
+        _ => serde_json::from_slice(&text),
     };
+    let entries: Vec<Entry> = one_or_many.map_err(CamerasError::Json)?;
     if entries.is_empty() {
         return Err(CamerasError::Empty);
     }

@@ -1,4 +1,8 @@
 //! Control messages: JSON text frames.
+//!
+//! Answers may gain fields, so the types in them let unknown ones pass. In requests unknown fields
+//! are mistakes: types of requests refuse them, and [`super::unknown_field`] finds them within the
+//! types that both ways share.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,7 +11,6 @@ use super::error::Code;
 
 /// A rigid transform: position in metres, unit quaternion (w, x, y, z).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
 pub struct Pose {
     /// Position, in metres.
     pub xyz: [f64; 3],
@@ -141,8 +144,8 @@ impl Open {
 }
 
 /// Where an episode starts.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[serde(untagged)]
 pub enum Start {
     /// At a pose.
     Pose {
@@ -160,7 +163,7 @@ pub enum Start {
 }
 
 /// Which cameras.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 pub enum RigChoice {
     /// A preset, by name.
@@ -181,7 +184,6 @@ pub struct Rig {
 
 /// A pinhole camera on the vehicle; all intrinsics in pixels.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
 pub struct RigCamera {
     /// Name.
     pub name: String,
@@ -203,7 +205,7 @@ pub struct RigCamera {
 
 /// What each observation holds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(default)]
 pub struct Outputs {
     /// Names of the cameras to render, in the order wanted; all if absent.
     #[serde(skip_serializing_if = "Option::is_none")]

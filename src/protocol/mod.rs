@@ -7,6 +7,9 @@
 pub mod error;
 pub mod message;
 pub mod observation;
+mod strict;
+
+pub use strict::unknown_field;
 
 /// The WebSocket subprotocol, and the only protocol version there is so far.
 pub const PROTOCOL: &str = "wildcity.v1";

@@ -19,8 +19,16 @@ use super::socket::{Incoming, Lost, Socket};
 
 /// Serves a client until it leaves or is turned away. An open session is parked then.
 pub(super) async fn serve(server: Arc<Server>, socket: Socket) {
-    let mut connection =
-        Connection { server, socket, greeted: false, answered: None, last: None, place: None };
+    let hello_by = Instant::now() + server.limits.hello;
+    let mut connection = Connection {
+        server,
+        socket,
+        hello_by,
+        greeted: false,
+        answered: None,
+        last: None,
+        place: None,
+    };
     let lost = connection.run().await;
     connection.end(lost).await;
 }
@@ -28,6 +36,8 @@ pub(super) async fn serve(server: Arc<Server>, socket: Socket) {
 struct Connection {
     server: Arc<Server>,
     socket: Socket,
+    /// When `hello` must have come, however much else comes before it.
+    hello_by: Instant,
     greeted: bool,
     /// Number of the last request answered, refusals included.
     answered: Option<u64>,
@@ -53,10 +63,12 @@ impl Connection {
     }
 
     async fn next_request(&mut self) -> Result<String, Lost> {
-        let limits = &self.server.limits;
-        let (patience, awaited) =
-            if self.greeted { (limits.idle, "request") } else { (limits.hello, "hello") };
-        let mut deadline = Instant::now() + patience;
+        let idle = self.server.limits.idle;
+        let (mut deadline, awaited) = if self.greeted {
+            (Instant::now() + idle, "request")
+        } else {
+            (self.hello_by, "hello")
+        };
         loop {
             let leave = async {
                 match &self.place {
@@ -69,7 +81,7 @@ impl Connection {
                     Incoming::Text(text) => return Ok(text),
                     Incoming::SignOfLife => {
                         if self.greeted {
-                            deadline = Instant::now() + patience;
+                            deadline = Instant::now() + idle;
                         }
                         continue;
                     }
@@ -83,12 +95,9 @@ impl Connection {
     }
 
     async fn handle(&mut self, text: &str) -> Result<(), Lost> {
-        let Parsed { seq, command } = convert::parse(text);
-        let Some(seq) = seq else {
-            return match command {
-                Err(fault) => self.refuse(None, &fault).await,
-                Ok(_) => Ok(()),
-            };
+        let (seq, command) = match convert::parse(text) {
+            Parsed::Numbered { seq, command } => (seq, command),
+            Parsed::Unnumbered(fault) => return self.refuse(None, &fault).await,
         };
         if let Some((last, answer)) = &self.last
             && *last == seq
@@ -115,7 +124,7 @@ impl Connection {
         if resumes {
             // From here on the numbers are the session's.
             self.last = self.place.as_ref().and_then(|place| place.last.clone());
-            self.answered = self.last.as_ref().map(|(last, _)| *last);
+            self.answered = self.place.as_ref().map(|place| place.answered);
         } else {
             self.last = Some((seq, answer.clone()));
             if let Some(place) = &mut self.place {

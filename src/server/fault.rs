@@ -11,8 +11,13 @@ pub(super) enum Fault {
     #[error("not JSON: {0}")]
     MalformedJson(String),
     /// JSON, but not a request.
-    #[error("not a request: {0}")]
-    InvalidRequest(String),
+    #[error("not a request: {reason}")]
+    InvalidRequest {
+        /// The field at fault, as `rig.cameras[2].width`, if one is.
+        field: Option<String>,
+        /// What is wrong.
+        reason: String,
+    },
     /// A binary message.
     #[error("requests are JSON text frames; only the server sends binary ones")]
     UnexpectedBinary,
@@ -70,12 +75,12 @@ pub(super) enum Fault {
         name: String,
     },
     /// Not a pose.
-    #[error("{field}: {source}")]
+    #[error("{field}: {cause}")]
     Pose {
         /// The pose, as `poses[3]`.
         field: String,
         /// What is wrong with it.
-        source: PoseError,
+        cause: PoseError,
     },
     /// NaN or infinity where JSON has no number.
     #[error("{field} is not finite; a pose needs finite numbers")]
@@ -84,20 +89,20 @@ pub(super) enum Fault {
         field: String,
     },
     /// Not a camera.
-    #[error("{field}: {source}")]
+    #[error("{field}: {cause}")]
     Camera {
         /// The camera, as `rig.cameras[2]`.
         field: String,
         /// What is wrong with it.
-        source: CameraError,
+        cause: CameraError,
     },
     /// Not a rig.
-    #[error("{source}")]
+    #[error("{cause}")]
     Rig {
         /// The field.
         field: String,
         /// What is wrong with it.
-        source: RigError,
+        cause: RigError,
     },
     /// Too much at once.
     #[error("there are {limit} {what} already; try again later")]

@@ -45,10 +45,14 @@ pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
             .header_read_timeout(server.limits.hello)
             .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
             .with_upgrades();
+        // The request and its answer; what becomes a WebSocket is over here by then.
+        let patience = server.limits.hello + server.limits.send;
+        let connection = tokio::time::timeout(patience, connection);
         let server = server.clone();
         tokio::spawn(async move {
             tokio::select! {
-                // The client's fault, and of no interest: it went away, or never spoke HTTP.
+                // The client's fault, and of no interest: it went away, never spoke HTTP, or does
+                // not read.
                 _ = connection => {}
                 () = server.stopped() => {}
             }

@@ -29,15 +29,15 @@ pub(super) fn router(server: Arc<Server>) -> Router {
 
 /// Whether sessions can be opened: the twins can be listed.
 async fn ready(State(server): State<Arc<Server>>) -> Response {
-    match server.engine.twins().await {
-        Ok(_) => "ready\n".into_response(),
+    match server.engine.check_twins().await {
+        Ok(()) => "ready\n".into_response(),
         Err(error) => refuse(StatusCode::SERVICE_UNAVAILABLE, &error.into()),
     }
 }
 
 async fn twins(State(server): State<Arc<Server>>) -> Response {
     match server.engine.twins().await {
-        Ok(versions) => Json(convert::twins(&versions)).into_response(),
+        Ok(twins) => Json(convert::twins(&twins)).into_response(),
         Err(error) => refuse(StatusCode::INTERNAL_SERVER_ERROR, &error.into()),
     }
 }
@@ -87,10 +87,11 @@ fn into_tcp(upgraded: Upgraded) -> Result<(TcpStream, Vec<u8>), Upgraded> {
 
 /// The client's key, if it may come in.
 fn check(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
-    let has = |name: header::HeaderName, wanted: &str| {
+    let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
         let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
-        values.flat_map(|value| value.split(',')).any(|v| v.trim().eq_ignore_ascii_case(wanted))
+        values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))
     };
+    let has = |name, wanted: &str| any(name, &|value| value.eq_ignore_ascii_case(wanted));
     let bad = |message: &str| Err((StatusCode::BAD_REQUEST, message.to_owned()));
     // Browsers send Origin and cannot leave it out; agents do not. Any page may try to reach
     // 127.0.0.1, so only pages that come from there are let in.
@@ -107,13 +108,20 @@ fn check(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
     if !has(header::SEC_WEBSOCKET_VERSION, "13") {
         return bad("Sec-WebSocket-Version must be 13");
     }
-    if !has(header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL) {
+    // Unlike the tokens above, names of subprotocols have a case.
+    if !any(header::SEC_WEBSOCKET_PROTOCOL, &|offered| offered == convert::SUBPROTOCOL) {
         return bad("offer the subprotocol wildcity.v1 in Sec-WebSocket-Protocol");
     }
     match headers.get(header::SEC_WEBSOCKET_KEY) {
-        Some(key) => Ok(key.as_bytes()),
-        None => bad("Sec-WebSocket-Key is missing"),
+        Some(key) if is_key(key.as_bytes()) => Ok(key.as_bytes()),
+        _ => bad("Sec-WebSocket-Key must be 16 bytes in base64"),
     }
+}
+
+/// Whether a text is base64 of 16 bytes: 22 digits, and padding.
+fn is_key(text: &[u8]) -> bool {
+    let is_digit = |b: &u8| b.is_ascii_alphanumeric() || b"+/".contains(b);
+    matches!(text.strip_suffix(b"=="), Some(digits) if digits.len() == 22 && digits.iter().all(is_digit))
 }
 
 /// Whether an origin is a page served from this machine.

@@ -79,20 +79,30 @@ impl std::fmt::Debug for Running {
     }
 }
 
-/// Returns when the process is asked to stop: SIGTERM, or Ctrl-C.
+/// A future that ends when the process is asked to stop: SIGTERM, or Ctrl-C. From the call on, a
+/// signal no longer ends the process by itself.
 ///
 /// # Errors
 /// Signals cannot be received.
-pub async fn stop_signal() -> std::io::Result<()> {
+pub fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     #[cfg(unix)]
     {
         use tokio::signal::unix::{SignalKind, signal};
         let mut terminate = signal(SignalKind::terminate())?;
-        tokio::select! {
-            result = tokio::signal::ctrl_c() => result,
-            _ = terminate.recv() => Ok(()),
-        }
+        let mut interrupt = signal(SignalKind::interrupt())?;
+        Ok(async move {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+        })
     }
     #[cfg(not(unix))]
-    tokio::signal::ctrl_c().await
+    {
+        let mut interrupt = tokio::signal::windows::ctrl_c()?;
+        Ok(async move {
+            // `None` would mean that no signal can come any more.
+            let _ = interrupt.recv().await;
+        })
+    }
 }

@@ -48,6 +48,8 @@ impl Buffer {
         let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
         let more = answers.hold((len - start) as u64)?;
         self.hold.join(more);
+        // Exactly: growing by half again would take memory that no budget knows of.
+        self.words.reserve_exact(len.div_ceil(8) - self.words.len());
         self.words.resize(len.div_ceil(8), 0);
         self.len = len;
         for part in parts {
@@ -55,5 +57,20 @@ impl Buffer {
             start += part.len();
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_is_what_the_budget_knows_of() {
+        let answers = Answers::default();
+        let mut buffer = Buffer::zeroed(&answers, 80_000, 16).unwrap();
+        buffer.append(&answers, &[&[1; 5], &[2; 11]]).unwrap();
+        assert_eq!(buffer.bytes().len(), 80_016);
+        assert_eq!(buffer.words.capacity() * 8, 80_016);
+        assert_eq!(buffer.bytes()[80_004..80_006], [1, 2]);
     }
 }

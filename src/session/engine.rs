@@ -12,9 +12,10 @@ use tokio::time::{Instant, timeout_at};
 use crate::config;
 use crate::render::Backend;
 use crate::residency::{Cache, Resident};
-use crate::store::{Catalog, StoreError, Version};
+use crate::store::Catalog;
 
 use super::SessionError;
+use super::listing::{Listings, TwinSummary};
 
 /// What an engine is made of.
 pub struct EngineSettings {
@@ -34,7 +35,7 @@ pub struct EngineSettings {
 /// twice the memory. Frames wait in the order in which they were asked for, and a session asks for
 /// one at a time, so that sessions take turns.
 pub struct Engine {
-    catalog: Catalog,
+    listings: Arc<Listings>,
     cache: Cache,
     episodes: PathBuf,
     backend: Arc<dyn Backend>,
@@ -73,12 +74,13 @@ impl Engine {
                 let mut scratch = Scratch::new();
                 while let Some(job) = queue.blocking_recv() {
                     job(&mut scratch);
+                    shrink(&mut scratch);
                 }
             })
             .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
-        let cache = Cache::new(catalog.clone());
-        let answers = Answers::default();
-        Ok(Arc::new(Self { catalog, cache, episodes, backend, step_timeout, jobs, answers }))
+        let listings = Arc::new(Listings::new(catalog.clone()));
+        let (cache, answers) = (Cache::new(catalog), Answers::default());
+        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
     }
 
     /// The latest version of every twin, in order of name. A damaged one is logged and left out,
@@ -86,24 +88,30 @@ impl Engine {
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Version>, SessionError> {
-        let engine = self.clone();
-        let listed = tokio::task::spawn_blocking(move || {
-            let mut versions = Vec::new();
-            for listing in engine.catalog.twins()? {
-                match engine.catalog.version(&listing.name, Some(listing.number)) {
-                    Ok(version) => versions.push(version),
-                    Err(error) => tracing::warn!(twin = listing.name, "not listed: {error}"),
-                }
-            }
-            Ok::<_, StoreError>(versions)
-        });
+    pub async fn twins(&self) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
+        let listings = self.listings.clone();
+        let listed = tokio::task::spawn_blocking(move || listings.read());
         Ok(listed.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Whether twins can be listed.
+    ///
+    /// # Errors
+    /// The directory of twins cannot be read.
+    pub async fn check_twins(&self) -> Result<(), SessionError> {
+        let listings = self.listings.clone();
+        let checked = tokio::task::spawn_blocking(move || listings.check());
+        Ok(checked.await.map_err(|_| SessionError::Crashed)??)
     }
 
     /// Name of the backend.
     pub fn backend(&self) -> &'static str {
         self.backend.name()
+    }
+
+    /// What else of the backend pixels depend on.
+    pub(super) fn backend_detail(&self) -> String {
+        self.backend.detail()
     }
 
     /// A version of a twin, or its latest, loaded if nobody has it.
@@ -171,6 +179,11 @@ impl std::fmt::Debug for Engine {
     }
 }
 
+/// Gives back what one session's huge images left behind.
+fn shrink(scratch: &mut Scratch) {
+    scratch.retain(|image| image.capacity() <= config::SCRATCH_IMAGE_BYTES);
+}
+
 impl Answers {
     /// Takes a part of the budget.
     ///
@@ -202,6 +215,13 @@ impl Drop for Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn huge_images_are_not_kept() {
+        let mut scratch = vec![vec![0; config::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
+        shrink(&mut scratch);
+        assert_eq!(scratch, [vec![0; 1000]]);
+    }
 
     #[test]
     fn the_budget_for_answers_comes_back() {

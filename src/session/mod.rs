@@ -9,6 +9,7 @@ mod encode;
 mod engine;
 mod episode;
 mod error;
+mod listing;
 mod observation;
 mod opening;
 mod record;
@@ -30,6 +31,7 @@ pub(crate) use encode::{jpeg, png};
 pub use engine::{Engine, EngineSettings};
 pub use episode::{Episode, History, Outcome, Summary};
 pub use error::SessionError;
+pub use listing::{TrajectorySummary, TwinSummary};
 pub use observation::{DType, Frame, HEADER_PREFIX_BYTES, Image, Tensor, TensorKind, Timings};
 pub use opening::{Opening, Outputs, RigChoice, Start};
 pub use record::{EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs};
@@ -269,6 +271,7 @@ impl Session {
             profile: version.manifest.profile,
             profile_hash: self.profile_hash.to_hex().to_string(),
             backend: self.engine.backend().to_owned(),
+            backend_detail: self.engine.backend_detail(),
             rig: Rig { name: self.rig_name.clone(), cameras },
             outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity },
             seed: episode.seed(),

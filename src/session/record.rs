@@ -48,6 +48,9 @@ pub struct EpisodeHeader {
     pub profile_hash: String,
     /// Name of the backend.
     pub backend: String,
+    /// What else pixels depend on: the instruction set.
+    #[serde(default)]
+    pub backend_detail: String,
     /// The cameras that were rendered, in the order of the images.
     pub rig: Rig,
     /// What the observations held beside colour, and how colour travelled.

@@ -48,7 +48,7 @@ pub enum Extent {
 /// Something that is not as it was.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Change {
-    /// `build`, `backend`, `version hash` or `profile hash`.
+    /// `build`, `backend`, `backend detail`, `version hash` or `profile hash`.
     pub what: &'static str,
     /// As recorded.
     pub recorded: String,
@@ -253,6 +253,7 @@ impl Recording {
         [
             ("build", &*header.build, BUILD),
             ("backend", &*header.backend, backend.name()),
+            ("backend detail", &*header.backend_detail, &*backend.detail()),
             ("version hash", &*header.version_hash, &*resident.version.hash),
             ("profile hash", &*header.profile_hash, &*profile),
         ]

@@ -1,9 +1,9 @@
 //! Golden text messages: one file per request and per answer.
 
-use serde_json::json;
-use wildcity::protocol::PROTOCOL;
+use serde_json::{Value, json};
 use wildcity::protocol::error::Code;
 use wildcity::protocol::message::*;
+use wildcity::protocol::{PROTOCOL, unknown_field};
 
 use super::{check_json, read};
 
@@ -38,6 +38,49 @@ fn what_may_be_left_out_has_a_default() {
     // Unknown fields are mistakes, not extensions.
     let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
     assert!(parse(&unknown).unwrap_err().to_string().contains("speed"));
+}
+
+/// A server of next year may say more, at any depth.
+#[test]
+fn answers_with_unknown_fields_are_the_same_answers() {
+    for (name, answer) in answers() {
+        let mut more: Value =
+            serde_json::from_slice(&read(&format!("vectors/answers/{name}.json"))).unwrap();
+        add_unknown_fields(&mut more);
+        assert_eq!(serde_json::from_value::<Answer>(more).unwrap(), answer, "{name}");
+    }
+}
+
+/// Adds a field to every object but a profile, whose fields are all known as none is.
+pub(crate) fn add_unknown_fields(value: &mut Value) {
+    match value {
+        Value::Object(fields) => {
+            fields
+                .iter_mut()
+                .filter(|(name, _)| *name != "profile")
+                .for_each(|(_, inner)| add_unknown_fields(inner));
+            fields.insert("since_next_year".to_owned(), json!([1, "x"]));
+        }
+        Value::Array(items) => items.iter_mut().for_each(add_unknown_fields),
+        _ => {}
+    }
+}
+
+#[test]
+fn unknown_fields_of_requests_are_found_at_any_depth() {
+    let file = read("vectors/requests/open.json");
+    let understood: Value = serde_json::from_slice(&file).unwrap();
+    for (pointer, path) in [
+        ("", "speed"),
+        ("/outputs", "outputs.speed"),
+        ("/rig/cameras/1", "rig.cameras[1].speed"),
+        ("/rig/cameras/0/camera_to_rig", "rig.cameras[0].camera_to_rig.speed"),
+    ] {
+        let mut sent = understood.clone();
+        sent.pointer_mut(pointer).unwrap()["speed"] = 3.into();
+        assert_eq!(unknown_field(&sent, &understood).as_deref(), Some(path));
+    }
+    assert_eq!(unknown_field(&understood, &understood), None);
 }
 
 fn pose(xyz: [f64; 3], q: [f64; 4]) -> Pose {

@@ -78,6 +78,16 @@ fn a_wrong_pixel_or_hash_is_found() {
     assert!(matches!(hash, Err(FrameError::Hash { name, .. }) if name == "frame_hash"));
 }
 
+#[test]
+fn unknown_fields_of_the_metadata_are_ignored() {
+    let frame = raw_frame();
+    let mut metadata = serde_json::to_value(&frame.metadata).unwrap();
+    super::messages::add_unknown_fields(&mut metadata);
+    let known: wildcity::protocol::observation::Observation =
+        serde_json::from_value(metadata).unwrap();
+    assert_eq!(known, frame.metadata);
+}
+
 fn check_history(observation: &Observation) {
     let xyz_m = observation.history_xyz_m();
     let expected: Vec<f32> = (0..16).flat_map(frames::history_xyz_m).collect();

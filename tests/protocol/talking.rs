@@ -124,6 +124,28 @@ async fn another_client_can_take_a_session_over() {
 }
 
 #[tokio::test]
+async fn numbers_have_an_end() {
+    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
+    let result = Client::resume(&server.url, "test", "run-17", u64::MAX).await;
+    assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
+}
+
+/// Why a connection was lost is still known to the call after the failed `reconnect`.
+#[tokio::test]
+async fn a_refused_resume_says_why() {
+    let busy = r#"{"type":"error","seq":1,"code":"busy","message":"full","fatal":false}"#;
+    let first = vec![HELLO, OPEN, Reply::HangUp];
+    let (_server, mut client) = opened(vec![first, vec![HELLO, Reply::Text(busy.into())]]).await;
+    client.step(HERE).await.unwrap_err();
+    client.reconnect().await.unwrap_err();
+    let gone = client.step(HERE).await;
+    assert!(
+        matches!(&gone, Err(ClientError::Disconnected(why)) if why.contains("full")),
+        "{gone:?}"
+    );
+}
+
+#[tokio::test]
 async fn a_session_that_is_elsewhere_is_not_taken_over() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
     let result = Client::resume(&server.url, "test", "run-17", 2).await;

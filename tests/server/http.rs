@@ -1,10 +1,12 @@
 //! HTTP: health, twins, and who may upgrade.
 
+use std::time::Duration;
+
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use wildcity::server::{self, Config, Limits, ServerError};
 
-use crate::support::TestServer;
+use crate::support::{PATIENCE, TestServer};
 
 /// Sends a request as it is, and reads until the server closes or the answer is there.
 async fn request(server: &TestServer, text: &str) -> (u16, String) {
@@ -21,11 +23,12 @@ async fn get(server: &TestServer, path: &str) -> (u16, String) {
     request(server, &format!("GET {path} HTTP/1.1\nHost: localhost\n\n")).await
 }
 
+const UPGRADE: &str = "GET /v1/session HTTP/1.1\nHost: localhost\nConnection: keep-alive, Upgrade\n\
+                       Upgrade: websocket\nSec-WebSocket-Version: 13\n\
+                       Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n";
+
 async fn upgrade(server: &TestServer, more: &str) -> u16 {
-    let upgrade = "GET /v1/session HTTP/1.1\nHost: localhost\nConnection: keep-alive, Upgrade\n\
-                   Upgrade: websocket\nSec-WebSocket-Version: 13\n\
-                   Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n";
-    request(server, &format!("{upgrade}{more}\n")).await.0
+    request(server, &format!("{UPGRADE}{more}\n")).await.0
 }
 
 #[tokio::test]
@@ -40,8 +43,33 @@ async fn health_and_twins() {
         serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
     assert_eq!(body["twins"][0]["name"], "test");
     assert_eq!(get(&server, "/nothing").await.0, 404);
+    // A version never changes: what was read of it is not read again.
+    let manifest = body["twins"][0]["version_hash"].as_str().unwrap();
+    let mut objects = walk(server.twins.path());
+    objects.retain(|path| path.to_string_lossy().replace('/', "").contains(manifest));
+    std::fs::remove_file(&objects[0]).unwrap();
+    let (_, again) = get(&server, "/v1/twins").await;
+    assert!(again.contains(manifest), "{again}");
+    assert_eq!(get(&server, "/readyz").await.0, 200);
     assert_eq!(get(&server, "/v1/session").await.0, 426);
     assert_eq!(request(&server, "rubbish\n\n").await.0, 400);
+}
+
+/// All files below a directory.
+fn walk(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let paths = std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path());
+    paths.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+/// Answers that nobody reads are given up, and their place is free again.
+#[tokio::test]
+async fn an_answer_that_is_not_read_is_given_up() {
+    let short = Duration::from_millis(300);
+    let server = TestServer::with(Limits { hello: short, send: short, ..Limits::default() }).await;
+    let mut stream = TcpStream::connect(server.address()).await.unwrap();
+    let requests = "GET /v1/twins HTTP/1.1\r\nHost: localhost\r\n\r\n".repeat(1000);
+    let asking = async { while stream.write_all(requests.as_bytes()).await.is_ok() {} };
+    tokio::time::timeout(PATIENCE / 2, asking).await.expect("the connection ends");
     server.still_serves().await;
 }
 
@@ -51,6 +79,12 @@ async fn only_local_pages_and_agents_may_drive() {
     let subprotocol = "Sec-WebSocket-Protocol: other, wildcity.v1\n";
     assert_eq!(upgrade(&server, subprotocol).await, 101);
     assert_eq!(upgrade(&server, "").await, 400);
+    // Names of subprotocols have a case, and the key is 16 bytes in base64.
+    assert_eq!(upgrade(&server, "Sec-WebSocket-Protocol: WildCity.v1\n").await, 400);
+    for key in ["", "x", "dGhlIHNhbXBsZSBub25jZQ=", "dGhlIHNhbXBsZSBub25jZ!=="] {
+        let bad = UPGRADE.replace("dGhlIHNhbXBsZSBub25jZQ==", key);
+        assert_eq!(request(&server, &format!("{bad}{subprotocol}\n")).await.0, 400, "{key}");
+    }
     assert_eq!(upgrade(&server, "Sec-WebSocket-Protocol: other\n").await, 400);
     for (origin, status) in [
         ("http://localhost:3000", 101),

@@ -52,6 +52,43 @@ async fn what_is_not_a_request() {
     server.still_serves().await;
 }
 
+/// The field that a mistake is in is named, however deep it is.
+#[tokio::test]
+async fn mistakes_are_named_by_their_path() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    let camera = |more: &str| {
+        format!(
+            r#"{{"name":"c","width":8,"height":8,"fx":8,"cx":4,"cy":4,"camera_to_rig":{{"xyz":[0,0,0],"q":[1,0,0,0]}}{more}}}"#
+        )
+    };
+    let good = camera(r#","fy":8"#);
+    let rig = |camera: String| format!(r#""rig":{{"name":"r","cameras":[{good},{camera}]}}"#);
+    for (fields, field, reason) in [
+        (rig(camera("")), "rig.cameras[1]", "missing field `fy`"),
+        (rig(good.replace("\"width\":8", "\"width\":-1")), "rig.cameras[1].width", "-1"),
+        (rig(good.replace("\"width\":8", "\"width\":1e9")), "rig.cameras[1].width", "floating"),
+        (rig(camera(r#","fy":8,"fov":90"#)), "rig.cameras[1].fov", "no field"),
+        (r#""rig":7"#.to_owned(), "rig", "preset"),
+        (
+            r#""start":{"pose":{"xyz":[0,0],"q":[1,0,0,0]}}"#.to_owned(),
+            "start.pose.xyz",
+            "length 2",
+        ),
+        (r#""start":{"trajectory":3}"#.to_owned(), "start.trajectory", "integer `3`"),
+        (r#""start":{"station_m":3}"#.to_owned(), "start", "either pose"),
+        (r#""outputs":{"deep":true}"#.to_owned(), "outputs.deep", "no field"),
+        (r#""dt_us":"x""#.to_owned(), "dt_us", "string"),
+    ] {
+        agent.send_text(&format!(r#"{{"type":"open","seq":1,"twin":"test",{fields}}}"#)).await;
+        let answer = answer(&mut agent).await;
+        refused(&answer, "invalid_request");
+        assert_eq!((&answer["field"], &answer["seq"]), (&json!(field), &json!(1)), "{answer}");
+        assert!(answer["message"].as_str().unwrap().contains(reason), "{answer}");
+    }
+    server.still_serves().await;
+}
+
 #[tokio::test]
 async fn poses_that_are_none() {
     let server = TestServer::start().await;
@@ -260,6 +297,35 @@ async fn silence_ends_a_connection() {
     let reading = tokio::io::AsyncReadExt::read_to_end(&mut half_open, &mut rest);
     tokio::time::timeout(Duration::from_secs(5), reading).await.expect("closed").unwrap();
     server.still_serves().await;
+}
+
+/// Rubbish is answered, but does not put off the time by which `hello` must have come.
+#[tokio::test]
+async fn hello_must_come_in_time_whatever_else_comes() {
+    let hello = Duration::from_millis(400);
+    let server = TestServer::with(Limits { hello, ..Limits::default() }).await;
+    let mut agent = Agent::connect(server.address()).await;
+    for _ in 0..40 {
+        tokio::time::sleep(hello / 8).await;
+        // The connection may have ended just now.
+        let _ = agent.socket.send(Message::text("rubbish")).await;
+        match agent.receive().await {
+            Reply::Text(answer) if answer["code"] == "timed_out" => return,
+            Reply::Text(answer) => refused(&answer, "malformed_json"),
+            other => panic!("{other:?}"),
+        }
+    }
+    panic!("still welcome after {:?}", 5 * hello);
+}
+
+#[tokio::test]
+async fn what_is_too_much_to_draw_is_the_agents_affair() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    server.painter.too_many.store(true, Ordering::SeqCst);
+    let answer = agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await;
+    refused(&answer, "answer_too_large");
+    assert_eq!(agent.step(1.0).await.meta["step"], 1);
 }
 
 #[tokio::test]

@@ -87,6 +87,24 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
     server.still_serves().await;
 }
 
+/// A refused request used up its number, on this connection and on the next.
+#[tokio::test]
+async fn numbers_go_on_after_a_refused_request() {
+    let server = TestServer::start().await;
+    for repeated in [4, 5] {
+        let mut agent = server.driver(&format!("n{repeated}")).await;
+        agent.step(1.0).await;
+        assert_eq!(agent.step(2.0).await.meta["seq"], 3);
+        refused(&agent.ask(json!({ "type": "observe", "poses": [] })).await, "out_of_range");
+        assert_eq!(agent.seq, 5);
+        drop(agent);
+        let (mut agent, resumed) = resume(&server, &format!("n{repeated}"), 4).await;
+        assert_eq!(resumed["last_seq"], 3, "{resumed}");
+        agent.seq = repeated;
+        assert_eq!(agent.step(3.0).await.meta["step"], 3);
+    }
+}
+
 /// After a network failure the client is back before the server knows that it was gone.
 #[tokio::test]
 async fn resuming_takes_over_from_a_dead_connection() {

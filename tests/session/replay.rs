@@ -78,7 +78,14 @@ async fn the_first_differing_image_is_named() {
 async fn another_backend_is_noticed() {
     let (server, path) = recorded().await;
     let report = replay(&server, &path, &Cpu::new(1, Simd::Best).unwrap()).unwrap();
-    assert_eq!(report.changes.len(), 1);
+    assert_eq!(report.changes.len(), 2);
+    let detail = &report.changes[1];
+    assert_eq!((detail.what, &*detail.recorded), ("backend detail", ""));
+    assert!(
+        ["Avx512", "Avx2", "Sse4_2", "Neon", "Fallback"].contains(&&*detail.now),
+        "{}",
+        detail.now
+    );
     let change = &report.changes[0];
     assert_eq!((change.what, &*change.recorded, &*change.now), ("backend", "painter", "cpu"));
     assert_eq!(report.difference.unwrap().step, 1);

@@ -34,6 +34,8 @@ pub(crate) struct Painter {
     pub(crate) slow_ms: AtomicU64,
     /// Whether the next frame crashes.
     pub(crate) crash: AtomicBool,
+    /// Whether the next frame has too much in it.
+    pub(crate) too_many: AtomicBool,
     /// Frames begun.
     pub(crate) begun: AtomicU64,
 }
@@ -68,6 +70,9 @@ impl Backend for Painter {
         frame.check(targets)?;
         self.begun.fetch_add(1, Ordering::SeqCst);
         assert!(!self.crash.swap(false, Ordering::SeqCst), "a crash was asked for");
+        if self.too_many.swap(false, Ordering::SeqCst) {
+            return Err(RenderError::TooMany { what: "dots", limit: 1 });
+        }
         std::thread::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst)));
         for (k, (view, target)) in frame.views.iter().zip(targets).enumerate() {
             if let Some(rgb8) = target.rgb8.as_deref_mut() {

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
+import re
 import socket
+import struct
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 import wildcity.aio
-from conftest import frame
+from conftest import frame, vector
 from fake_server import HANG_UP, SEEN, SILENCE, FakeServer, observation
+from websockets.utils import accept_key
 from wildcity import (
     BadFrame,
     ConnectFailed,
@@ -23,6 +29,7 @@ from wildcity import (
     TimedOut,
     WildCityError,
 )
+from wildcity.protocol import PROTOCOL
 
 Connect = Callable[..., Any]
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
@@ -74,6 +81,51 @@ def test_a_request_that_json_cannot_say_is_not_sent(connect: Connect) -> None:
             client.open("street", seed=float("nan"))
         client.open("street").step(HERE)
     assert seqs(server.requests[0]) == [0, 1, 2]
+
+
+def test_a_server_that_does_not_read_ends_in_a_time_out(connect: Connect) -> None:
+    with deaf_server() as url:
+        client = connect(url, timeout=0.5)
+        asked = time.monotonic()
+        # Some 30 MB: more than the buffers of two sockets.
+        with pytest.raises(TimedOut):
+            client.open("x" * 30_000_000)
+        assert time.monotonic() - asked < 10.0
+
+
+@contextlib.contextmanager
+def deaf_server() -> Iterator[str]:
+    """Answers the upgrade and `hello`, and reads nothing after that."""
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        peer, _ = listener.accept()
+        request = b""
+        while b"\r\n\r\n" not in request:
+            request += peer.recv(4096)
+        (key,) = re.findall(rb"(?i)sec-websocket-key: (\S+)", request)
+        answer = (
+            "HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Accept: {accept_key(key.decode())}\r\n"
+            f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
+        )
+        peer.sendall(answer.encode())
+        peer.recv(4096)
+        welcome = json.dumps(vector("answers/welcome.json")).encode()
+        # A text frame of a two-byte length (RFC 6455, section 5.2).
+        peer.sendall(struct.pack(">BBH", 0x81, 126, len(welcome)) + welcome)
+        done.wait()
+        peer.close()
+
+    done = threading.Event()
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"ws://127.0.0.1:{listener.getsockname()[1]}/v1/session"
+    finally:
+        done.set()
+        thread.join()
+        listener.close()
 
 
 def test_a_fatal_error_ends_the_connection(connect: Connect) -> None:

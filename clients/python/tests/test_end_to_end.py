@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import re
 import subprocess
 import threading
 import time
@@ -92,6 +93,23 @@ def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
             assert summary.distance_m == pytest.approx(5.0)
 
 
+def test_the_example_of_the_front_page_runs(server: Server) -> None:
+    page = (Path(__file__).resolve().parents[3] / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    example = example.replace("ws://127.0.0.1:8080/v1/session", server.url)
+    example = example.replace('client.open("demo")', "client.open('corridor')")
+    example = example.replace("range(100)", "range(3)")
+    shapes = []
+
+    def my_agent(front: Any, seen: Observation) -> Pose:
+        shapes.append(front.shape)
+        x, y, z = seen.ego.pose.xyz
+        return Pose((x + 0.5, y, z), seen.ego.pose.q)
+
+    exec(example, {"my_agent": my_agent})
+    assert shapes == [(928, 1440, 3)] * 3
+
+
 def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:
     """Red wall on the left, green on the right; the rear camera sees them swapped."""
     with connect(server.url) as client:
@@ -160,7 +178,7 @@ def test_observe_does_not_move(connect: Connect, server: Server) -> None:
         ({"rig": PAIR, "outputs": Outputs(("left",))}, "unknown_camera", "outputs.cameras[0]"),
         ({"start": Station("nowhere")}, "unknown_trajectory", "start.trajectory"),
         ({"start": Pose(q=(2, 0, 0, 0))}, "pose_invalid", "start.pose.q"),
-        ({"seed": -1}, "invalid_request", None),
+        ({"seed": -1}, "invalid_request", "seed"),
     ],
 )
 def test_bad_openings_are_refused_and_cost_nothing(

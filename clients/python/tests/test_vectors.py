@@ -78,6 +78,38 @@ def test_answers_keep_everything(name: str) -> None:
     assert plain(answer) == golden
 
 
+@pytest.mark.parametrize("name", names("answers"))
+def test_unknown_fields_of_answers_are_ignored(name: str) -> None:
+    golden = vector(f"answers/{name}.json")
+    assert decode_answer(json.dumps(with_unknown_fields(golden))) == decode_answer(
+        json.dumps(golden)
+    )
+
+
+def test_unknown_fields_of_the_metadata_are_ignored() -> None:
+    data = frame("observations/raw.bin")
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    metadata = json.loads(header["__metadata__"]["observation"])
+    header["__metadata__"]["observation"] = json.dumps(with_unknown_fields(metadata))
+    text = json.dumps(header).encode()
+    more = len(text).to_bytes(8, "little") + text + data[8 + length :]
+    assert Observation(more).metadata == Observation(data).metadata
+
+
+def with_unknown_fields(value: Any) -> Any:
+    """With one more in every object but a profile, whose fields are all known as none is."""
+    if isinstance(value, list):
+        return [with_unknown_fields(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    fields = {
+        name: inner if name == "profile" else with_unknown_fields(inner)
+        for name, inner in value.items()
+    }
+    return {**fields, "since_next_year": [1, "x"]}
+
+
 @pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses"])
 def test_observations_decode_to_what_went_in(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")

@@ -1,6 +1,7 @@
 //! Session to wire.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use serde::Serialize;
 
@@ -10,11 +11,12 @@ use crate::protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
 use crate::protocol::observation::{Ego, Image, Observation, Stage, Timings};
-use crate::scene::{Manifest, Rig};
+use crate::scene::Rig;
 use crate::server::Limits as ServerLimits;
 use crate::server::fault::Fault;
 use crate::session::{
     DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, Session, Summary, TensorKind,
+    TrajectorySummary, TwinSummary,
 };
 use crate::store::Version;
 
@@ -26,7 +28,7 @@ pub(in crate::server) fn welcome(
     seq: u64,
     server: &ServerLimits,
     backend: &str,
-    twins: &[Version],
+    twins: &[Arc<TwinSummary>],
 ) -> Result<String, Fault> {
     let limits = Limits {
         message_bytes: config::INBOUND_MESSAGE_BYTES as u64,
@@ -46,7 +48,7 @@ pub(in crate::server) fn welcome(
         },
         limits,
         backend: backend.to_owned(),
-        twins: twins.iter().map(twin_info).collect(),
+        twins: twins.iter().map(|twin| twin_info(twin)).collect(),
     })
 }
 
@@ -76,7 +78,12 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
         deadline_ms: session.deadline().as_millis() as u64,
         cameras: session.cameras().iter().map(camera).collect(),
         outputs: message::Outputs { cameras: Some(names), encoding, quality, depth, opacity },
-        trajectories: trajectories(manifest),
+        trajectories: manifest
+            .trajectories
+            .iter()
+            .map(TrajectorySummary::of)
+            .map(trajectory_info)
+            .collect(),
         resident_bytes: resident.scene.bytes() as u64,
     })))
 }
@@ -121,8 +128,8 @@ pub(in crate::server) fn refusal_body(fault: &Fault) -> serde_json::Value {
 }
 
 /// The body of `GET /v1/twins`.
-pub(in crate::server) fn twins(versions: &[Version]) -> serde_json::Value {
-    serde_json::json!({ "twins": versions.iter().map(twin_info).collect::<Vec<_>>() })
+pub(in crate::server) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
+    serde_json::json!({ "twins": twins.iter().map(|twin| twin_info(twin)).collect::<Vec<_>>() })
 }
 
 /// Completes an observation: writes the header that says what its bytes are.
@@ -249,25 +256,20 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     }
 }
 
-fn twin_info(version: &Version) -> TwinInfo {
-    let Version { number, hash, manifest, .. } = version;
+fn twin_info(twin: &TwinSummary) -> TwinInfo {
     TwinInfo {
-        name: manifest.twin.clone(),
-        version: *number,
-        version_hash: hash.clone(),
-        gaussians: manifest.gaussians(),
-        sh_degree: manifest.sh_degree,
-        trajectories: trajectories(manifest),
+        name: twin.name.clone(),
+        version: twin.number,
+        version_hash: twin.hash.clone(),
+        gaussians: twin.gaussians,
+        sh_degree: twin.sh_degree,
+        trajectories: twin.trajectories.iter().cloned().map(trajectory_info).collect(),
     }
 }
 
-fn trajectories(manifest: &Manifest) -> Vec<TrajectoryInfo> {
-    let info = |log: &crate::scene::Trajectory| TrajectoryInfo {
-        name: log.name.clone(),
-        length_m: log.length_m(),
-        keyframes: log.keyframes.len() as u64,
-    };
-    manifest.trajectories.iter().map(info).collect()
+fn trajectory_info(log: TrajectorySummary) -> TrajectoryInfo {
+    let TrajectorySummary { name, length_m, keyframes } = log;
+    TrajectoryInfo { name, length_m, keyframes }
 }
 
 fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {

@@ -2,6 +2,7 @@
 
 use crate::geometry::PoseError;
 use crate::protocol::error::Code;
+use crate::render::RenderError;
 use crate::scene::rig::RigError;
 use crate::server::fault::Fault;
 use crate::session::SessionError;
@@ -12,7 +13,7 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
     let field = |text: &str| Some(text.to_owned());
     match fault {
         Fault::MalformedJson(_) | Fault::BrokenFrame(_) => (Code::MalformedJson, None),
-        Fault::InvalidRequest(_) => (Code::InvalidRequest, None),
+        Fault::InvalidRequest { field, .. } => (Code::InvalidRequest, field.clone()),
         Fault::UnexpectedBinary => (Code::UnexpectedBinary, None),
         Fault::MessageTooLarge { .. } => (Code::MessageTooLarge, None),
         Fault::SeqOutOfOrder { .. } => (Code::SeqOutOfOrder, field("seq")),
@@ -22,19 +23,19 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
         Fault::UnknownSession { .. } => (Code::UnknownSession, field("session")),
         Fault::SessionExists { .. } => (Code::SessionExists, field("session")),
         Fault::InvalidName { field, .. } => (Code::InvalidName, Some(field.clone())),
-        Fault::Pose { field, source } => {
-            let code = match source {
+        Fault::Pose { field, cause } => {
+            let code = match cause {
                 PoseError::NotFinite { .. } => Code::PoseNotFinite,
                 PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
             };
-            (code, Some(format!("{field}.{}", source.field())))
+            (code, Some(format!("{field}.{}", cause.field())))
         }
         Fault::NotFinite { field } => (Code::PoseNotFinite, Some(field.clone())),
-        Fault::Camera { field, source } => {
-            (Code::CameraInvalid, Some(format!("{field}.{}", source.field())))
+        Fault::Camera { field, cause } => {
+            (Code::CameraInvalid, Some(format!("{field}.{}", cause.field())))
         }
-        Fault::Rig { field, source } => {
-            let code = match source {
+        Fault::Rig { field, cause } => {
+            let code = match cause {
                 RigError::Count { .. } => Code::OutOfRange,
                 RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
                 RigError::Camera { .. } => Code::CameraInvalid,
@@ -69,7 +70,9 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
             (Code::UnknownTrajectory, field("start.trajectory"))
         }
         SessionError::OutOfRange { field, .. } => (Code::OutOfRange, Some((*field).to_owned())),
-        SessionError::AnswerTooLarge { .. } => (Code::AnswerTooLarge, None),
+        SessionError::AnswerTooLarge { .. } | SessionError::Render(RenderError::TooMany { .. }) => {
+            (Code::AnswerTooLarge, None)
+        }
         SessionError::EpisodeOver { .. } => (Code::SessionState, None),
         SessionError::Busy { .. } => (Code::Busy, None),
         SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),

@@ -8,6 +8,7 @@ use crate::config;
 use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, Pose};
 use crate::protocol::message::{self, Request};
+use crate::protocol::unknown_field;
 use crate::scene::rig::{Rig, RigCamera, is_name};
 use crate::server::fault::Fault;
 use crate::session::{Encoding, Opening, Outputs, RigChoice, Start};
@@ -16,11 +17,16 @@ use super::SUBPROTOCOL;
 
 /// A text frame, checked as far as it can be on its own.
 #[derive(Debug)]
-pub(in crate::server) struct Parsed {
-    /// Its number, if it could be read.
-    pub(in crate::server) seq: Option<u64>,
-    /// What is wanted, or why it is refused.
-    pub(in crate::server) command: Result<Command, Fault>,
+pub(in crate::server) enum Parsed {
+    /// A request, or something with the number of one.
+    Numbered {
+        /// Its number.
+        seq: u64,
+        /// What is wanted, or why it is refused.
+        command: Result<Command, Fault>,
+    },
+    /// Its number could not be read.
+    Unnumbered(Fault),
 }
 
 /// What a client wants.
@@ -72,26 +78,81 @@ pub(in crate::server) enum Command {
 pub(in crate::server) fn parse(text: &str) -> Parsed {
     use serde_json::error::Category;
     let error = match serde_json::from_str::<Request>(text) {
-        Ok(request) => {
-            let (seq, command) = convert(request);
-            return Parsed { seq: Some(seq), command };
-        }
+        Ok(request) => return checked(text, request),
         Err(error) => error,
     };
     if let Some((seq, field)) = not_finite(text) {
-        return Parsed { seq, command: Err(Fault::NotFinite { field }) };
+        return Parsed::refused(seq, Fault::NotFinite { field });
     }
     // An error of the data stops the parser: the rest may still not be JSON.
     let rest = serde_json::from_str::<serde::de::IgnoredAny>(text).err();
     match (error.classify(), rest) {
-        (Category::Data, None) => {
-            Parsed { seq: seq_of(text), command: Err(Fault::InvalidRequest(error.to_string())) }
-        }
+        (Category::Data, None) => Parsed::refused(seq_of(text), invalid(text, &error)),
         (_, rest) => {
             let reason = rest.unwrap_or(error).to_string();
-            Parsed { seq: None, command: Err(Fault::MalformedJson(reason)) }
+            Parsed::Unnumbered(Fault::MalformedJson(reason))
         }
     }
+}
+
+impl Parsed {
+    fn refused(seq: Option<u64>, fault: Fault) -> Self {
+        match seq {
+            Some(seq) => Self::Numbered { seq, command: Err(fault) },
+            None => Self::Unnumbered(fault),
+        }
+    }
+}
+
+/// A request, unless it says more than was understood.
+fn checked(text: &str, request: Request) -> Parsed {
+    let unknown = serde_json::from_str(text)
+        .and_then(|sent| Ok(unknown_field(&sent, &serde_json::to_value(&request)?)));
+    let (seq, command) = convert(request);
+    let command = match unknown {
+        Ok(None) => command,
+        Ok(Some(field)) => {
+            let reason = format!("there is no field {field}");
+            Err(Fault::InvalidRequest { field: Some(field), reason })
+        }
+        Err(error) => Err(Fault::Internal(error.to_string())),
+    };
+    Parsed::Numbered { seq, command }
+}
+
+/// What is wrong with something that is JSON but no request.
+fn invalid(text: &str, error: &serde_json::Error) -> Fault {
+    // Behind the tag `type` serde forgets where it was, so that every field is read once more.
+    let deserializer = &mut serde_json::Deserializer::from_str(text);
+    match serde_path_to_error::deserialize::<_, Fields>(deserializer) {
+        Err(found) if found.path().iter().next().is_some() => {
+            let (field, reason) = (found.path().to_string(), found.inner());
+            Fault::InvalidRequest { reason: format!("{field}: {reason}"), field: Some(field) }
+        }
+        _ => Fault::InvalidRequest { field: None, reason: error.to_string() },
+    }
+}
+
+/// Every field of any request.
+#[derive(Deserialize)]
+#[expect(dead_code, reason = "read for the path to a mistake, not for the values")]
+struct Fields {
+    seq: Option<u64>,
+    client: Option<message::ClientInfo>,
+    protocols: Option<Vec<String>>,
+    twin: Option<String>,
+    version: Option<u64>,
+    session: Option<String>,
+    seed: Option<u64>,
+    start: Option<message::Start>,
+    rig: Option<message::RigChoice>,
+    outputs: Option<message::Outputs>,
+    dt_us: Option<i64>,
+    deadline_ms: Option<u64>,
+    pose: Option<message::Pose>,
+    poses: Option<Vec<message::Pose>>,
+    terminate: Option<bool>,
+    last_seq: Option<u64>,
 }
 
 fn convert(request: Request) -> (u64, Result<Command, Fault>) {
@@ -181,12 +242,12 @@ fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
             Ok(RigCamera {
                 name: name_of(&format!("{field}.name"), name)?,
                 rig_from_camera: pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?,
-                camera: camera.map_err(|source| Fault::Camera { field, source })?,
+                camera: camera.map_err(|cause| Fault::Camera { field, cause })?,
             })
         })
         .collect::<Result<_, Fault>>()?;
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };
-    rig.check().map_err(|source| Fault::Rig { field: "rig.cameras".to_owned(), source })?;
+    rig.check().map_err(|cause| Fault::Rig { field: "rig.cameras".to_owned(), cause })?;
     Ok(rig)
 }
 
@@ -195,7 +256,7 @@ fn name_of(field: &str, name: String) -> Result<String, Fault> {
 }
 
 fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
-    Pose::checked(pose.xyz, pose.q).map_err(|source| Fault::Pose { field: field.into(), source })
+    Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
 }
 
 /// The number of something that has one but is no request.
@@ -282,16 +343,22 @@ mod tests {
             format!(r#"{{"type":"step","seq":3,"pose":{{"xyz":[0,{x},0],"q":[1,0,0,0]}}}}"#)
         };
         for x in ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "null"] {
-            let Parsed { seq, command } = parse(&step(x));
-            assert_eq!(seq, Some(3), "{x}");
+            let Parsed::Numbered { seq: 3, command } = parse(&step(x)) else { panic!("{x}") };
             let field = field_of(command);
             assert_eq!(field, "pose.xyz[1]", "{x}");
         }
-        assert!(parse(&step("1e308")).command.is_err(), "too far");
-        assert!(parse(&step("1.5")).command.is_ok());
+        assert!(command(&step("1e308")).is_err(), "too far");
+        assert!(command(&step("1.5")).is_ok());
         for x in ["nope", "\"1\"", "1e", "[1]"] {
-            let fault = parse(&step(x)).command.unwrap_err();
+            let fault = command(&step(x)).unwrap_err();
             assert!(!matches!(fault, Fault::NotFinite { .. }), "{x}: {fault}");
+        }
+    }
+
+    fn command(text: &str) -> Result<Command, Fault> {
+        match parse(text) {
+            Parsed::Numbered { command, .. } => command,
+            Parsed::Unnumbered(fault) => Err(fault),
         }
     }
 
@@ -307,10 +374,10 @@ mod tests {
         let unit = r#"{"xyz":[0,0,0],"q":[1,0,0,0]}"#;
         let bad = r#"{"xyz":[0,0,0],"q":[1,0,NaN,0]}"#;
         let observe = format!(r#"{{"type":"observe","seq":0,"poses":[{unit},{bad}]}}"#);
-        assert_eq!(field_of(parse(&observe).command), "poses[1].q[2]");
+        assert_eq!(field_of(command(&observe)), "poses[1].q[2]");
         let camera = format!(r#"{{"name":"NaN \" NaN","camera_to_rig":{bad}}}"#);
         let open = format!(r#"{{"type":"open","seq":1,"rig":{{"cameras":[{camera}]}}}}"#);
-        assert_eq!(field_of(parse(&open).command), "rig.cameras[0].camera_to_rig.q[2]");
+        assert_eq!(field_of(command(&open)), "rig.cameras[0].camera_to_rig.q[2]");
     }
 
     #[test]
@@ -323,7 +390,7 @@ mod tests {
 
     #[test]
     fn deep_nesting_is_malformed() {
-        let fault = parse(&"[".repeat(100_000)).command.unwrap_err();
+        let fault = command(&"[".repeat(100_000)).unwrap_err();
         assert!(matches!(fault, Fault::MalformedJson(_)), "{fault}");
     }
 }

@@ -11,7 +11,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as dial
 from websockets.exceptions import WebSocketException
 
-from .core import DIAL, Conversation, Exchange, keeps_connection, translated
+from .core import DIAL, Conversation, Exchange, Message, keeps_connection, translated
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -121,8 +121,7 @@ class Client:
             raise Disconnected("there is no connection, or a call is under way on it")
         keep = False
         try:
-            await connection.send(request)
-            exchange.send(await asyncio.wait_for(connection.recv(), self.timeout))
+            exchange.send(await asyncio.wait_for(_answer(connection, request), self.timeout))
         except StopIteration as done:
             keep = True
             result: T = done.value
@@ -140,6 +139,11 @@ class Client:
                 # No closing handshake: this may be a cancellation, which must not wait.
                 connection.transport.abort()
         raise AssertionError("an exchange is one message each way")
+
+
+async def _answer(connection: ClientConnection, request: str) -> Message:
+    await connection.send(request)
+    return await connection.recv()
 
 
 class Session:

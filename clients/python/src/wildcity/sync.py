@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import TypeVar
 
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as dial
 
-from .core import DIAL, Conversation, Exchange, keeps_connection, translated
+from .core import DIAL, Conversation, Exchange, Message, keeps_connection, translated
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -122,8 +125,7 @@ class Client:
             raise Disconnected("there is no connection, or a call is under way on it")
         keep = False
         try:
-            connection.send(request)
-            exchange.send(connection.recv(timeout=self.timeout))
+            exchange.send(self._answer(connection, request))
         except StopIteration as done:
             keep = True
             result: T = done.value
@@ -140,6 +142,22 @@ class Client:
             else:
                 connection.close()
         raise AssertionError("an exchange is one message each way")
+
+
+    def _answer(self, connection: ClientConnection, request: str) -> Message:
+        deadline = time.monotonic() + self.timeout
+        # Sending has no time-out of its own: a server that does not read would hold it for ever.
+        hang_up = threading.Timer(self.timeout, connection.socket.shutdown, (socket.SHUT_RDWR,))
+        hang_up.start()
+        try:
+            connection.send(request)
+        except ConnectionClosed as error:
+            if time.monotonic() >= deadline:
+                raise TimeoutError from error
+            raise
+        finally:
+            hang_up.cancel()
+        return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
 
 
 class Session:
