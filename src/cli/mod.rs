@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 mod bench;
 mod demo;
+mod devices;
 mod import;
 mod inspect;
 mod output;
@@ -35,6 +36,7 @@ enum Command {
     Render(render::Render),
     Replay(replay::Replay),
     Bench(bench::Bench),
+    Devices(devices::Devices),
 }
 
 /// Parses the command line, runs, and tells how it went: 0 done, 1 failed, 2 not understood.
@@ -49,6 +51,7 @@ pub fn main() -> ExitCode {
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Bench(command) => command.run(),
+        Command::Devices(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -8,6 +8,7 @@ use crate::config;
 use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::cpu::{Cpu, Simd};
+use crate::render::gpu::{AdapterChoice, Gpu};
 use crate::render::reference::Reference;
 use crate::render::{Backend, View};
 use crate::residency::Cache;
@@ -52,6 +53,11 @@ pub(super) struct Engine {
     #[arg(long, default_value_t = 0, value_parser = threads)]
     threads: usize,
 
+    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name; the fastest
+    /// kind if not given.
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<String>,
+
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
     simd: SimdName,
@@ -60,9 +66,11 @@ pub(super) struct Engine {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// The fastest of this machine.
+    /// cpu: the gpu backend waits to be asked for until it has run on hardware.
     #[default]
     Auto,
+    /// wgpu on Vulkan, `--device`.
+    Gpu,
     /// f32, SIMD, all cores.
     Cpu,
     /// f64 by definition: slow.
@@ -100,6 +108,10 @@ impl Engine {
         Ok(match self.backend {
             BackendName::Auto | BackendName::Cpu => {
                 Box::new(Cpu::new(self.threads, self.simd.into())?)
+            }
+            BackendName::Gpu => {
+                let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
+                Box::new(Gpu::new(&choice, self.threads)?)
             }
             BackendName::Reference => Box::new(Reference),
         })

@@ -5,6 +5,7 @@
 
 pub mod constants;
 pub mod cpu;
+pub mod gpu;
 pub mod layout;
 pub mod reference;
 
@@ -102,6 +103,14 @@ pub enum RenderError {
         what: &'static str,
         /// How many fit.
         limit: u64,
+    },
+    /// The device failed. It is opened anew for the next frame.
+    #[error("{device} failed: {reason}")]
+    Device {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        reason: String,
     },
 }
 

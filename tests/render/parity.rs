@@ -1,29 +1,16 @@
 //! cpu against reference: f32 and tiles against f64 and none.
 
 use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
 use wildcity::ingest;
 use wildcity::render::View;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::render::reference::Reference;
-use wildcity::scene::{Gaussians, RenderProfile, Rig, Scene};
+use wildcity::scene::{Gaussians, RenderProfile, Scene};
 
 use crate::data::real;
 use crate::images::{agree, cpu, look, render, render_one};
 use crate::scene_files::gaussians;
-use crate::streets::street;
-
-/// Views from within a street: along it, across it, and back.
-fn street_views() -> [View; 3] {
-    let at = DVec3::new(0.4, 0.0, 20.0);
-    [
-        look([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
-        look([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
-        look([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
-    ]
-}
+use crate::streets::{demo_street, street, street_views};
 
 /// Compares all views, and returns the least agreement in dB.
 fn compare(scene: &Gaussians, profile: &RenderProfile, views: &[View]) -> f64 {
@@ -73,23 +60,8 @@ fn a_cloud_around_the_camera() {
 fn the_demo_street_from_its_own_cameras() {
     // Coplanar surfels in thousands: where two depths differ by less than f32 tells, the backends
     // may draw them in another order.
-    let street = generate::street(&StreetSettings::default()).unwrap();
-    let rig = Rig::preset("vehicle6").unwrap();
-    let world_from_rig = street.trajectory.at_station(60.0);
-    let view = |name: &str| {
-        let mounted = rig.cameras.iter().find(|camera| camera.name == name).unwrap();
-        let p = mounted.camera.pinhole;
-        let eighth = |c: f64| c / 8.0;
-        let pinhole =
-            Pinhole { fx: eighth(p.fx), fy: eighth(p.fy), cx: eighth(p.cx), cy: eighth(p.cy) };
-        let (width_px, height_px) = (mounted.camera.width_px / 8, mounted.camera.height_px / 8);
-        View {
-            camera: Camera { width_px, height_px, pinhole },
-            world_from_camera: world_from_rig * mounted.rig_from_camera,
-        }
-    };
-    let views = [view("front"), view("left")];
-    compare(&street.gaussians, &RenderProfile::default(), &views);
+    let (street, views) = demo_street();
+    compare(&street, &RenderProfile::default(), &views);
 }
 
 #[test]
