@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::render::{Frame, FrameStats, Target, View};
+use crate::render::{Backend, Frame, FrameStats, Target, View};
 
 use super::progress;
 use super::scene_source::SceneSource;
@@ -24,7 +24,8 @@ enum What {
 
 /// Time one step: all cameras of the list in one frame, to 8-bit colour.
 ///
-/// Reports the median of the repeats, after one that is not counted, per stage; (Gaussian, view)
+/// Reports the median and the extremes of the repeats, after one that is not counted, and medians
+/// per stage; (Gaussian, view)
 /// pairs that are visible, (Gaussian, tile) pairs after binning, and Gaussian-pixel evaluations.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
@@ -86,17 +87,21 @@ impl Step {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        self.report(&ready.scene, &views, ready.backend.name(), &runs)
+        self.report(&ready.scene, &views, &*ready.backend, &runs)
     }
 
     fn report(
         &self,
         scene: &crate::scene::Scene,
         views: &[View],
-        backend: &str,
+        backend: &dyn Backend,
         runs: &[(f64, FrameStats)],
     ) -> anyhow::Result<()> {
-        let step_ms = median(runs.iter().map(|(step_ms, _)| *step_ms));
+        let steps_ms = || runs.iter().map(|(step_ms, _)| *step_ms);
+        let step_ms = median(steps_ms());
+        let (min_ms, max_ms) =
+            (steps_ms().fold(step_ms, f64::min), steps_ms().fold(step_ms, f64::max));
+        let (name, simd, threads) = (backend.name(), backend.detail(), backend.threads());
         let (_, stats) = &runs[0];
         let stages: Vec<(&str, f64)> = (0..stats.stages_ms.len())
             .map(|k| (stats.stages_ms[k].0, median(runs.iter().map(|(_, s)| s.stages_ms[k].1))))
@@ -107,7 +112,9 @@ impl Step {
             let stages: serde_json::Map<_, _> =
                 stages.iter().map(|(name, ms)| (name.to_string(), json!(ms))).collect();
             let report = json!({
-                "backend": backend,
+                "backend": name,
+                "simd": simd,
+                "threads": threads,
                 "gaussians": scene.gaussians(),
                 "sh_degree": scene.sh_degree(),
                 "resident_bytes": scene.bytes(),
@@ -115,6 +122,8 @@ impl Step {
                 "pixels": pixels,
                 "repeat": self.repeat,
                 "step_ms": step_ms,
+                "step_ms_min": min_ms,
+                "step_ms_max": max_ms,
                 "stages_ms": stages,
                 "visible_pairs": stats.visible_pairs,
                 "instances": stats.instances,
@@ -125,7 +134,7 @@ impl Step {
         }
         writeln!(
             out,
-            "{} Gaussians, {} cameras, {pixels} px, {backend}",
+            "{} Gaussians, {} cameras, {pixels} px, {name} {simd}, {threads} threads",
             scene.gaussians(),
             views.len()
         )?;
@@ -135,7 +144,11 @@ impl Step {
         for (name, ms) in stages {
             writeln!(out, "{name:<14} {ms:>11.1} ms")?;
         }
-        writeln!(out, "{:<14} {step_ms:>11.1} ms   (median of {})", "step", self.repeat)?;
+        writeln!(
+            out,
+            "{:<14} {step_ms:>11.1} ms   (median of {}, from {min_ms:.1} to {max_ms:.1})",
+            "step", self.repeat
+        )?;
         Ok(())
     }
 }

@@ -2,14 +2,12 @@
 
 mod mosaic;
 
-use std::fs;
 use std::io::{self, ErrorKind, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::Context;
 use serde_json::json;
 
 use crate::client::{Client, Observation, Open, Pose};
@@ -20,8 +18,8 @@ use crate::server::{self, Limits};
 use crate::store::{Catalog, NewVersion, StoreError, Version};
 
 use super::places::Twins;
-use super::progress;
 use super::scene_source::Engine;
+use super::{output, progress};
 
 /// Drive through the demo twin and look at the pictures.
 ///
@@ -65,7 +63,7 @@ impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
         let version = demo_twin(&twins)?;
-        fs::create_dir_all(&self.out).with_context(|| format!("{}", self.out.display()))?;
+        output::make_dir(&self.out)?;
         let config = server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             twins,
@@ -125,7 +123,7 @@ impl Demo {
             "mosaics": drive.mosaics,
         });
         let path = self.out.join("report.json");
-        fs::write(&path, format!("{report:#}\n")).with_context(|| format!("{}", path.display()))?;
+        output::write(&path, format!("{report:#}\n").as_bytes())?;
         let mut out = io::stdout().lock();
         writeln!(
             out,
@@ -226,7 +224,7 @@ fn built(
         Ok(version) => version,
         Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
         Err(StoreError::Damaged { .. } | StoreError::Format { .. }) => return Ok(Err(DAMAGED)),
-        Err(StoreError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {
+        Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
             return Ok(Err(DAMAGED));
         }
         Err(error) => return Err(error.into()),

@@ -1,7 +1,6 @@
 //! `wildcity import`.
 
-use std::fs::File;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -106,6 +105,10 @@ impl Import {
         let (mut gaussians, source) = read.with_context(cannot)?;
         axes.apply(&mut gaussians);
         bar.finish_and_clear();
+        if gaussians.is_empty() {
+            let source = self.source.display();
+            writeln!(std::io::stderr(), "warning: {source} holds no Gaussians: nothing to see")?;
+        }
 
         let bar = progress::count("writing");
         let new = NewVersion {
@@ -170,15 +173,11 @@ fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
 }
 
 fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let cannot = || format!("cannot read {}", path.display());
-    let file = File::open(path).with_context(cannot)?;
-    let mut text = Vec::new();
-    file.take(config::SETTINGS_FILE_BYTES + 1).read_to_end(&mut text).with_context(cannot)?;
-    let limit = config::SETTINGS_FILE_BYTES;
-    anyhow::ensure!(text.len() as u64 <= limit, "{} is above {limit} bytes", path.display());
+    let text = ingest::read_whole(path, config::SETTINGS_FILE_BYTES);
+    let text = text.with_context(|| format!("{}", path.display()))?;
     // serde would take a list for the object's values in order, and count them.
     if text.trim_ascii_start().first() == Some(&b'[') {
         anyhow::bail!("{} is a JSON list; one object is read: see --help", path.display());
     }
-    serde_json::from_slice(&text).with_context(cannot)
+    serde_json::from_slice(&text).with_context(|| format!("cannot read {}", path.display()))
 }

@@ -7,6 +7,7 @@ mod demo;
 mod devices;
 mod import;
 mod inspect;
+mod output;
 mod places;
 mod progress;
 mod render;

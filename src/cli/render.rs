@@ -1,6 +1,5 @@
 //! `wildcity render`.
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
@@ -10,8 +9,8 @@ use crate::config;
 use crate::render::{Frame, Target};
 use crate::session;
 
-use super::progress;
 use super::scene_source::{SceneSource, Shot};
+use super::{output, progress};
 
 /// Render cameras of a file to images.
 ///
@@ -50,7 +49,7 @@ enum Format {
 impl Render {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
-        fs::create_dir_all(&self.out).with_context(|| format!("{}", self.out.display()))?;
+        output::make_dir(&self.out)?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
         let mut out = io::stdout().lock();
@@ -76,8 +75,8 @@ impl Render {
             };
             ready.backend.render(&frame, &mut [target], &|_, _| {})?;
             let file = self.format.file(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
-            file.and_then(|file| Ok(fs::write(&path, file)?))
-                .with_context(|| format!("cannot write {}", path.display()))?;
+            let file = file.with_context(|| format!("cannot write {}", path.display()))?;
+            output::write(&path, &file)?;
             bar.inc(1);
             writeln!(out, "{}", path.display())?;
         }

@@ -1,6 +1,5 @@
 //! `wildcity replay`.
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -11,8 +10,8 @@ use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
 use crate::store::Catalog;
 
 use super::places::Twins;
-use super::progress;
 use super::scene_source::Engine;
+use super::{output, progress};
 
 /// Show a recorded episode, render it again, and compare every frame.
 ///
@@ -25,7 +24,8 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again and fail with exit code 1 if one differs; without --out, at once.
+    /// Render every frame again and fail with exit code 1 if one differs (without --out, at once) or
+    /// the recording is incomplete.
     #[arg(long)]
     verify: bool,
 
@@ -55,7 +55,7 @@ impl Replay {
             return Ok(());
         }
         if let Some(dir) = &self.out {
-            fs::create_dir_all(dir).with_context(|| format!("{}", dir.display()))?;
+            output::make_dir(dir)?;
         }
         let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
         let header = &recording.header;
@@ -81,14 +81,20 @@ impl Replay {
         match &report.difference {
             None => {
                 writeln!(out, "verified    {} images, all as recorded", report.images)?;
-                Ok(())
             }
             Some(difference) if self.verify => anyhow::bail!("differs at {difference}"),
             Some(difference) => {
                 writeln!(out, "differs     {difference}")?;
-                Ok(())
             }
         }
+        // Nothing, or the beginning of something, is no proof of the whole.
+        let missing = match (recording.frames.is_empty(), &recording.end) {
+            (true, _) => "has no frames",
+            (false, None) => "has no end: the episode still runs, or was cut off",
+            (false, Some(_)) => return Ok(()),
+        };
+        anyhow::ensure!(!self.verify, "the recording is incomplete: it {missing}");
+        Ok(())
     }
 }
 
@@ -125,6 +131,5 @@ fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
     let (width, height) = (camera.camera.width_px, camera.camera.height_px);
     let file = session::png(rgb8, width, height).map_err(anyhow::Error::msg);
-    file.and_then(|file| Ok(fs::write(&path, file)?))
-        .with_context(|| format!("cannot write {}", path.display()))
+    output::write(&path, &file.with_context(|| format!("cannot write {}", path.display()))?)
 }

@@ -163,7 +163,8 @@ impl SceneSource {
 
     fn scene(&self) -> anyhow::Result<(Scene, RenderProfile)> {
         let path = Path::new(&self.scene);
-        if path.is_file() {
+        // A pipe or a device too, so that it is refused as one; a directory may share a twin's name.
+        if path.exists() && !path.is_dir() {
             let bar = progress::bytes("reading");
             let gaussians = ingest::read(path, &mut progress::show(&bar))
                 .with_context(|| format!("{}", path.display()))?;

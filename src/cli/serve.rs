@@ -8,6 +8,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::config;
 use crate::server::{self, Limits};
+use crate::store::Catalog;
 
 use super::places::{Episodes, Twins};
 use super::scene_source::Engine;
@@ -26,7 +27,7 @@ pub(super) struct Serve {
     episodes: Episodes,
 
     /// Loopback address and port to listen on; port 0 takes a free one.
-    #[arg(long, value_name = "ADDR", default_value = config::LISTEN)]
+    #[arg(long, value_name = "ADDR", default_value = config::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
     #[command(flatten)]
@@ -52,9 +53,19 @@ impl Serve {
             .with_writer(io::stderr)
             .with_ansi(io::stderr().is_terminal())
             .init();
+        let twins = self.twins.dir()?;
+        anyhow::ensure!(
+            !twins.exists() || twins.is_dir(),
+            "--twins {} is not a directory",
+            twins.display()
+        );
+        if Catalog::open(&twins)?.twins()?.is_empty() {
+            let dir = twins.display();
+            tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
+        }
         let config = server::Config {
             listen: self.listen,
-            twins: self.twins.dir()?,
+            twins,
             episodes: self.episodes.dir()?,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits::default(),
@@ -72,4 +83,8 @@ impl Serve {
             Ok(())
         })
     }
+}
+
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an address and a port, as 127.0.0.1:8080".to_owned())
 }

@@ -57,7 +57,7 @@ impl Connection {
         seq: u64,
         patience: Duration,
     ) -> Result<Incoming, ClientError> {
-        let text = serde_json::to_string(request)?;
+        let text = serde_json::to_string(request).map_err(ClientError::Request)?;
         let both_ways = async {
             let sent = self.socket.send(Message::text(text)).await;
             // A server that closes says why first, and that outlives the failure to send.
@@ -88,7 +88,9 @@ impl Connection {
         loop {
             match self.socket.next().await {
                 Some(Ok(Message::Text(text))) => {
-                    return Ok(Incoming::Answer(serde_json::from_str(&text)?));
+                    return Ok(Incoming::Answer(
+                        serde_json::from_str(&text).map_err(ClientError::Answer)?,
+                    ));
                 }
                 Some(Ok(Message::Binary(frame))) => return decode(frame),
                 Some(Ok(Message::Close(Some(close)))) => {
@@ -106,7 +108,8 @@ impl Connection {
 }
 
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
-    Ok(Incoming::Observation(Box::new(Observation::decode(frame)?)))
+    let seen = Observation::decode(frame).map_err(ClientError::Frame)?;
+    Ok(Incoming::Observation(Box::new(seen)))
 }
 
 impl Incoming {

@@ -51,12 +51,15 @@ pub enum ClientError {
         /// The answer's.
         got: Option<u64>,
     },
+    /// The request cannot be written as JSON.
+    #[error("cannot write the request: {0}")]
+    Request(serde_json::Error),
     /// A text frame is no answer; the connection was given up.
     #[error("cannot read an answer: {0}")]
-    Answer(#[from] serde_json::Error),
+    Answer(serde_json::Error),
     /// A binary frame is no observation; the connection was given up.
     #[error("cannot read an observation: {0}")]
-    Frame(#[from] FrameError),
+    Frame(FrameError),
 }
 
 /// Why a binary frame is not an observation.
@@ -72,13 +75,13 @@ pub enum FrameError {
     },
     /// Not safetensors: truncated, no JSON, tensors that overlap or reach beyond the end.
     #[error("not in safetensors layout: {0}")]
-    Layout(#[from] SafeTensorError),
+    Layout(SafeTensorError),
     /// `__metadata__` has no `observation`.
     #[error("the header's __metadata__ has no observation")]
     NoObservation,
     /// `__metadata__.observation` is not what the protocol says.
     #[error("cannot read __metadata__.observation: {0}")]
-    Observation(#[from] serde_json::Error),
+    Observation(serde_json::Error),
     /// A tensor is missing.
     #[error("there is no tensor {name:?}")]
     Missing {
@@ -96,12 +99,12 @@ pub enum FrameError {
         expected: String,
     },
     /// A JPEG or PNG file cannot be decoded.
-    #[error("image {name:?}: {source}")]
+    #[error("image {name:?}: {cause}")]
     Image {
         /// The tensor.
         name: String,
         /// What the decoder says.
-        source: image::ImageError,
+        cause: image::ImageError,
     },
     /// Pixels, or hashes, do not have the hash that the observation names.
     #[error("{name:?} hashes to {found}, not to {expected}")]

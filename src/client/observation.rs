@@ -41,9 +41,11 @@ impl Observation {
     pub fn decode(frame: impl Into<Bytes>) -> Result<Self, FrameError> {
         let frame = frame.into();
         check_header_length(&frame)?;
-        let (header_bytes, tensors) = SafeTensors::read_metadata(&frame)?;
+        let (header_bytes, tensors) =
+            SafeTensors::read_metadata(&frame).map_err(FrameError::Layout)?;
         let text = tensors.metadata().as_ref().and_then(|m| m.get("observation"));
-        let metadata = serde_json::from_str(text.ok_or(FrameError::NoObservation)?)?;
+        let metadata = serde_json::from_str(text.ok_or(FrameError::NoObservation)?)
+            .map_err(FrameError::Observation)?;
         let data_start = size_of::<u64>() + header_bytes;
         let observation = Self { metadata, tensors, data_start, frame };
         observation.check()?;
@@ -186,7 +188,7 @@ impl<'a> ImageView<'a> {
         limits.max_image_height = u32::try_from(*height).ok();
         reader.limits(limits);
         let image =
-            reader.decode().map_err(|source| FrameError::Image { name: name.clone(), source })?;
+            reader.decode().map_err(|cause| FrameError::Image { name: name.clone(), cause })?;
         if (u64::from(image.width()), u64::from(image.height())) != (*width, *height) {
             let found = format!("an image of {}x{} px", image.width(), image.height());
             let expected = format!("{width}x{height} px");

@@ -21,7 +21,7 @@ pub struct Pose {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PoseError {
     /// A component is NaN or infinite.
-    #[error("{field} is {value}; a pose needs finite numbers")]
+    #[error("{field} is {value:?}; a pose needs finite numbers")]
     NotFinite {
         /// Which component, as `xyz[0]` or `q[3]`.
         field: &'static str,
@@ -29,13 +29,13 @@ pub enum PoseError {
         value: f64,
     },
     /// The quaternion's length is too far from one to be a rotation.
-    #[error("q has length {length}; a rotation needs a unit quaternion (w, x, y, z)")]
+    #[error("q has length {length:?}; a rotation needs a unit quaternion (w, x, y, z)")]
     NotARotation {
         /// Euclidean length of (w, x, y, z).
         length: f64,
     },
     /// Farther from the origin than any twin reaches.
-    #[error("{field} is {value} m; at most {limit_m} m from the twin's origin is accepted")]
+    #[error("{field} is {value:?} m; at most {limit_m:?} m from the twin's origin is accepted")]
     TooFar {
         /// Which component, as `xyz[0]`.
         field: &'static str,

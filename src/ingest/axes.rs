@@ -49,13 +49,16 @@ impl Axes {
     /// # Errors
     /// [`IngestError::Frame`] if the rows are not of unit length and at right angles.
     pub fn from_rows(rows: [[f64; 3]; 3]) -> Result<Self, IngestError> {
+        Self::orthonormal(rows).ok_or_else(|| stretched(format!("{rows:?}")))
+    }
+
+    /// `None` if the rows are not of unit length and at right angles.
+    fn orthonormal(rows: [[f64; 3]; 3]) -> Option<Self> {
         let given = DMat3::from_cols_array_2d(&rows).transpose();
         let error = given * given.transpose() - DMat3::IDENTITY;
         let is_orthonormal = error.to_cols_array().iter().all(|e| e.abs() <= Self::MAX_ERROR);
         if !is_orthonormal {
-            let reason = "the rows of the matrix must be of length 1 and at right angles; \
-                          lengths belong into --scale";
-            return Err(frame_error("--axes", format!("{rows:?}"), reason.into()));
+            return None;
         }
         // Gram-Schmidt, so that what four digits left over does not stretch the scene.
         let [x, y, z] = rows.map(DVec3::from_array);
@@ -63,7 +66,7 @@ impl Axes {
         let y = (y - x * x.dot(y)).normalize();
         let z_right = x.cross(y);
         let z = z_right * z_right.dot(z).signum();
-        Ok(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
+        Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
     }
 
     /// The same axes with a unit of so many metres.
@@ -73,7 +76,7 @@ impl Axes {
     pub fn scaled(self, metres_per_unit: f64) -> Result<Self, IngestError> {
         if !(1e-6..=1e6).contains(&metres_per_unit) {
             let reason = "a scale is from 1e-6 to 1e6 metres per unit".to_owned();
-            return Err(frame_error("--scale", metres_per_unit.to_string(), reason));
+            return Err(frame_error("--scale", format!("{metres_per_unit:?}"), reason));
         }
         Ok(Self { metres_per_unit, ..self })
     }
@@ -126,7 +129,10 @@ impl FromStr for Axes {
         let words = text.split([',', ' ']).filter(|word| !word.is_empty());
         let numbers: Result<Vec<f64>, _> = words.map(str::parse).collect();
         match numbers.as_deref() {
-            Ok(&[a, b, c, d, e, f, g, h, i]) => Self::from_rows([[a, b, c], [d, e, f], [g, h, i]]),
+            Ok(&[a, b, c, d, e, f, g, h, i]) => {
+                Self::orthonormal([[a, b, c], [d, e, f], [g, h, i]])
+                    .ok_or_else(|| stretched(text.to_owned()))
+            }
             _ => {
                 let presets: Vec<_> =
                     PRESETS.iter().map(|(name, what, _)| format!("{name} ({what})")).collect();
@@ -136,6 +142,12 @@ impl FromStr for Axes {
             }
         }
     }
+}
+
+fn stretched(given: String) -> IngestError {
+    let reason = "the rows of the matrix must be of length 1 and at right angles; lengths belong \
+                  into --scale";
+    frame_error("--axes", given, reason.into())
 }
 
 fn frame_error(option: &'static str, given: String, reason: String) -> IngestError {

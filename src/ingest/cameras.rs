@@ -1,8 +1,6 @@
 //! Camera lists: JSON files of pinhole views in the scene's own axes.
 
 use std::collections::BTreeSet;
-use std::fs::File;
-use std::io::{BufReader, Read};
 use std::path::Path;
 
 use glam::{DMat3, DQuat};
@@ -11,6 +9,8 @@ use serde::Deserialize;
 use crate::config;
 use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, CameraError, Pose, PoseError};
+
+use super::file::{self, FileError};
 use crate::scene::rig::MAX_NAME_BYTES;
 
 /// A camera of a list.
@@ -29,18 +29,15 @@ pub struct ListedCamera {
 /// Why a camera list was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CamerasError {
-    /// The operating system refused.
-    #[error("cannot read the camera list: {0}")]
-    Io(#[from] std::io::Error),
-    /// Larger than any list should be.
-    #[error("the camera list is larger than {} bytes", config::CAMERA_LIST_BYTES)]
-    TooLarge,
+    /// It cannot be read, is no regular file, or is larger than any list should be.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Not the JSON that is asked for.
     #[error(
         "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
          fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
     )]
-    Json(#[from] serde_json::Error),
+    Json(serde_json::Error),
     /// There is no camera in it.
     #[error("the camera list is empty")]
     Empty,
@@ -60,6 +57,12 @@ pub enum CamerasError {
         /// The camera.
         name: String,
     },
+    /// The matrix is a rotation with a mirror.
+    #[error("camera {name:?}: R_world_to_cam is a mirror; flip one of its axes")]
+    Mirror {
+        /// The camera.
+        name: String,
+    },
     /// The matrix is not a rotation.
     #[error(
         "camera {name:?}: R_world_to_cam is no rotation (rows off by {error:.1e} from orthonormal, \
@@ -70,26 +73,28 @@ pub enum CamerasError {
         name: String,
         /// Largest entry of R Rᵀ - I.
         error: f64,
-        /// Its determinant; -1 is a mirror.
+        /// Its determinant.
         determinant: f64,
     },
     /// The position cannot be used.
-    #[error("camera {name:?}: {source}")]
+    #[error("camera {name:?}: {cause}")]
     Pose {
         /// The camera.
         name: String,
         /// What is wrong.
-        source: PoseError,
+        cause: PoseError,
     },
     /// The size or an intrinsic cannot be used.
-    #[error("camera {name:?}: {source}")]
+    #[error("camera {name:?}: {cause}")]
     Camera {
         /// The camera.
         name: String,
         /// What is wrong.
-        source: CameraError,
+        cause: CameraError,
     },
 }
+
+const NAME_RULE: &str = "must be 1 to 64 of A-Z a-z 0-9 . _ -, not starting with .";
 
 /// One entry, as written; fields that are not named here are somebody else's notes.
 #[derive(Deserialize)]
@@ -115,16 +120,12 @@ struct Entry {
 /// # Errors
 /// Names the camera and the field at fault.
 pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
-    let mut text = Vec::new();
-    let file = BufReader::new(File::open(path)?);
-    file.take(config::CAMERA_LIST_BYTES + 1).read_to_end(&mut text)?;
-    if text.len() as u64 > config::CAMERA_LIST_BYTES {
-        return Err(CamerasError::TooLarge);
-    }
-    let entries: Vec<Entry> = match text.trim_ascii_start().first() {
-        Some(b'{') => vec![serde_json::from_slice(&text)?],
-        _ => serde_json::from_slice(&text)?,
+    let text = file::read_whole(path, config::CAMERA_LIST_BYTES)?;
+    let one_or_many = match text.trim_ascii_start().first() {
+        Some(b'{') => serde_json::from_slice(&text).map(|entry| vec![entry]),
+        _ => serde_json::from_slice(&text),
     };
+    let entries: Vec<Entry> = one_or_many.map_err(CamerasError::Json)?;
     if entries.is_empty() {
         return Err(CamerasError::Empty);
     }
@@ -137,7 +138,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
             && !entry.name.starts_with('.');
         let twice = !names.insert(entry.name.clone());
         if !usable || twice {
-            let must = if twice { "comes twice" } else { "must be 1 to 64 of A-Z a-z 0-9 . _ -" };
+            let must = if twice { "comes twice" } else { NAME_RULE };
             return Err(CamerasError::Name { index, name: entry.name, must });
         }
         cameras.push(check(entry)?);
@@ -156,16 +157,19 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
     let determinant = rotation.determinant();
-    let is_rotation = error <= 1e-4 && determinant > 0.0;
-    if !is_rotation {
+    let is_orthonormal = error <= 1e-4;
+    if is_orthonormal && determinant < 0.0 {
+        return Err(CamerasError::Mirror { name });
+    }
+    if !is_orthonormal {
         return Err(CamerasError::Rotation { name, error, determinant });
     }
     let rotation = DQuat::from_mat3(&rotation).normalize();
     let q = [rotation.w, rotation.x, rotation.y, rotation.z];
     let pose = Pose::checked(position, q);
     let world_from_camera =
-        pose.map_err(|source| CamerasError::Pose { name: name.clone(), source })?;
+        pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
     let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy })
-        .map_err(|source| CamerasError::Camera { name: name.clone(), source })?;
+        .map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near })
 }

@@ -6,12 +6,12 @@
 
 pub mod axes;
 pub mod cameras;
+mod file;
 mod hashing;
 mod ply;
 mod safetensors;
 pub mod validate;
 
-use std::fs::File;
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 
@@ -19,6 +19,7 @@ use crate::config;
 use crate::scene::Gaussians;
 
 pub use axes::Axes;
+pub use file::{FileError, read_whole};
 
 use hashing::Hashing;
 
@@ -28,9 +29,9 @@ pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
 /// Why a file was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum IngestError {
-    /// The operating system refused.
-    #[error("cannot read: {0}")]
-    Io(#[from] io::Error),
+    /// It cannot be read, or is no regular file.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Neither of the formats.
     #[error(
         "the file starts with {start:?}: neither PLY (\"ply\") nor safetensors (header length, \
@@ -99,6 +100,12 @@ pub enum IngestError {
     },
 }
 
+impl From<io::Error> for IngestError {
+    fn from(error: io::Error) -> Self {
+        Self::File(error.into())
+    }
+}
+
 /// Reads a scene file: INRIA PLY, PlayCanvas compressed PLY, or safetensors with gsplat's names.
 ///
 /// Axes and unit stay the file's; [`Axes::apply`] changes them.
@@ -118,8 +125,7 @@ pub fn read_hashed(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
-    let file = File::open(path)?;
-    let file_bytes = file.metadata()?.len();
+    let (file, file_bytes) = file::open(path)?;
     let mut input = BufReader::with_capacity(BUFFER_BYTES, Hashing::new(file));
     let start = input.fill_buf()?;
     let gaussians = if start.starts_with(b"ply\n") || start.starts_with(b"ply\r\n") {

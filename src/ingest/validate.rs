@@ -79,37 +79,37 @@ fn first_fault(gaussians: &Gaussians, index: usize) -> Option<Fault> {
         if !near {
             return Some((
                 Field::Mean(axis),
-                m.to_string(),
+                format!("{m:?}"),
                 "a centre is within 1e8 of the origin",
             ));
         }
     }
     let quat = gaussians.quats_wxyz[index];
     if let Some(i) = quat.iter().position(|q| !q.is_finite()) {
-        return Some((Field::Quat(i), quat[i].to_string(), "a quaternion is finite"));
+        return Some((Field::Quat(i), format!("{:?}", quat[i]), "a quaternion is finite"));
     }
     let length = quat.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
     if !(QUAT_LENGTH[0]..=QUAT_LENGTH[1]).contains(&length) {
         let must = "a quaternion's length is from 1e-6 to 1e6";
-        return Some((Field::QuatLength, length.to_string(), must));
+        return Some((Field::QuatLength, format!("{length:?}"), must));
     }
     for (axis, ln) in gaussians.ln_scales[index].iter().enumerate() {
         if !(LN_SCALE[0]..=LN_SCALE[1]).contains(ln) {
             let must = "a scale is the natural logarithm of metres, from -30 to 10";
-            return Some((Field::Scale(axis), ln.to_string(), must));
+            return Some((Field::Scale(axis), format!("{ln:?}"), must));
         }
     }
     let logit = gaussians.logit_opacities[index];
     let bounded = logit.abs() <= MAX_LOGIT;
     if !bounded {
         let must = "an opacity is a logit (before the sigmoid), within 1e4 of 0";
-        return Some((Field::Opacity, logit.to_string(), must));
+        return Some((Field::Opacity, format!("{logit:?}"), must));
     }
     for (i, c) in gaussians.sh_of(index).iter().enumerate() {
         let bounded = c.abs() <= MAX_SH;
         if !bounded {
             let must = "a colour coefficient is within 1000 of 0";
-            return Some((Field::Sh(i / 3, i % 3), c.to_string(), must));
+            return Some((Field::Sh(i / 3, i % 3), format!("{c:?}"), must));
         }
     }
     None

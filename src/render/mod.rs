@@ -124,6 +124,11 @@ pub trait Backend: Send + Sync {
         String::new()
     }
 
+    /// Threads that it renders with. Pixels do not depend on it.
+    fn threads(&self) -> usize {
+        1
+    }
+
     /// Renders all views into their targets, `targets[i]` for `views[i]`.
     ///
     /// # Errors

@@ -43,7 +43,7 @@ impl Default for RenderProfile {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ProfileError {
     /// A field is outside what the stages can compute with.
-    #[error("profile field {field} is {value}; {must}")]
+    #[error("profile field {field} is {value:?}; {must}")]
     Value {
         /// The field.
         field: &'static str,

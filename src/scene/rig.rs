@@ -58,12 +58,12 @@ pub enum RigError {
         name: String,
     },
     /// A camera cannot be used.
-    #[error("camera {name:?}: {source}")]
+    #[error("camera {name:?}: {cause}")]
     Camera {
         /// The camera.
         name: String,
         /// What is wrong with it.
-        source: CameraError,
+        cause: CameraError,
     },
 }
 
@@ -106,7 +106,7 @@ impl Rig {
                 return Err(RigError::Duplicate { name: name.clone() });
             }
             Camera::checked(camera.width_px.into(), camera.height_px.into(), camera.pinhole)
-                .map_err(|source| RigError::Camera { name: name.clone(), source })?;
+                .map_err(|cause| RigError::Camera { name: name.clone(), cause })?;
         }
         Ok(())
     }

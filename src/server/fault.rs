@@ -75,12 +75,12 @@ pub(super) enum Fault {
         name: String,
     },
     /// Not a pose.
-    #[error("{field}: {source}")]
+    #[error("{field}: {cause}")]
     Pose {
         /// The pose, as `poses[3]`.
         field: String,
         /// What is wrong with it.
-        source: PoseError,
+        cause: PoseError,
     },
     /// NaN or infinity where JSON has no number.
     #[error("{field} is not finite; a pose needs finite numbers")]
@@ -89,20 +89,20 @@ pub(super) enum Fault {
         field: String,
     },
     /// Not a camera.
-    #[error("{field}: {source}")]
+    #[error("{field}: {cause}")]
     Camera {
         /// The camera, as `rig.cameras[2]`.
         field: String,
         /// What is wrong with it.
-        source: CameraError,
+        cause: CameraError,
     },
     /// Not a rig.
-    #[error("{source}")]
+    #[error("{cause}")]
     Rig {
         /// The field.
         field: String,
         /// What is wrong with it.
-        source: RigError,
+        cause: RigError,
     },
     /// Too much at once.
     #[error("there are {limit} {what} already; try again later")]

@@ -85,20 +85,20 @@ pub enum ServerError {
         address: SocketAddr,
     },
     /// The address cannot be used.
-    #[error("cannot listen on {address}: {source}")]
+    #[error("cannot listen on {address}: {cause}")]
     Listen {
         /// The address.
         address: SocketAddr,
         /// What the operating system says.
-        source: io::Error,
+        cause: io::Error,
     },
     /// The directory for episodes cannot be made.
-    #[error("cannot record episodes in {}: {source}", path.display())]
+    #[error("cannot record episodes in {}: {cause}", path.display())]
     Episodes {
         /// The directory.
         path: PathBuf,
         /// What the operating system says.
-        source: io::Error,
+        cause: io::Error,
     },
     /// The directory of twins cannot be read.
     #[error(transparent)]
@@ -118,7 +118,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         return Err(ServerError::PublicAddress { address: listen });
     }
     std::fs::create_dir_all(&episodes)
-        .map_err(|source| ServerError::Episodes { path: episodes.clone(), source })?;
+        .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let settings = EngineSettings {
         catalog: Catalog::open(&twins)?,
         episodes,
@@ -126,7 +126,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         step_timeout: limits.step,
     };
     let engine = Engine::start(settings)?;
-    let failed = |source| ServerError::Listen { address: listen, source };
+    let failed = |cause| ServerError::Listen { address: listen, cause };
     let listener = TcpListener::bind(listen).await.map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
     let (stop, stopping) = tokio::sync::watch::channel(false);

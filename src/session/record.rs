@@ -121,12 +121,12 @@ pub(super) enum Line {
 
 /// Why an episode could not be recorded.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot record the episode in {}: {source}", path.display())]
+#[error("cannot record the episode in {}: {cause}", path.display())]
 pub struct RecordError {
     /// The file or directory.
     pub path: PathBuf,
     /// What the operating system says.
-    pub source: io::Error,
+    pub cause: io::Error,
 }
 
 /// An episode's file, open for appending.
@@ -150,8 +150,8 @@ impl Recorder {
         first_number: u64,
         lines: &[Line],
     ) -> Result<(Self, u64), RecordError> {
-        let failed = |path: &Path, source| RecordError { path: path.to_owned(), source };
-        fs::create_dir_all(dir).map_err(|source| failed(dir, source))?;
+        let failed = |path: &Path, cause| RecordError { path: path.to_owned(), cause };
+        fs::create_dir_all(dir).map_err(|cause| failed(dir, cause))?;
         let mut number = first_number;
         loop {
             let path = dir.join(format!("{session}-{number}.jsonl"));
@@ -168,7 +168,7 @@ impl Recorder {
                     };
                 }
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => number += 1,
-                Err(source) => return Err(failed(&path, source)),
+                Err(cause) => return Err(failed(&path, cause)),
             }
         }
     }
@@ -191,7 +191,7 @@ impl Recorder {
                 }
                 written
             });
-        written.map_err(|source| RecordError { path: self.path.to_path_buf(), source })
+        written.map_err(|cause| RecordError { path: self.path.to_path_buf(), cause })
     }
 }
 

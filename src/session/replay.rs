@@ -96,12 +96,12 @@ pub struct Redrawn<'a> {
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// The file cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {cause}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
         /// What the operating system says.
-        source: io::Error,
+        cause: io::Error,
     },
     /// A line is damaged, cut off, or not where it belongs.
     #[error("{}, line {line}: {reason}", path.display())]
@@ -120,12 +120,12 @@ pub enum ReplayError {
     #[error(transparent)]
     Twin(#[from] StoreError),
     /// The backend refused a frame.
-    #[error("step {step}: {source}")]
+    #[error("step {step}: {cause}")]
     Render {
         /// The step.
         step: u64,
         /// Why.
-        source: RenderError,
+        cause: RenderError,
     },
     /// What was to be done with an image failed.
     #[error("step {step}, camera {camera:?}: {reason:#}")]
@@ -145,7 +145,7 @@ impl Recording {
     /// # Errors
     /// Names the first line that is damaged or cut off.
     pub fn read(path: &Path) -> Result<Self, ReplayError> {
-        let failed = |source| ReplayError::Read { path: path.to_owned(), source };
+        let failed = |cause| ReplayError::Read { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
         let (mut header, mut frames, mut end) = (None, Vec::new(), None);
         for line in 1.. {
@@ -214,7 +214,7 @@ impl Recording {
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
                 let hashes = redraw(resident, backend, cameras, *world_from_rig, &mut pixels)
-                    .map_err(|source| ReplayError::Render { step: frame.step, source })?;
+                    .map_err(|cause| ReplayError::Render { step: frame.step, cause })?;
                 for (((camera, rgb8), hash), recorded) in
                     cameras.iter().zip(&pixels).zip(hashes).zip(&mut recorded)
                 {

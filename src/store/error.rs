@@ -13,14 +13,14 @@ use crate::scene::trajectory::TrajectoryError;
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The operating system refused.
-    #[error("cannot {action} {}: {source}", path.display())]
+    #[error("cannot {action} {}: {cause}", path.display())]
     Io {
         /// What was tried, as `write`.
         action: &'static str,
         /// On which file or directory.
         path: PathBuf,
         /// The reason given.
-        source: io::Error,
+        cause: io::Error,
     },
     /// A twin's name could be mistaken for a path.
     #[error("{name:?} is not a name of a twin: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
@@ -77,7 +77,7 @@ pub enum StoreError {
     /// A version is committed and visible, but the disk refused to say that it will stay.
     #[error(
         "version {number} of twin {name:?} is in place, but might not last through a power cut \
-         ({source}); import the same again"
+         ({cause}); import the same again"
     )]
     NotSynced {
         /// The twin.
@@ -85,7 +85,7 @@ pub enum StoreError {
         /// The version.
         number: u64,
         /// What failed.
-        source: Box<StoreError>,
+        cause: Box<StoreError>,
     },
     /// The Gaussians of a commit cannot be used.
     #[error(transparent)]
@@ -121,7 +121,7 @@ impl StoreError {
     /// Turns an I/O error into one that says what was tried on which file.
     pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
-        move |source| Self::Io { action, path, source }
+        move |cause| Self::Io { action, path, cause }
     }
 }
 

@@ -211,7 +211,7 @@ impl Staging {
     }
 
     fn not_synced(&self, number: u64, error: StoreError) -> StoreError {
-        StoreError::NotSynced { name: self.name.clone(), number, source: Box::new(error) }
+        StoreError::NotSynced { name: self.name.clone(), number, cause: Box::new(error) }
     }
 
     /// Removes objects that no version names: what a killed commit had already placed.

@@ -11,7 +11,7 @@ use super::{Catalog, StoreError};
 pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
     for name in catalog.objects.begun()? {
         match clean_twin(catalog, &name) {
-            Err(StoreError::Io { source, .. }) if is_read_only(&source) => {}
+            Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
             cleaned => cleaned?,
         }
     }

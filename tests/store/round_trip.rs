@@ -117,9 +117,12 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
         (NewVersion { trajectories: vec![empty], ..street(&good) }, "has no keyframes"),
         (
             NewVersion { trajectories: vec![still("a"), still("a")], ..street(&good) },
-            "\"a\" cannot name a trajectory: another one",
+            "two trajectories are named \"a\"",
         ),
-        (NewVersion { trajectories: vec![still("A B")], ..street(&good) }, "\"A B\" cannot name"),
+        (
+            NewVersion { trajectories: vec![still("A B")], ..street(&good) },
+            "\"A B\" is not a name of a trajectory",
+        ),
     ];
     for (new, wanted) in cases {
         let text = commit(dir.path(), new).unwrap_err().to_string();

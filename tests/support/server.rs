@@ -71,7 +71,7 @@ impl Backend for Painter {
         self.begun.fetch_add(1, Ordering::SeqCst);
         assert!(!self.crash.swap(false, Ordering::SeqCst), "a crash was asked for");
         if self.too_many.swap(false, Ordering::SeqCst) {
-            return Err(RenderError::TooMany { what: "dots", needed: 2, limit: 1 });
+            return Err(RenderError::TooMany { what: "dots", limit: 1 });
         }
         std::thread::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst)));
         for (k, (view, target)) in frame.views.iter().zip(targets).enumerate() {

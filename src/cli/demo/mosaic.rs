@@ -3,10 +3,13 @@
 use std::path::Path;
 
 use anyhow::Context;
+use image::RgbImage;
 use image::imageops::{self, FilterType};
-use image::{ImageFormat, RgbImage};
 
 use crate::client::{ImageView, Observation};
+use crate::session;
+
+use super::output;
 
 /// Cameras of the demo's rig from left to right, row by row.
 const ROWS: [[&str; 3]; 2] = [["front_left", "front", "front_right"], ["left", "rear", "right"]];
@@ -28,7 +31,8 @@ pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
             imageops::replace(&mut mosaic, &cell, x.into(), y.into());
         }
     }
-    mosaic.save_with_format(path, ImageFormat::Png).with_context(|| format!("{}", path.display()))
+    let file = session::png(&mosaic, mosaic.width(), mosaic.height());
+    output::write(path, &file.map_err(anyhow::Error::msg)?)
 }
 
 /// The whole image, as large as a cell allows.

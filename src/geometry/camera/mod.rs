@@ -31,7 +31,7 @@ pub enum CameraError {
         limit: u32,
     },
     /// An intrinsic is not a usable number.
-    #[error("{field} is {value}; {must}")]
+    #[error("{field} is {value:?}; {must}")]
     Intrinsic {
         /// `fx`, `fy`, `cx` or `cy`.
         field: &'static str,

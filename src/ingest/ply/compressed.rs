@@ -19,7 +19,7 @@ const CHUNK: usize = 256;
 /// Largest logit made of an 8-bit opacity: 255 means 1, whose logit is infinite; 20's is 1 in f32.
 const MAX_LOGIT: f64 = 20.0;
 
-/// Reads the body; its size was checked.
+/// Reads the body.
 pub(super) fn read(
     input: impl BufRead,
     header: &Header,
@@ -27,13 +27,15 @@ pub(super) fn read(
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     let (chunk, vertex, colour) = tables(header)?;
-    let count = check_count(vertex.count)?;
     let sh_degree = colour.map_or(Ok(0), degree)?;
     let extremes = Extremes::find(chunk)?;
     let packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
     let packed = packed.map(|name| vertex.property(name).cloned());
     let [position, rotation, scale, color] = packed;
     let [position, rotation, scale, color] = [position?, rotation?, scale?, color?];
+    let rest = colour.map_or(Ok(Vec::new()), |colour| higher_degrees(colour, sh_degree))?;
+    header.check_size(file_bytes)?;
+    let count = check_count(vertex.count)?;
 
     let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
     let mut body = Body { input, done: header.bytes, file_bytes, progress };
@@ -59,10 +61,6 @@ pub(super) fn read(
         gaussians.sh.extend(std::iter::repeat_n(0.0, 3 * (coefficients - 1)));
     })?;
     if let Some(colour) = colour {
-        let rest = (1..coefficients).flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
-        let rest: Vec<Property> = rest
-            .map(|field| colour.property(&file_name(field, sh_degree)).cloned())
-            .collect::<Result<_, _>>()?;
         let mut sh = gaussians.sh.chunks_exact_mut(3 * coefficients);
         body.rows(colour, |row| {
             for (value, property) in sh.next().into_iter().flat_map(|s| &mut s[3..]).zip(&rest) {
@@ -72,6 +70,13 @@ pub(super) fn read(
     }
     validate::check(&gaussians, &|field| file_name(field, sh_degree))?;
     Ok(gaussians)
+}
+
+/// Columns of the coefficients above degree 0, coefficient-major, then red, green, blue.
+fn higher_degrees(colour: &Element, sh_degree: u8) -> Result<Vec<Property>, IngestError> {
+    let rest = 1..sh::coefficients(sh_degree);
+    let rest = rest.flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
+    rest.map(|field| colour.property(&file_name(field, sh_degree)).cloned()).collect()
 }
 
 /// The tables chunk, vertex and, if there is one, sh, in that order and of fitting lengths.

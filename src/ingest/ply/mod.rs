@@ -22,14 +22,15 @@ pub(super) fn read(
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     let header = Header::read(&mut input)?;
-    header.check_size(file_bytes)?;
     let Some(vertex) = header.element("vertex") else {
         return Err(error("end".into(), "there is no element vertex".into()));
     };
     if vertex.property("packed_position").is_ok() {
         return compressed::read(input, &header, file_bytes, progress);
     }
+    // A missing column changes the size too; its name says more.
     let columns = Columns::find(vertex)?;
+    header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;
     let mut gaussians = Gaussians::with_capacity(columns.sh_degree, count);
     let mut body = Body { input, done: header.bytes, file_bytes, progress };

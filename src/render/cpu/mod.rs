@@ -57,7 +57,7 @@ pub enum CpuError {
     },
     /// The threads could not be started.
     #[error("cannot start the render threads: {0}")]
-    Threads(#[from] rayon::ThreadPoolBuildError),
+    Threads(rayon::ThreadPoolBuildError),
 }
 
 /// What a frame leaves behind for the next one to fill again.
@@ -91,8 +91,8 @@ impl Cpu {
         };
         let level = level.ok_or(CpuError::NoSuchSimd(simd))?;
         let name = |i| format!("render-{i}");
-        let pool =
-            rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()?;
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build();
+        let pool = pool.map_err(CpuError::Threads)?;
         Ok(Self { pool, level, scratch: Mutex::default() })
     }
 }
@@ -106,6 +106,10 @@ impl Backend for Cpu {
         // Four lanes have no fused multiply-add, so instruction sets differ in the last bit.
         let token = format!("{:?}", self.level);
         token.split('(').next().unwrap_or_default().to_owned()
+    }
+
+    fn threads(&self) -> usize {
+        self.pool.current_num_threads()
     }
 
     fn render(

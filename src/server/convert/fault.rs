@@ -23,19 +23,19 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
         Fault::UnknownSession { .. } => (Code::UnknownSession, field("session")),
         Fault::SessionExists { .. } => (Code::SessionExists, field("session")),
         Fault::InvalidName { field, .. } => (Code::InvalidName, Some(field.clone())),
-        Fault::Pose { field, source } => {
-            let code = match source {
+        Fault::Pose { field, cause } => {
+            let code = match cause {
                 PoseError::NotFinite { .. } => Code::PoseNotFinite,
                 PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
             };
-            (code, Some(format!("{field}.{}", source.field())))
+            (code, Some(format!("{field}.{}", cause.field())))
         }
         Fault::NotFinite { field } => (Code::PoseNotFinite, Some(field.clone())),
-        Fault::Camera { field, source } => {
-            (Code::CameraInvalid, Some(format!("{field}.{}", source.field())))
+        Fault::Camera { field, cause } => {
+            (Code::CameraInvalid, Some(format!("{field}.{}", cause.field())))
         }
-        Fault::Rig { field, source } => {
-            let code = match source {
+        Fault::Rig { field, cause } => {
+            let code = match cause {
                 RigError::Count { .. } => Code::OutOfRange,
                 RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
                 RigError::Camera { .. } => Code::CameraInvalid,

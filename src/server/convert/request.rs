@@ -242,12 +242,12 @@ fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
             Ok(RigCamera {
                 name: name_of(&format!("{field}.name"), name)?,
                 rig_from_camera: pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?,
-                camera: camera.map_err(|source| Fault::Camera { field, source })?,
+                camera: camera.map_err(|cause| Fault::Camera { field, cause })?,
             })
         })
         .collect::<Result<_, Fault>>()?;
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };
-    rig.check().map_err(|source| Fault::Rig { field: "rig.cameras".to_owned(), source })?;
+    rig.check().map_err(|cause| Fault::Rig { field: "rig.cameras".to_owned(), cause })?;
     Ok(rig)
 }
 
@@ -256,7 +256,7 @@ fn name_of(field: &str, name: String) -> Result<String, Fault> {
 }
 
 fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
-    Pose::checked(pose.xyz, pose.q).map_err(|source| Fault::Pose { field: field.into(), source })
+    Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
 }
 
 /// The number of something that has one but is no request.
