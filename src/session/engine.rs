@@ -20,6 +20,9 @@ use super::SessionError;
 pub struct EngineSettings {
     /// The twins that can be opened.
     pub catalog: Catalog,
+    /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
+    /// machine's.
+    pub resident_bytes: Option<u64>,
     /// Where episodes are recorded.
     pub episodes: PathBuf,
     /// What renders.
@@ -65,7 +68,7 @@ impl Engine {
     /// # Errors
     /// The thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { catalog, episodes, backend, step_timeout } = settings;
+        let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
         let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
         std::thread::Builder::new()
             .name("render".to_owned())
@@ -76,7 +79,7 @@ impl Engine {
                 }
             })
             .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
-        let cache = Cache::new(catalog.clone());
+        let cache = Cache::limited(catalog.clone(), resident_bytes);
         let answers = Answers::default();
         Ok(Arc::new(Self { catalog, cache, episodes, backend, step_timeout, jobs, answers }))
     }
