@@ -14,9 +14,12 @@ pub const JPEG_QUALITY: u8 = 90;
 /// Largest message from a client. Poses and rigs are kilobytes; 1 MiB is room for 10,000 poses.
 pub const INBOUND_MESSAGE_BYTES: usize = 1 << 20;
 
-/// Largest observation a client accepts: 16 raw 4K images with depth and opacity would be 2.9 GB;
-/// six 1440x928 raw images with both are 88 MB.
-pub const OBSERVATION_BYTES: usize = 1 << 30;
+/// Largest observation a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are
+/// 1,476 MB. Six raw 1440x928 images with depth and opacity are 88 MB.
+pub const OBSERVATION_BYTES: usize = 3 << 29;
+
+/// Bytes of a pixel at most: raw colour, f32 depth and opacity.
+pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
 /// of at most 1.5 kB, together 0.4 MB.
@@ -31,8 +34,12 @@ pub const SESSIONS: usize = 256;
 /// Poses of one `observe`.
 pub const OBSERVE_POSES: usize = 16;
 
-/// Pixels of one answer, all images together: 16 images of 8 MPx.
-pub const ANSWER_PIXELS: u64 = 16 * (8 << 20);
+/// Pixels of one answer, all images together: 16 poses of six 1440x928 cameras are 128 MPx.
+pub const ANSWER_PIXELS: u64 = 128 << 20;
+
+// Whatever a server may answer, a client accepts.
+const _: () =
+    assert!(ANSWER_PIXELS * PIXEL_BYTES + OBSERVATION_HEADER_BYTES <= OBSERVATION_BYTES as u64);
 
 /// How long the first message of a connection may take.
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
@@ -47,7 +54,7 @@ pub const SEND_TIMEOUT: Duration = Duration::from_secs(30);
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How long a client waits for an answer: the longest step, and the longest time to send it.
-pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(60 + 30);
+pub const ANSWER_TIMEOUT: Duration = STEP_TIMEOUT.saturating_add(SEND_TIMEOUT);
 
 /// How long a session outlives its connection, waiting for `resume`.
 pub const RESUME_GRACE: Duration = Duration::from_secs(60);
@@ -79,6 +86,12 @@ pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 /// six raw 1440x928 images, depth and opacity (88 MB each), or every session with JPEGs.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
+// One answer of any kind fits while nobody else has one.
+const _: () = assert!(OBSERVATION_BYTES as u64 <= ANSWERS_BYTES);
+
+/// Pongs that a client has not read, and the goodbye, of at most 129 bytes each.
+pub const PONGS_BYTES: usize = 4 << 10;
+
 /// How long a refused client's last bytes are read and thrown away, so that it can read why.
 pub const LINGER: Duration = Duration::from_secs(2);
 
@@ -90,6 +103,9 @@ pub const KEEPALIVE: (Duration, Duration, u32) =
 
 /// Longest line of an episode file: 256 image hashes of `observe` take 17 kB.
 pub const EPISODE_LINE_BYTES: usize = 1 << 20;
+
+/// Most render threads: above any machine's cores, below what exhausts a machine's processes.
+pub const RENDER_THREADS: usize = 1024;
 
 /// The rig of a session on a twin that has none, unless the session says otherwise.
 pub const RIG: &str = "vehicle6";

@@ -11,7 +11,7 @@
 //! | [`ingest`] | one file per outside format | config, geometry, scene |
 //! | [`store`] | twins on disk, versioned, content-addressed | config, geometry, scene, ingest |
 //! | [`residency`] | what is in memory now | config, scene, store |
-//! | [`render`] | six images per step: `cpu`, `reference` | geometry, scene |
+//! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | config, geometry, scene, store, render, session, protocol |

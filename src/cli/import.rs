@@ -53,11 +53,11 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// JSON file of the vehicle's cameras, kept as the twin's default rig.
+    /// JSON file of the vehicle's cameras (see below), kept as the twin's default rig.
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
 
-    /// JSON file of a recorded drive, in the twin's axes and metres; may be given again.
+    /// JSON file of a recorded drive (see below), in the twin's axes and metres; may be given again.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
@@ -71,7 +71,19 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity import skull.ply --twin skull --axes y-down-z-forward --profile near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
-  wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01";
+  wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
+
+Rig file: sizes and intrinsics in pixels, camera_to_rig in metres. Cameras have x right, y down, z
+forward; the rig has x forward, y left, z up. q is (w, x, y, z); this one looks straight ahead.
+  {\"name\": \"car\", \"cameras\": [
+    {\"name\": \"front\", \"width\": 1440, \"height\": 928,
+     \"fx\": 1800, \"fy\": 1800, \"cx\": 720, \"cy\": 464,
+     \"camera_to_rig\": {\"xyz\": [1.9, 0, 1.65], \"q\": [0.5, -0.5, 0.5, -0.5]}}]}
+
+Trajectory file: where the rig was, in the twin's axes and metres, at rising times.
+  {\"name\": \"log\", \"keyframes\": [
+    {\"time_us\": 0, \"world_from_rig\": {\"xyz\": [0, 0, 0], \"q\": [1, 0, 0, 0]}},
+    {\"time_us\": 100000, \"world_from_rig\": {\"xyz\": [0.8, 0, 0], \"q\": [1, 0, 0, 0]}}]}";
 
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -84,9 +96,8 @@ impl Import {
         for setting in &self.profile {
             profile.set(setting)?;
         }
-        let rig = self.rig.as_deref().map(read_json::<Rig>).transpose()?;
-        let trajectories = self.trajectory.iter().map(|path| read_json::<Trajectory>(path));
-        let trajectories = trajectories.collect::<anyhow::Result<_>>()?;
+        let rig = self.rig.as_deref().map(read_rig).transpose()?;
+        let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = Catalog::open(&self.twins.dir()?)?;
 
         let cannot = || format!("cannot import {}", self.source.display());
@@ -138,6 +149,26 @@ impl Import {
     }
 }
 
+fn read_rig(path: &Path) -> anyhow::Result<Rig> {
+    let rig: Rig = read_json(path)?;
+    rig.check().with_context(|| format!("{}", path.display()))?;
+    Ok(rig)
+}
+
+fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
+    let mut read: Vec<Trajectory> = Vec::with_capacity(paths.len());
+    for path in paths {
+        let trajectory: Trajectory = read_json(path)?;
+        let cannot = || format!("{}", path.display());
+        trajectory.check().with_context(cannot)?;
+        if read.iter().any(|before| before.name == trajectory.name) {
+            return Err(StoreError::TrajectoryName { name: trajectory.name }).with_context(cannot);
+        }
+        read.push(trajectory);
+    }
+    Ok(read)
+}
+
 fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     let cannot = || format!("cannot read {}", path.display());
     let file = File::open(path).with_context(cannot)?;
@@ -145,5 +176,9 @@ fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     file.take(config::SETTINGS_FILE_BYTES + 1).read_to_end(&mut text).with_context(cannot)?;
     let limit = config::SETTINGS_FILE_BYTES;
     anyhow::ensure!(text.len() as u64 <= limit, "{} is above {limit} bytes", path.display());
+    // serde would take a list for the object's values in order, and count them.
+    if text.trim_ascii_start().first() == Some(&b'[') {
+        anyhow::bail!("{} is a JSON list; one object is read: see --help", path.display());
+    }
     serde_json::from_slice(&text).with_context(cannot)
 }

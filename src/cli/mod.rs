@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 mod bench;
 mod demo;
+mod devices;
 mod import;
 mod inspect;
 mod places;
@@ -34,6 +35,7 @@ enum Command {
     Render(render::Render),
     Replay(replay::Replay),
     Bench(bench::Bench),
+    Devices(devices::Devices),
 }
 
 /// Parses the command line, runs, and tells how it went: 0 done, 1 failed, 2 not understood.
@@ -48,6 +50,7 @@ pub fn main() -> ExitCode {
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Bench(command) => command.run(),
+        Command::Devices(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use crate::residency::Cache;
-use crate::session::{self, FrameRequest, Recording, Redrawn};
+use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
 use crate::store::Catalog;
 
 use super::places::Twins;
@@ -25,7 +25,7 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again and fail with exit code 1 at the first that differs.
+    /// Render every frame again and fail with exit code 1 if one differs; without --out, at once.
     #[arg(long)]
     verify: bool,
 
@@ -64,7 +64,9 @@ impl Replay {
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
-        let report = recording.replay(&resident, &*backend, &mut |image| {
+        // Pictures that were asked for are all drawn; a yes or no needs none after a no.
+        let extent = if self.out.is_some() { Extent::Whole } else { Extent::FirstDifference };
+        let report = recording.replay(&resident, &*backend, extent, &mut |image| {
             bar.inc(1);
             match &self.out {
                 Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),

@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
+use crate::config;
 use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::cpu::{Cpu, Simd};
+use crate::render::gpu::{AdapterChoice, Gpu};
 use crate::render::reference::Reference;
 use crate::render::{Backend, View};
 use crate::residency::Cache;
@@ -48,8 +50,13 @@ pub(super) struct Engine {
     backend: BackendName,
 
     /// Render threads; 0 for one per core. Pixels do not depend on it.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = threads)]
     threads: usize,
+
+    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name; the fastest
+    /// kind if not given.
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<String>,
 
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
@@ -59,9 +66,11 @@ pub(super) struct Engine {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// The fastest of this machine.
+    /// cpu: the gpu backend waits to be asked for until it has run on hardware.
     #[default]
     Auto,
+    /// wgpu on Vulkan, `--device`.
+    Gpu,
     /// f32, SIMD, all cores.
     Cpu,
     /// f64 by definition: slow.
@@ -100,8 +109,19 @@ impl Engine {
             BackendName::Auto | BackendName::Cpu => {
                 Box::new(Cpu::new(self.threads, self.simd.into())?)
             }
+            BackendName::Gpu => {
+                let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
+                Box::new(Gpu::new(&choice, self.threads)?)
+            }
             BackendName::Reference => Box::new(Reference),
         })
+    }
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(threads) if threads <= config::RENDER_THREADS => Ok(threads),
+        _ => Err(format!("expected 0 to {}", config::RENDER_THREADS)),
     }
 }
 

@@ -7,8 +7,9 @@ pub const TILE_PX: u32 = 16;
 /// small splat more tightly than a row of 16 pixels does (a third fewer evaluations on a street).
 pub const BLOCK_PX: u32 = 4;
 
-/// Most (Gaussian, tile) pairs of a frame: 2^28 of 4 B are 1 GiB.
-pub const MAX_INSTANCES: u64 = 1 << 28;
+/// Most (Gaussian, tile) pairs of a frame: 2^27 of 4 B are 512 MiB, five times what 5 million visible
+/// Gaussians of a street take.
+pub const MAX_INSTANCES: u64 = 1 << 27;
 
 /// How much wider than computed a splat's extent is taken when tiles and blocks are chosen, in
 /// pixels. A mean at 16,384 px is rounded by 1e-3 px; what is chosen in vain contributes nothing,
@@ -20,8 +21,8 @@ pub const EXTENT_SLACK_PX: f32 = 2e-3;
 /// rule for a centred principal point).
 pub const SLOPE_SLACK: f64 = 0.3;
 
-/// Widest splat, in pixels of one standard deviation. The determinant is of fourth order: 1e9 px
-/// give 1e36, and f32 ends at 3.4e38. Wider ones are drawn this wide, which no image can tell.
+/// Widest splat that is computed in pixels. The determinant of its covariance is of fourth order:
+/// 1e9 px give 1e36, and f32 ends at 3.4e38.
 pub const MAX_SIGMA_PX: f32 = 1e9;
 
 /// Bits of the depth key: exact f32 order of z from near up to 2^32 times near.

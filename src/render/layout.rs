@@ -75,6 +75,9 @@ pub struct ChunkView {
     pub rotation: [[f32; 3]; 3],
     /// The chunk's origin in camera space, in metres.
     pub translation_m: [f32; 3],
+    /// The camera's forward axis in the world, and the chunk's origin along it in metres. f64: the
+    /// order of surfels in one plane must not be that of rounding errors.
+    pub forward: [f64; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
     /// Focal lengths, in pixels.
@@ -102,9 +105,12 @@ impl ChunkView {
         };
         let x = axis(view.camera.width_px, p.fx, p.cx);
         let y = axis(view.camera.height_px, p.fy, p.cy);
+        let forward = rotation.z_axis;
+        let origin_m = camera_from_world.rotation * -camera_m;
         Self {
+            forward: [forward.x, forward.y, forward.z, origin_m.z],
             rotation: rotation.to_cols_array_2d().map(|row| row.map(|r| r as f32)),
-            translation_m: (camera_from_world.rotation * -camera_m).as_vec3().to_array(),
+            translation_m: origin_m.as_vec3().to_array(),
             camera_m: camera_m.as_vec3().to_array(),
             focal_px: [p.fx as f32, p.fy as f32],
             center_px: [p.cx as f32, p.cy as f32],

@@ -5,6 +5,7 @@
 
 pub mod constants;
 pub mod cpu;
+pub mod gpu;
 pub mod layout;
 pub mod reference;
 
@@ -87,15 +88,29 @@ pub enum RenderError {
         /// The length that the camera asks for.
         wanted: usize,
     },
-    /// More (Gaussian, tile) pairs than a frame may hold.
-    #[error("the frame needs {needed} {what}; at most {limit} fit")]
+    /// Not one target for each view.
+    #[error("{targets} targets for {views} views; each view needs its own")]
+    Targets {
+        /// How many targets were given.
+        targets: usize,
+        /// How many views.
+        views: usize,
+    },
+    /// More than a frame may hold.
+    #[error("the frame needs more than {limit} {what}: ask for smaller images or fewer views")]
     TooMany {
         /// What there is too much of.
         what: &'static str,
-        /// How many.
-        needed: u64,
         /// How many fit.
         limit: u64,
+    },
+    /// The device failed. It is opened anew for the next frame.
+    #[error("{device} failed: {reason}")]
+    Device {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        reason: String,
     },
 }
 
@@ -121,8 +136,11 @@ impl Frame<'_> {
     /// Names the first view whose target does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
         let count = self.views.len();
-        if !(1..=MAX_VIEWS).contains(&count) || targets.len() != count {
+        if !(1..=MAX_VIEWS).contains(&count) {
             return Err(RenderError::Views { count });
+        }
+        if targets.len() != count {
+            return Err(RenderError::Targets { targets: targets.len(), views: count });
         }
         for (view, (target, View { camera, .. })) in targets.iter().zip(self.views).enumerate() {
             let pixels = camera.pixels();

@@ -69,6 +69,11 @@ pub struct Cluster {
     pub sigma_m: f32,
 }
 
+impl Cluster {
+    /// Contains nothing and is seen by nobody.
+    const EMPTY: Self = Self { min_m: Vec3::INFINITY, max_m: Vec3::NEG_INFINITY, sigma_m: 0.0 };
+}
+
 /// The Gaussians of one cell, ready to be rendered.
 #[derive(Clone, Debug)]
 pub struct Chunk {
@@ -90,6 +95,9 @@ impl Chunk {
 
     /// Activates one Gaussian and appends it.
     ///
+    /// The gate at import keeps everything finite. What slips past it becomes an empty lane: it
+    /// keeps its place, is never drawn, and its neighbours do not notice.
+    ///
     /// # Panics
     /// If the record's colour is not of the chunk's degree.
     pub fn push(&mut self, record: &RawRecord<'_>) {
@@ -97,12 +105,22 @@ impl Chunk {
         assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
         let (slot, lane) = (self.count / LANES * width, self.count % LANES);
         if lane == 0 {
-            // Lanes without a Gaussian are never drawn: their opacity is zero.
             self.lanes.resize(slot + width, Lanes([0.0; LANES]));
             self.lanes[slot + column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
         }
+        if self.count.is_multiple_of(CLUSTER) {
+            self.clusters.push(Cluster::EMPTY);
+        }
+        self.count += 1;
+
         let scale = record.ln_scale.map(|ln| f64::from(ln).exp() as f32);
         let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
+        let quat = record.quat_wxyz.map(|q| (f64::from(q) / length) as f32);
+        let log2_opacity = log2_sigmoid(record.logit_opacity);
+        let mut values = record.mean_m.iter().chain(&scale).chain(&quat).chain(record.sh);
+        if !values.all(|value| value.is_finite()) || log2_opacity.is_nan() {
+            return;
+        }
         let block = &mut self.lanes[slot..slot + width];
         let mut set = |first: usize, values: &[f32]| {
             for (column, &value) in block[first..].iter_mut().zip(values) {
@@ -111,20 +129,15 @@ impl Chunk {
         };
         set(column::MEAN, &record.mean_m);
         set(column::SCALE, &scale);
-        set(column::QUAT, &record.quat_wxyz.map(|q| (f64::from(q) / length) as f32));
-        set(column::LOG2_OPACITY, &[log2_sigmoid(record.logit_opacity)]);
+        set(column::QUAT, &quat);
+        set(column::LOG2_OPACITY, &[log2_opacity]);
         set(column::SH, record.sh);
-
-        let mean = Vec3::from_array(record.mean_m);
-        let sigma_m = scale[0].max(scale[1]).max(scale[2]);
-        if self.count.is_multiple_of(CLUSTER) {
-            self.clusters.push(Cluster { min_m: mean, max_m: mean, sigma_m });
-        } else if let Some(cluster) = self.clusters.last_mut() {
+        if let Some(cluster) = self.clusters.last_mut() {
+            let mean = Vec3::from_array(record.mean_m);
             cluster.min_m = cluster.min_m.min(mean);
             cluster.max_m = cluster.max_m.max(mean);
-            cluster.sigma_m = cluster.sigma_m.max(sigma_m);
+            cluster.sigma_m = cluster.sigma_m.max(scale[0]).max(scale[1]).max(scale[2]);
         }
-        self.count += 1;
     }
 
     /// Grid cell (x, y).

@@ -4,11 +4,15 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
+use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, CameraError, Pose};
 
 /// A camera on the vehicle.
+///
+/// In rig files, manifests and episodes it looks as on the wire: `{"name", "width", "height", "fx",
+/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
     /// Name within the rig, `[a-z0-9._-]+`.
     pub name: String,
@@ -42,7 +46,7 @@ pub enum RigError {
         limit: usize,
     },
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
-    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are")]
+    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
     Name {
         /// The refused name.
         name: String,
@@ -90,6 +94,9 @@ impl Rig {
             let rig = self.name.clone();
             return Err(RigError::Count { rig, count, limit: Self::MAX_CAMERAS });
         }
+        if !is_name(&self.name) {
+            return Err(RigError::Name { name: self.name.clone() });
+        }
         let mut names = BTreeSet::new();
         for RigCamera { name, camera, .. } in &self.cameras {
             if !is_name(name) {
@@ -118,10 +125,40 @@ pub fn is_name(text: &str) -> bool {
         && text.bytes().all(allowed)
 }
 
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CameraFields {
+    name: String,
+    width: u32,
+    height: u32,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    camera_to_rig: Pose,
+}
+
+impl From<RigCamera> for CameraFields {
+    fn from(RigCamera { name, camera, rig_from_camera: camera_to_rig }: RigCamera) -> Self {
+        let Camera { width_px: width, height_px: height, pinhole } = camera;
+        let Pinhole { fx, fy, cx, cy } = pinhole;
+        Self { name, width, height, fx, fy, cx, cy, camera_to_rig }
+    }
+}
+
+/// Whoever reads a rig calls [`Rig::check`], which names the camera at fault.
+impl From<CameraFields> for RigCamera {
+    fn from(fields: CameraFields) -> Self {
+        let CameraFields { name, width, height, fx, fy, cx, cy, camera_to_rig } = fields;
+        let pinhole = Pinhole { fx, fy, cx, cy };
+        let camera = Camera { width_px: width, height_px: height, pinhole };
+        Self { name, camera, rig_from_camera: camera_to_rig }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::Pinhole;
     use glam::DVec3;
 
     fn camera(name: &str) -> RigCamera {
@@ -137,12 +174,30 @@ mod tests {
     fn a_rig_is_checked() {
         let rig = |cameras| Rig { name: "test".into(), cameras };
         assert_eq!(rig(vec![camera("front"), camera("rear")]).check(), Ok(()));
+        let nameless = Rig { name: "My car".into(), cameras: vec![camera("front")] };
+        assert!(matches!(nameless.check(), Err(RigError::Name { .. })));
         assert!(matches!(rig(vec![]).check(), Err(RigError::Count { count: 0, .. })));
         let twice = rig(vec![camera("front"), camera("front")]);
         assert!(matches!(twice.check(), Err(RigError::Duplicate { .. })));
         let mut flat = camera("front");
         flat.camera.height_px = 0;
         assert!(matches!(rig(vec![flat]).check(), Err(RigError::Camera { .. })));
+    }
+
+    #[test]
+    fn a_rig_file_says_what_the_wire_says() {
+        let rig = Rig { name: "test".into(), cameras: vec![camera("front")] };
+        let text = serde_json::to_string(&rig).unwrap();
+        assert_eq!(
+            text,
+            r#"{"name":"test","cameras":[{"name":"front","width":100,"height":80,"fx":100.0,"#
+                .to_owned()
+                + r#""fy":100.0,"cx":50.0,"cy":40.0,"#
+                + r#""camera_to_rig":{"xyz":[0.0,0.0,0.0],"q":[1.0,0.0,0.0,0.0]}}]}"#
+        );
+        assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), rig);
+        let fisheye = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
+        assert!(serde_json::from_str::<Rig>(&fisheye).is_err(), "a lens that is not drawn");
     }
 
     #[test]

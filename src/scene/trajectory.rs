@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose;
 
+use super::rig::is_name;
+
 /// One recorded pose of the rig.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -27,6 +29,14 @@ pub struct Trajectory {
 /// Why a trajectory was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TrajectoryError {
+    /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
+    #[error(
+        "{name:?} is not a name of a trajectory: 1 to 64 of a-z 0-9 . _ - are, not starting with ."
+    )]
+    Name {
+        /// The refused name.
+        name: String,
+    },
     /// There is nothing to drive along.
     #[error("trajectory {name:?} has no keyframes")]
     Empty {
@@ -47,8 +57,12 @@ pub enum TrajectoryError {
 
 impl Trajectory {
     /// # Errors
-    /// Names the first keyframe that breaks the order of time.
+    /// The name is none, or there is nothing to drive along; else names the first keyframe that
+    /// breaks the order of time.
     pub fn check(&self) -> Result<(), TrajectoryError> {
+        if !is_name(&self.name) {
+            return Err(TrajectoryError::Name { name: self.name.clone() });
+        }
         if self.keyframes.is_empty() {
             return Err(TrajectoryError::Empty { name: self.name.clone() });
         }
@@ -119,6 +133,10 @@ mod tests {
         assert_eq!(log.check(), Ok(()));
         log.keyframes[3].time_us = 200_000;
         assert!(matches!(log.check(), Err(TrajectoryError::Time { index: 3, .. })));
+        assert!(matches!(
+            Trajectory { name: "../log".into(), ..straight() }.check(),
+            Err(TrajectoryError::Name { .. })
+        ));
         log.keyframes.clear();
         assert!(matches!(log.check(), Err(TrajectoryError::Empty { .. })));
     }

@@ -53,21 +53,28 @@ impl Socket {
             .max_frame_size(Some(config::INBOUND_MESSAGE_BYTES))
             // Requests are short, and 1,000 connections hold a buffer each.
             .read_buffer_size(4 << 10)
-            // Text answers are written at once, and observations pass it by.
-            .write_buffer_size(0);
+            // Answers pass it by: only pongs and the goodbye go through it.
+            .write_buffer_size(0)
+            .max_write_buffer_size(config::PONGS_BYTES);
         let (role, limits) = (Role::Server, Some(limits));
         let stream = WebSocketStream::from_partially_read(stream, read_ahead, role, limits).await;
         Self { stream, send_timeout }
     }
 
-    /// Waits for the next message. Dropping the future loses nothing.
+    /// Waits for the next message. Dropping the future loses no request.
     pub(super) async fn receive(&mut self) -> Result<Incoming, Lost> {
         match self.stream.next().await {
             Some(Ok(Message::Text(text))) => Ok(Incoming::Text(text.as_str().to_owned())),
             Some(Ok(Message::Binary(_))) => Err(Lost::Fault(Fault::UnexpectedBinary)),
-            Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => {
-                Ok(Incoming::SignOfLife)
+            // Its pong must leave before more is read: who pings and never reads is no sign of life.
+            Some(Ok(Message::Ping(_))) => {
+                match timeout(self.send_timeout, self.stream.flush()).await {
+                    Ok(Ok(())) => Ok(Incoming::SignOfLife),
+                    Ok(Err(_)) => Err(Lost::Gone),
+                    Err(_) => Err(Lost::Stuck),
+                }
             }
+            Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::SignOfLife),
             None | Some(Ok(Message::Close(_))) => Err(Lost::Gone),
             Some(Err(error)) => Err(match error {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
@@ -85,21 +92,21 @@ impl Socket {
 
     /// Sends a text message.
     pub(super) async fn send_text(&mut self, text: &str) -> Result<(), Lost> {
-        let sent = timeout(self.send_timeout, self.stream.send(Message::text(text))).await;
-        match sent {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(_)) => Err(Lost::Gone),
-            Err(_) => Err(Lost::Stuck),
-        }
+        self.send(FINAL_TEXT, text.as_bytes()).await
     }
 
-    /// Sends a binary message, straight from where it lies: a WebSocket library would copy the
-    /// megabytes into its own buffer first. After an error the connection cannot be used.
+    /// Sends a binary message.
     pub(super) async fn send_binary(&mut self, payload: &[u8]) -> Result<(), Lost> {
+        self.send(FINAL_BINARY, payload).await
+    }
+
+    /// Sends a message straight from where it lies: a WebSocket library would copy the megabytes
+    /// into its own buffer first. After an error the connection cannot be used.
+    async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Lost> {
         let send = async {
             // A pong may be waiting; frames must not mix.
             self.stream.flush().await.map_err(io::Error::other)?;
-            let header = binary_header(payload.len());
+            let header = frame_header(first_byte, payload.len());
             let stream = self.stream.get_mut();
             let parts = [IoSlice::new(&header), IoSlice::new(payload)];
             let written = stream.write_vectored(&parts).await?;
@@ -131,10 +138,13 @@ impl Socket {
     }
 }
 
-/// The header of an unmasked binary frame that is a whole message (RFC 6455, section 5.2).
-fn binary_header(len: usize) -> Vec<u8> {
-    const FINAL_BINARY: u8 = 0x82;
-    let mut header = vec![FINAL_BINARY];
+/// First bytes of frames that are whole messages (RFC 6455, section 5.2).
+const FINAL_TEXT: u8 = 0x81;
+const FINAL_BINARY: u8 = 0x82;
+
+/// The header of an unmasked frame (RFC 6455, section 5.2).
+fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {
+    let mut header = vec![first_byte];
     match len {
         0..=125 => header.push(len as u8),
         126..=0xFFFF => {
@@ -155,9 +165,10 @@ mod tests {
 
     #[test]
     fn frame_headers_of_every_length() {
-        assert_eq!(binary_header(125), [0x82, 125]);
-        assert_eq!(binary_header(126), [0x82, 126, 0, 126]);
-        assert_eq!(binary_header(0xFFFF), [0x82, 126, 0xFF, 0xFF]);
-        assert_eq!(binary_header(0x1_0000), [0x82, 127, 0, 0, 0, 0, 0, 1, 0, 0]);
+        assert_eq!(frame_header(FINAL_BINARY, 125), [0x82, 125]);
+        assert_eq!(frame_header(FINAL_TEXT, 0), [0x81, 0]);
+        assert_eq!(frame_header(FINAL_BINARY, 126), [0x82, 126, 0, 126]);
+        assert_eq!(frame_header(FINAL_BINARY, 0xFFFF), [0x82, 126, 0xFF, 0xFF]);
+        assert_eq!(frame_header(FINAL_BINARY, 0x1_0000), [0x82, 127, 0, 0, 0, 0, 0, 1, 0, 0]);
     }
 }

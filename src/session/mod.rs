@@ -33,7 +33,7 @@ pub use error::SessionError;
 pub use observation::{DType, Frame, HEADER_PREFIX_BYTES, Image, Tensor, TensorKind, Timings};
 pub use opening::{Opening, Outputs, RigChoice, Start};
 pub use record::{EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs};
-pub use replay::{Change, Difference, Recording, Redrawn, ReplayError, Report};
+pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 
 use observation::{Assembly, Layout};
 use opening::{choose_cameras, resolve_start};

@@ -15,9 +15,9 @@ use std::time::{Duration, Instant};
 
 use crate::config;
 use crate::geometry::Pose;
-use crate::render::{Backend, Frame as RenderFrame, Target, View};
+use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
 use crate::residency::Resident;
-use crate::scene::rig::RigCamera;
+use crate::scene::rig::{Rig, RigCamera};
 
 use super::buffer::Buffer;
 use super::encode::{Drawn, Encoding, encode};
@@ -34,6 +34,15 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// Room for what the header says per image: three tensors of at most 190 bytes, and 11 numbers of
 /// at most 24 digits, two names and a hash with their escaped keys: below 1,400 bytes.
 const HEADER_IMAGE_BYTES: usize = 1536;
+
+/// Images of one answer at most.
+const IMAGES: usize = config::OBSERVE_POSES * Rig::MAX_CAMERAS;
+
+// A client accepts the longest header, and the renderer draws every rig in one frame.
+const _: () = assert!(
+    HEADER_BASE_BYTES + IMAGES * HEADER_IMAGE_BYTES <= config::OBSERVATION_HEADER_BYTES as usize
+);
+const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 
 /// What every observation of a session looks like.
 #[derive(Debug)]

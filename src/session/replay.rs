@@ -32,8 +32,17 @@ pub struct Report {
     pub images: u64,
     /// What is not as it was when the episode was recorded.
     pub changes: Vec<Change>,
-    /// The first image that differs. Nothing after it was rendered.
+    /// The first image that differs.
     pub difference: Option<Difference>,
+}
+
+/// How far to render.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Extent {
+    /// To the end, whatever differs.
+    Whole,
+    /// To the first image that differs.
+    FirstDifference,
 }
 
 /// Something that is not as it was.
@@ -185,8 +194,7 @@ impl Recording {
         Ok(Self { header: header.ok_or_else(empty)?, frames, end })
     }
 
-    /// Renders everything again, up to the first image that differs. Each image is shown to
-    /// `visit` before it is compared.
+    /// Renders the episode again. Each image is shown to `visit` before it is compared.
     ///
     /// # Errors
     /// The backend refuses a frame, or `visit` fails.
@@ -194,6 +202,7 @@ impl Recording {
         &self,
         resident: &Resident,
         backend: &dyn Backend,
+        extent: Extent,
         visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
     ) -> Result<Report, ReplayError> {
         let mut report =
@@ -218,7 +227,7 @@ impl Recording {
                     )?;
                     report.images += 1;
                     let now = hash.to_hex().to_string();
-                    if now != *recorded {
+                    if now != *recorded && report.difference.is_none() {
                         report.difference = Some(Difference {
                             line: index + 2,
                             request,
@@ -228,7 +237,9 @@ impl Recording {
                             recorded: recorded.clone(),
                             now,
                         });
-                        return Ok(report);
+                        if extent == Extent::FirstDifference {
+                            return Ok(report);
+                        }
                     }
                 }
             }

@@ -99,13 +99,11 @@ pub enum StoreError {
     /// A trajectory of a commit cannot be used.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
-    /// Two trajectories share a name, or one has none that is usable.
-    #[error("{name:?} cannot name a trajectory: {must}")]
+    /// Two trajectories share a name.
+    #[error("two trajectories are named {name:?}: rename one")]
     TrajectoryName {
-        /// The refused name.
+        /// The name.
         name: String,
-        /// What must hold instead.
-        must: &'static str,
     },
     /// Everything but the chunks is too much for one manifest.
     #[error(

@@ -101,16 +101,10 @@ impl NewVersion<'_> {
         }
         let mut names = BTreeSet::new();
         for trajectory in &self.trajectories {
-            let name = trajectory.name.clone();
-            if !is_name(&name) {
-                let must = "1 to 64 of a-z 0-9 . _ - can";
-                return Err(StoreError::TrajectoryName { name, must });
-            }
-            if !names.insert(name.clone()) {
-                let must = "another one has that name";
-                return Err(StoreError::TrajectoryName { name, must });
-            }
             trajectory.check()?;
+            if !names.insert(&*trajectory.name) {
+                return Err(StoreError::TrajectoryName { name: trajectory.name.clone() });
+            }
         }
         Ok(())
     }

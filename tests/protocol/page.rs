@@ -61,6 +61,35 @@ fn every_error_code_has_its_row() {
     assert_eq!(rows, codes);
 }
 
+/// The numbers on the page are those of the program.
+#[test]
+fn limits_are_those_of_the_configuration() {
+    use wildcity::config;
+    let page = page();
+    let poses = config::HISTORY_POSES;
+    let seconds = |limit: std::time::Duration| limit.as_secs();
+    for row in [
+        format!("| `ego.history_xyz` | F32 [{poses}, 3] |"),
+        format!("| `ego.history_rot` | F32 [{poses}, 3, 3] |"),
+        format!("| poses of one `observe` | {} |", config::OBSERVE_POSES),
+        format!("| cameras of a rig | {} |", wildcity::scene::Rig::MAX_CAMERAS),
+        format!("| message to the server | {} MiB |", config::INBOUND_MESSAGE_BYTES >> 20),
+        format!("| `hello` after connecting | {} s |", seconds(config::HELLO_TIMEOUT)),
+        format!("| silence between requests | {} s |", seconds(config::IDLE_TIMEOUT)),
+        format!("| reading an answer | {} s |", seconds(config::SEND_TIMEOUT)),
+        format!("| resuming | {} s |", seconds(config::RESUME_GRACE)),
+        format!("hears nothing for {} s", seconds(config::ANSWER_TIMEOUT)),
+        format!("headers up to {} MiB", config::OBSERVATION_HEADER_BYTES >> 20),
+        format!("frames up to {} GiB", config::OBSERVATION_BYTES as f64 / f64::from(1 << 30)),
+    ] {
+        assert!(page.contains(&row), "{row}");
+    }
+    let pixels =
+        page.split("all images together | ").nth(1).and_then(|rest| rest.split(' ').next());
+    let pixels = pixels.map(|pixels| pixels.replace(',', ""));
+    assert_eq!(pixels, Some(config::ANSWER_PIXELS.to_string()));
+}
+
 fn page() -> String {
     String::from_utf8(read("README.md")).unwrap()
 }

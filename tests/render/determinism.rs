@@ -3,7 +3,8 @@
 use std::sync::Mutex;
 
 use glam::DVec3;
-use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::config;
+use wildcity::render::cpu::{Cpu, CpuError, Simd};
 use wildcity::render::{Backend, Frame, RenderError, Target, View};
 use wildcity::scene::{RenderProfile, Scene};
 
@@ -40,6 +41,13 @@ fn the_number_of_threads_does_not_show() {
     for threads in [2, 3, 7] {
         assert!(by(threads) == one, "{threads} threads");
     }
+}
+
+#[test]
+fn more_threads_than_any_machine_has_are_refused_before_they_start() {
+    let refused = Cpu::new(config::RENDER_THREADS + 1, Simd::Best).unwrap_err();
+    assert!(matches!(refused, CpuError::TooManyThreads { threads: 1025 }), "{refused}");
+    assert_eq!(refused.to_string(), "1025 render threads; 0 to 1024 are accepted");
 }
 
 #[test]
@@ -100,5 +108,8 @@ fn targets_of_another_size_are_refused() {
         cpu().render(&frame, &mut [target], &|_, _| {}),
         Err(RenderError::TargetSize { view: 0, buffer: "rgb8", given: 10, wanted })
     );
-    assert_eq!(cpu().render(&frame, &mut [], &|_, _| {}), Err(RenderError::Views { count: 1 }));
+    let targets_of_none = RenderError::Targets { targets: 0, views: 1 };
+    assert_eq!(cpu().render(&frame, &mut [], &|_, _| {}), Err(targets_of_none));
+    let nothing = Frame { views: &[], ..frame };
+    assert_eq!(cpu().render(&nothing, &mut [], &|_, _| {}), Err(RenderError::Views { count: 0 }));
 }

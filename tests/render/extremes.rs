@@ -4,8 +4,8 @@
 use glam::{DQuat, DVec3};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
-use wildcity::render::View;
 use wildcity::render::reference::Reference;
+use wildcity::render::{Backend, Frame, RenderError, Target, View};
 use wildcity::scene::{Gaussians, RenderProfile, Scene, sh};
 
 use crate::images::{Image, agree, cpu, look, max_difference, render_one};
@@ -108,6 +108,21 @@ fn t3_a_splat_larger_than_the_screen() {
     for sigma_m in [10.0, 1e3, 1e4] {
         let image = agreed(&scene(&[wall(sigma_m)]), &RenderProfile::default(), view);
         assert!(image.opacity.iter().all(|&o| (o - 0.9).abs() < 0.15), "{sigma_m} m");
+    }
+}
+
+#[test]
+fn t3_a_needle_of_two_thousand_million_pixels() {
+    // 22 km long, 1 mm thin, a centimetre before a lens of 1,000 px: xx² is 1e37.
+    for angle in [0.0, 0.4, 0.8, 1.3] {
+        let needle = scene(&[Blob {
+            mean_m: DVec3::new(0.0, 0.0, 0.0101),
+            rotation: DQuat::from_rotation_z(angle),
+            sigma_m: DVec3::new(2.2e4, 1e-3, 1e-3),
+            ..Blob::default()
+        }]);
+        let image = agreed(&needle, &RenderProfile::default(), ahead([160, 120], 1000.0));
+        assert!(image.opacity.iter().all(|o| o.is_finite()));
     }
 }
 
@@ -232,6 +247,44 @@ fn t11_every_opacity() {
 }
 
 #[test]
+fn t12_what_slips_past_the_gate_is_not_drawn() {
+    let good = street(2_000, 1, 24);
+    let view = look([160, 100], 120.0, DVec3::new(0.3, 0.1, 20.0), DVec3::Z, DVec3::Y);
+    let profile = RenderProfile::default();
+    let right = render_one(&cpu(), &Scene::from_gaussians(&good), &profile, view);
+    type Poison = fn(&mut Gaussians, f32);
+    let poisons: [Poison; 5] = [
+        |g, bad| g.means_m[0][1] = bad.into(),
+        |g, bad| g.quats_wxyz[0][2] = bad,
+        |g, bad| g.ln_scales[0][0] = bad,
+        |g, _| g.logit_opacities[0] = f32::NAN,
+        |g, bad| g.sh[4] = bad,
+    ];
+    // One more Gaussian, in front of all others in the file, that must not be seen.
+    let mut more = good.clone();
+    more.means_m.insert(0, [0.3, 0.1, 22.0]);
+    more.quats_wxyz.insert(0, [1.0, 0.0, 0.0, 0.0]);
+    more.ln_scales.insert(0, [-2.0; 3]);
+    more.logit_opacities.insert(0, 4.0);
+    more.sh.splice(0..0, [1.0; 12]);
+    let seen = render_one(&cpu(), &Scene::from_gaussians(&more), &profile, view);
+    assert!(max_difference(&seen.rgba, &right.rgba) > 0.1, "unpoisoned, it would be seen");
+    for (i, poison) in poisons.into_iter().enumerate() {
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut poisoned = more.clone();
+            poison(&mut poisoned, bad);
+            let (image, truth) = both(&Scene::from_gaussians(&poisoned), &profile, view);
+            assert!(max_difference(&image.rgba, &right.rgba) < 1e-6, "poison {i}, {bad}");
+            agree(&image, &truth).unwrap();
+        }
+    }
+    let mut no_rotation = more.clone();
+    no_rotation.quats_wxyz[0] = [0.0; 4];
+    let image = render_one(&cpu(), &Scene::from_gaussians(&no_rotation), &profile, view);
+    assert!(max_difference(&image.rgba, &right.rgba) < 1e-6, "a zero quaternion");
+}
+
+#[test]
 fn t13_needles_and_dust_are_as_wide_as_the_blur() {
     for sigma_m in [DVec3::splat(1e-8), DVec3::new(1.0, 1e-6, 1e-6), DVec3::new(1e-8, 1e-2, 1e-8)] {
         agreed(
@@ -244,6 +297,25 @@ fn t13_needles_and_dust_are_as_wide_as_the_blur() {
     let image = agreed(&dust, &RenderProfile::default(), ahead([9, 9], 100.0));
     // The middle of 9 px is the centre of a pixel, which has all of it.
     assert!((image.opacity[4 * 9 + 4] - 0.9).abs() < 1e-4);
+}
+
+#[test]
+fn t15_too_much_is_refused_and_the_next_frame_is_right() {
+    // 400,000 tiles of an 10,240 px square times 340 walls are beyond 2^27 pairs.
+    let wall = || Blob { sigma_m: DVec3::splat(1e3), opacity: 0.01, ..Blob::default() };
+    let walls: Vec<Blob> = (0..340).map(|_| wall()).collect();
+    let (backend, profile) = (cpu(), RenderProfile::default());
+    let view = ahead([10_240, 10_240], 300.0);
+    let small = ahead([64, 48], 50.0);
+    let walls = scene(&walls);
+    let fresh = render_one(&backend, &walls, &profile, small);
+    let mut opacity = vec![7.0; view.camera.pixels()];
+    let target = Target { opacity: Some(&mut opacity), ..Target::default() };
+    let frame = Frame { scene: &walls, profile: &profile, views: &[view] };
+    let refused = backend.render(&frame, &mut [target], &|_, _| {}).unwrap_err();
+    assert!(matches!(refused, RenderError::TooMany { .. }), "{refused}");
+    assert!(opacity.iter().all(|&o| o == 7.0), "nothing was written");
+    assert!(render_one(&backend, &walls, &profile, small) == fresh);
 }
 
 #[test]

@@ -9,7 +9,7 @@ use tokio::io::AsyncWriteExt;
 use tokio_tungstenite::tungstenite::Message;
 use wildcity::server::Limits;
 
-use crate::support::{Agent, Reply, TestServer, pose, refused};
+use crate::support::{self, Agent, Reply, TestServer, pose, refused};
 
 async fn answer(agent: &mut Agent) -> Value {
     match agent.receive().await {
@@ -274,6 +274,28 @@ async fn pings_are_answered_and_count_as_life() {
         assert!(matches!(pong, Some(Ok(Message::Pong(_)))), "{pong:?}");
     }
     assert_eq!(agent.step(1.0).await.meta["step"], 1);
+}
+
+/// Pongs that nobody reads must neither pile up in the server nor keep the connection.
+#[tokio::test]
+async fn pings_of_a_client_that_does_not_read_are_no_life() {
+    let send = Duration::from_millis(300);
+    let server = TestServer::with(Limits { send, ..Limits::default() }).await;
+    let mut agent = server.agent().await;
+    // A masked ping of 125 zeros, 500 at a time (RFC 6455, section 5.2).
+    let ping = [&[0x89, 0x80 | 125][..], &[0; 4 + 125]].concat();
+    let block = ping.repeat(500);
+    let mut written_bytes = 0;
+    let flood = async {
+        while agent.tcp().write_all(&block).await.is_ok() {
+            written_bytes += block.len();
+        }
+    };
+    let ended = tokio::time::timeout(support::PATIENCE / 2, flood).await;
+    assert!(ended.is_ok(), "still connected after {written_bytes} bytes of pings");
+    // What the kernel's buffers hold, and no more.
+    assert!(written_bytes < 64 << 20, "{written_bytes} bytes of pings were read");
+    server.still_serves().await;
 }
 
 #[tokio::test]

@@ -9,7 +9,7 @@ use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
 use wildcity::server::{self, Config, Limits};
-use wildcity::session::{FrameRequest, Recording, ReplayError, Report};
+use wildcity::session::{Extent, FrameRequest, Recording, ReplayError, Report};
 use wildcity::store::Catalog;
 
 use crate::support::{self, Agent, Painter, TestServer, pose};
@@ -36,7 +36,7 @@ fn replay(server: &TestServer, path: &Path, backend: &dyn Backend) -> Result<Rep
     let resident = Cache::new(Catalog::open(server.twins.path())?)
         .open(&recording.header.twin, Some(recording.header.version))
         .unwrap();
-    recording.replay(&resident, backend, &mut |_| Ok(()))
+    recording.replay(&resident, backend, Extent::FirstDifference, &mut |_| Ok(()))
 }
 
 /// Changes one hex digit of the hash of an image, in a line counted from 0.
@@ -151,10 +151,19 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let recorded = crate::record::lines(&path);
     assert_eq!(recorded[4]["images"][0], blake3::hash(&front).to_hex().as_str());
 
-    tamper(&path, 7, 1);
+    // Another backend differs, and its pictures are wanted all the same.
+    let others = episodes.path().join("others");
+    let arguments = ["--backend", "reference", "--out", others.to_str().unwrap()];
+    tamper(&path, 2, 0);
+    tamper(&path, 5, 1);
+    let drawn = wildcity(&arguments, &path, twins.path());
+    let text = String::from_utf8(drawn.stdout).unwrap();
+    assert!(drawn.status.success() && text.contains("differs     step"), "{text}");
+    assert_eq!(std::fs::read_dir(&others).unwrap().count(), 24);
+
     let failed = wildcity(&["--verify"], &path, twins.path());
     assert_eq!(failed.status.code(), Some(1));
     let error = String::from_utf8(failed.stderr).unwrap();
-    assert!(error.contains("step 7") && error.contains("\"rear\""), "{error}");
+    assert!(error.contains("step 2") && error.contains("\"front\""), "{error}");
     running.stop().await;
 }

@@ -29,9 +29,8 @@ fn import_inspect_and_verify_tell_what_is_there() {
     let dir = tempfile::tempdir().unwrap();
     let scene = ply(&gaussians(3_000, 1, 100.0, 1), &inria_columns(1, true));
     let rig = r#"{"name": "car", "cameras": [{"name": "front",
-        "camera": {"width_px": 64, "height_px": 48,
-                   "pinhole": {"fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.0}},
-        "rig_from_camera": {"xyz": [1.5, 0, 1.6], "q": [0.5, -0.5, 0.5, -0.5]}}]}"#;
+        "width": 64, "height": 48, "fx": 50, "fy": 50.0, "cx": 32.0, "cy": 24.0,
+        "camera_to_rig": {"xyz": [1.5, 0, 1.6], "q": [0.5, -0.5, 0.5, -0.5]}}]}"#;
     let log = r#"{"name": "log", "keyframes": [
         {"time_us": 0, "world_from_rig": {"xyz": [0, 0, 0], "q": [1, 0, 0, 0]}},
         {"time_us": 100000, "world_from_rig": {"xyz": [3, 4, 0], "q": [1, 0, 0, 0]}}]}"#;
@@ -131,6 +130,59 @@ fn bad_options_are_named_before_the_file_is_read() {
         assert!(said.contains(wanted), "{options:?}: {said}");
         assert!(!dir.path().join("twins").exists(), "{options:?}");
     }
+}
+
+#[test]
+fn a_bad_rig_or_drive_is_named_with_its_file_before_the_scene_is_read() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("settings.json").display().to_string();
+    let drive = r#"{"name": "log", "keyframes": [
+        {"time_us": 0, "world_from_rig": {"xyz": [0, 0, 0], "q": [1, 0, 0, 0]}}]}"#;
+    let rig = r#"{"name": "car", "cameras": [{"name": "front", "width": 0, "height": 48, "fx": 50,
+        "fy": 50, "cx": 32, "cy": 24,
+        "camera_to_rig": {"xyz": [0, 0, 0], "q": [1, 0, 0, 0]}}]}"#;
+    for (option, text, wanted) in [
+        ("--rig", rig.to_owned(), "settings.json: camera \"front\": width is 0"),
+        ("--rig", rig.replace("car", "Car"), "settings.json: \"Car\" is not a name"),
+        ("--rig", "[]".into(), "settings.json is a JSON list; one object is read"),
+        ("--trajectory", " []".into(), "settings.json is a JSON list; one object is read"),
+        ("--trajectory", drive.replace("log", "a/b"), "settings.json: \"a/b\" is not a name"),
+        ("--trajectory", r#"{"name": "log", "keyframes": []}"#.into(), "has no keyframes"),
+        ("--trajectory", drive.to_owned(), "settings.json: two trajectories are named \"log\""),
+    ] {
+        fs::write(&path, text).unwrap();
+        let twice = [option, &path, option, &path];
+        let said = refusal(&import(
+            dir.path(),
+            b"no scene",
+            &twice[..if option == "--rig" { 2 } else { 4 }],
+        ));
+        assert!(said.contains(wanted) && !said.contains("scene.ply"), "{said}");
+    }
+}
+
+#[test]
+fn the_files_that_help_shows_are_accepted() {
+    let help = stdout(&wildcity().args(["import", "--help"]).output().unwrap());
+    let dir = tempfile::tempdir().unwrap();
+    let shown = |start: &str| {
+        let from = &help[help.find(start).unwrap()..];
+        let path = dir.path().join("shown.json").display().to_string();
+        fs::write(&path, &from[..from.find("]}\n").unwrap() + 2]).unwrap();
+        path
+    };
+    let scene = ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false));
+    stdout(&import(dir.path(), &scene, &["--rig", &shown("{\"name\": \"car\"")]));
+    stdout(&import(dir.path(), &scene, &["--trajectory", &shown("{\"name\": \"log\"")]));
+}
+
+#[test]
+fn an_absurd_number_of_threads_is_a_mistake_on_the_command_line() {
+    let bench = ["bench", "step", "street", "--cameras", "none.json", "--threads", "9999999"];
+    let output = wildcity().args(bench).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("--threads") && said.contains("expected 0 to 1024"), "{said}");
 }
 
 #[test]

@@ -1,7 +1,13 @@
 //! Scenes with the shape of a street: flat things, thin things, near and far.
 
-use wildcity::scene::{Gaussians, sh};
+use glam::DVec3;
+use wildcity::generate::{self, StreetSettings};
+use wildcity::geometry::Camera;
+use wildcity::geometry::camera::Pinhole;
+use wildcity::render::View;
+use wildcity::scene::{Gaussians, Rig, sh};
 
+use crate::images::look;
 use crate::scene_files::Random;
 
 /// `n` Gaussians of a road, two facades and clutter along +z, y down (a camera's own axes).
@@ -31,4 +37,35 @@ pub(crate) fn street(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
         g.sh.extend((3..3 * sh::coefficients(sh_degree)).map(|_| random.between(-0.3, 0.3)));
     }
     g
+}
+
+/// Views from within a street: along it, across it, and back.
+pub(crate) fn street_views() -> [View; 3] {
+    let at = DVec3::new(0.4, 0.0, 20.0);
+    [
+        look([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
+        look([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
+        look([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
+    ]
+}
+
+/// The demo street, and what two of its cameras see at an eighth of their size.
+pub(crate) fn demo_street() -> (Gaussians, [View; 2]) {
+    let street = generate::street(&StreetSettings::default()).unwrap();
+    let rig = Rig::preset("vehicle6").unwrap();
+    let world_from_rig = street.trajectory.at_station(60.0);
+    let view = |name: &str| {
+        let mounted = rig.cameras.iter().find(|camera| camera.name == name).unwrap();
+        let p = mounted.camera.pinhole;
+        let eighth = |c: f64| c / 8.0;
+        let pinhole =
+            Pinhole { fx: eighth(p.fx), fy: eighth(p.fy), cx: eighth(p.cx), cy: eighth(p.cy) };
+        let (width_px, height_px) = (mounted.camera.width_px / 8, mounted.camera.height_px / 8);
+        View {
+            camera: Camera { width_px, height_px, pinhole },
+            world_from_camera: world_from_rig * mounted.rig_from_camera,
+        }
+    };
+    let views = [view("front"), view("left")];
+    (street.gaussians, views)
 }

@@ -17,6 +17,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("anyhow", &["cli"]),
     ("indicatif", &["cli"]),
     ("fearless_simd", &["render/cpu"]),
+    ("wgpu", &["render/gpu"]),
     ("rayon", &["render", "scene/chunk.rs", "ingest/validate.rs", "residency/cache.rs"]),
     ("tokio", &["server", "client", "session", "cli"]),
     ("schemars", &["protocol"]),

@@ -2,15 +2,12 @@
 
 pub mod pinhole;
 
-use serde::{Deserialize, Serialize};
-
 pub use pinhole::Pinhole;
 
 /// An image size and the model that maps camera rays to its pixels.
 ///
 /// Pixel (column, row) covers `[column, column + 1) x [row, row + 1)`; its centre is at +0.5.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Image width, in pixels.
     pub width_px: u32,

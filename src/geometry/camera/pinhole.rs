@@ -1,13 +1,11 @@
 //! The pinhole: `u = fx x/z + cx`, `v = fy y/z + cy`.
 
 use glam::{DVec2, DVec3};
-use serde::{Deserialize, Serialize};
 
 use super::CameraError;
 
 /// Pinhole intrinsics, in pixels from the image's top-left corner.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pinhole {
     /// Focal length along x.
     pub fx: f64,

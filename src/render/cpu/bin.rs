@@ -4,7 +4,7 @@
 //! them, and counts; the second only unpacks them, so the two cannot disagree. A prefix sum over
 //! (tile, block) gives every block its own places, so the lists do not depend on the schedule.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -115,8 +115,13 @@ impl Bins {
             self.blocks.resize_with(jobs.len(), Block::default);
         }
 
+        let total = AtomicU64::new(0);
         let blocks = self.blocks.par_iter_mut().zip(&jobs);
         blocks.for_each_init(Vec::new, |spans, (block, (view, keys))| {
+            // Beyond the limit the frame fails whatever the rest holds: gather no more of it.
+            if total.load(Relaxed) > MAX_INSTANCES {
+                return;
+            }
             let grid = &grids[*view];
             block.cursors.clear();
             block.cursors.resize(grid.tiles(), 0);
@@ -126,9 +131,15 @@ impl Bins {
             block.spans.clear();
             block.spans.reserve_exact(spans.len());
             block.spans.extend_from_slice(spans);
+            let count: u64 = block.cursors.iter().map(|&count| u64::from(count)).sum();
+            total.fetch_add(count, Relaxed);
         });
+        if total.into_inner() > MAX_INSTANCES {
+            let what = "(Gaussian, tile) pairs";
+            return Err(RenderError::TooMany { what, limit: MAX_INSTANCES });
+        }
 
-        self.place(&jobs, &grids)?;
+        self.place(&jobs, &grids);
 
         self.blocks.par_iter_mut().zip(&jobs).for_each(|(block, (_, keys))| {
             emit(keys, &block.spans, &mut block.cursors, &self.instances);
@@ -137,10 +148,10 @@ impl Bins {
     }
 
     /// Turns counts into places, tile by tile and within a tile block by block.
-    fn place(&mut self, jobs: &[(usize, &[u64])], grids: &[Grid]) -> Result<(), RenderError> {
+    fn place(&mut self, jobs: &[(usize, &[u64])], grids: &[Grid]) {
         self.starts.clear();
         self.first_tile.clear();
-        let mut total = 0_u64;
+        let mut total = 0;
         let mut rest = &mut self.blocks[..jobs.len()];
         for (view, grid) in grids.iter().enumerate() {
             let count = jobs.iter().filter(|(of, _)| *of == view).count();
@@ -148,19 +159,15 @@ impl Bins {
             rest = after;
             self.first_tile.push(self.starts.len());
             for tile in 0..grid.tiles() {
-                self.starts.push(total as u32);
+                self.starts.push(total);
                 for block in &mut *blocks {
                     let count = block.cursors[tile];
-                    block.cursors[tile] = total as u32;
-                    total += u64::from(count);
+                    block.cursors[tile] = total;
+                    total += count;
                 }
             }
-            if total > MAX_INSTANCES {
-                let what = "(Gaussian, tile) pairs";
-                return Err(RenderError::TooMany { what, needed: total, limit: MAX_INSTANCES });
-            }
         }
-        self.starts.push(total as u32);
+        self.starts.push(total);
         self.used = total as usize;
         if self.instances.len() < self.used {
             // An eighth to spare, not as much again: a drive's frames differ by little.
@@ -168,7 +175,6 @@ impl Bins {
             self.instances.reserve_exact(wanted - self.instances.len());
             self.instances.resize_with(wanted, AtomicU32::default);
         }
-        Ok(())
     }
 
     /// (Gaussian, tile) pairs of the frame.

@@ -16,6 +16,8 @@ use std::time::Instant;
 use fearless_simd::Level;
 use rayon::ThreadPool;
 
+use crate::config;
+
 use super::layout::Cutoffs;
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
@@ -47,6 +49,12 @@ pub enum CpuError {
     /// The machine lacks the instruction set asked for.
     #[error("this machine has no {0:?}")]
     NoSuchSimd(Simd),
+    /// More threads than any machine has cores.
+    #[error("{threads} render threads; 0 to {} are accepted", config::RENDER_THREADS)]
+    TooManyThreads {
+        /// How many were asked for.
+        threads: usize,
+    },
     /// The threads could not be started.
     #[error("cannot start the render threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
@@ -64,8 +72,11 @@ impl Cpu {
     /// A backend with threads of its own: `threads`, or one per core if 0.
     ///
     /// # Errors
-    /// The machine lacks the instruction set, or the threads.
+    /// The machine lacks the instruction set, or the threads; or there are too many of them.
     pub fn new(threads: usize, simd: Simd) -> Result<Self, CpuError> {
+        if threads > config::RENDER_THREADS {
+            return Err(CpuError::TooManyThreads { threads });
+        }
         let best = Level::new();
         let level = match simd {
             Simd::Best => Some(best),

@@ -5,7 +5,7 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, f64x8, i32x16, prelude::*};
 use rayon::prelude::*;
 
 use super::lanes::Vec3x16;
@@ -172,7 +172,18 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
 /// Sixteen splats as columns, and which of them are visible.
 struct SplatLanes {
     visible: u64,
-    columns: [[f32; LANES]; 12],
+    mean_x: [f32; LANES],
+    mean_y: [f32; LANES],
+    l0: [f32; LANES],
+    l1: [f32; LANES],
+    l2: [f32; LANES],
+    log2_opacity: [f32; LANES],
+    red: [f32; LANES],
+    green: [f32; LANES],
+    blue: [f32; LANES],
+    depth_m: [f32; LANES],
+    extent_x: [f32; LANES],
+    extent_y: [f32; LANES],
 }
 
 impl SplatLanes {
@@ -180,26 +191,21 @@ impl SplatLanes {
     fn append(&self, splats: &mut Vec<Splat>) {
         let mut visible = self.visible;
         while visible != 0 {
-            let lane = visible.trailing_zeros() as usize;
+            let i = visible.trailing_zeros() as usize % LANES;
             visible &= visible - 1;
-            let c = |column: usize| self.columns[column][lane];
             splats.push(Splat {
-                mean_px: [c(0), c(1)],
-                factor: [c(2), c(3), c(4)],
-                log2_opacity: c(5),
-                rgb: [c(6), c(7), c(8)],
-                depth_m: c(9),
-                extent_px: [c(10), c(11)],
+                mean_px: [self.mean_x[i], self.mean_y[i]],
+                factor: [self.l0[i], self.l1[i], self.l2[i]],
+                log2_opacity: self.log2_opacity[i],
+                rgb: [self.red[i], self.green[i], self.blue[i]],
+                depth_m: self.depth_m[i],
+                extent_px: [self.extent_x[i], self.extent_y[i]],
             });
         }
     }
 }
 
 /// Projects one block, or returns `None` if nothing of it can be seen.
-///
-/// `Σ′ = J W Σ Wᵀ Jᵀ + blur I` (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5) through its square
-/// root `V = J W R S` (2x3). With the minors `m_ij` of `V`, `det Σ′ = Σ m_ij² + blur |V|² + blur²`
-/// is a sum of positives: exact to rounding for needles whose `ac - b²` cancels to nothing.
 #[inline(always)]
 fn project_block<S: Simd>(
     simd: S,
@@ -210,14 +216,7 @@ fn project_block<S: Simd>(
 ) -> Option<SplatLanes> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let mean = Vec3x16::load(simd, columns, column::MEAN);
-
-    // Camera space: in range?
-    let camera = |i: usize| {
-        let [rx, ry, rz] = view.rotation[i];
-        let z = splat(rz).mul_add(mean.z, splat(view.translation_m[i]));
-        splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
-    };
-    let (x, y, z) = (camera(0), camera(1), camera(2));
+    let z = depth(simd, view, mean);
     let mut log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let in_range = z.simd_ge(splat(cutoffs.near_m))
         & z.simd_le(splat(cutoffs.far_m))
@@ -226,52 +225,28 @@ fn project_block<S: Simd>(
         return None;
     }
 
-    // V = J W R S, with J at the clamped slope, and no wider than f32 can square twice.
     let inverse_z = splat(1.0) / z;
-    let (slope_x, slope_y) = (x * inverse_z, y * inverse_z);
+    let slope_x = to_camera(simd, view, mean, 0) * inverse_z;
+    let slope_y = to_camera(simd, view, mean, 1) * inverse_z;
     let mean_x = slope_x.mul_add(splat(view.focal_px[0]), splat(view.center_px[0]));
     let mean_y = slope_y.mul_add(splat(view.focal_px[1]), splat(view.center_px[1]));
+
     let own = rotation_columns(simd, columns);
     let scale = Vec3x16::load(simd, columns, column::SCALE);
-    let row = |i: usize, slope: f32x16<S>| {
-        let clamped = slope.max(splat(view.slope_min[i])).min(splat(view.slope_max[i]));
-        let forward = Vec3x16::splat(simd, view.rotation[2]);
-        let jw = forward
-            .mul_add(-clamped, Vec3x16::splat(simd, view.rotation[i]))
-            .scale(inverse_z * splat(view.focal_px[i]));
-        Vec3x16 { x: jw.dot(own[0]), y: jw.dot(own[1]), z: jw.dot(own[2]) }.times(scale)
-    };
-    let (v0, v1) = (row(0, slope_x), row(1, slope_y));
-    let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
-    let shrink = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
-    let (v0, v1) = (v0.scale(shrink), v1.scale(shrink));
-
-    // The covariance, its determinant, and the factor of its inverse.
-    let blur = splat(cutoffs.blur_px2);
-    let (xx, yy, b) = (v0.dot(v0), v1.dot(v1), v0.dot(v1));
-    let minors = v0.cross(v1);
-    let det_before = minors.dot(minors);
-    let det = blur.mul_add(xx + yy + blur, det_before);
-    let (a, c) = (xx + blur, yy + blur);
+    let v0 = root_row(simd, view, 0, slope_x, inverse_z, own).times(scale);
+    let v1 = root_row(simd, view, 1, slope_y, inverse_z, own).times(scale);
+    let ellipse = Ellipse::new(simd, v0, v1, cutoffs.blur_px2);
     if cutoffs.antialiased {
-        // Yu et al. 2024 (Mip-Splatting): sqrt(det_before / det), with gsplat's floor 0.005.
-        let ratio = (det_before / det).max(splat(0.005 * 0.005));
+        // Yu et al. 2024 (Mip-Splatting): sqrt(det before / det), with gsplat's floor 0.005.
+        let ratio = ellipse.det_share.max(splat(0.005 * 0.005));
         log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
     }
-    // q(dx, dy) = (c dx - b dy)²/(c det) + dy²/c; times log2(e)/2 it is a power of two.
-    let unit = splat((0.5 * std::f64::consts::LOG2_E).sqrt() as f32);
-    let root_c = c.sqrt();
-    let l2 = unit / root_c;
-    let root_det = det.sqrt();
-    let l0 = unit * root_c / root_det;
-    let l1 = -(b * l2) / root_det;
 
     // The box where alpha reaches the cut, against the image's pixel centres.
     let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
-    let reach = power.max(splat(0.0)).sqrt() / unit;
-    let slack = splat(EXTENT_SLACK_PX);
-    let extent_x = reach.mul_add(a.sqrt(), slack);
-    let extent_y = reach.mul_add(root_c, slack);
+    let reach = power.max(splat(0.0)).sqrt() / splat(LOG2_UNIT);
+    let extent_x = reach.mul_add(ellipse.sigma_x, splat(EXTENT_SLACK_PX));
+    let extent_y = reach.mul_add(ellipse.sigma_y, splat(EXTENT_SLACK_PX));
     let on_image = |mean: f32x16<S>, extent: f32x16<S>, size_px: f32| {
         (mean + extent).simd_ge(splat(0.5)) & (mean - extent).simd_le(splat(size_px - 0.5))
     };
@@ -285,20 +260,116 @@ fn project_block<S: Simd>(
 
     let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     let rgb = color(simd, columns, sh_degree, toward);
-    let mut lanes = SplatLanes { visible: visible.to_bitmask(), columns: [[0.0; LANES]; 12] };
-    mean_x.store_array(&mut lanes.columns[0]);
-    mean_y.store_array(&mut lanes.columns[1]);
-    l0.store_array(&mut lanes.columns[2]);
-    l1.store_array(&mut lanes.columns[3]);
-    l2.store_array(&mut lanes.columns[4]);
-    log2_opacity.store_array(&mut lanes.columns[5]);
-    rgb.x.store_array(&mut lanes.columns[6]);
-    rgb.y.store_array(&mut lanes.columns[7]);
-    rgb.z.store_array(&mut lanes.columns[8]);
-    z.store_array(&mut lanes.columns[9]);
-    extent_x.store_array(&mut lanes.columns[10]);
-    extent_y.store_array(&mut lanes.columns[11]);
-    Some(lanes)
+    Some(SplatLanes {
+        visible: visible.to_bitmask(),
+        mean_x: mean_x.to_array(),
+        mean_y: mean_y.to_array(),
+        l0: ellipse.l0.to_array(),
+        l1: ellipse.l1.to_array(),
+        l2: ellipse.l2.to_array(),
+        log2_opacity: log2_opacity.to_array(),
+        red: rgb.x.to_array(),
+        green: rgb.y.to_array(),
+        blue: rgb.z.to_array(),
+        depth_m: z.to_array(),
+        extent_x: extent_x.to_array(),
+        extent_y: extent_y.to_array(),
+    })
+}
+
+/// Camera-space z of centres, in metres: computed in f64 and rounded to f32 once.
+///
+/// Splats are blended in order of this number. Were it a sum of f32, thousands of surfels of one
+/// facade would be blended in the order of their rounding errors.
+#[inline(always)]
+fn depth<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>) -> f32x16<S> {
+    let splat = |value: f64| f64x8::splat(simd, value);
+    let [rx, ry, rz, origin_m] = view.forward.map(splat);
+    let (x, y, z) = (mean.x.widen(), mean.y.widen(), mean.z.widen());
+    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, origin_m)));
+    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, origin_m)));
+    low.narrow(high)
+}
+
+/// The camera-space x or y of centres, in metres.
+#[inline(always)]
+fn to_camera<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>, axis: usize) -> f32x16<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let [rx, ry, rz] = view.rotation[axis];
+    let z = splat(rz).mul_add(mean.z, splat(view.translation_m[axis]));
+    splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
+}
+
+/// A row of `J W R`, in px/m: how a pixel coordinate moves along each own axis, linearised at the
+/// clamped slope.
+#[inline(always)]
+fn root_row<S: Simd>(
+    simd: S,
+    view: &ChunkView,
+    axis: usize,
+    slope: f32x16<S>,
+    inverse_z: f32x16<S>,
+    own: [Vec3x16<S>; 3],
+) -> Vec3x16<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let clamped = slope.max(splat(view.slope_min[axis])).min(splat(view.slope_max[axis]));
+    let forward = Vec3x16::splat(simd, view.rotation[2]);
+    let jw = forward
+        .mul_add(-clamped, Vec3x16::splat(simd, view.rotation[axis]))
+        .scale(inverse_z * splat(view.focal_px[axis]));
+    Vec3x16 { x: jw.dot(own[0]), y: jw.dot(own[1]), z: jw.dot(own[2]) }
+}
+
+/// `√(log2(e)/2)`: what turns standard deviations into the unit of [`Splat::factor`].
+const LOG2_UNIT: f32 = 0.849_321_8;
+
+/// Screen ellipses, by their factor.
+struct Ellipse<S: Simd> {
+    l0: f32x16<S>,
+    l1: f32x16<S>,
+    l2: f32x16<S>,
+    /// Standard deviation along x, in pixels.
+    sigma_x: f32x16<S>,
+    /// Standard deviation along y, in pixels.
+    sigma_y: f32x16<S>,
+    /// Determinant before the blur as a share of the one after.
+    det_share: f32x16<S>,
+}
+
+impl<S: Simd> Ellipse<S> {
+    /// From the rows of `V = J W R S`, a square root of the screen covariance before the blur.
+    ///
+    /// `Σ′ = V Vᵀ + blur I` (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5). With the minors `m` of
+    /// `V`, `det Σ′ = |m|² + blur |V|² + blur²` is a sum of positives: exact to rounding for needles
+    /// whose `ac - b²` cancels to nothing. It is of fourth order, so whatever is wider than
+    /// [`MAX_SIGMA_PX`] is computed in a larger unit than the pixel.
+    #[inline(always)]
+    fn new(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, blur_px2: f32) -> Self {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
+        let per_px = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
+        let px = splat(1.0) / per_px;
+        let (v0, v1) = (v0.scale(per_px), v1.scale(per_px));
+        let blur = splat(blur_px2) * per_px * per_px;
+
+        let (xx, yy, b) = (v0.dot(v0), v1.dot(v1), v0.dot(v1));
+        let minors = v0.cross(v1);
+        let det_before = minors.dot(minors);
+        let det = blur.mul_add(xx + yy + blur, det_before);
+        // q(dx, dy) = (c dx - b dy)²/(c det) + dy²/c; times log2(e)/2 it is a power of two.
+        let (sigma_x, sigma_y) = ((xx + blur).sqrt(), (yy + blur).sqrt());
+        let unit = splat(LOG2_UNIT) * per_px;
+        let l2 = unit / sigma_y;
+        let root_det = det.sqrt();
+        Self {
+            l0: unit * sigma_y / root_det,
+            l1: -(b * l2) / root_det,
+            l2,
+            sigma_x: sigma_x * px,
+            sigma_y: sigma_y * px,
+            det_share: det_before / det,
+        }
+    }
 }
 
 /// Columns of the rotation matrices of a block's unit quaternions: the own axes in the world.

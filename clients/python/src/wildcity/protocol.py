@@ -16,7 +16,7 @@ from .errors import Code, ProtocolError
 PROTOCOL = "wildcity.v1"
 """The WebSocket subprotocol."""
 
-OBSERVATION_BYTES = 1 << 30
+OBSERVATION_BYTES = 3 << 29
 """Largest message accepted from a server."""
 
 Encoding = Literal["jpeg", "png", "raw"]

@@ -1,0 +1,293 @@
+// Stage project: 3D Gaussians become splats on the screens of all views, one workgroup per item: one
+// cluster of 256 Gaussians in one view. Items are in order of (view, global id).
+//
+// `cull` decides which are visible and counts them; a prefix sum over the items gives each its place;
+// `project` writes the visible ones there, so that splats keep the order of their items. Twin of
+// `src/render/cpu/project.rs`, where the equations are documented.
+
+#import constants
+#import layout
+#import math
+
+override SH_DEGREE: u32;
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> span: Span;
+@group(0) @binding(2) var<storage, read> page_items: array<u32>;
+@group(0) @binding(3) var<storage, read> items: array<Item>;
+@group(0) @binding(4) var<storage, read> chunk_views: array<ChunkView>;
+@group(0) @binding(5) var<storage, read> gaussians: array<u32>;
+@group(0) @binding(6) var<storage, read_write> visible: array<u32>;
+@group(0) @binding(7) var<storage, read_write> offsets: array<u32>;
+@group(0) @binding(8) var<storage, read_write> shapes: array<SplatShape>;
+@group(0) @binding(9) var<storage, read_write> colors: array<SplatColor>;
+@group(0) @binding(10) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(11) var<storage, read_write> places: array<u32>;
+
+const MASK_WORDS: u32 = CLUSTER / 32;
+
+var<workgroup> mask: array<atomic<u32>, MASK_WORDS>;
+
+@compute @workgroup_size(CLUSTER)
+fn cull(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(num_workgroups) groups: vec3u,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let index = group_index(group, groups);
+    if index >= span.count {
+        return;
+    }
+    let item_index = page_items[span.first + index];
+    let item = items[item_index];
+    if thread < MASK_WORDS {
+        atomicStore(&mask[thread], 0u);
+    }
+    workgroupBarrier();
+    if project_shape(geometry(item.cluster, thread), chunk_views[item.chunk_view]).visible {
+        atomicOr(&mask[thread / 32u], 1u << (thread % 32u));
+    }
+    workgroupBarrier();
+    if thread < MASK_WORDS {
+        visible[item_index * MASK_WORDS + thread] = atomicLoad(&mask[thread]);
+    }
+    if thread == 0u {
+        var count = 0u;
+        for (var word = 0u; word < MASK_WORDS; word++) {
+            count += countOneBits(atomicLoad(&mask[word]));
+        }
+        offsets[item_index] = count;
+    }
+}
+
+@compute @workgroup_size(CLUSTER)
+fn project(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(num_workgroups) groups: vec3u,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let index = group_index(group, groups);
+    if index >= span.count {
+        return;
+    }
+    let item_index = page_items[span.first + index];
+    let item = items[item_index];
+    // What `cull` decided stands, even where this pipeline rounds otherwise.
+    let own_word = visible[item_index * MASK_WORDS + thread / 32u];
+    let own_bit = 1u << (thread % 32u);
+    if (own_word & own_bit) == 0u {
+        return;
+    }
+    var place = offsets[item_index] + countOneBits(own_word & (own_bit - 1u));
+    for (var word = 0u; word < thread / 32u; word++) {
+        place += countOneBits(visible[item_index * MASK_WORDS + word]);
+    }
+    if place >= frame.splat_capacity {
+        return;
+    }
+    let chunk_view = chunk_views[item.chunk_view];
+    let own = geometry(item.cluster, thread);
+    let projected = project_shape(own, chunk_view);
+    shapes[place] = projected.shape;
+    let rgb = color(item.cluster, thread, own.mean_m - chunk_view.camera_m);
+    colors[place] = SplatColor(rgb, projected.depth_m);
+    let depth = bitcast<u32>(projected.depth_m) - bitcast<u32>(frame.near_m);
+    keys[place] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
+    places[place] = place;
+}
+
+struct Projected {
+    visible: bool,
+    shape: SplatShape,
+    depth_m: f32,
+}
+
+// Camera-space z, as if computed exactly and rounded once: splats are blended in order of it, and
+// surfels of one facade must not be ordered by rounding errors. Products and sums carry what their
+// rounding loses (Dekker 1971; two-sum by Knuth); where `fma` rounds twice, what products lose is lost.
+fn depth(mean: vec3f, view: ChunkView) -> f32 {
+    var sum = view.forward_high.w;
+    var lost = view.forward_low.w;
+    for (var axis = 0; axis < 3; axis++) {
+        let product = mean[axis] * view.forward_high[axis];
+        lost += fma(mean[axis], view.forward_high[axis], -product);
+        lost += mean[axis] * view.forward_low[axis];
+        let next = sum + product;
+        let part = next - sum;
+        lost += (sum - (next - part)) + (product - part);
+        sum = next;
+    }
+    return sum + lost;
+}
+
+fn project_shape(own: Geometry, view: ChunkView) -> Projected {
+    // Camera space: in range?
+    let mean = vec4f(own.mean_m, 1.0);
+    let x = dot(view.camera_from_chunk[0], mean);
+    let y = dot(view.camera_from_chunk[1], mean);
+    let z = depth(own.mean_m, view);
+    let in_range = z >= frame.near_m && z <= frame.far_m
+        && own.log2_opacity >= frame.log2_alpha_cut;
+    if !in_range {
+        return Projected();
+    }
+
+    // V = J W R S, with J at the clamped slope, and no wider than f32 can square twice.
+    let slope = vec2f(x, y) / z;
+    let mean_px = view.focal_px * slope + view.center_px;
+    let clamped = clamp(slope, view.slope_min, view.slope_max);
+    let px_per_m = view.focal_px / z;
+    let right = view.camera_from_chunk[0].xyz;
+    let down = view.camera_from_chunk[1].xyz;
+    let forward = view.camera_from_chunk[2].xyz;
+    let rotation = rotation_from_quat(own.quat_wxyz);
+    var v0 = ((right - clamped.x * forward) * px_per_m.x) * rotation * own.scale_m;
+    var v1 = ((down - clamped.y * forward) * px_per_m.y) * rotation * own.scale_m;
+    let widest = max(max_component(abs(v0)), max_component(abs(v1)));
+    let shrink = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
+    v0 *= shrink;
+    v1 *= shrink;
+
+    // The covariance, its determinant (a sum of positives), and the factor of its inverse.
+    let xx = dot(v0, v0);
+    let yy = dot(v1, v1);
+    let b = dot(v0, v1);
+    let minors = cross(v0, v1);
+    let det_before = dot(minors, minors);
+    let det = frame.blur_px2 * (xx + yy + frame.blur_px2) + det_before;
+    let a = xx + frame.blur_px2;
+    let c = yy + frame.blur_px2;
+    var log2_opacity = own.log2_opacity;
+    if frame.antialiased != 0u {
+        log2_opacity += 0.5 * log2(max(det_before / det, 0.005 * 0.005));
+    }
+    let unit = 0.8493218; // sqrt(log2(e) / 2)
+    let root_c = sqrt(c);
+    let root_det = sqrt(det);
+    let l2 = unit / root_c;
+    let l0 = unit * root_c / root_det;
+    let l1 = -(b * l2) / root_det;
+
+    // The box where alpha reaches the cut, against the image's pixel centres.
+    let power = log2_opacity - frame.log2_alpha_cut;
+    let reach = sqrt(max(power, 0.0)) / unit;
+    let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
+    let size_px = vec2f(frame.view[view.view].size_px);
+    let on_image = all(mean_px + extent_px >= vec2f(0.5))
+        && all(mean_px - extent_px <= size_px - 0.5);
+    let shape = SplatShape(mean_px, extent_px, vec3f(l0, l1, l2), log2_opacity);
+    return Projected(power >= 0.0 && on_image, shape, z);
+}
+
+fn max_component(v: vec3f) -> f32 {
+    return max(v.x, max(v.y, v.z));
+}
+
+// World from own axes, of a unit quaternion.
+fn rotation_from_quat(wxyz: vec4f) -> mat3x3f {
+    let w = wxyz.x;
+    let x = 2.0 * wxyz.y * wxyz.yzw;
+    let y = 2.0 * wxyz.z * wxyz.yzw;
+    let z = 2.0 * wxyz.w * wxyz.yzw;
+    let turn = 2.0 * w * wxyz.yzw;
+    return mat3x3f(
+        vec3f(1.0 - y.y - z.z, x.y + turn.z, x.z - turn.y),
+        vec3f(x.y - turn.z, 1.0 - x.x - z.z, y.z + turn.x),
+        vec3f(x.z + turn.y, y.z - turn.x, 1.0 - x.x - y.y),
+    );
+}
+
+// A Gaussian without its colour.
+struct Geometry {
+    mean_m: vec3f,
+    scale_m: vec3f,
+    log2_opacity: f32,
+    quat_wxyz: vec4f,
+}
+
+// Decodes what `src/render/gpu/mirror.rs` encodes: word after word, 256 Gaussians side by side.
+fn geometry(cluster: u32, thread: u32) -> Geometry {
+    var at = cluster_start(cluster) + CLUSTER_HEADER_WORDS + thread;
+    var own: Geometry;
+    own.mean_m = vec3f(float(at), float(at + CLUSTER), float(at + 2u * CLUSTER));
+    at += 3u * CLUSTER;
+    own.scale_m = vec3f(float(at), float(at + CLUSTER), float(at + 2u * CLUSTER));
+    own.log2_opacity = float(at + 3u * CLUSTER);
+    own.quat_wxyz = quat_from_bits(gaussians[at + 4u * CLUSTER], gaussians[at + 5u * CLUSTER]);
+    return own;
+}
+
+// The three smaller components in 20 bits each, and which one is the largest, made positive.
+fn quat_from_bits(low: u32, high: u32) -> vec4f {
+    let steps = vec3u(low & 0xFFFFFu, (low >> 20u) | ((high & 0xFFu) << 12u), (high >> 8u) & 0xFFFFFu);
+    let small = (vec3f(steps) / 1048575.0 * 2.0 - 1.0) * 0.70710678;
+    let large = sqrt(max(1.0 - dot(small, small), 0.0));
+    switch high >> 28u {
+        case 0u: { return vec4f(large, small); }
+        case 1u: { return vec4f(small.x, large, small.yz); }
+        case 2u: { return vec4f(small.xy, large, small.z); }
+        default: { return vec4f(small, large); }
+    }
+}
+
+fn coefficients() -> u32 {
+    return (SH_DEGREE + 1u) * (SH_DEGREE + 1u);
+}
+
+fn cluster_start(cluster: u32) -> u32 {
+    let words = GEOMETRY_WORDS + (3u * coefficients() + 1u) / 2u;
+    return cluster * (CLUSTER_HEADER_WORDS + CLUSTER * words);
+}
+
+fn float(at: u32) -> f32 {
+    return bitcast<f32>(gaussians[at]);
+}
+
+// `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
+fn color(cluster: u32, thread: u32, toward: vec3f) -> vec3f {
+    let start = cluster_start(cluster);
+    let scale = vec2f(float(start), float(start + 1u));
+    let at = start + CLUSTER_HEADER_WORDS + GEOMETRY_WORDS * CLUSTER + thread;
+    var rgb = 0.28209479177387814 * scale.x * coefficient(at, 0u) + 0.5;
+    if SH_DEGREE > 0u {
+        let d = toward * (1.0 / sqrt(max(dot(toward, toward), 1e-30)));
+        var sum = 0.4886025119029199
+            * (-d.y * coefficient(at, 1u) + d.z * coefficient(at, 2u) - d.x * coefficient(at, 3u));
+        if SH_DEGREE > 1u {
+            sum += second_band(at, d);
+        }
+        if SH_DEGREE > 2u {
+            sum += third_band(at, d);
+        }
+        rgb += scale.y * sum;
+    }
+    return max(rgb, vec3f(0.0));
+}
+
+fn second_band(at: u32, d: vec3f) -> vec3f {
+    let dd = d * d;
+    return 1.0925484305920792 * d.x * d.y * coefficient(at, 4u)
+        - 1.0925484305920792 * d.y * d.z * coefficient(at, 5u)
+        + 0.31539156525252005 * (2.0 * dd.z - dd.x - dd.y) * coefficient(at, 6u)
+        - 1.0925484305920792 * d.x * d.z * coefficient(at, 7u)
+        + 0.5462742152960396 * (dd.x - dd.y) * coefficient(at, 8u);
+}
+
+fn third_band(at: u32, d: vec3f) -> vec3f {
+    let dd = d * d;
+    return -0.5900435899266435 * d.y * (3.0 * dd.x - dd.y) * coefficient(at, 9u)
+        + 2.890611442640554 * d.x * d.y * d.z * coefficient(at, 10u)
+        - 0.4570457994644658 * d.y * (4.0 * dd.z - dd.x - dd.y) * coefficient(at, 11u)
+        + 0.3731763325901154 * d.z * (2.0 * dd.z - 3.0 * (dd.x + dd.y)) * coefficient(at, 12u)
+        - 0.4570457994644658 * d.x * (4.0 * dd.z - dd.x - dd.y) * coefficient(at, 13u)
+        + 1.445305721320277 * d.z * (dd.x - dd.y) * coefficient(at, 14u)
+        - 0.5900435899266435 * d.x * (dd.x - 3.0 * dd.y) * coefficient(at, 15u);
+}
+
+// Red, green and blue of coefficient `k`, before the cluster's scale: two values to a word.
+fn coefficient(at: u32, k: u32) -> vec3f {
+    let word = at + (3u * k / 2u) * CLUSTER;
+    let first = unpack2x16snorm(gaussians[word]);
+    let second = unpack2x16snorm(gaussians[word + CLUSTER]);
+    return select(vec3f(first.y, second), vec3f(first, second.x), k % 2u == 0u);
+}

@@ -1,0 +1,65 @@
+// Stage resolve: a pixel's sums become the values that were asked for. It runs in the threads of
+// `rasterize`, so that the sums never travel through memory.
+//
+// Output is tile after tile, and within a tile one plane of 256 pixels after another, of those asked
+// for: packed RGBA8, red, green, blue, opacity, depth. Twin of `src/render/cpu/resolve.rs`.
+
+override RGB8: bool;
+override RGB: bool;
+override OPACITY: bool;
+override DEPTH: bool;
+
+@group(0) @binding(7) var<storage, read_write> pixels: array<vec4u>;
+
+const PLANE: u32 = TILE_PX * TILE_PX;
+
+// What four pixels of a row have gathered.
+struct Sums {
+    // Linear and premultiplied.
+    red: vec4f,
+    green: vec4f,
+    blue: vec4f,
+    // Weighted by contribution, in metres; zero unless wanted.
+    depth: vec4f,
+    // Share of the background that is seen.
+    transmittance: vec4f,
+}
+
+fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
+    let planes = u32(RGB8) + 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH);
+    var at = tile * planes * PLANE + first_pixel;
+    let opacity = 1.0 - sums.transmittance;
+    if RGB8 {
+        let bytes = to_8_bit(sums.red)
+            | (to_8_bit(sums.green) << vec4u(8u))
+            | (to_8_bit(sums.blue) << vec4u(16u))
+            | (to_8_bit(opacity) << vec4u(24u));
+        write(at, bytes);
+        at += PLANE;
+    }
+    if RGB {
+        write(at, bitcast<vec4u>(sums.red));
+        write(at + PLANE, bitcast<vec4u>(sums.green));
+        write(at + 2u * PLANE, bitcast<vec4u>(sums.blue));
+        at += 3u * PLANE;
+    }
+    if OPACITY {
+        write(at, bitcast<vec4u>(opacity));
+        at += PLANE;
+    }
+    if DEPTH {
+        let covered = opacity > vec4f(0.0);
+        let depth_m = sums.depth / select(vec4f(1.0), opacity, covered);
+        write(at, bitcast<vec4u>(select(vec4f(0.0), depth_m, covered)));
+    }
+}
+
+// Planes and rows are multiples of four pixels.
+fn write(at: u32, four: vec4u) {
+    pixels[at / 4u] = four;
+}
+
+// Clamps to [0, 1], and rounds to the nearest of 0 to 255.
+fn to_8_bit(linear: vec4f) -> vec4u {
+    return vec4u(saturate(linear) * 255.0 + 0.5);
+}

@@ -1,0 +1,20 @@
+// Documented in `src/render/constants.rs`, `src/scene` and `src/render/gpu/layout.rs`; held equal by
+// `tests/gpu/twins.rs`.
+
+const TILE_PX: u32 = 16;
+const EXTENT_SLACK_PX: f32 = 2e-3;
+const MAX_SIGMA_PX: f32 = 1e9;
+const DEPTH_BITS: u32 = 28;
+const MAX_VIEWS: u32 = 16;
+
+const CLUSTER: u32 = 256;
+const CLUSTER_HEADER_WORDS: u32 = 32;
+const GEOMETRY_WORDS: u32 = 9;
+
+const WORKGROUP: u32 = 256;
+const SCAN_BLOCK: u32 = 2048;
+const SORT_BLOCK: u32 = 4096;
+const DIGITS: u32 = 256;
+const MAX_GROUPS: u32 = 65535;
+const BIG_SPLAT_TILES: u32 = 64;
+const RASTER_BATCH: u32 = 128;

@@ -1,0 +1,74 @@
+// Documented in `src/render/gpu/layout.rs`; held equal by `tests/gpu/twins.rs`.
+
+struct FrameView {
+    size_px: vec2u,
+    columns: u32,
+    first_tile: u32,
+}
+
+struct Frame {
+    splat_capacity: u32,
+    instance_capacity: u32,
+    tiles: u32,
+    views: u32,
+    near_m: f32,
+    far_m: f32,
+    blur_px2: f32,
+    antialiased: u32,
+    alpha_cap: f32,
+    log2_alpha_cut: f32,
+    stop: f32,
+    pad: f32,
+    view: array<FrameView, MAX_VIEWS>,
+}
+
+struct ChunkView {
+    camera_from_chunk: array<vec4f, 3>,
+    forward_high: vec4f,
+    forward_low: vec4f,
+    camera_m: vec3f,
+    view: u32,
+    focal_px: vec2f,
+    center_px: vec2f,
+    slope_min: vec2f,
+    slope_max: vec2f,
+}
+
+struct Item {
+    cluster: u32,
+    chunk_view: u32,
+}
+
+struct Span {
+    first: u32,
+    count: u32,
+}
+
+struct Job {
+    length: u32,
+    groups: array<u32, 3>,
+}
+
+struct JobSlot {
+    job: Job,
+    pad: array<vec4u, 15>,
+}
+
+struct Counters {
+    splats: u32,
+    instances: u32,
+    batches: atomic<u32>,
+    pad: u32,
+}
+
+struct SplatShape {
+    mean_px: vec2f,
+    extent_px: vec2f,
+    factor: vec3f,
+    log2_opacity: f32,
+}
+
+struct SplatColor {
+    rgb: vec3f,
+    depth_m: f32,
+}

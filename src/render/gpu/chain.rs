@@ -1,0 +1,345 @@
+//! All stages on one device, in order, for all views of a step: one submission per frame.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use wgpu::{BufferUsages, BufferView, MapMode, PollType, QuerySet, SubmissionIndex};
+
+use super::bin::Bin;
+use super::device::Device;
+use super::growing::Growing;
+use super::kernel::{Recorder, TICKS_BYTES, clock};
+use super::layout::{Counters, Frame as GpuFrame, FrameView};
+use super::mirror::Mirror;
+use super::plan::{Plan, job};
+use super::project::{Project, Splats, Work};
+use super::rasterize::Rasterize;
+use super::resolve::Planes;
+use super::scan::Scan;
+use super::shaders::Shaders;
+use super::sort::Sort;
+use crate::render::constants::{DEPTH_BITS, TILE_PX};
+use crate::render::layout::Cutoffs;
+use crate::render::{Frame, FrameStats, RenderError};
+
+/// How long a frame may take on the device before it counts as lost.
+const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Room for splats and instances to begin with; what a frame needs beyond makes it grow.
+const FIRST_SPLATS: u64 = 1 << 15;
+const FIRST_INSTANCES: u64 = 1 << 17;
+
+/// The renderer on one device.
+#[derive(Debug)]
+pub(super) struct Chain {
+    pub(super) device: Device,
+    pub(super) mirror: Mirror,
+    plan: Plan,
+    scan: Scan,
+    project: Project,
+    sort: Sort,
+    bin: Bin,
+    rasterize: Rasterize,
+    splats: Splats,
+    clock: Option<QuerySet>,
+    /// Resolved ticks, on their way to the host.
+    ticks: Growing,
+    /// Read-back buffers that nobody reads.
+    ring: Vec<ReadBack>,
+    /// The most that any frame needed.
+    high_water: Needs,
+    /// Frames that were drawn again in larger buffers.
+    pub(super) retries: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Needs {
+    splats: u64,
+    instances: u64,
+}
+
+/// Where a frame reaches the host. A step's images are copied out of one while the next step fills
+/// another.
+#[derive(Debug)]
+pub(super) struct ReadBack {
+    /// Counters, then ticks.
+    head: Growing,
+    pages: Vec<Growing>,
+}
+
+/// A frame that is done, in mapped memory.
+#[derive(Debug)]
+pub(super) struct Drawn {
+    read_back: ReadBack,
+    /// Pixels, page by page.
+    pub(super) pages: Vec<BufferView>,
+    pub(super) tiles_per_page: u32,
+    pub(super) views: Vec<FrameView>,
+    pub(super) stats: FrameStats,
+}
+
+impl Chain {
+    /// Compiles what every frame needs.
+    ///
+    /// # Errors
+    /// A shader does not compile, or memory is out.
+    pub(super) fn new(device: Device, shaders: &Shaders) -> Result<Self, RenderError> {
+        let chain = Self {
+            mirror: Mirror::default(),
+            plan: Plan::new(&device, shaders),
+            scan: Scan::new(&device, shaders),
+            project: Project::new(&device, shaders),
+            sort: Sort::new(&device, shaders),
+            bin: Bin::new(&device, shaders),
+            rasterize: Rasterize::new(&device, shaders),
+            splats: Splats::new(&device),
+            clock: clock(&device),
+            ticks: Growing::new(
+                &device,
+                "ticks",
+                BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
+            ),
+            ring: Vec::new(),
+            high_water: Needs { splats: FIRST_SPLATS, instances: FIRST_INSTANCES },
+            retries: 0,
+            device,
+        };
+        chain.device.check()?;
+        Ok(chain)
+    }
+
+    /// Draws a frame, again in larger buffers where they were too small: the device never drops
+    /// what does not fit, it draws nothing then.
+    ///
+    /// # Errors
+    /// The device fails, or the frame needs more than it can hold.
+    pub(super) fn draw(&mut self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
+        let start = Instant::now();
+        self.mirror.hold(&self.device, frame.scene);
+        let work = Work::new(frame, &self.mirror);
+        self.project.upload(&self.device, &work);
+        let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
+        let mut gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
+        let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
+        let mut read_back = self.ring.pop().unwrap_or_else(|| ReadBack::new(&self.device));
+        read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
+        loop {
+            self.reserve(&mut gpu_frame, work.items());
+            let stages = self.submit(&work, &gpu_frame, (planes, tiles_per_page), &read_back);
+            let (stages, submission) = stages;
+            read_back.map(&self.device, submission)?;
+            self.device.check()?;
+            let (counters, ticks) = read_back.head()?;
+            if self.is_enough(&counters, &gpu_frame)? {
+                let pages = read_back.pages()?;
+                let stats = self.stats(&counters, prepare_ms, &stages, &ticks, start.elapsed());
+                let views = gpu_frame.view[..frame.views.len()].to_vec();
+                return Ok(Drawn { read_back, pages, tiles_per_page, views, stats });
+            }
+            read_back.unmap();
+            self.retries += 1;
+            tracing::debug!(
+                splats = counters.splats,
+                instances = counters.instances,
+                "drawn again"
+            );
+        }
+    }
+
+    /// Takes a frame's memory back for another one.
+    pub(super) fn recycle(&mut self, drawn: Drawn) {
+        let Drawn { read_back, pages, .. } = drawn;
+        // A buffer stays mapped for as long as a view of it lives.
+        drop(pages);
+        read_back.unmap();
+        self.ring.push(read_back);
+    }
+
+    fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
+        let Needs { splats, instances } = self.high_water;
+        let (device, scan) = (&self.device, &mut self.scan);
+        frame.splat_capacity = self.splats.reserve(device, splats);
+        let (splats, tiles) = (u64::from(frame.splat_capacity), frame.tiles);
+        frame.instance_capacity = self.bin.reserve(device, splats, instances, tiles);
+        let instances = u64::from(frame.instance_capacity);
+        scan.reserve(device, u64::from(items).max(splats));
+        self.sort.reserve(device, scan, splats.max(instances));
+        self.ticks.reserve(device, TICKS_BYTES);
+    }
+
+    /// Whether everything fitted; if not, the high water rises to what it takes.
+    fn is_enough(&mut self, counters: &Counters, frame: &GpuFrame) -> Result<bool, RenderError> {
+        let splats = Splats::limit(&self.device);
+        let instances = Bin::limit(&self.device);
+        let checks = [
+            ("visible splats", counters.splats, splats),
+            ("(Gaussian, tile) pairs", counters.instances, instances),
+        ];
+        for (what, needed, limit) in checks {
+            if u64::from(needed) > limit {
+                return Err(RenderError::TooMany { what, limit });
+            }
+        }
+        self.high_water.splats = self.high_water.splats.max(counters.splats.into());
+        self.high_water.instances = self.high_water.instances.max(counters.instances.into());
+        Ok(counters.splats <= frame.splat_capacity && counters.instances <= frame.instance_capacity)
+    }
+
+    fn submit(
+        &mut self,
+        work: &Work,
+        frame: &GpuFrame,
+        (planes, per_page): (Planes, u32),
+        read_back: &ReadBack,
+    ) -> (Vec<&'static str>, SubmissionIndex) {
+        let Self { device, plan, scan, splats, .. } = self;
+        let (device, plan, scan) = (&*device, &*plan, &*scan);
+        plan.start(device, frame, work.items());
+        let mut recorder = Recorder::new(device, self.clock.clone());
+        recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
+
+        let mut pass = recorder.stage("project");
+        self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
+        drop(pass);
+
+        let mut pass = recorder.stage("sort");
+        let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
+        let depth_bits = DEPTH_BITS + bits(frame.views - 1);
+        let data = (&splats.keys, &splats.places);
+        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+        drop(pass);
+
+        let mut pass = recorder.stage("bin");
+        self.bin.run(device, &mut pass, (plan, scan), (splats, sorted));
+        drop(pass);
+
+        let mut pass = recorder.stage("tile sort");
+        let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
+        let data = (&self.bin.tiles, &self.bin.places);
+        // The number after the last tile occurs too.
+        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, bits(frame.tiles));
+        drop(pass);
+
+        let mut pass = recorder.stage("ranges");
+        self.bin.ranges(device, &mut pass, plan, sorted);
+        drop(pass);
+
+        let mut pass = recorder.stage("rasterize");
+        let output = (planes, frame.tiles, per_page);
+        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin, sorted), output);
+        drop(pass);
+
+        let stages = recorder.finish_stages(self.ticks.buffer());
+        let encoder = &mut recorder.encoder;
+        let head = read_back.head.buffer();
+        encoder.copy_buffer_to_buffer(plan.counters(), 0, head, 0, size_of::<Counters>() as u64);
+        encoder.copy_buffer_to_buffer(self.ticks.buffer(), 0, head, TICKS_OFFSET, TICKS_BYTES);
+        self.rasterize.copy(encoder, &read_back.pages, planes, (frame.tiles, per_page));
+        let submission = device.queue.submit([recorder.encoder.finish()]);
+        (stages, submission)
+    }
+
+    fn stats(
+        &self,
+        counters: &Counters,
+        prepare_ms: f64,
+        stages: &[&'static str],
+        ticks: &[u64],
+        whole: Duration,
+    ) -> FrameStats {
+        let mut stages_ms = vec![("prepare", prepare_ms)];
+        match self.device.tick_ns() {
+            Some(tick_ns) => {
+                let spans = stages.iter().zip(ticks.chunks_exact(2));
+                stages_ms.extend(spans.map(|(name, tick)| {
+                    let ticks = tick[1].saturating_sub(tick[0]);
+                    (*name, ticks as f64 * f64::from(tick_ns) * 1e-6)
+                }));
+            }
+            None => stages_ms.push(("device", whole.as_secs_f64() * 1e3 - prepare_ms)),
+        }
+        FrameStats {
+            stages_ms,
+            visible_pairs: counters.splats.into(),
+            instances: counters.instances.into(),
+            evaluations: u64::from(counters.batches)
+                * u64::from(super::layout::RASTER_BATCH)
+                * u64::from(TILE_PX * TILE_PX),
+        }
+    }
+}
+
+/// Where the ticks lie behind the counters.
+const TICKS_OFFSET: u64 = 256;
+
+impl ReadBack {
+    fn new(device: &Device) -> Self {
+        Self { head: Self::buffer(device, "counters read back"), pages: Vec::new() }
+    }
+
+    fn buffer(device: &Device, label: &'static str) -> Growing {
+        Growing::new(device, label, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
+    }
+
+    fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32, per_page: u32) {
+        self.head.reserve(device, TICKS_OFFSET + TICKS_BYTES);
+        let firsts = (0..tiles).step_by(per_page as usize);
+        self.pages.resize_with(firsts.len(), || Self::buffer(device, "pixels read back"));
+        for (page, first) in self.pages.iter_mut().zip(firsts) {
+            page.reserve(device, planes.tile_bytes() * u64::from(per_page.min(tiles - first)));
+        }
+    }
+
+    /// Waits for a submission, and maps everything.
+    fn map(&self, device: &Device, submission: SubmissionIndex) -> Result<(), RenderError> {
+        let failed = Arc::new(AtomicBool::new(false));
+        for growing in self.all() {
+            let failed = Arc::clone(&failed);
+            growing.buffer().slice(..).map_async(MapMode::Read, move |result| {
+                failed.fetch_or(result.is_err(), Relaxed);
+            });
+        }
+        let wait =
+            PollType::Wait { submission_index: Some(submission), timeout: Some(FRAME_TIMEOUT) };
+        let polled = device.device.poll(wait);
+        device.check()?;
+        polled.map_err(|error| device.failed(error.to_string()))?;
+        match failed.load(Relaxed) {
+            true => Err(device.failed("its memory could not be read".to_owned())),
+            false => Ok(()),
+        }
+    }
+
+    fn head(&self) -> Result<(Counters, Vec<u64>), RenderError> {
+        let view = view(&self.head)?;
+        let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
+        let ticks = &view[TICKS_OFFSET as usize..(TICKS_OFFSET + TICKS_BYTES) as usize];
+        Ok((counters, ticks.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect()))
+    }
+
+    fn pages(&self) -> Result<Vec<BufferView>, RenderError> {
+        self.pages.iter().map(view).collect()
+    }
+
+    fn unmap(&self) {
+        self.all().for_each(|growing| growing.buffer().unmap());
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Growing> {
+        std::iter::once(&self.head).chain(&self.pages)
+    }
+}
+
+fn view(growing: &Growing) -> Result<BufferView, RenderError> {
+    growing
+        .buffer()
+        .slice(..)
+        .get_mapped_range()
+        .map_err(|error| RenderError::Device { device: String::new(), reason: error.to_string() })
+}
+
+/// Bits of a number.
+fn bits(number: u32) -> u32 {
+    u32::BITS - number.leading_zeros()
+}

@@ -1,0 +1,250 @@
+//! Which device, and what went wrong on it. Nothing here panics: a machine without a driver, a name
+//! that no adapter has and a device that dies are ordinary errors.
+
+use std::ops::RangeInclusive;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use futures_util::FutureExt;
+use wgpu::{
+    Adapter, AdapterInfo, Backends, Buffer, BufferDescriptor, BufferUsages, DeviceDescriptor,
+    DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
+};
+
+use crate::render::RenderError;
+
+/// Why there is no GPU to render on.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum GpuError {
+    /// The machine has no Vulkan driver, or the driver has no device.
+    #[error(
+        "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a device in \
+         software; `wildcity devices` lists what is found"
+    )]
+    NoAdapter,
+    /// Nothing goes by this name or number.
+    #[error("no device is called {choice:?}; there are {}", found.join(", "))]
+    NoSuchAdapter {
+        /// What was asked for.
+        choice: String,
+        /// What was found, numbered.
+        found: Vec<String>,
+    },
+    /// The driver refuses to open the device.
+    #[error("cannot open {name:?}: {reason}")]
+    Device {
+        /// The adapter's name.
+        name: String,
+        /// The driver's words.
+        reason: String,
+    },
+    /// The device opened, but a stage could not be compiled for it.
+    #[error("{0}")]
+    Stages(#[from] RenderError),
+    /// The threads that copy images could not be started.
+    #[error("cannot start the render threads: {reason}")]
+    Threads {
+        /// The system's words.
+        reason: String,
+    },
+}
+
+/// Which adapter to use.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub enum AdapterChoice {
+    /// The fastest kind: a card of its own, before one that shares memory, before software.
+    #[default]
+    Best,
+    /// The fastest kind that is not software.
+    Hardware,
+    /// Its number in [`devices`], or a part of its name in any case.
+    Named(String),
+}
+
+/// What a device is and can do, as its driver says.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DeviceInfo {
+    /// The driver's name for it.
+    pub name: String,
+    /// `discrete`, `integrated`, `virtual`, `other`, or `cpu` for software.
+    pub kind: &'static str,
+    /// The driver and its version.
+    pub driver: String,
+    /// Most bytes that a shader sees of one buffer.
+    pub binding_bytes: u64,
+    /// Most bytes of one buffer.
+    pub buffer_bytes: u64,
+    /// Most threads of a workgroup.
+    pub workgroup_threads: u32,
+    /// Memory of a workgroup, in bytes.
+    pub workgroup_bytes: u32,
+    /// Most workgroups of a dimension of a dispatch.
+    pub groups_per_dimension: u32,
+    /// Fewest and most threads of a subgroup.
+    pub subgroup_threads: RangeInclusive<u32>,
+    /// Whether the device times its stages itself.
+    pub has_clock: bool,
+}
+
+/// The devices of this machine, the fastest kind first, and in the driver's order within a kind.
+pub fn devices() -> Vec<DeviceInfo> {
+    adapters().iter().map(DeviceInfo::new).collect()
+}
+
+impl DeviceInfo {
+    fn new(adapter: &Adapter) -> Self {
+        let (info, limits) = (adapter.get_info(), adapter.limits());
+        Self {
+            kind: match info.device_type {
+                DeviceType::DiscreteGpu => "discrete",
+                DeviceType::IntegratedGpu => "integrated",
+                DeviceType::VirtualGpu => "virtual",
+                DeviceType::Other => "other",
+                DeviceType::Cpu => "cpu",
+            },
+            driver: format!("{} {}", info.driver, info.driver_info),
+            binding_bytes: limits.max_storage_buffer_binding_size,
+            buffer_bytes: limits.max_buffer_size,
+            workgroup_threads: limits.max_compute_invocations_per_workgroup,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size,
+            groups_per_dimension: limits.max_compute_workgroups_per_dimension,
+            subgroup_threads: info.subgroup_min_size..=info.subgroup_max_size,
+            has_clock: adapter.features().contains(Features::TIMESTAMP_QUERY),
+            name: info.name,
+        }
+    }
+}
+
+fn adapters() -> Vec<Adapter> {
+    let instance = Instance::new(InstanceDescriptor {
+        backends: Backends::VULKAN,
+        // Every group count is computed by `plan.wgsl` within the limits that the validation would
+        // check, at the price of one more dispatch per indirect one.
+        flags: InstanceFlags::default() - InstanceFlags::VALIDATION_INDIRECT_CALL,
+        ..InstanceDescriptor::new_without_display_handle()
+    });
+    // Outside of browsers the answer is there at once.
+    let found = instance.enumerate_adapters(Backends::VULKAN).now_or_never();
+    let mut found = found.unwrap_or_default();
+    found.sort_by_key(|adapter| match adapter.get_info().device_type {
+        DeviceType::DiscreteGpu => 0,
+        DeviceType::IntegratedGpu => 1,
+        DeviceType::VirtualGpu => 2,
+        DeviceType::Other => 3,
+        DeviceType::Cpu => 4,
+    });
+    found
+}
+
+impl AdapterChoice {
+    fn find(&self) -> Result<Adapter, GpuError> {
+        let found = adapters();
+        let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
+        let index = match self {
+            Self::Best => (!found.is_empty()).then_some(0),
+            Self::Hardware => infos.iter().position(|info| info.device_type != DeviceType::Cpu),
+            Self::Named(choice) => {
+                let name = choice.to_lowercase();
+                let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
+                let numbered = choice.parse().ok().filter(|&index: &usize| index < found.len());
+                numbered.or_else(|| infos.iter().position(has_name))
+            }
+        };
+        match (index.and_then(|index| found.into_iter().nth(index)), self) {
+            (Some(adapter), _) => Ok(adapter),
+            (None, Self::Named(choice)) if !infos.is_empty() => {
+                let found = infos.iter().enumerate();
+                let found = found.map(|(index, info)| format!("{index}: {}", info.name)).collect();
+                Err(GpuError::NoSuchAdapter { choice: choice.clone(), found })
+            }
+            (None, _) => Err(GpuError::NoAdapter),
+        }
+    }
+}
+
+/// An open device.
+#[derive(Debug)]
+pub(super) struct Device {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: Queue,
+    pub(super) info: AdapterInfo,
+    limits: Limits,
+    /// The first thing that went wrong since the last look.
+    fault: Arc<Mutex<Option<String>>>,
+}
+
+impl Device {
+    /// Opens a device with all that its adapter can do.
+    ///
+    /// # Errors
+    /// There is none, or it does not open.
+    pub(super) fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
+        let adapter = choice.find()?;
+        let (info, limits) = (adapter.get_info(), adapter.limits());
+        let descriptor = DeviceDescriptor {
+            required_features: adapter.features() & Features::TIMESTAMP_QUERY,
+            required_limits: limits.clone(),
+            ..DeviceDescriptor::default()
+        };
+        let failed = |reason: String| GpuError::Device { name: info.name.clone(), reason };
+        let opened = adapter.request_device(&descriptor).now_or_never();
+        let opened = opened.ok_or_else(|| failed("the driver does not answer".into()))?;
+        let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
+
+        // At once: an error that nobody listens to would end the process.
+        let fault = Arc::new(Mutex::new(None));
+        let note = |fault: &Mutex<Option<String>>, reason: String| {
+            let mut fault = fault.lock().unwrap_or_else(PoisonError::into_inner);
+            fault.get_or_insert(reason);
+        };
+        let (refused, lost) = (Arc::clone(&fault), Arc::clone(&fault));
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            note(&refused, error.to_string());
+        }));
+        device.set_device_lost_callback(move |_, message| note(&lost, message));
+        Ok(Self { device, queue, info, limits, fault })
+    }
+
+    /// Tells of what went wrong since the last call.
+    ///
+    /// # Errors
+    /// A command was refused, memory ran out, or the device is lost.
+    pub(super) fn check(&self) -> Result<(), RenderError> {
+        let mut fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner);
+        match fault.take() {
+            None => Ok(()),
+            Some(reason) => Err(self.failed(reason)),
+        }
+    }
+
+    /// An error of this device.
+    pub(super) fn failed(&self, reason: String) -> RenderError {
+        RenderError::Device { device: self.info.name.clone(), reason }
+    }
+
+    /// Most bytes that a shader sees at once: 128 MiB on lavapipe, 2 GiB on cards.
+    pub(super) fn binding_bytes(&self) -> u64 {
+        self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size) / 256 * 256
+    }
+
+    /// Nanoseconds per tick of the clock, where the device has one.
+    pub(super) fn tick_ns(&self) -> Option<f32> {
+        let has_clock = self.device.features().contains(Features::TIMESTAMP_QUERY);
+        has_clock.then(|| self.queue.get_timestamp_period())
+    }
+
+    /// A buffer of its own, at least 256 bytes.
+    pub(super) fn buffer(&self, label: &str, bytes: u64, usage: BufferUsages) -> Buffer {
+        self.device.create_buffer(&BufferDescriptor {
+            label: Some(label),
+            size: bytes.next_multiple_of(256).max(256),
+            usage,
+            mapped_at_creation: false,
+        })
+    }
+
+    /// Copies bytes to a buffer, and submits the copy so that its staging memory does not pile up.
+    pub(super) fn write_now(&self, buffer: &Buffer, offset: u64, bytes: &[u8]) {
+        self.queue.write_buffer(buffer, offset, bytes);
+        self.queue.submit([]);
+    }
+}

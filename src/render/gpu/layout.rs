@@ -1,0 +1,218 @@
+//! What lies in GPU buffers. WGSL copy: `shaders/shared/{constants,layout}.wgsl`, held equal by
+//! `tests/gpu/twins.rs`.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
+use crate::render::{MAX_VIEWS, View, constants};
+
+/// Threads of a workgroup; any device has them.
+pub const WORKGROUP: u32 = 256;
+/// Elements that one workgroup of the prefix sum adds up.
+pub const SCAN_BLOCK: u32 = 2048;
+/// Keys that one workgroup of the radix sort places: its 256 counters are 1 KiB beside 32 KiB.
+pub const SORT_BLOCK: u32 = 4096;
+/// Values of a digit of the radix sort.
+pub const DIGITS: u32 = 256;
+/// Most groups of one dimension of a dispatch, on any device.
+pub const MAX_GROUPS: u32 = 65_535;
+/// Splats over more tiles are emitted by a whole workgroup.
+pub const BIG_SPLAT_TILES: u32 = 64;
+/// Splats that a tile blends at a time.
+pub const RASTER_BATCH: u32 = 128;
+/// Words before a cluster's columns: two are used, 128 B keep the columns aligned.
+pub const CLUSTER_HEADER_WORDS: u32 = 32;
+/// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
+pub const GEOMETRY_WORDS: u32 = 9;
+
+/// The grid of tiles of one view (16 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct FrameView {
+    /// Image size, in pixels.
+    pub size_px: [u32; 2],
+    /// Tiles per row.
+    pub columns: u32,
+    /// Index of the first tile among those of all views.
+    pub first_tile: u32,
+}
+
+/// What all stages know of a frame (304 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Frame {
+    /// Splats that the buffers hold.
+    pub splat_capacity: u32,
+    /// Instances that the buffers hold.
+    pub instance_capacity: u32,
+    /// Tiles of all views.
+    pub tiles: u32,
+    /// How many of `view` are used.
+    pub views: u32,
+    /// As in [`Cutoffs`], likewise the fields that follow.
+    pub near_m: f32,
+    /// In metres.
+    pub far_m: f32,
+    /// In px².
+    pub blur_px2: f32,
+    /// 1 or 0.
+    pub antialiased: u32,
+    /// Largest alpha.
+    pub alpha_cap: f32,
+    /// Base-2 logarithm of the smallest alpha.
+    pub log2_alpha_cut: f32,
+    /// Transmittance that ends a pixel.
+    pub stop: f32,
+    /// Zero.
+    pub pad: f32,
+    /// The views, in order.
+    pub view: [FrameView; MAX_VIEWS],
+}
+
+impl Frame {
+    /// A frame of these views; the capacities are the caller's to fill in.
+    pub(super) fn new(views: &[View], cutoffs: &Cutoffs) -> Self {
+        let mut frame = Self {
+            views: views.len() as u32,
+            near_m: cutoffs.near_m,
+            far_m: cutoffs.far_m,
+            blur_px2: cutoffs.blur_px2,
+            antialiased: cutoffs.antialiased.into(),
+            alpha_cap: cutoffs.alpha_cap,
+            log2_alpha_cut: cutoffs.log2_alpha_cut,
+            stop: cutoffs.stop,
+            ..Self::zeroed()
+        };
+        for (slot, view) in frame.view.iter_mut().zip(views) {
+            let size_px = [view.camera.width_px, view.camera.height_px];
+            let [columns, rows] = size_px.map(|size| size.div_ceil(constants::TILE_PX));
+            *slot = FrameView { size_px, columns, first_tile: frame.tiles };
+            // At most 16 views of 1024 x 1024 tiles: 2^24.
+            frame.tiles += columns * rows;
+        }
+        frame
+    }
+}
+
+/// A pinhole view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct ChunkView {
+    /// Rows of the rigid transform, translation last, in metres.
+    pub camera_from_chunk: [[f32; 4]; 3],
+    /// The camera's forward axis in the chunk and the chunk's origin along it, rounded to f32, ...
+    pub forward_high: [f32; 4],
+    /// ... and what the rounding left over: depth is computed from both.
+    pub forward_low: [f32; 4],
+    /// The camera's centre relative to the chunk's origin, in world axes, in metres.
+    pub camera_m: [f32; 3],
+    /// Index of the view.
+    pub view: u32,
+    /// Focal lengths, in pixels.
+    pub focal_px: [f32; 2],
+    /// Principal point, in pixels.
+    pub center_px: [f32; 2],
+    /// Smallest slope at which the projection is linearised.
+    pub slope_min: [f32; 2],
+    /// Largest slope.
+    pub slope_max: [f32; 2],
+}
+
+impl ChunkView {
+    /// The same numbers in rows of four.
+    pub(super) fn new(view: u32, from: &CpuChunkView) -> Self {
+        let row = |i: usize| {
+            let [x, y, z] = from.rotation[i];
+            [x, y, z, from.translation_m[i]]
+        };
+        Self {
+            camera_from_chunk: [row(0), row(1), row(2)],
+            forward_high: from.forward.map(|high| high as f32),
+            forward_low: from.forward.map(|exact| (exact - f64::from(exact as f32)) as f32),
+            camera_m: from.camera_m,
+            view,
+            focal_px: from.focal_px,
+            center_px: from.center_px,
+            slope_min: from.slope_min,
+            slope_max: from.slope_max,
+        }
+    }
+}
+
+/// One cluster in one view (8 bytes): the unit of projection.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Item {
+    /// Which cluster of its page of the mirror.
+    pub cluster: u32,
+    /// Which [`ChunkView`].
+    pub chunk_view: u32,
+}
+
+/// A range (8 bytes): items of a page for `project`, tiles of a page for `rasterize`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Span {
+    /// The first one.
+    pub first: u32,
+    /// How many.
+    pub count: u32,
+}
+
+/// How many elements a stage treats, and the groups of its indirect dispatch (16 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Job {
+    /// Elements.
+    pub length: u32,
+    /// Groups in x, y, z.
+    pub groups: [u32; 3],
+}
+
+/// A job where a binding may start (256 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct JobSlot {
+    /// The job.
+    pub job: Job,
+    /// Zero.
+    pub pad: [[u32; 4]; 15],
+}
+
+/// What the host reads after a frame (16 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Counters {
+    /// (Gaussian, view) pairs that survived culling, whether or not they fit.
+    pub splats: u32,
+    /// (Gaussian, tile) pairs, whether or not they fit; 2^32 - 1 stands for more.
+    pub instances: u32,
+    /// Batches of [`RASTER_BATCH`] splats that tiles blended.
+    pub batches: u32,
+    /// Zero.
+    pub pad: u32,
+}
+
+/// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct SplatShape {
+    /// Centre, in pixels from the image's top-left corner.
+    pub mean_px: [f32; 2],
+    /// Half-size of the box that alpha_cut reaches, in pixels.
+    pub extent_px: [f32; 2],
+    /// Factor `(l0, l1, l2)`, in 1/px.
+    pub factor: [f32; 3],
+    /// Base-2 logarithm of the peak opacity.
+    pub log2_opacity: f32,
+}
+
+/// What a splat adds where it is seen (16 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct SplatColor {
+    /// Linear colour towards its view, at least 0.
+    pub rgb: [f32; 3],
+    /// Camera-space z of the centre, in metres.
+    pub depth_m: f32,
+}

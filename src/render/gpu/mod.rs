@@ -1,0 +1,183 @@
+//! The wgpu backend: one WGSL file per stage in `shaders/`, twin of the cpu backend.
+//!
+//! Deterministic: sorts are stable, sums of floats keep one order per pixel, and what threads do in
+//! any order commutes. Nothing is read back in mid-frame: a frame that does not fit its buffers is
+//! drawn again in larger ones.
+
+mod bin;
+mod chain;
+mod device;
+mod growing;
+mod kernel;
+pub mod layout;
+mod mirror;
+mod plan;
+mod project;
+mod rasterize;
+mod resolve;
+mod scan;
+pub mod shaders;
+mod sort;
+
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+use rayon::ThreadPool;
+use rayon::prelude::*;
+
+pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
+
+use self::chain::{Chain, Drawn};
+use self::device::Device;
+use self::resolve::{Pixels, Planes};
+use self::shaders::Shaders;
+use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+
+/// The wgpu backend.
+#[derive(Debug)]
+pub struct Gpu {
+    choice: AdapterChoice,
+    shaders: Shaders,
+    pool: ThreadPool,
+    /// Gone after the device failed, and made again by the next frame.
+    chain: Mutex<Option<Chain>>,
+}
+
+/// What a device holds and has done since it was opened.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GpuUse {
+    /// The adapter's name.
+    pub name: String,
+    /// Bytes of resident Gaussians.
+    pub mirror_bytes: u64,
+    /// Frames that were drawn again, since their buffers were too small.
+    pub retries: u64,
+}
+
+impl Gpu {
+    /// Opens a device. `threads` copy images out of its memory; 0 for one per core.
+    ///
+    /// # Errors
+    /// There is no such device, or it cannot do what the stages need.
+    pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
+        Self::with_shaders(choice, threads, Shaders::default())
+    }
+
+    /// The same with other shaders: for tests that break one and see that it is noticed.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`].
+    pub fn with_shaders(
+        choice: &AdapterChoice,
+        threads: usize,
+        shaders: Shaders,
+    ) -> Result<Self, GpuError> {
+        let name = |i| format!("gpu-{i}");
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build();
+        let pool = pool.map_err(|error| GpuError::Threads { reason: error.to_string() })?;
+        let chain = Chain::new(Device::open(choice)?, &shaders)?;
+        Ok(Self { choice: choice.clone(), shaders, pool, chain: Mutex::new(Some(chain)) })
+    }
+
+    /// What the device holds; `None` while it is lost.
+    pub fn usage(&self) -> Option<GpuUse> {
+        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        chain.as_ref().map(|chain| GpuUse {
+            name: chain.device.info.name.clone(),
+            mirror_bytes: chain.mirror.bytes(),
+            retries: chain.retries,
+        })
+    }
+
+    fn draw(&self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
+        let mut slot = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let chain = match &mut *slot {
+            Some(chain) => chain,
+            None => {
+                let device = Device::open(&self.choice).map_err(|error| RenderError::Device {
+                    device: "the GPU".to_owned(),
+                    reason: error.to_string(),
+                })?;
+                tracing::info!(device = device.info.name, "the GPU is opened again");
+                slot.insert(Chain::new(device, &self.shaders)?)
+            }
+        };
+        let drawn = chain.draw(frame, planes);
+        // Whatever else it was, memory may be half-written: begin anew.
+        if let Err(RenderError::Device { .. }) = drawn {
+            *slot = None;
+        }
+        drawn
+    }
+}
+
+impl Backend for Gpu {
+    fn name(&self) -> &'static str {
+        "gpu"
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        frame.check(targets)?;
+        let planes = Planes::of(targets);
+        self.pool.install(|| {
+            let drawn = self.draw(frame, planes)?;
+            // From here on the device is free for another session's step.
+            let start = Instant::now();
+            let words: Result<Vec<&[u32]>, _> =
+                drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
+            let words = words.map_err(|error| RenderError::Device {
+                device: "the GPU".to_owned(),
+                reason: format!("its memory cannot be read: {error}"),
+            })?;
+            let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
+            let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
+            views.with_max_len(1).for_each(|(index, (view, target))| {
+                pixels.deliver(view, target);
+                finished(index, target);
+            });
+            let mut stats = drawn.stats.clone();
+            stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
+            let mut chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(chain) = &mut *chain {
+                chain.recycle(drawn);
+            }
+            Ok(stats)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Pinhole;
+    use crate::geometry::{Camera, Pose};
+    use crate::render::View;
+    use crate::scene::{RenderProfile, Scene};
+
+    #[test]
+    fn a_lost_device_fails_its_frame_and_not_the_next() {
+        let gpu = Gpu::new(&AdapterChoice::Best, 1)
+            .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
+        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
+        let camera = Camera { width_px: 16, height_px: 16, pinhole };
+        let views = [View { camera, world_from_camera: Pose::IDENTITY }];
+        let (scene, profile) = (Scene::default(), RenderProfile::default());
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let mut image = vec![77; 3 * 256];
+        let mut render = || {
+            let target = Target { rgb8: Some(&mut image), ..Target::default() };
+            gpu.render(&frame, &mut [target], &|_, _| {}).map(|_| image[0])
+        };
+        assert_eq!(render(), Ok(0));
+        gpu.chain.lock().unwrap().as_ref().unwrap().device.device.destroy();
+        let lost = render();
+        assert!(matches!(lost, Err(RenderError::Device { .. })), "{lost:?}");
+        assert_eq!(gpu.usage(), None);
+        assert_eq!(render(), Ok(0));
+    }
+}

@@ -1,0 +1,218 @@
+//! Stage project: the host culls clusters, the device projects the rest, in order of (view, global
+//! id). Twin of `render/cpu/project.rs`; WGSL: `shaders/project.wgsl`.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use wgpu::{BufferUsages, ComputePass, ShaderModule};
+
+use super::device::Device;
+use super::growing::Growing;
+use super::kernel::{Groups, Kernel, SLOT_BYTES, module, slot};
+use super::layout::{ChunkView, Item, Span, SplatColor, SplatShape};
+use super::mirror::Mirror;
+use super::plan::{Plan, job};
+use super::scan::Scan;
+use super::shaders::Shaders;
+use crate::render::Frame;
+use crate::render::layout::{ChunkView as CpuChunkView, Frustum};
+use crate::scene::Chunk;
+
+/// What a frame projects.
+#[derive(Debug, Default)]
+pub(super) struct Work {
+    sh_degree: u8,
+    items: Vec<Item>,
+    /// Indices of items, page after page of the mirror, since one page is bound at a time.
+    page_items: Vec<u32>,
+    /// Each page that is needed, and its part of `page_items`.
+    spans: Vec<(usize, Span)>,
+    chunk_views: Vec<ChunkView>,
+}
+
+impl Work {
+    /// Tests every cluster against every view, and keeps what may be seen.
+    pub(super) fn new(frame: &Frame<'_>, mirror: &Mirror) -> Self {
+        let pairs: Vec<(usize, &Arc<Chunk>)> = (0..frame.views.len())
+            .flat_map(|view| frame.scene.chunks.iter().map(move |chunk| (view, chunk)))
+            .collect();
+        let visible: Vec<Vec<(usize, u32)>> =
+            pairs.par_iter().map(|(view, chunk)| visible(frame, *view, chunk, mirror)).collect();
+        let mut work = Self { sh_degree: frame.scene.sh_degree(), ..Self::default() };
+        let mut pages = vec![Vec::new(); mirror.pages()];
+        for ((view, chunk), clusters) in pairs.into_iter().zip(visible) {
+            if clusters.is_empty() {
+                continue;
+            }
+            let chunk_view = work.chunk_views.len() as u32;
+            let from = CpuChunkView::new(&frame.views[view], chunk);
+            work.chunk_views.push(ChunkView::new(view as u32, &from));
+            for (page, cluster) in clusters {
+                pages[page].push(work.items.len() as u32);
+                work.items.push(Item { cluster, chunk_view });
+            }
+        }
+        for (page, items) in pages.into_iter().enumerate().filter(|(_, items)| !items.is_empty()) {
+            let first = work.page_items.len() as u32;
+            work.spans.push((page, Span { first, count: items.len() as u32 }));
+            work.page_items.extend(items);
+        }
+        work
+    }
+
+    /// Clusters in views.
+    pub(super) fn items(&self) -> u32 {
+        self.items.len() as u32
+    }
+}
+
+/// Page and cluster of what one view may see of a chunk, in order.
+fn visible(
+    frame: &Frame<'_>,
+    view: usize,
+    chunk: &Arc<Chunk>,
+    mirror: &Mirror,
+) -> Vec<(usize, u32)> {
+    let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
+    let runs = mirror.runs(chunk).iter();
+    let places = runs.flat_map(|run| run.clusters.clone().map(|cluster| (run.page, cluster)));
+    let places = places.zip(chunk.clusters());
+    places
+        .filter(|(_, cluster)| frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m))
+        .map(|(place, _)| place)
+        .collect()
+}
+
+/// The splats of a frame, and the keys that they are sorted by.
+#[derive(Debug)]
+pub(super) struct Splats {
+    pub(super) shapes: Growing,
+    pub(super) colors: Growing,
+    /// View and depth, before and after each pass of the sort.
+    pub(super) keys: [Growing; 2],
+    /// Indices into `shapes` and `colors`.
+    pub(super) places: [Growing; 2],
+}
+
+impl Splats {
+    pub(super) fn new(device: &Device) -> Self {
+        let growing = |label| Growing::new(device, label, BufferUsages::STORAGE);
+        Self {
+            shapes: growing("shapes"),
+            colors: growing("colors"),
+            keys: [growing("depth keys"), growing("depth keys")],
+            places: [growing("places"), growing("places")],
+        }
+    }
+
+    /// Makes room for `count` splats, and tells how many fit then.
+    pub(super) fn reserve(&mut self, device: &Device, count: u64) -> u32 {
+        self.shapes.reserve(device, count * size_of::<SplatShape>() as u64);
+        self.colors.reserve(device, count * size_of::<SplatColor>() as u64);
+        for words in self.keys.iter_mut().chain(&mut self.places) {
+            words.reserve(device, 4 * count);
+        }
+        let bytes = [(&self.shapes, size_of::<SplatShape>()), (&self.keys[0], 4)];
+        let held = bytes.map(|(growing, each)| growing.buffer().size() / each as u64);
+        held[0].min(held[1]).min(u64::from(u32::MAX)) as u32
+    }
+
+    /// Most splats that a device can hold: the largest array decides.
+    pub(super) fn limit(device: &Device) -> u64 {
+        device.binding_bytes() / size_of::<SplatShape>() as u64
+    }
+}
+
+/// The stage on the device.
+#[derive(Debug)]
+pub(super) struct Project {
+    module: ShaderModule,
+    /// By SH degree, compiled when the first scene needs it: cull, project.
+    kernels: [Option<[Kernel; 2]>; 4],
+    items: Growing,
+    page_items: Growing,
+    chunk_views: Growing,
+    spans: Growing,
+    visible: Growing,
+    offsets: Growing,
+}
+
+impl Project {
+    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
+        let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let uniform = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
+        Self {
+            module: module(device, shaders, "project"),
+            kernels: [const { None }; 4],
+            items: Growing::new(device, "items", storage),
+            page_items: Growing::new(device, "page items", storage),
+            chunk_views: Growing::new(device, "chunk views", storage),
+            spans: Growing::new(device, "project spans", uniform),
+            visible: Growing::new(device, "visible", storage),
+            offsets: Growing::new(device, "item offsets", storage),
+        }
+    }
+
+    /// Sends a frame's work to the device.
+    pub(super) fn upload(&mut self, device: &Device, work: &Work) {
+        let spans: Vec<[u32; SLOT_BYTES as usize / 4]> = (work.spans.iter())
+            .map(|(_, span)| {
+                let mut slot = [0; SLOT_BYTES as usize / 4];
+                slot[..2].copy_from_slice(&[span.first, span.count]);
+                slot
+            })
+            .collect();
+        self.items.fill(device, bytemuck::cast_slice(&work.items));
+        self.page_items.fill(device, bytemuck::cast_slice(&work.page_items));
+        self.chunk_views.fill(device, bytemuck::cast_slice(&work.chunk_views));
+        self.spans.fill(device, bytemuck::cast_slice(&spans));
+        self.visible.reserve(device, 32 * u64::from(work.items()));
+        self.offsets.reserve(device, 4 * u64::from(work.items()));
+    }
+
+    /// Projects what was uploaded.
+    pub(super) fn run(
+        &mut self,
+        device: &Device,
+        pass: &mut ComputePass<'_>,
+        (work, mirror): (&Work, &Mirror),
+        (plan, scan): (&Plan, &Scan),
+        splats: &Splats,
+    ) {
+        let degree = usize::from(work.sh_degree.min(3));
+        let module = &self.module;
+        let [cull, project] = self.kernels[degree].get_or_insert_with(|| {
+            let constants = [("SH_DEGREE", degree as f64)];
+            ["cull", "project"].map(|entry| Kernel::new(device, module, entry, &constants))
+        });
+        let mut pages = Vec::with_capacity(work.spans.len());
+        for (index, (page, span)) in work.spans.iter().enumerate() {
+            let Some(page) = mirror.page(*page) else { continue };
+            let resources = vec![
+                (0, plan.frame().as_entire_binding()),
+                (1, slot(self.spans.buffer(), index as u64, size_of::<Span>())),
+                (2, self.page_items.bind()),
+                (3, self.items.bind()),
+                (4, self.chunk_views.bind()),
+                (5, page.as_entire_binding()),
+                (6, self.visible.bind()),
+                (7, self.offsets.bind()),
+            ];
+            pages.push((Groups::Count(span.count), resources));
+        }
+        for (groups, resources) in &pages {
+            cull.run(device, pass, *groups, resources);
+        }
+        scan.run(device, pass, (plan.jobs(), job::ITEMS), self.offsets.buffer());
+        plan.splats(device, pass, scan.block_sums());
+        for (groups, mut resources) in pages {
+            resources.extend([
+                (8, splats.shapes.bind()),
+                (9, splats.colors.bind()),
+                (10, splats.keys[0].bind()),
+                (11, splats.places[0].bind()),
+            ]);
+            project.run(device, pass, groups, &resources);
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! Stage resolve: what the device leaves, tile after tile, becomes the rows of the targets.
+//!
+//! The arithmetic is in `shaders/resolve.wgsl`; twin of `render/cpu/resolve.rs`.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::layout::FrameView;
+use crate::render::Target;
+use crate::render::constants::TILE_PX;
+
+/// Pixels of a tile.
+const PLANE: usize = (TILE_PX * TILE_PX) as usize;
+
+/// Which values of a pixel the device computes and the host reads: what any target wants.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Planes {
+    rgb8: bool,
+    rgb: bool,
+    opacity: bool,
+    depth: bool,
+}
+
+impl Planes {
+    /// Number of combinations.
+    pub(super) const VARIANTS: usize = 16;
+
+    /// What these targets ask for.
+    pub(super) fn of(targets: &[Target<'_>]) -> Self {
+        let any = |wants: fn(&Target<'_>) -> bool| targets.iter().any(wants);
+        Self {
+            rgb8: any(|t| t.rgb8.is_some()),
+            rgb: any(|t| t.rgba.is_some()),
+            opacity: any(|t| t.rgba.is_some() || t.opacity.is_some()),
+            depth: any(|t| t.depth_m.is_some()),
+        }
+    }
+
+    /// A number below [`Planes::VARIANTS`].
+    pub(super) fn variant(self) -> usize {
+        let bits = [self.rgb8, self.rgb, self.opacity, self.depth];
+        bits.into_iter().fold(0, |number, bit| 2 * number + usize::from(bit))
+    }
+
+    /// The switches of `shaders/resolve.wgsl`.
+    pub(super) fn constants(self) -> [(&'static str, f64); 4] {
+        let switch = |name, on| (name, f64::from(u8::from(on)));
+        [
+            switch("RGB8", self.rgb8),
+            switch("RGB", self.rgb),
+            switch("OPACITY", self.opacity),
+            switch("DEPTH", self.depth),
+        ]
+    }
+
+    /// Bytes of the pixels of one tile; one plane at least, so that buffers are not empty.
+    pub(super) fn tile_bytes(self) -> u64 {
+        4 * (self.count().max(1) * PLANE) as u64
+    }
+
+    fn count(self) -> usize {
+        let [rgb8, rgb, opacity, depth] = self.starts();
+        [rgb8.map(|s| s + 1), rgb.map(|s| s + 3), opacity.map(|s| s + 1), depth.map(|s| s + 1)]
+            .into_iter()
+            .flatten()
+            .max()
+            .unwrap_or(0)
+    }
+
+    /// First plane of rgb8, rgb, opacity and depth, where they are wanted.
+    fn starts(self) -> [Option<usize>; 4] {
+        let mut next = 0;
+        [(self.rgb8, 1), (self.rgb, 3), (self.opacity, 1), (self.depth, 1)].map(
+            |(wanted, planes)| {
+                wanted.then(|| {
+                    next += planes;
+                    next - planes
+                })
+            },
+        )
+    }
+}
+
+/// All pixels of a frame as the device wrote them.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Pixels<'a> {
+    /// Pages of as many tiles each, the last one perhaps fewer.
+    pub(super) pages: &'a [&'a [u32]],
+    /// Tiles of a page.
+    pub(super) tiles_per_page: u32,
+    /// What each tile has.
+    pub(super) planes: Planes,
+}
+
+impl Pixels<'_> {
+    /// Fills one view's target.
+    pub(super) fn deliver(&self, view: &FrameView, target: &mut Target<'_>) {
+        let row_pixels = (view.size_px[0] * TILE_PX) as usize;
+        let [rgb8, rgb, opacity, depth] = self.planes.starts();
+        if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
+            self.rows(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
+                for (to, word) in to[3 * at..].chunks_exact_mut(3).zip(row(tile, plane, &from)) {
+                    to.copy_from_slice(&word.to_le_bytes()[..3]);
+                }
+            });
+        }
+        if let (Some(to), Some(rgb), Some(opacity)) = (&mut target.rgba, rgb, opacity) {
+            self.rows(view, to.par_chunks_mut(4 * row_pixels), |to, at, tile, from| {
+                for (channel, plane) in [rgb, rgb + 1, rgb + 2, opacity].into_iter().enumerate() {
+                    let to = to[4 * at..].chunks_exact_mut(4);
+                    for (to, word) in to.zip(row(tile, plane, &from)) {
+                        to[channel] = f32::from_bits(*word);
+                    }
+                }
+            });
+        }
+        for (to, plane) in [(&mut target.opacity, opacity), (&mut target.depth_m, depth)] {
+            if let (Some(to), Some(plane)) = (to, plane) {
+                self.rows(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
+                    for (to, word) in to[at..].iter_mut().zip(row(tile, plane, &from)) {
+                        *to = f32::from_bits(*word);
+                    }
+                });
+            }
+        }
+    }
+
+    /// For every row of every tile: `copy` gets the band of the target under the tile's row of
+    /// tiles, the pixel in it, the tile's words, and the row's range of a plane.
+    fn rows<'t, T: Send + 't>(
+        &self,
+        view: &FrameView,
+        bands: impl IndexedParallelIterator<Item = &'t mut [T]>,
+        copy: impl Fn(&mut [T], usize, &[u32], Range<usize>) + Sync,
+    ) {
+        let [width, height] = view.size_px.map(|size| size as usize);
+        let edge = TILE_PX as usize;
+        bands.enumerate().for_each(|(tile_row, band)| {
+            for column in 0..view.columns {
+                let tile = view.first_tile + tile_row as u32 * view.columns + column;
+                let words = self.tile(tile);
+                let left = column as usize * edge;
+                let columns = edge.min(width - left);
+                for y in 0..edge.min(height - tile_row * edge) {
+                    copy(band, y * width + left, words, y * edge..y * edge + columns);
+                }
+            }
+        });
+    }
+
+    fn tile(&self, tile: u32) -> &[u32] {
+        let page = self.pages[(tile / self.tiles_per_page) as usize];
+        let words = self.planes.count() * PLANE;
+        let first = (tile % self.tiles_per_page) as usize * words;
+        &page[first..first + words]
+    }
+}
+
+/// One row of one plane of a tile.
+fn row<'a>(tile: &'a [u32], plane: usize, range: &Range<usize>) -> &'a [u32] {
+    &tile[plane * PLANE + range.start..plane * PLANE + range.end]
+}

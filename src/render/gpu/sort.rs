@@ -1,0 +1,72 @@
+//! Stage sort, of splats by (view, depth) and of instances by tile: a stable radix sort, 8 bits a
+//! pass. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`.
+
+use wgpu::{Buffer, BufferUsages, ComputePass};
+
+use super::device::Device;
+use super::growing::Growing;
+use super::kernel::{Groups, Kernel, module, slot};
+use super::layout::{DIGITS, Job, SORT_BLOCK};
+use super::scan::Scan;
+use super::shaders::Shaders;
+
+/// Bits of a digit.
+const DIGIT_BITS: u32 = DIGITS.ilog2();
+
+/// The kernels of each pass, and the counters between them.
+#[derive(Debug)]
+pub(super) struct Sort {
+    /// Histogram and scatter, by the digit's number.
+    passes: Vec<[Kernel; 2]>,
+    offsets: Growing,
+}
+
+impl Sort {
+    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
+        let module = module(device, shaders, "sort");
+        let pass = |digit: u32| {
+            let constants = [("SHIFT", f64::from(DIGIT_BITS * digit))];
+            ["histogram", "scatter"].map(|entry| Kernel::new(device, &module, entry, &constants))
+        };
+        Self {
+            passes: (0..u32::BITS / DIGIT_BITS).map(pass).collect(),
+            offsets: Growing::new(device, "digit offsets", BufferUsages::STORAGE),
+        }
+    }
+
+    /// Makes room to sort `count` keys.
+    pub(super) fn reserve(&mut self, device: &Device, scan: &mut Scan, count: u64) {
+        let counters = u64::from(DIGITS) * count.div_ceil(u64::from(SORT_BLOCK));
+        self.offsets.reserve(device, 4 * counters);
+        scan.reserve(device, counters);
+    }
+
+    /// Sorts by the lowest `bits` of the keys, to and fro between two buffers each. Returns which of
+    /// the two has the result.
+    pub(super) fn run(
+        &self,
+        device: &Device,
+        pass: &mut ComputePass<'_>,
+        scan: &Scan,
+        (jobs, sort, digits): (&Buffer, u64, u64),
+        (keys, values): (&[Growing; 2], &[Growing; 2]),
+        bits: u32,
+    ) -> usize {
+        let mut from = 0;
+        for [histogram, scatter] in &self.passes[..bits.div_ceil(DIGIT_BITS) as usize] {
+            let to = 1 - from;
+            let counts = [
+                (0, slot(jobs, sort, size_of::<Job>())),
+                (1, self.offsets.bind()),
+                (2, keys[from].bind()),
+            ];
+            histogram.run(device, pass, Groups::Job(jobs, sort), &counts);
+            scan.run(device, pass, (jobs, digits), self.offsets.buffer());
+            let moved = [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];
+            let all: Vec<_> = counts.into_iter().chain(moved).collect();
+            scatter.run(device, pass, Groups::Job(jobs, sort), &all);
+            from = to;
+        }
+        from
+    }
+}

@@ -1,0 +1,96 @@
+//! The same input, the same bytes.
+
+use glam::DVec3;
+use wildcity::render::View;
+use wildcity::scene::{RenderProfile, Scene};
+
+use crate::gpu::gpu;
+use crate::images::{look, render, render_one};
+use crate::scene_files::gaussians;
+use crate::streets::street;
+
+fn views() -> Vec<View> {
+    (0..6)
+        .map(|i| {
+            let yaw = f64::from(i);
+            let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
+            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
+        })
+        .collect()
+}
+
+#[test]
+fn a_hundred_repeats_are_equal_to_the_bit() {
+    let scene = Scene::from_gaussians(&street(20_000, 1, 11));
+    let (backend, profile) = (gpu(), RenderProfile::default());
+    let first = render(&backend, &scene, &profile, &views());
+    for repeat in 1..100 {
+        assert!(render(&backend, &scene, &profile, &views()) == first, "repeat {repeat}");
+    }
+}
+
+#[test]
+fn a_frame_that_outgrows_its_buffers_is_the_same_frame() {
+    // 300,000 splats do not fit the first buffers, and no frame of the second backend does better.
+    let scene = Scene::from_gaussians(&street(300_000, 1, 12));
+    let (profile, backend) = (RenderProfile::default(), gpu());
+    let grown = render(&backend, &scene, &profile, &views());
+    let retries = backend.usage().unwrap().retries;
+    assert!(retries >= 2, "splats and instances both fitted at once: {retries} retries");
+    let fitting = render(&backend, &scene, &profile, &views());
+    assert_eq!(backend.usage().unwrap().retries, retries, "the second frame grew too");
+    assert!(grown == fitting);
+}
+
+#[test]
+fn a_view_does_not_see_its_neighbours() {
+    let scene = Scene::from_gaussians(&street(20_000, 1, 13));
+    let (backend, profile) = (gpu(), RenderProfile::default());
+    let together = render(&backend, &scene, &profile, &views());
+    for (view, image) in views().into_iter().zip(&together) {
+        assert!(render_one(&backend, &scene, &profile, view) == *image);
+    }
+}
+
+#[test]
+fn a_frame_leaves_nothing_for_the_next() {
+    let street = Scene::from_gaussians(&street(20_000, 1, 14));
+    let cloud = Scene::from_gaussians(&gaussians(5_000, 3, 4.0, 15));
+    let (backend, profile) = (gpu(), RenderProfile::default());
+    let fresh = render(&gpu(), &street, &profile, &views());
+    render(&backend, &cloud, &profile, &views()[..2]);
+    assert!(render(&backend, &street, &profile, &views()) == fresh);
+}
+
+/// Lavapipe takes the width of its subgroups from the environment: 4, 8 and 16 threads. On other
+/// devices the variable does nothing. A process of its own, since a driver reads it once.
+#[test]
+fn subgroups_of_any_size() {
+    for width in ["128", "256", "512"] {
+        let output = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "parity::streets_of_every_sh_degree"])
+            .env("LP_NATIVE_VECTOR_WIDTH", width)
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.success() && said.contains("1 passed"), "{width}: {said}");
+    }
+}
+
+#[test]
+fn memory_is_what_is_resident() {
+    let (backend, profile) = (gpu(), RenderProfile::default());
+    let bytes = || backend.usage().unwrap().mirror_bytes;
+    let street_of = |seed| Scene::from_gaussians(&street(40_000, 1, seed));
+    let first = street_of(16);
+    render(&backend, &first, &profile, &views()[..1]);
+    let one = bytes();
+    // Three chunks, each padded to a cluster of 256.
+    let padded = 40_000 + 256 * first.chunks.len() as u64;
+    assert!(one <= 61 * padded, "{one} B for 40,000 Gaussians");
+    for seed in 17..27 {
+        let scene = street_of(seed);
+        render(&backend, &scene, &profile, &views()[..1]);
+        assert!(bytes() <= 3 * one, "{} B after scene {seed}", bytes());
+    }
+}

@@ -1,0 +1,19 @@
+//! The gpu backend against the others, on any Vulkan device; lavapipe is enough.
+
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/gpu.rs"]
+mod gpu;
+#[path = "../support/images.rs"]
+mod images;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+#[path = "../support/streets.rs"]
+mod streets;
+
+mod determinism;
+mod devices;
+mod extremes;
+mod parity;
+mod slips;
+mod twins;

@@ -1,0 +1,111 @@
+//! Rust and WGSL write constants and layouts down twice; naga compares them, and sees that nothing
+//! was left out.
+
+use std::collections::BTreeMap;
+
+use naga::{Expression, Literal, Module, TypeInner};
+use wildcity::render::gpu::layout;
+use wildcity::render::gpu::shaders::Shaders;
+use wildcity::render::{MAX_VIEWS, constants};
+use wildcity::scene::chunk;
+
+/// The shared files alone: whatever they declare has a twin.
+fn shared() -> Module {
+    let shared = concat!(
+        include_str!("../../shaders/shared/constants.wgsl"),
+        include_str!("../../shaders/shared/layout.wgsl")
+    );
+    naga::front::wgsl::parse_str(shared).unwrap()
+}
+
+#[test]
+fn constants_are_the_same() {
+    let rust = BTreeMap::from([
+        ("TILE_PX", Literal::U32(constants::TILE_PX)),
+        ("EXTENT_SLACK_PX", Literal::F32(constants::EXTENT_SLACK_PX)),
+        ("MAX_SIGMA_PX", Literal::F32(constants::MAX_SIGMA_PX)),
+        ("DEPTH_BITS", Literal::U32(constants::DEPTH_BITS)),
+        ("MAX_VIEWS", Literal::U32(MAX_VIEWS as u32)),
+        ("CLUSTER", Literal::U32(chunk::CLUSTER as u32)),
+        ("CLUSTER_HEADER_WORDS", Literal::U32(layout::CLUSTER_HEADER_WORDS)),
+        ("GEOMETRY_WORDS", Literal::U32(layout::GEOMETRY_WORDS)),
+        ("WORKGROUP", Literal::U32(layout::WORKGROUP)),
+        ("SCAN_BLOCK", Literal::U32(layout::SCAN_BLOCK)),
+        ("SORT_BLOCK", Literal::U32(layout::SORT_BLOCK)),
+        ("DIGITS", Literal::U32(layout::DIGITS)),
+        ("MAX_GROUPS", Literal::U32(layout::MAX_GROUPS)),
+        ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
+        ("BIG_SPLAT_TILES", Literal::U32(layout::BIG_SPLAT_TILES)),
+    ]);
+    let module = shared();
+    let wgsl: BTreeMap<&str, Literal> = (module.constants.iter())
+        .map(|(_, constant)| {
+            let name = constant.name.as_deref().unwrap();
+            match module.global_expressions[constant.init] {
+                Expression::Literal(literal) => (name, literal),
+                ref other => panic!("{name} is {other:?}"),
+            }
+        })
+        .collect();
+    assert_eq!(wgsl, rust);
+}
+
+/// Name, fields with their offsets, and size of a struct.
+type Layout = (String, Vec<(String, usize)>, usize);
+
+macro_rules! layouts {
+    ($($name:ident { $($field:ident),+ $(,)? })+) => {
+        vec![$((
+            stringify!($name).to_owned(),
+            vec![$((
+                stringify!($field).to_owned(),
+                std::mem::offset_of!(layout::$name, $field),
+            )),+],
+            size_of::<layout::$name>(),
+        )),+]
+    };
+}
+
+#[test]
+fn layouts_are_the_same() {
+    let mut rust: Vec<Layout> = layouts! {
+        FrameView { size_px, columns, first_tile }
+        Frame {
+            splat_capacity, instance_capacity, tiles, views, near_m, far_m, blur_px2, antialiased,
+            alpha_cap, log2_alpha_cut, stop, pad, view,
+        }
+        ChunkView {
+            camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
+        }
+        Item { cluster, chunk_view }
+        Span { first, count }
+        Job { length, groups }
+        JobSlot { job, pad }
+        Counters { splats, instances, batches, pad }
+        SplatShape { mean_px, extent_px, factor, log2_opacity }
+        SplatColor { rgb, depth_m }
+    };
+    let module = shared();
+    let structs = module.types.iter().filter_map(|(_, ty)| {
+        let TypeInner::Struct { members, span } = &ty.inner else { return None };
+        let field = |m: &naga::StructMember| (m.name.clone().unwrap(), m.offset as usize);
+        Some((ty.name.clone().unwrap(), members.iter().map(field).collect(), *span as usize))
+    });
+    let mut wgsl: Vec<Layout> = structs.collect();
+    rust.sort();
+    wgsl.sort();
+    assert_eq!(wgsl, rust);
+}
+
+#[test]
+fn every_shader_is_valid_and_linked() {
+    for (name, source) in Shaders::default().stages() {
+        assert!(!source.contains("#import"), "{name}: an import was not found");
+        let module = naga::front::wgsl::parse_str(source)
+            .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
+        let everything = naga::valid::Capabilities::all();
+        naga::valid::Validator::new(naga::valid::ValidationFlags::all(), everything)
+            .validate(&module)
+            .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
+    }
+}
