@@ -30,6 +30,10 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ADDR", default_value = config::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
+    /// Memory that all twins in use may take, in GiB [default: three quarters of the machine's]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    memory_gib: Option<u32>,
+
     #[command(flatten)]
     engine: Engine,
 
@@ -68,7 +72,10 @@ impl Serve {
             twins,
             episodes: self.episodes.dir()?,
             backend: Arc::from(self.engine.backend()?),
-            limits: Limits::default(),
+            limits: Limits {
+                resident_bytes: self.memory_gib.map(|gib| u64::from(gib) << 30),
+                ..Limits::default()
+            },
         };
         tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

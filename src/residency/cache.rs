@@ -8,6 +8,9 @@ use rayon::prelude::*;
 use crate::scene::Scene;
 use crate::store::{Catalog, Listing, StoreError, Version};
 
+use super::ResidencyError;
+use super::budget::{Budget, Room};
+
 /// A version of a twin, ready to be rendered.
 #[derive(Debug)]
 pub struct Resident {
@@ -15,6 +18,7 @@ pub struct Resident {
     pub version: Version,
     /// Its chunks, in the manifest's order.
     pub scene: Scene,
+    _room: Room,
 }
 
 /// Loads twin versions and shares them between sessions for as long as one holds them; the one that
@@ -22,6 +26,7 @@ pub struct Resident {
 #[derive(Debug)]
 pub struct Cache {
     catalog: Catalog,
+    budget: Budget,
     /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is
     /// held while loading, so that others wait for the result rather than load again; a failed load
     /// leaves an empty slot, and the next one tries.
@@ -32,9 +37,15 @@ pub struct Cache {
 type Slot = Arc<Mutex<Weak<Resident>>>;
 
 impl Cache {
-    /// Nothing in memory yet.
+    /// Nothing in memory yet, and room for three quarters of the machine's memory.
     pub fn new(catalog: Catalog) -> Self {
-        Self { catalog, slots: Mutex::default(), last: Mutex::default() }
+        Self::limited(catalog, None)
+    }
+
+    /// The same with room for so many bytes of twins, if it is said.
+    pub fn limited(catalog: Catalog, limit_bytes: Option<u64>) -> Self {
+        let budget = Budget::new(limit_bytes);
+        Self { catalog, budget, slots: Mutex::default(), last: Mutex::default() }
     }
 
     /// The twins that can be opened.
@@ -48,8 +59,9 @@ impl Cache {
     /// One version of a twin, or the latest, loaded if nobody holds it. Blocks while it loads.
     ///
     /// # Errors
-    /// As [`Catalog::version`] and [`Catalog::chunk`].
-    pub fn open(&self, name: &str, number: Option<u64>) -> Result<Arc<Resident>, StoreError> {
+    /// As [`Catalog::version`] and [`Catalog::chunk`]; [`ResidencyError::NoRoom`], before anything
+    /// is loaded, if it does not fit beside the twins in use.
+    pub fn open(&self, name: &str, number: Option<u64>) -> Result<Arc<Resident>, ResidencyError> {
         let version = self.catalog.version(name, number)?;
         let slot = self.slot(&version);
         let mut held = lock(&slot);
@@ -74,11 +86,12 @@ impl Cache {
         slots.entry((version.hash.clone(), version.number)).or_default().clone()
     }
 
-    fn load(&self, version: Version) -> Result<Resident, StoreError> {
+    fn load(&self, version: Version) -> Result<Resident, ResidencyError> {
+        let room = self.budget.take(&version.manifest)?;
         let chunks = version.manifest.chunks.par_iter();
         let chunks = chunks.map(|entry| self.catalog.chunk(&version, entry).map(Arc::new));
-        let scene = Scene { chunks: chunks.collect::<Result<_, _>>()? };
-        Ok(Resident { version, scene })
+        let scene = Scene { chunks: chunks.collect::<Result<_, StoreError>>()? };
+        Ok(Resident { version, scene, _room: room })
     }
 }
 

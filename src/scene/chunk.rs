@@ -181,6 +181,13 @@ impl Chunk {
         self.block(index / LANES)[column].0[index % LANES]
     }
 
+    /// Memory that a chunk of so many Gaussians will hold, in bytes.
+    pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
+        let blocks = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
+        let clusters = count.div_ceil(CLUSTER as u64);
+        blocks.saturating_mul(size_of::<Lanes>() as u64) + clusters * size_of::<Cluster>() as u64
+    }
+
     /// Memory held, in bytes.
     pub fn bytes(&self) -> usize {
         self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()

@@ -70,6 +70,9 @@ pub struct Limits {
     pub connections: usize,
     /// Sessions at once.
     pub sessions: usize,
+    /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
+    /// machine's.
+    pub resident_bytes: Option<u64>,
 }
 
 /// Why a server did not start.
@@ -121,6 +124,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let settings = EngineSettings {
         catalog: Catalog::open(&twins)?,
+        resident_bytes: limits.resident_bytes,
         episodes,
         backend,
         step_timeout: limits.step,
@@ -170,6 +174,7 @@ impl Default for Limits {
             drain: config::DRAIN_TIMEOUT,
             connections: config::CONNECTIONS,
             sessions: config::SESSIONS,
+            resident_bytes: None,
         }
     }
 }

@@ -21,6 +21,9 @@ use super::listing::{Listings, TwinSummary};
 pub struct EngineSettings {
     /// The twins that can be opened.
     pub catalog: Catalog,
+    /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
+    /// machine's.
+    pub resident_bytes: Option<u64>,
     /// Where episodes are recorded.
     pub episodes: PathBuf,
     /// What renders.
@@ -66,7 +69,7 @@ impl Engine {
     /// # Errors
     /// The thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { catalog, episodes, backend, step_timeout } = settings;
+        let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
         let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
         std::thread::Builder::new()
             .name("render".to_owned())
@@ -79,7 +82,7 @@ impl Engine {
             })
             .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         let listings = Arc::new(Listings::new(catalog.clone()));
-        let (cache, answers) = (Cache::new(catalog), Answers::default());
+        let (cache, answers) = (Cache::limited(catalog, resident_bytes), Answers::default());
         Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
     }
 

@@ -1,6 +1,7 @@
 //! What can go wrong with a session.
 
 use crate::render::RenderError;
+use crate::residency::ResidencyError;
 use crate::store::StoreError;
 
 use super::record::RecordError;
@@ -11,6 +12,9 @@ pub enum SessionError {
     /// The twin cannot be had.
     #[error(transparent)]
     Twin(#[from] StoreError),
+    /// The twin does not fit into memory.
+    #[error(transparent)]
+    NoRoom(ResidencyError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
@@ -100,6 +104,15 @@ pub enum SessionError {
         /// What the operating system says.
         reason: String,
     },
+}
+
+impl From<ResidencyError> for SessionError {
+    fn from(error: ResidencyError) -> Self {
+        match error {
+            ResidencyError::Store(error) => Self::Twin(error),
+            no_room @ ResidencyError::NoRoom { .. } => Self::NoRoom(no_room),
+        }
+    }
 }
 
 fn listed(names: &[String]) -> String {

@@ -1,7 +1,7 @@
 use std::fs;
 use std::sync::Arc;
 
-use wildcity::residency::Cache;
+use wildcity::residency::{Cache, ResidencyError};
 use wildcity::store::Catalog;
 
 use crate::scene_files::gaussians;
@@ -64,4 +64,36 @@ fn a_gaussian_of_degree_one_takes_at_most_120_bytes() {
     assert!(scene.chunks.len() > 30);
     let each = scene.bytes() as f64 / 50_000.0;
     assert!((92.0..120.0).contains(&each), "{each} bytes");
+}
+
+#[test]
+fn twins_that_do_not_fit_beside_those_in_use_are_refused_before_they_are_loaded() {
+    let dir = tempfile::tempdir().unwrap();
+    let (few, many) = (gaussians(1_000, 1, 100.0, 1), gaussians(5_000, 1, 100.0, 2));
+    commit(dir.path(), street(&few)).unwrap();
+    commit(dir.path(), street(&many)).unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let unlimited = Cache::new(catalog.clone());
+    let [few_bytes, many_bytes] =
+        [1, 2].map(|number| unlimited.open("street", Some(number)).unwrap().scene.bytes() as u64);
+
+    let cache = Cache::limited(catalog.clone(), Some(few_bytes + many_bytes - 1));
+    let held = cache.open("street", Some(1)).unwrap();
+    match cache.open("street", Some(2)).unwrap_err() {
+        ResidencyError::NoRoom { needed_bytes, held_bytes, limit_bytes, .. } => {
+            let wanted = (many_bytes, few_bytes, few_bytes + many_bytes - 1);
+            assert_eq!((needed_bytes, held_bytes, limit_bytes), wanted, "exact, and unloaded");
+        }
+        error => panic!("{error}"),
+    }
+    // What is in memory already costs nothing more, and what is let go is room again.
+    let again = cache.open("street", Some(1)).unwrap();
+    assert!(Arc::ptr_eq(&again, &held));
+    drop((again, held));
+    assert_eq!(cache.open("street", Some(2)).unwrap().scene.gaussians(), 5_000);
+
+    let both = Cache::limited(catalog, Some(few_bytes + many_bytes));
+    let held = both.open("street", Some(1)).unwrap();
+    assert_eq!(both.open("street", Some(2)).unwrap().scene.gaussians(), 5_000);
+    drop(held);
 }

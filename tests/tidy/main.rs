@@ -24,9 +24,10 @@ const PACKAGES: &[(&str, &[&str])] = &[
 ];
 
 /// Who may touch files: those of a twin only `store/objects.rs`; the others scenes and settings of
-/// the user, episodes (the server makes their directory), and pictures.
+/// the user, episodes (the server makes their directory), pictures, and how much memory there is.
 const FILES: &[&str] = &[
     "store/objects.rs",
+    "residency/budget.rs",
     "ingest",
     "session/record.rs",
     "session/replay.rs",

@@ -58,6 +58,7 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
         SessionError::Twin(StoreError::NoVersion { .. }) => {
             (Code::UnknownVersion, field("version"))
         }
+        SessionError::NoRoom(_) => (Code::Busy, field("twin")),
         SessionError::Twin(_) => (Code::TwinDamaged, field("twin")),
         SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
         SessionError::UnknownCamera { index, .. } => {
