@@ -55,6 +55,66 @@ fn the_first_of_many_bad_ones_is_named() {
 }
 
 #[test]
+fn a_missing_column_is_named_though_the_size_is_wrong_too() {
+    let mut columns = inria_columns(1, false);
+    let whole = ply(&gaussians(20, 1, 1.0, 1), &columns);
+    let body = &whole[ply_header(20, &columns).len()..];
+    columns.retain(|column| column.name != "rot_3");
+    let text = refusal(&[ply_header(20, &columns).as_bytes(), body].concat());
+    assert_eq!(text, "PLY header, element vertex: there is no property rot_3");
+}
+
+#[test]
+fn what_is_no_regular_file_is_refused_at_once() {
+    for (path, found) in [("/dev/zero", "a device"), ("/", "a directory")] {
+        let scene = wildcity::ingest::read(path.as_ref(), &mut |_, _| {}).unwrap_err();
+        let cameras = wildcity::ingest::cameras::read(path.as_ref()).unwrap_err();
+        for text in [scene.to_string(), cameras.to_string()] {
+            assert!(text.starts_with("not a regular file but ") && text.contains(found), "{text}");
+        }
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let pipe = dir.path().join("pipe");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let text = wildcity::ingest::read(&pipe, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(text.starts_with("not a regular file but a pipe"), "{text}");
+}
+
+#[test]
+fn a_file_is_read_up_to_its_limit() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("settings");
+    std::fs::write(&path, b"12345").unwrap();
+    assert_eq!(wildcity::ingest::read_whole(&path, 5).unwrap(), b"12345");
+    let text = wildcity::ingest::read_whole(&path, 4).unwrap_err().to_string();
+    assert_eq!(text, "larger than 4 bytes");
+}
+
+#[test]
+fn camera_lists_say_what_is_wrong() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("cameras.json");
+    let good = r#"{"name": "a", "width": 8, "height": 8, "fx": 5, "fy": 5, "cx": 4, "cy": 4,
+        "position": [0, 0, 0], "R_world_to_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"#;
+    let refusal = |text: String| {
+        std::fs::write(&path, text).unwrap();
+        // As the command line prints it: with every source behind it.
+        let error = wildcity::ingest::cameras::read(&path).unwrap_err();
+        let sources = std::iter::successors(std::error::Error::source(&error), |e| e.source());
+        sources.fold(error.to_string(), |text, source| format!("{text}: {source}"))
+    };
+    let flat = refusal(good.replace("\"width\": 8", "\"width\": 0"));
+    assert_eq!(flat, "camera \"a\": width is 0; a side is from 1 to 16384 pixels");
+    let far = refusal(good.replace("\"fx\": 5", "\"fx\": 1e300"));
+    assert!(far.starts_with("camera \"a\": fx is 1e300; a focal length"), "{far}");
+    let mirror = refusal(good.replace("[0, 0, 1]]", "[0, 0, -1]]"));
+    assert_eq!(mirror, "camera \"a\": R_world_to_cam is a mirror; flip one of its axes");
+    let hidden = refusal(good.replace("\"a\"", "\".a\""));
+    assert!(hidden.ends_with("not starting with ."), "{hidden}");
+    assert_eq!(refusal("[]".into()), "the camera list is empty");
+}
+
+#[test]
 fn a_ply_of_another_size_is_refused_with_the_numbers() {
     let whole = ply(&gaussians(20, 0, 1.0, 1), &inria_columns(0, false));
     let text = refusal(&whole[..whole.len() - 9]);

@@ -158,6 +158,18 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let recorded = crate::record::lines(&path);
     assert_eq!(recorded[4]["images"][0], blake3::hash(&front).to_hex().as_str());
 
+    let whole = std::fs::read_to_string(&path).unwrap();
+    let lines: Vec<&str> = whole.lines().collect();
+    for (kept, wanted) in [(1, "it has no frames"), (lines.len() - 1, "it has no end")] {
+        std::fs::write(&path, lines[..kept].join("\n") + "\n").unwrap();
+        let partial = wildcity(&["--verify"], &path, twins.path());
+        assert_eq!(partial.status.code(), Some(1));
+        let error = String::from_utf8(partial.stderr).unwrap();
+        assert!(error.contains("the recording is incomplete") && error.contains(wanted), "{error}");
+        assert!(wildcity(&[], &path, twins.path()).status.success(), "it can still be looked at");
+    }
+    std::fs::write(&path, whole).unwrap();
+
     // Another backend differs, and its pictures are wanted all the same.
     let others = episodes.path().join("others");
     let arguments = ["--backend", "reference", "--out", others.to_str().unwrap()];

@@ -117,6 +117,7 @@ fn bad_options_are_named_before_the_file_is_read() {
     fs::write(dir.path().join("broken.json"), "{").unwrap();
     let broken = dir.path().join("broken.json").display().to_string();
     for (options, wanted) in [
+        (["--axes", "2 0 0 0 1 0 0 0 1"], "--axes \"2 0 0 0 1 0 0 0 1\": the rows of the matrix"),
         (["--axes", "sideways"], "--axes \"sideways\": expected nine numbers"),
         (["--scale", "-2"], "--scale \"-2\": a scale is from 1e-6 to 1e6"),
         (["--profile", "fog=1"], "there is no field \"fog\""),
@@ -129,6 +130,33 @@ fn bad_options_are_named_before_the_file_is_read() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(said.contains(wanted), "{options:?}: {said}");
         assert!(!dir.path().join("twins").exists(), "{options:?}");
+    }
+}
+
+#[test]
+fn an_empty_scene_is_imported_with_a_warning() {
+    let dir = tempfile::tempdir().unwrap();
+    let output = import(dir.path(), &ply(&gaussians(0, 0, 1.0, 1), &inria_columns(0, false)), &[]);
+    assert!(stdout(&output).contains(" 0 Gaussians"));
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.starts_with("warning: ") && said.contains("holds no Gaussians"), "{said}");
+}
+
+#[test]
+fn devices_pipes_and_files_for_directories_are_refused_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("file").display().to_string();
+    fs::write(&file, b"").unwrap();
+    for (arguments, code, wanted) in [
+        (vec!["import", "/dev/zero", "--twin", "a"], 1, "not a regular file but a pipe, a socket"),
+        (vec!["serve", "--twins", &file], 1, "is not a directory"),
+        (vec!["serve", "--listen", "localhost:0"], 2, "an address and a port, as 127.0.0.1:8080"),
+    ] {
+        let mut command = wildcity();
+        let output = command.env("HOME", dir.path()).args(&arguments).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
+        assert!(said.contains(wanted), "{arguments:?}: {said}");
     }
 }
 

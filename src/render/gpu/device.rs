@@ -38,7 +38,7 @@ pub enum GpuError {
         reason: String,
     },
     /// The device opened, but a stage could not be compiled for it.
-    #[error("{0}")]
+    #[error(transparent)]
     Stages(#[from] RenderError),
     /// The threads that copy images could not be started.
     #[error("cannot start the render threads: {reason}")]
