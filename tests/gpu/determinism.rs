@@ -1,23 +1,11 @@
 //! The same input, the same bytes.
 
-use glam::DVec3;
-use wildcity::render::View;
 use wildcity::scene::{RenderProfile, Scene};
 
 use crate::gpu::gpu;
-use crate::images::{look, render, render_one};
+use crate::images::{render, render_one};
 use crate::scene_files::gaussians;
-use crate::streets::street;
-
-fn views() -> Vec<View> {
-    (0..6)
-        .map(|i| {
-            let yaw = f64::from(i);
-            let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
-        })
-        .collect()
-}
+use crate::streets::{street, turning_views as views};
 
 #[test]
 fn a_hundred_repeats_are_equal_to_the_bit() {

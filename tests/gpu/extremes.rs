@@ -4,52 +4,12 @@ use glam::{DQuat, DVec3};
 use wildcity::render::View;
 use wildcity::render::gpu::Gpu;
 use wildcity::render::reference::Reference;
-use wildcity::scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity::scene::{RenderProfile, Scene};
 
+use crate::blobs::{Blob, ahead, raw, scene};
 use crate::gpu::gpu;
 use crate::images::{Image, agree, cpu, look, max_difference, render_one};
 use crate::streets::street;
-
-/// One Gaussian by what it is, not by what is stored.
-struct Blob {
-    mean_m: DVec3,
-    rotation: DQuat,
-    sigma_m: DVec3,
-    opacity: f64,
-    rgb: [f64; 3],
-}
-
-impl Default for Blob {
-    fn default() -> Self {
-        Self {
-            mean_m: DVec3::new(0.0, 0.0, 5.0),
-            rotation: DQuat::IDENTITY,
-            sigma_m: DVec3::splat(0.1),
-            opacity: 0.9,
-            rgb: [1.0, 0.6, 0.2],
-        }
-    }
-}
-
-fn raw(blobs: &[Blob]) -> Gaussians {
-    let mut g = Gaussians::with_capacity(0, blobs.len());
-    for Blob { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
-        g.means_m.push(mean_m.to_array());
-        g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
-        g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
-        g.logit_opacities.push((opacity / (1.0 - opacity)).ln() as f32);
-        g.sh.extend(rgb.map(|c| ((c - 0.5) / sh::C0) as f32));
-    }
-    g
-}
-
-fn scene(blobs: &[Blob]) -> Scene {
-    Scene::from_gaussians(&raw(blobs))
-}
-
-fn ahead(size_px: [u32; 2], focal_px: f64) -> View {
-    look(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
-}
 
 /// The image, after it was made sure that the definition gives it too.
 fn agreed(gpu: &Gpu, scene: &Scene, profile: &RenderProfile, view: View, what: &str) -> Image {

@@ -1,5 +1,7 @@
 //! The gpu backend against the others, on any Vulkan device; lavapipe is enough.
 
+#[path = "../support/blobs.rs"]
+mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/gpu.rs"]
@@ -10,6 +12,8 @@ mod images;
 mod scene_files;
 #[path = "../support/streets.rs"]
 mod streets;
+#[path = "../support/truths.rs"]
+mod truths;
 
 mod determinism;
 mod devices;

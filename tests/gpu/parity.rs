@@ -1,12 +1,6 @@
 //! Whole images: gpu against cpu, and against images that others made.
 
-use std::path::Path;
-
 use glam::DVec3;
-use safetensors::SafeTensors;
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
-use wildcity::ingest;
 use wildcity::render::View;
 use wildcity::render::reference::Reference;
 use wildcity::scene::{RenderProfile, Scene};
@@ -16,6 +10,7 @@ use crate::gpu::gpu;
 use crate::images::{agree, cpu, look, max_difference, psnr, render, render_one};
 use crate::scene_files::gaussians;
 use crate::streets::{demo_street, street, street_views};
+use crate::truths::{gsplat, read, skull_front};
 
 /// Compares all views on both backends.
 fn compare(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
@@ -53,10 +48,6 @@ fn compare_colors(
         let close = db >= bound.least_db && off <= bound.most_off;
         assert!(close, "{what}, view {view}: {db:.1} dB, off by {off}");
     }
-}
-
-fn read(path: &Path) -> Scene {
-    Scene::from_gaussians(&ingest::read(path, &mut |_, _| {}).unwrap())
 }
 
 #[test]
@@ -147,59 +138,19 @@ fn real_captures() {
     }
 }
 
-/// How gsplat rendered when the images of the real data were made.
-const GSPLAT_OF_THEN: RenderProfile = RenderProfile {
-    near: 0.01,
-    far: 1e10,
-    blur: 0.3,
-    antialiased: false,
-    alpha_cap: 0.999,
-    alpha_cut: 1.0 / 255.0,
-    stop: 1e-4,
-};
-
 #[test]
 fn gsplat_is_met() {
-    let Some(path) = real("reference/gsplat_tiny_case.safetensors") else { return };
-    let file = std::fs::read(&path).unwrap();
-    let tensors = SafeTensors::deserialize(&file).unwrap();
-    let out = tensors.tensor("out_img").unwrap();
-    let [height_px, width_px] = [out.shape()[0] as u32, out.shape()[1] as u32];
-    let (w, h) = (f64::from(width_px), f64::from(height_px));
-    let at = DVec3::new(0.123, 0.456, -8.0);
-    let view = View {
-        camera: Camera {
-            width_px,
-            height_px,
-            pinhole: Pinhole { fx: 0.5 * w, fy: 0.5 * w, cx: 0.5 * w, cy: 0.5 * h },
-        },
-        ..look([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
-    };
-    let truth = out.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
-    let truth: Vec<f32> = truth.collect();
-    let image = render_one(&gpu(), &read(&path), &GSPLAT_OF_THEN, view);
-    let off = max_difference(&image.rgba, &truth);
+    let Some(truth) = gsplat() else { return };
+    let image = render_one(&gpu(), &truth.scene, &truth.profile, truth.view);
+    let off = max_difference(&image.rgba, &truth.rgba);
     assert!(off <= 1e-4, "off by {off:e}");
 }
 
 #[test]
 fn an_independent_renderer_of_a_real_capture_is_met() {
-    let (Some(scene), Some(camera), Some(truth)) = (
-        real("scenes/skull/skull.ply"),
-        real("reference/skull_front.camera.json"),
-        real("reference/skull_front.oracle_f32.npy"),
-    ) else {
-        return;
-    };
-    let listed = ingest::cameras::read(&camera).unwrap().remove(0);
-    let profile = RenderProfile { near: listed.near.unwrap(), ..GSPLAT_OF_THEN };
-    let view = View { camera: listed.camera, world_from_camera: listed.world_from_camera };
-    let file = std::fs::read(&truth).unwrap();
-    let header = 10 + usize::from(u16::from_le_bytes([file[8], file[9]]));
-    let truth = file[header..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
-    let truth: Vec<f32> = truth.collect();
-    let image = render_one(&gpu(), &read(&scene), &profile, view);
-    let db = psnr(&image.rgba, &truth);
+    let Some(truth) = skull_front() else { return };
+    let image = render_one(&gpu(), &truth.scene, &truth.profile, truth.view);
+    let db = psnr(&image.rgba, &truth.rgba);
     assert!(db >= 60.0, "{db:.1} dB");
 }
 

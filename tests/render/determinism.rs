@@ -2,25 +2,14 @@
 
 use std::sync::Mutex;
 
-use glam::DVec3;
 use wildcity::config;
 use wildcity::render::cpu::{Cpu, CpuError, Simd};
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
+use wildcity::render::{Backend, Frame, RenderError, Target};
 use wildcity::scene::{RenderProfile, Scene};
 
-use crate::images::{cpu, look, render, render_one};
+use crate::images::{cpu, render, render_one};
 use crate::scene_files::gaussians;
-use crate::streets::street;
-
-fn views() -> Vec<View> {
-    (0..6)
-        .map(|i| {
-            let yaw = f64::from(i);
-            let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
-        })
-        .collect()
-}
+use crate::streets::{street, turning_views as views};
 
 #[test]
 fn a_hundred_repeats_are_equal_to_the_bit() {

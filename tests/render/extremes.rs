@@ -6,51 +6,11 @@ use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::reference::Reference;
 use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity::scene::{Gaussians, RenderProfile, Scene};
 
+use crate::blobs::{Blob, ahead, raw, scene};
 use crate::images::{Image, agree, cpu, look, max_difference, render_one};
 use crate::streets::street;
-
-/// One Gaussian by what it is, not by what is stored.
-struct Blob {
-    mean_m: DVec3,
-    rotation: DQuat,
-    sigma_m: DVec3,
-    opacity: f64,
-    rgb: [f64; 3],
-}
-
-impl Default for Blob {
-    fn default() -> Self {
-        Self {
-            mean_m: DVec3::new(0.0, 0.0, 5.0),
-            rotation: DQuat::IDENTITY,
-            sigma_m: DVec3::splat(0.1),
-            opacity: 0.9,
-            rgb: [1.0, 0.6, 0.2],
-        }
-    }
-}
-
-fn scene(blobs: &[Blob]) -> Scene {
-    Scene::from_gaussians(&raw(blobs))
-}
-
-fn raw(blobs: &[Blob]) -> Gaussians {
-    let mut g = Gaussians::with_capacity(0, blobs.len());
-    for Blob { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
-        g.means_m.push(mean_m.to_array());
-        g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
-        g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
-        g.logit_opacities.push((opacity / (1.0 - opacity)).ln() as f32);
-        g.sh.extend(rgb.map(|c| ((c - 0.5) / sh::C0) as f32));
-    }
-    g
-}
-
-fn ahead(size_px: [u32; 2], focal_px: f64) -> View {
-    look(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
-}
 
 fn both(scene: &Scene, profile: &RenderProfile, view: View) -> (Image, Image) {
     (render_one(&cpu(), scene, profile, view), render_one(&Reference, scene, profile, view))

@@ -1,5 +1,7 @@
 //! The backends against each other, against images made by others, and at the extremes.
 
+#[path = "../support/blobs.rs"]
+mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/images.rs"]
@@ -8,6 +10,8 @@ mod images;
 mod scene_files;
 #[path = "../support/streets.rs"]
 mod streets;
+#[path = "../support/truths.rs"]
+mod truths;
 
 mod determinism;
 mod extremes;

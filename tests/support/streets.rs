@@ -39,6 +39,17 @@ pub(crate) fn street(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
     g
 }
 
+/// Six views from within a street, all around, of six sizes.
+pub(crate) fn turning_views() -> Vec<View> {
+    (0..6)
+        .map(|i| {
+            let yaw = f64::from(i);
+            let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
+            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
+        })
+        .collect()
+}
+
 /// Views from within a street: along it, across it, and back.
 pub(crate) fn street_views() -> [View; 3] {
     let at = DVec3::new(0.4, 0.0, 20.0);

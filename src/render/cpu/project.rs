@@ -9,7 +9,6 @@ use fearless_simd::{Level, dispatch, f32x16, f64x8, i32x16, prelude::*};
 use rayon::prelude::*;
 
 use super::lanes::Vec3x16;
-
 use crate::render::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
 use crate::render::{Frame, View};
