@@ -18,7 +18,7 @@ use super::rasterize::Rasterize;
 use super::resolve::Planes;
 use super::scan::Scan;
 use super::shaders::Shaders;
-use super::sort::Sort;
+use super::sort::{Columns, Sort};
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
 use crate::render::{Frame, FrameStats, RenderError};
@@ -26,8 +26,9 @@ use crate::render::{Frame, FrameStats, RenderError};
 /// How long a frame may take on the device before it counts as lost.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Room for splats and instances to begin with; what a frame needs beyond makes it grow.
+/// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
 const FIRST_SPLATS: u64 = 1 << 15;
+const FIRST_TOUCHES: u64 = 1 << 16;
 const FIRST_INSTANCES: u64 = 1 << 17;
 
 /// The renderer on one device.
@@ -56,6 +57,7 @@ pub(super) struct Chain {
 #[derive(Clone, Copy, Debug)]
 struct Needs {
     splats: u64,
+    touches: u64,
     instances: u64,
 }
 
@@ -101,7 +103,11 @@ impl Chain {
                 BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
             ),
             ring: Vec::new(),
-            high_water: Needs { splats: FIRST_SPLATS, instances: FIRST_INSTANCES },
+            high_water: Needs {
+                splats: FIRST_SPLATS,
+                touches: FIRST_TOUCHES,
+                instances: FIRST_INSTANCES,
+            },
             retries: 0,
             device,
         };
@@ -141,6 +147,7 @@ impl Chain {
             self.retries += 1;
             tracing::debug!(
                 splats = counters.splats,
+                touches = counters.touches,
                 instances = counters.instances,
                 "drawn again"
             );
@@ -157,33 +164,43 @@ impl Chain {
     }
 
     fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
-        let Needs { splats, instances } = self.high_water;
+        let Needs { splats, touches, instances } = self.high_water;
         let (device, scan) = (&self.device, &mut self.scan);
         frame.splat_capacity = self.splats.reserve(device, splats);
-        let (splats, tiles) = (u64::from(frame.splat_capacity), frame.tiles);
-        frame.instance_capacity = self.bin.reserve(device, splats, instances, tiles);
-        let instances = u64::from(frame.instance_capacity);
-        scan.reserve(device, u64::from(items).max(splats));
-        self.sort.reserve(device, scan, splats.max(instances));
+        let (splats, tiles) = (u64::from(frame.splat_capacity), (frame.macros, frame.tiles));
+        (frame.touch_capacity, frame.instance_capacity) =
+            self.bin.reserve(device, splats, tiles, (touches, instances));
+        scan.reserve(device, splats.max(items.max(frame.tiles).into()));
+        self.sort.reserve(device, scan, splats.max(frame.touch_capacity.into()));
         self.ticks.reserve(device, TICKS_BYTES);
     }
 
     /// Whether everything fitted; if not, the high water rises to what it takes.
     fn is_enough(&mut self, counters: &Counters, frame: &GpuFrame) -> Result<bool, RenderError> {
         let splats = Splats::limit(&self.device);
-        let instances = Bin::limit(&self.device);
+        let listed = Bin::limit(&self.device);
         let checks = [
             ("visible splats", counters.splats, splats),
-            ("(Gaussian, tile) pairs", counters.instances, instances),
+            ("(Gaussian, macro tile) pairs", counters.touches, listed),
+            ("(Gaussian, tile) pairs", counters.instances, listed),
         ];
         for (what, needed, limit) in checks {
             if u64::from(needed) > limit {
                 return Err(RenderError::TooMany { what, limit });
             }
         }
-        self.high_water.splats = self.high_water.splats.max(counters.splats.into());
-        self.high_water.instances = self.high_water.instances.max(counters.instances.into());
-        Ok(counters.splats <= frame.splat_capacity && counters.instances <= frame.instance_capacity)
+        let Needs { splats, touches, instances } = &mut self.high_water;
+        let checks = [
+            (counters.splats, splats, frame.splat_capacity),
+            (counters.touches, touches, frame.touch_capacity),
+            (counters.instances, instances, frame.instance_capacity),
+        ];
+        let mut is_enough = true;
+        for (needed, high_water, capacity) in checks {
+            *high_water = u64::from(needed).max(*high_water);
+            is_enough &= needed <= capacity;
+        }
+        Ok(is_enough)
     }
 
     fn submit(
@@ -197,7 +214,7 @@ impl Chain {
         let (device, plan, scan) = (&*device, &*plan, &*scan);
         plan.start(device, frame, work.items());
         let mut recorder = Recorder::new(device, self.clock.clone());
-        recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
+        recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
 
         let mut pass = recorder.stage("project");
         self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
@@ -206,28 +223,28 @@ impl Chain {
         let mut pass = recorder.stage("sort");
         let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
         let depth_bits = DEPTH_BITS + bits(frame.views - 1);
-        let data = (&splats.keys, &splats.places);
+        let data = Columns { keys: &splats.keys, values: &splats.places, masks: None };
         let sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
         drop(pass);
 
         let mut pass = recorder.stage("bin");
-        self.bin.run(device, &mut pass, (plan, scan), (splats, sorted));
+        self.bin.touch(device, &mut pass, (plan, scan), (splats, sorted));
         drop(pass);
 
         let mut pass = recorder.stage("tile sort");
-        let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
-        let data = (&self.bin.tiles, &self.bin.places);
-        // The number after the last tile occurs too.
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, bits(frame.tiles));
+        let jobs = (plan.jobs(), job::TOUCHES_SORT, job::TOUCHES_DIGITS);
+        // The number after the last macro tile occurs too.
+        let (data, macro_bits) = (self.bin.touches(), bits(frame.macros));
+        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, macro_bits);
         drop(pass);
 
-        let mut pass = recorder.stage("ranges");
-        self.bin.ranges(device, &mut pass, plan, sorted);
+        let mut pass = recorder.stage("expand");
+        self.bin.expand(device, &mut pass, (plan, scan), (frame.macros, sorted));
         drop(pass);
 
         let mut pass = recorder.stage("rasterize");
         let output = (planes, frame.tiles, per_page);
-        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin, sorted), output);
+        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin), output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
