@@ -2,6 +2,7 @@
 //! that no adapter has and a device that dies are ordinary errors.
 
 use std::ops::RangeInclusive;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use futures_util::FutureExt;
@@ -137,7 +138,10 @@ fn adapters() -> Vec<Adapter> {
 
 impl AdapterChoice {
     fn find(&self) -> Result<Adapter, GpuError> {
-        let found = adapters();
+        let found = match self {
+            Self::Hardware if !may_have_hardware() => Vec::new(),
+            _ => adapters(),
+        };
         let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
         let index = match self {
             Self::Best => (!found.is_empty()).then_some(0),
@@ -159,6 +163,13 @@ impl AdapterChoice {
             (None, _) => Err(GpuError::NoAdapter),
         }
     }
+}
+
+/// Whether it is worth asking for devices in hardware. Linux gives each a node, those of NVIDIA and of
+/// Windows beneath names of their own; where there is none, no Vulkan library is loaded.
+fn may_have_hardware() -> bool {
+    let nodes = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg"];
+    cfg!(not(target_os = "linux")) || nodes.iter().any(|node| Path::new(node).exists())
 }
 
 /// An open device.

@@ -24,6 +24,7 @@ use std::time::Instant;
 
 use rayon::ThreadPool;
 use rayon::prelude::*;
+use wgpu::AdapterInfo;
 
 pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
 
@@ -37,6 +38,8 @@ use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
+    /// The device and its driver.
+    detail: String,
     shaders: Shaders,
     pool: ThreadPool,
     /// Gone after the device failed, and made again by the next frame.
@@ -75,8 +78,11 @@ impl Gpu {
         let name = |i| format!("gpu-{i}");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build();
         let pool = pool.map_err(|error| GpuError::Threads { reason: error.to_string() })?;
-        let chain = Chain::new(Device::open(choice)?, &shaders)?;
-        Ok(Self { choice: choice.clone(), shaders, pool, chain: Mutex::new(Some(chain)) })
+        let device = Device::open(choice)?;
+        let AdapterInfo { name, driver, driver_info, .. } = &device.info;
+        let detail = format!("{name}, {driver} {driver_info}");
+        let chain = Mutex::new(Some(Chain::new(device, &shaders)?));
+        Ok(Self { choice: choice.clone(), detail, shaders, pool, chain })
     }
 
     /// What the device holds; `None` while it is lost.
@@ -114,6 +120,10 @@ impl Gpu {
 impl Backend for Gpu {
     fn name(&self) -> &'static str {
         "gpu"
+    }
+
+    fn detail(&self) -> String {
+        self.detail.clone()
     }
 
     fn render(
