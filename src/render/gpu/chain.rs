@@ -19,6 +19,7 @@ use super::resolve::Planes;
 use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::{Columns, Sort};
+use super::traffic::FrameWork;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
 use crate::render::{Frame, FrameStats, RenderError};
@@ -52,6 +53,7 @@ pub(super) struct Chain {
     high_water: Needs,
     /// Frames that were drawn again in larger buffers.
     pub(super) retries: u64,
+    pub(super) last: FrameWork,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -109,6 +111,7 @@ impl Chain {
                 instances: FIRST_INSTANCES,
             },
             retries: 0,
+            last: FrameWork::default(),
             device,
         };
         chain.device.check()?;
@@ -139,6 +142,7 @@ impl Chain {
             let (counters, ticks) = read_back.head()?;
             if self.is_enough(&counters, &gpu_frame)? {
                 let pages = read_back.pages()?;
+                self.last = frame_work(frame, planes, &work, &gpu_frame, &counters);
                 let stats = self.stats(&counters, prepare_ms, &stages, &ticks, start.elapsed());
                 let views = gpu_frame.view[..frame.views.len()].to_vec();
                 return Ok(Drawn { read_back, pages, tiles_per_page, views, stats });
@@ -284,6 +288,28 @@ impl Chain {
                 * u64::from(super::layout::RASTER_BATCH)
                 * u64::from(TILE_PX * TILE_PX),
         }
+    }
+}
+
+fn frame_work(
+    frame: &Frame<'_>,
+    planes: Planes,
+    work: &Work,
+    gpu_frame: &GpuFrame,
+    counters: &Counters,
+) -> FrameWork {
+    FrameWork {
+        sh_degree: frame.scene.sh_degree(),
+        views: gpu_frame.views,
+        pixels: frame.views.iter().map(|view| view.camera.pixels() as u64).sum(),
+        planes: planes.tile_bytes() / u64::from(4 * TILE_PX * TILE_PX),
+        tiles: gpu_frame.tiles.into(),
+        macros: gpu_frame.macros.into(),
+        clusters: work.items().into(),
+        splats: counters.splats.into(),
+        touches: counters.touches.into(),
+        instances: counters.instances.into(),
+        batches: counters.batches.into(),
     }
 }
 

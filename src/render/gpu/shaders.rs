@@ -18,6 +18,7 @@ impl Default for Shaders {
             ("ranges", include_str!("../../../shaders/ranges.wgsl")),
             ("expand", include_str!("../../../shaders/expand.wgsl")),
             ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+            ("roofline", include_str!("../../../shaders/roofline.wgsl")),
         ];
         Self { stages: stages.map(|(name, source)| (name, link(source))).to_vec() }
     }

@@ -11,7 +11,7 @@ use super::scan::Scan;
 use super::shaders::Shaders;
 
 /// Bits of a digit.
-const DIGIT_BITS: u32 = DIGITS.ilog2();
+pub(super) const DIGIT_BITS: u32 = DIGITS.ilog2();
 
 /// The kernels of each pass, and the counters between them.
 #[derive(Debug)]
