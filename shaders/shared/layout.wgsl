@@ -4,6 +4,8 @@ struct FrameView {
     size_px: vec2u,
     columns: u32,
     first_tile: u32,
+    rows: vec2u,
+    pad: vec2u,
 }
 
 struct Frame {

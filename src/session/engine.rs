@@ -2,8 +2,8 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
@@ -34,9 +34,10 @@ pub struct EngineSettings {
 
 /// The renderer and the twins, shared by all sessions.
 ///
-/// One frame is drawn at a time, on all cores: two at once would take as long together and hold
-/// twice the memory. Frames wait in the order in which they were asked for, and a session asks for
-/// one at a time, so that sessions take turns.
+/// As many frames are drawn at a time as the backend wants. The cpu backend draws one, on all cores:
+/// two at once would take as long together and hold twice the memory. A GPU draws one while the one
+/// before is encoded. Frames are begun in the order in which they were asked for, and a session asks
+/// for one at a time, so that sessions take turns.
 pub struct Engine {
     listings: Arc<Listings>,
     cache: Cache,
@@ -64,23 +65,22 @@ pub(super) struct Hold {
 }
 
 impl Engine {
-    /// Starts the render thread. It ends when the engine is dropped.
+    /// Starts the render threads, one for each frame that the backend takes at once. They end when
+    /// the engine is dropped.
     ///
     /// # Errors
-    /// The thread cannot be started.
+    /// A thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
-        let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
-        std::thread::Builder::new()
-            .name("render".to_owned())
-            .spawn(move || {
-                let mut scratch = Scratch::new();
-                while let Some(job) = queue.blocking_recv() {
-                    job(&mut scratch);
-                    shrink(&mut scratch);
-                }
-            })
-            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        let (jobs, queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
+        let queue = Arc::new(Mutex::new(queue));
+        for number in 0..backend.frames_at_once().max(1) {
+            let queue = queue.clone();
+            std::thread::Builder::new()
+                .name(format!("render-{number}"))
+                .spawn(move || draw_all(&queue))
+                .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        }
         let listings = Arc::new(Listings::new(catalog.clone()));
         let (cache, answers) = (Cache::limited(catalog, resident_bytes), Answers::default());
         Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
@@ -128,7 +128,7 @@ impl Engine {
         Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
 
-    /// Does some work on the render thread when its turn comes, and tells how long it waited.
+    /// Does some work on a render thread when its turn comes, and tells how long it waited.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if too much is queued, [`SessionError::DeadlineExceeded`] if the
@@ -179,6 +179,17 @@ impl Engine {
 impl std::fmt::Debug for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Engine").field("backend", &self.backend.name()).finish_non_exhaustive()
+    }
+}
+
+/// What a render thread does: the next job in its turn, until there is no engine any more.
+fn draw_all(queue: &Mutex<mpsc::Receiver<Job>>) {
+    let mut scratch = Scratch::new();
+    // The lock is held while waiting: whoever holds it takes the next job, and lets the next in.
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).blocking_recv();
+    while let Some(job) = next() {
+        job(&mut scratch);
+        shrink(&mut scratch);
     }
 }
 

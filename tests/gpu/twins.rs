@@ -69,7 +69,7 @@ macro_rules! layouts {
 #[test]
 fn layouts_are_the_same() {
     let mut rust: Vec<Layout> = layouts! {
-        FrameView { size_px, columns, first_tile }
+        FrameView { size_px, columns, first_tile, rows, pad }
         Frame {
             splat_capacity, instance_capacity, tiles, views, near_m, far_m, blur_px2, antialiased,
             alpha_cap, log2_alpha_cut, stop, pad, view,

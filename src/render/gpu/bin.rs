@@ -65,8 +65,7 @@ impl Bin {
         for words in self.tiles.iter_mut().chain(&mut self.places) {
             words.reserve(device, 4 * instances);
         }
-        // A total of 2^32 - 1 stands for more, which no buffer holds.
-        (self.tiles[0].buffer().size() / 4).min(u64::from(u32::MAX) - 1) as u32
+        (self.tiles[0].buffer().size() / 4).min(Self::limit(device)) as u32
     }
 
     /// Lists the tiles of all splats; `sorted` tells which of their buffers are in order.

@@ -119,7 +119,8 @@ fn adapters() -> Vec<Adapter> {
         backends: Backends::VULKAN,
         // Every group count is computed by `plan.wgsl` within the limits that the validation would
         // check, at the price of one more dispatch per indirect one.
-        flags: InstanceFlags::default() - InstanceFlags::VALIDATION_INDIRECT_CALL,
+        // WGPU_VALIDATION=1 in the environment asks for the Vulkan validation layer.
+        flags: InstanceFlags::default().with_env() - InstanceFlags::VALIDATION_INDIRECT_CALL,
         ..InstanceDescriptor::new_without_display_handle()
     });
     // Outside of browsers the answer is there at once.
@@ -168,16 +169,19 @@ pub(super) struct Device {
     pub(super) queue: Queue,
     pub(super) info: AdapterInfo,
     limits: Limits,
+    /// Most bytes of a binding, however many the adapter's own limits allow.
+    binding_limit: u64,
     /// The first thing that went wrong since the last look.
     fault: Arc<Mutex<Option<String>>>,
 }
 
 impl Device {
-    /// Opens a device with all that its adapter can do.
+    /// Opens a device with all that its adapter can do, but for bindings of at most `binding_limit`
+    /// bytes.
     ///
     /// # Errors
     /// There is none, or it does not open.
-    pub(super) fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
+    pub(super) fn open(choice: &AdapterChoice, binding_limit: u64) -> Result<Self, GpuError> {
         let adapter = choice.find()?;
         let (info, limits) = (adapter.get_info(), adapter.limits());
         let descriptor = DeviceDescriptor {
@@ -201,7 +205,7 @@ impl Device {
             note(&refused, error.to_string());
         }));
         device.set_device_lost_callback(move |_, message| note(&lost, message));
-        Ok(Self { device, queue, info, limits, fault })
+        Ok(Self { device, queue, info, limits, binding_limit, fault })
     }
 
     /// Tells of what went wrong since the last call.
@@ -223,7 +227,13 @@ impl Device {
 
     /// Most bytes that a shader sees at once: 128 MiB on lavapipe, 2 GiB on cards.
     pub(super) fn binding_bytes(&self) -> u64 {
-        self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size) / 256 * 256
+        let own = self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size);
+        own.min(self.binding_limit) / 256 * 256
+    }
+
+    /// Bytes of the device's memory that its buffers take, as the allocator counts them.
+    pub(super) fn allocated_bytes(&self) -> Option<u64> {
+        self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
     /// Nanoseconds per tick of the clock, where the device has one.
