@@ -60,7 +60,7 @@ struct Counters {
     splats: u32,
     instances: u32,
     batches: atomic<u32>,
-    pad: u32,
+    most_batches: atomic<u32>,
 }
 
 struct SplatShape {

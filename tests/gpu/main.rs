@@ -19,5 +19,6 @@ mod determinism;
 mod devices;
 mod extremes;
 mod parity;
+mod parts;
 mod slips;
 mod twins;

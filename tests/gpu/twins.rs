@@ -81,7 +81,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, instances, batches, pad }
+        Counters { splats, instances, batches, most_batches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

@@ -12,7 +12,7 @@ use super::bin::Bin;
 use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Recorder, TICKS_BYTES, clock};
-use super::layout::{Counters, Frame as GpuFrame, FrameView};
+use super::layout::{Counters, Frame as GpuFrame, FrameView, RASTER_BATCH};
 use super::mirror::Mirror;
 use super::parts::{Cuts, Needs, Rows, Subject};
 use super::plan::{Plan, job};
@@ -196,6 +196,11 @@ impl Chain {
             let fits = counters.splats <= frame.splat_capacity
                 && counters.instances <= frame.instance_capacity;
             if fits {
+                let limit = self.device.tile_splats();
+                if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
+                    let what = "visible splats in one tile (of a device in software)";
+                    return Err(RenderError::TooMany { what, limit });
+                }
                 count(stats, &counters);
                 return Ok(needs);
             }
@@ -323,7 +328,7 @@ fn add(stats: &mut FrameStats, stage: &'static str, time: Duration) {
 
 /// Adds the counts of a part. What reaches into two bands of a view counts twice.
 fn count(stats: &mut FrameStats, counters: &Counters) {
-    let evaluations_per_batch = u64::from(super::layout::RASTER_BATCH * TILE_PX * TILE_PX);
+    let evaluations_per_batch = u64::from(RASTER_BATCH * TILE_PX * TILE_PX);
     stats.visible_pairs += u64::from(counters.splats);
     stats.instances += u64::from(counters.instances);
     stats.evaluations += u64::from(counters.batches) * evaluations_per_batch;

@@ -10,6 +10,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
 };
 
+use super::layout::RASTER_BATCH;
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -234,6 +235,18 @@ impl Device {
     /// Bytes of the device's memory that its buffers take, as the allocator counts them.
     pub(super) fn allocated_bytes(&self) -> Option<u64> {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
+    }
+
+    /// Most splats of a tile that are blended. Mesa's software devices leave every loop of a shader,
+    /// without a word, after 65,535 iterations in all of its loops together
+    /// (`LP_MAX_TGSI_LOOP_ITERATIONS`); a batch of `rasterize` takes one iteration, one for each of
+    /// its splats, and two that load them.
+    pub(super) fn tile_splats(&self) -> u64 {
+        let batch = u64::from(RASTER_BATCH);
+        match self.info.device_type {
+            DeviceType::Cpu => 65_535 / (batch + 3) * batch,
+            _ => u64::MAX,
+        }
     }
 
     /// Nanoseconds per tick of the clock, where the device has one.

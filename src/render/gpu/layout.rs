@@ -209,8 +209,8 @@ pub struct Counters {
     pub instances: u32,
     /// Batches of [`RASTER_BATCH`] splats that tiles blended.
     pub batches: u32,
-    /// Zero.
-    pub pad: u32,
+    /// Those of the tile that blended the most.
+    pub most_batches: u32,
 }
 
 /// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.
