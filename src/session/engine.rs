@@ -229,12 +229,73 @@ impl Drop for Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render;
 
     #[test]
     fn huge_images_are_not_kept() {
         let mut scratch = vec![vec![0; config::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
         shrink(&mut scratch);
         assert_eq!(scratch, [vec![0; 1000]]);
+    }
+
+    struct Takes(usize);
+
+    impl Backend for Takes {
+        fn name(&self) -> &'static str {
+            "takes"
+        }
+
+        fn frames_at_once(&self) -> usize {
+            self.0
+        }
+
+        fn render(
+            &self,
+            _: &render::Frame<'_>,
+            _: &mut [render::Target<'_>],
+            _: render::Finished<'_>,
+        ) -> Result<render::FrameStats, render::RenderError> {
+            Ok(render::FrameStats::default())
+        }
+    }
+
+    #[tokio::test]
+    async fn as_many_frames_at_once_as_the_backend_takes() {
+        for at_once in [1, 3] {
+            let dir = tempfile::tempdir().unwrap();
+            let engine = Engine::start(EngineSettings {
+                catalog: Catalog::open(dir.path()).unwrap(),
+                resident_bytes: None,
+                episodes: dir.path().to_owned(),
+                backend: Arc::new(Takes(at_once)),
+                step_timeout: config::STEP_TIMEOUT,
+            });
+            let engine = engine.unwrap();
+            // How many run now, and how many ever ran at once.
+            let counts = Arc::new(Mutex::new((0, 0)));
+            let jobs = (0..at_once + 3).map(|_| {
+                let counts = counts.clone();
+                engine.run(Instant::now() + config::STEP_TIMEOUT, move |_, _| {
+                    let begun = Instant::now();
+                    let most = || {
+                        let mut counts = counts.lock().unwrap();
+                        counts.1 = counts.0.max(counts.1);
+                        counts.1
+                    };
+                    counts.lock().unwrap().0 += 1;
+                    while most() < at_once && begun.elapsed() < Duration::from_secs(10) {
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    std::thread::sleep(Duration::from_millis(20));
+                    most();
+                    counts.lock().unwrap().0 -= 1;
+                })
+            });
+            for done in futures_util::future::join_all(jobs).await {
+                done.unwrap();
+            }
+            assert_eq!(*counts.lock().unwrap(), (0, at_once));
+        }
     }
 
     #[test]

@@ -18,6 +18,8 @@ mod truths;
 mod determinism;
 mod devices;
 mod extremes;
+mod flat;
+mod overlap;
 mod parity;
 mod parts;
 mod slips;
