@@ -253,6 +253,9 @@ fn reach_of(rank: u32) -> Reach {
     }
     reach.thin = reach.first_row == reach.last_row
         || columns.x / i32(TILE_PX) == columns.y / i32(TILE_PX);
+    // Of an image that is drawn in bands, the rows of this one.
+    reach.first_row = max(reach.first_row, i32(reach.view.rows.x));
+    reach.last_row = min(reach.last_row, i32(reach.view.rows.y) - 1);
     let l = reach.shape.factor;
     reach.power = reach.shape.log2_opacity - frame.log2_alpha_cut;
     reach.inverse_l0 = 1.0 / l.x;

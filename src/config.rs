@@ -141,3 +141,16 @@ pub const RESIDENT_BYTES: u64 = 16 << 30;
 
 /// Most Gaussians of a street of `wildcity bench gpu`: 200 B each while it is made.
 pub const BENCH_GAUSSIANS: i64 = 100_000_000;
+
+/// Frames that a GPU has in hand at once: one is drawn, one is encoded, and one is ready to be drawn
+/// the moment the first is done. Six JPEGs take longer than a fast GPU takes to draw them. Each
+/// holds its images, 27 MB of six full cameras.
+pub const GPU_FRAMES: usize = 3;
+
+/// Frames that did not fit a GPU at once, and are known in which parts they do: a few kB, for more
+/// rigs than drive at once.
+pub const REMEMBERED_CUTS: usize = 64;
+
+/// Smallest limit of a binding that the gpu backend is made to live with: one cluster of SH degree 3
+/// takes 34 kB of one.
+pub const BINDING_BYTES_MIN: u64 = 64 << 10;

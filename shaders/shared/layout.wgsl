@@ -6,7 +6,7 @@ struct FrameView {
     first_tile: u32,
     macro_columns: u32,
     first_macro: u32,
-    pad: vec2u,
+    rows: vec2u,
 }
 
 struct Frame {
@@ -66,6 +66,7 @@ struct Counters {
     touches: u32,
     instances: u32,
     batches: atomic<u32>,
+    most_batches: atomic<u32>,
 }
 
 struct SplatShape {

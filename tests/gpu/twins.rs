@@ -72,7 +72,7 @@ macro_rules! layouts {
 #[test]
 fn layouts_are_the_same() {
     let mut rust: Vec<Layout> = layouts! {
-        FrameView { size_px, columns, first_tile, macro_columns, first_macro, pad }
+        FrameView { size_px, columns, first_tile, macro_columns, first_macro, rows }
         Frame {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macros, near_m, far_m,
             blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
@@ -84,7 +84,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, touches, instances, batches }
+        Counters { splats, touches, instances, batches, most_batches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

@@ -89,9 +89,8 @@ impl Bin {
         for words in [&mut self.macros, &mut self.places, &mut self.masks].into_iter().flatten() {
             words.reserve(device, 4 * touches);
         }
-        // A total of 2^32 - 1 stands for more, which no buffer holds.
-        let held = |words: &Growing| (words.buffer().size() / 4).min(u64::from(u32::MAX) - 1);
-        (held(&self.macros[0]) as u32, held(&self.instances) as u32)
+        let held = |words: &Growing| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
+        (held(&self.macros[0]), held(&self.instances))
     }
 
     /// Lists the touches of all splats; `sorted` tells which of their buffers are in order.

@@ -1,8 +1,11 @@
 //! What lies in GPU buffers. WGSL copy: `shaders/shared/{constants,layout}.wgsl`, held equal by
 //! `tests/gpu/twins.rs`.
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 
+use super::parts::{Part, Rows};
 use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
 use crate::render::{MAX_VIEWS, View, constants};
 
@@ -31,7 +34,7 @@ pub const CLUSTER_HEADER_WORDS: u32 = 32;
 /// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
 pub const GEOMETRY_WORDS: u32 = 9;
 
-/// The grid of tiles of one view (32 bytes).
+/// The grid of tiles of one view, and what is drawn of it (32 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct FrameView {
@@ -45,8 +48,8 @@ pub struct FrameView {
     pub macro_columns: u32,
     /// Index of the first macro tile among those of all views.
     pub first_macro: u32,
-    /// Zero.
-    pub pad: [u32; 2],
+    /// The first row of tiles that is drawn, and the one after the last.
+    pub rows: [u32; 2],
 }
 
 /// What all stages know of a frame (576 bytes).
@@ -107,13 +110,31 @@ impl Frame {
             let size_px = [view.camera.width_px, view.camera.height_px];
             let [columns, rows] = size_px.map(|size| size.div_ceil(constants::TILE_PX));
             let macro_columns = columns.div_ceil(MACRO_COLUMNS);
-            let (first_tile, first_macro, pad) = (frame.tiles, frame.macros, [0; 2]);
-            *slot = FrameView { size_px, columns, first_tile, macro_columns, first_macro, pad };
+            *slot = FrameView {
+                size_px,
+                columns,
+                first_tile: frame.tiles,
+                macro_columns,
+                first_macro: frame.macros,
+                rows: [0, rows],
+            };
             // At most 16 views of 1024 x 1024 tiles: 2^24.
             frame.tiles += columns * rows;
             frame.macros += macro_columns * rows.div_ceil(MACRO_ROWS);
         }
         frame
+    }
+
+    /// Draws these rows alone. Returns the tiles that they are.
+    pub(super) fn restrict(&mut self, rows: &Rows, part: &Part) -> Range<u32> {
+        let views = rows.views(part);
+        for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
+            let Range { start, end } = rows.of_view(index, part);
+            view.rows = [start, end];
+        }
+        let (first, last) = (&self.view[views.start], &self.view[views.end - 1]);
+        let start = first.first_tile + first.rows[0] * first.columns;
+        start..last.first_tile + last.rows[1] * last.columns
     }
 }
 
@@ -214,6 +235,8 @@ pub struct Counters {
     pub instances: u32,
     /// Batches of [`RASTER_BATCH`] splats that tiles blended.
     pub batches: u32,
+    /// Those of the tile that blended the most.
+    pub most_batches: u32,
 }
 
 /// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.

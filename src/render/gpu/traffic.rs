@@ -1,7 +1,12 @@
 //! The least that each stage must move, from what a frame counted: its memory roofline.
 
-use super::layout::{CLUSTER_HEADER_WORDS, DIGITS, GEOMETRY_WORDS, RASTER_BATCH, SORT_BLOCK};
+use super::layout::{
+    CLUSTER_HEADER_WORDS, Counters, DIGITS, Frame as GpuFrame, GEOMETRY_WORDS, RASTER_BATCH,
+    SORT_BLOCK,
+};
+use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
+use crate::render::Frame;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::scene::chunk::CLUSTER;
 use crate::scene::sh;
@@ -34,6 +39,28 @@ pub struct FrameWork {
 }
 
 impl FrameWork {
+    /// Of a frame of which nothing is drawn yet.
+    pub(super) fn new(frame: &Frame<'_>, planes: Planes, gpu_frame: &GpuFrame) -> Self {
+        Self {
+            sh_degree: frame.scene.sh_degree(),
+            views: gpu_frame.views,
+            pixels: frame.views.iter().map(|view| view.camera.pixels() as u64).sum(),
+            planes: planes.tile_bytes() / u64::from(4 * TILE_PX * TILE_PX),
+            tiles: gpu_frame.tiles.into(),
+            macros: gpu_frame.macros.into(),
+            ..Self::default()
+        }
+    }
+
+    /// Adds what a part of the frame counted.
+    pub(super) fn add(&mut self, clusters: u32, counters: &Counters) {
+        self.clusters += u64::from(clusters);
+        self.splats += u64::from(counters.splats);
+        self.touches += u64::from(counters.touches);
+        self.instances += u64::from(counters.instances);
+        self.batches += u64::from(counters.batches);
+    }
+
     /// Bytes that each stage reads and writes if every array passes once per kernel, nothing is read
     /// twice by one, and all that is read again by another comes from memory again:
     ///
