@@ -9,7 +9,7 @@ use crate::render::gpu::{DeviceInfo, devices};
 /// List the devices that the gpu backend could use, the fastest kind first.
 ///
 /// The number or a part of the name is what --device takes. A device of the kind "cpu" is software
-/// (lavapipe): right, and slower than the cpu backend, so --backend auto does not take it.
+/// (lavapipe): right, and slower than the cpu backend, so --backend auto never takes it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Devices {

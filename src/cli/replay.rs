@@ -60,7 +60,7 @@ impl Replay {
         let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
         let header = &recording.header;
         let resident = cache.open(&header.twin, Some(header.version))?;
-        let backend = self.engine.backend()?;
+        let backend = self.engine.backend_of(&header.backend)?;
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());

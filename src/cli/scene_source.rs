@@ -1,12 +1,15 @@
 //! What the rendering commands share: a scene to render, cameras, a profile, a backend.
 
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::ValueEnum;
 
 use crate::config;
 use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
+use crate::render::automatic::{Automatic, automatic};
 use crate::render::cpu::{Cpu, Simd};
 use crate::render::gpu::{AdapterChoice, Gpu};
 use crate::render::reference::Reference;
@@ -66,7 +69,8 @@ pub(super) struct Engine {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// cpu: the gpu backend waits to be asked for until it has run on hardware.
+    /// gpu if `--device` names one, or if there is one in hardware that draws a trial card as the cpu
+    /// backend does; else cpu. It is said on standard error.
     #[default]
     Auto,
     /// wgpu on Vulkan, `--device`.
@@ -103,18 +107,35 @@ impl From<SimdName> for Simd {
 }
 
 impl Engine {
-    /// Makes the backend.
+    /// Makes the backend, and says on standard error which one it is if nobody named it.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        Ok(match self.backend {
-            BackendName::Auto | BackendName::Cpu => {
-                Box::new(Cpu::new(self.threads, self.simd.into())?)
+        match (self.backend, &self.device) {
+            (BackendName::Auto, None) => {
+                let Automatic { backend, reason } = automatic(self.threads, self.simd.into())?;
+                writeln!(io::stderr(), "backend {reason}")?;
+                Ok(backend)
             }
-            BackendName::Gpu => {
-                let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
-                Box::new(Gpu::new(&choice, self.threads)?)
+            (BackendName::Auto | BackendName::Gpu, device) => self.gpu(device.as_deref()),
+            (_, Some(device)) => {
+                anyhow::bail!("--device {device:?} is one of the gpu backend: add --backend gpu")
             }
-            BackendName::Reference => Box::new(Reference),
-        })
+            (BackendName::Cpu, None) => Ok(Box::new(Cpu::new(self.threads, self.simd.into())?)),
+            (BackendName::Reference, None) => Ok(Box::new(Reference)),
+        }
+    }
+
+    /// The same, but what was recorded is drawn by what drew it, unless another one is named.
+    pub(super) fn backend_of(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
+        let named = BackendName::from_str(recorded, false);
+        match (self.backend, named) {
+            (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),
+            _ => self.backend(),
+        }
+    }
+
+    fn gpu(&self, device: Option<&str>) -> anyhow::Result<Box<dyn Backend>> {
+        let named = |name: &str| AdapterChoice::Named(name.to_owned());
+        Ok(Box::new(Gpu::new(&device.map_or(AdapterChoice::Best, named), self.threads)?))
     }
 }
 

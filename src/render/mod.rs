@@ -3,6 +3,7 @@
 //! The stages project, sort, bin, rasterize, resolve bear one name in every backend. An image is a
 //! function of (scene, profile, views): no clock, no cache, no thread count.
 
+pub mod automatic;
 pub mod constants;
 pub mod cpu;
 pub mod gpu;

@@ -34,6 +34,24 @@ fn software_is_not_taken_for_hardware() {
     }
 }
 
+/// Whoever names a device wants the gpu backend: another one is not taken in silence.
+#[test]
+fn a_device_is_for_the_gpu_backend() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = |arguments: &[&str]| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_wildcity"));
+        command.args(["demo", "--steps", "1", "--twins", "t", "--out", "o"]).args(arguments);
+        let output = command.current_dir(directory.path()).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success(), "{arguments:?}: {said}");
+        said
+    };
+    let said = run(&["--backend", "cpu", "--device", "0"]);
+    assert!(said.contains("add --backend gpu"), "{said}");
+    let said = run(&["--device", "no such card"]);
+    assert!(said.contains("no device is called") && said.contains(&devices()[0].name), "{said}");
+}
+
 #[test]
 fn a_shader_that_does_not_compile_is_an_error() {
     let broken = wildcity::render::gpu::shaders::Shaders::default();

@@ -2,6 +2,7 @@
 //! that no adapter has and a device that dies are ordinary errors.
 
 use std::ops::RangeInclusive;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use futures_util::FutureExt;
@@ -10,7 +11,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
 };
 
-use super::layout::RASTER_BATCH;
+use super::layout::{RASTER_BATCH, WORKGROUP};
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -139,7 +140,10 @@ fn adapters() -> Vec<Adapter> {
 
 impl AdapterChoice {
     fn find(&self) -> Result<Adapter, GpuError> {
-        let found = adapters();
+        let found = match self {
+            Self::Hardware if !may_have_hardware() => Vec::new(),
+            _ => adapters(),
+        };
         let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
         let index = match self {
             Self::Best => (!found.is_empty()).then_some(0),
@@ -161,6 +165,13 @@ impl AdapterChoice {
             (None, _) => Err(GpuError::NoAdapter),
         }
     }
+}
+
+/// Whether it is worth asking for devices in hardware. Linux gives each a node, those of NVIDIA and of
+/// Windows beneath names of their own; where there is none, no Vulkan library is loaded.
+fn may_have_hardware() -> bool {
+    let nodes = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg"];
+    cfg!(not(target_os = "linux")) || nodes.iter().any(|node| Path::new(node).exists())
 }
 
 /// An open device.
@@ -237,16 +248,24 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most splats of a tile that are blended. Mesa's software devices leave every loop of a shader,
-    /// without a word, after 65,535 iterations in all of its loops together
-    /// (`LP_MAX_TGSI_LOOP_ITERATIONS`); a batch of `rasterize` takes one iteration, one for each of
-    /// its splats, and two that load them.
+    /// Most splats of a tile that are blended. A batch of `rasterize` takes one iteration, one for
+    /// each of its splats, and two that load them.
     pub(super) fn tile_splats(&self) -> u64 {
         let batch = u64::from(RASTER_BATCH);
-        match self.info.device_type {
-            DeviceType::Cpu => 65_535 / (batch + 3) * batch,
-            _ => u64::MAX,
-        }
+        self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
+    }
+
+    /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
+    /// cover all of them: each takes 20 iterations, and 9 for every 256 tiles.
+    pub(super) fn view_tiles(&self) -> u64 {
+        let splats = u64::from(WORKGROUP);
+        self.loop_iterations().map_or(u64::MAX, |most| (most / splats - 20) / 9 * 256)
+    }
+
+    /// Mesa's software devices leave every loop of a shader, without a word, after so many iterations
+    /// in all of its loops together (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+    fn loop_iterations(&self) -> Option<u64> {
+        (self.info.device_type == DeviceType::Cpu).then_some(65_535)
     }
 
     /// Nanoseconds per tick of the clock, where the device has one.

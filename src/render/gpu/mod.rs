@@ -26,6 +26,7 @@ use std::time::Instant;
 
 use rayon::ThreadPool;
 use rayon::prelude::*;
+use wgpu::AdapterInfo;
 
 pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
 
@@ -41,6 +42,8 @@ use crate::config;
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
+    /// The device and its driver.
+    detail: String,
     shaders: Shaders,
     binding_limit: u64,
     /// Delivers images, and runs what `finished` does with them.
@@ -114,21 +117,24 @@ impl Gpu {
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
+        let device = Device::open(choice, binding_limit)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
             pool.map_err(|error| GpuError::Threads { reason: error.to_string() })
         };
         let (deliver, cull) = (pool("deliver")?, pool("cull")?);
-        let chain = Chain::new(Device::open(choice, binding_limit)?, &shaders)?;
+        let AdapterInfo { name, driver, driver_info, .. } = &device.info;
+        let detail = format!("{name}, {driver} {driver_info}");
         Ok(Self {
             choice: choice.clone(),
-            shaders,
+            detail,
             binding_limit,
             deliver,
             cull,
             turns: Turns::default(),
-            chain: Mutex::new(Some(chain)),
+            chain: Mutex::new(Some(Chain::new(device, &shaders)?)),
+            shaders,
         })
     }
 
@@ -185,6 +191,10 @@ impl Backend for Gpu {
 
     fn frames_at_once(&self) -> usize {
         config::GPU_FRAMES
+    }
+
+    fn detail(&self) -> String {
+        self.detail.clone()
     }
 
     fn render(
