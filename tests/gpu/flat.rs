@@ -46,7 +46,6 @@ fn ten_thousand_steps() {
     let (before, device_before) = memory();
     (0..10_000).for_each(step);
     let (after, device_after) = memory();
-    println!("{before} {after}, {device_before:?} {device_after:?}");
     assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
     assert!(device_before.is_some_and(|bytes| bytes > 0), "the device does not count its memory");
     assert_eq!(device_before, device_after);

@@ -166,3 +166,21 @@ fn more_splats_in_a_tile_than_software_blends() {
         }
     }
 }
+
+/// As many iterations, of the loops that list the tiles of huge splats: without bands, some of the
+/// 10,625 tiles of some of these would stay as they were in the frame before.
+#[test]
+fn huge_splats_on_a_large_image() {
+    let mut haze = Gaussians::with_capacity(0, 300);
+    for i in 0..300 {
+        haze.means_m.push([0.0, 0.0, 5.0 + 0.01 * f64::from(i)]);
+        haze.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        haze.ln_scales.push([5.0; 3]);
+        haze.logit_opacities.push(-4.5);
+        haze.sh.extend([0.01 * i as f32, 0.5, 0.2]);
+    }
+    let (scene, profile) = (Scene::from_gaussians(&haze), RenderProfile::default());
+    let view = look([2_000, 1_360], 1_000.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let image = render_one(&gpu(), &scene, &profile, view);
+    agree(&image, &render_one(&cpu(), &scene, &profile, view)).unwrap();
+}

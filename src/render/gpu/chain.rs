@@ -152,8 +152,19 @@ impl Chain {
         rest.reverse();
         let mut drawn = Vec::with_capacity(rest.len());
         while let Some(part) = rest.pop() {
+            let views = rows.views(&part);
+            let columns = |view: usize| u64::from(gpu_frame.view[view].columns);
+            let tiles =
+                views.clone().map(|view| columns(view) * rows.of_view(view, &part).len() as u64);
+            let pieces = tiles.max().unwrap_or(0).div_ceil(self.device.view_tiles());
+            if pieces > 1
+                && let Some(cut) = rows.cut(&part, pieces)
+            {
+                rest.extend(cut.into_iter().rev());
+                continue;
+            }
             let start = Instant::now();
-            let work = cull.install(|| Work::new(frame, rows.views(&part), &self.mirror));
+            let work = cull.install(|| Work::new(frame, views, &self.mirror));
             self.project.upload(&self.device, &work);
             add(&mut stats, "prepare", start.elapsed());
             let tiles = gpu_frame.restrict(&rows, &part);

@@ -11,7 +11,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
 };
 
-use super::layout::RASTER_BATCH;
+use super::layout::{RASTER_BATCH, WORKGROUP};
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -248,16 +248,24 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most splats of a tile that are blended. Mesa's software devices leave every loop of a shader,
-    /// without a word, after 65,535 iterations in all of its loops together
-    /// (`LP_MAX_TGSI_LOOP_ITERATIONS`); a batch of `rasterize` takes one iteration, one for each of
-    /// its splats, and two that load them.
+    /// Most splats of a tile that are blended. A batch of `rasterize` takes one iteration, one for
+    /// each of its splats, and two that load them.
     pub(super) fn tile_splats(&self) -> u64 {
         let batch = u64::from(RASTER_BATCH);
-        match self.info.device_type {
-            DeviceType::Cpu => 65_535 / (batch + 3) * batch,
-            _ => u64::MAX,
-        }
+        self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
+    }
+
+    /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
+    /// cover all of them: each takes 20 iterations, and 9 for every 256 tiles.
+    pub(super) fn view_tiles(&self) -> u64 {
+        let splats = u64::from(WORKGROUP);
+        self.loop_iterations().map_or(u64::MAX, |most| (most / splats - 20) / 9 * 256)
+    }
+
+    /// Mesa's software devices leave every loop of a shader, without a word, after so many iterations
+    /// in all of its loops together (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+    fn loop_iterations(&self) -> Option<u64> {
+        (self.info.device_type == DeviceType::Cpu).then_some(65_535)
     }
 
     /// Nanoseconds per tick of the clock, where the device has one.

@@ -123,25 +123,24 @@ impl Gpu {
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
+        let device = Device::open(choice, binding_limit)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
             pool.map_err(|error| GpuError::Threads { reason: error.to_string() })
         };
         let (deliver, cull) = (pool("deliver")?, pool("cull")?);
-        let device = Device::open(choice, binding_limit)?;
         let AdapterInfo { name, driver, driver_info, .. } = &device.info;
         let detail = format!("{name}, {driver} {driver_info}");
-        let chain = Chain::new(device, &shaders)?;
         Ok(Self {
             choice: choice.clone(),
             detail,
-            shaders,
             binding_limit,
             deliver,
             cull,
             turns: Turns::default(),
-            chain: Mutex::new(Some(chain)),
+            chain: Mutex::new(Some(Chain::new(device, &shaders)?)),
+            shaders,
         })
     }
 
@@ -206,16 +205,16 @@ impl Backend for Gpu {
         "gpu"
     }
 
-    fn detail(&self) -> String {
-        self.detail.clone()
-    }
-
     fn threads(&self) -> usize {
         self.deliver.current_num_threads()
     }
 
     fn frames_at_once(&self) -> usize {
         config::GPU_FRAMES
+    }
+
+    fn detail(&self) -> String {
+        self.detail.clone()
     }
 
     fn render(
