@@ -323,7 +323,7 @@ fn t18_a_principal_point_far_off_centre() {
 
 /// Sixteen views of 4,400,000 Gaussians each, and each of them alone, which the definition agrees with.
 #[test]
-#[ignore = "9 GB of memory and minutes: cargo test --release --test render t21 -- --ignored"]
+#[ignore = "gigabytes of memory and a minute: cargo test --release --test render t21 -- --ignored"]
 fn t21_seventy_million_sort_keys() {
     let n = 4_400_000;
     let mut random = Random(25);
