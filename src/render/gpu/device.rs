@@ -11,7 +11,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
 };
 
-use super::layout::{RASTER_BATCH, WORKGROUP};
+use super::layout::{MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -256,10 +256,13 @@ impl Device {
     }
 
     /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
-    /// cover all of them: each takes 20 iterations, and 9 for every 256 tiles.
+    /// cover all of them: each takes 20 iterations, and 13 for every 256 macro tiles. Those at the
+    /// edges of an image may be of a few tiles: half of a macro tile is counted on.
     pub(super) fn view_tiles(&self) -> u64 {
         let splats = u64::from(WORKGROUP);
-        self.loop_iterations().map_or(u64::MAX, |most| (most / splats - 20) / 9 * 256)
+        let macros = |most: u64| (most / splats - 20) / 13 * 256;
+        let tiles = u64::from(MACRO_COLUMNS * MACRO_ROWS / 2);
+        self.loop_iterations().map_or(u64::MAX, |most| macros(most) * tiles)
     }
 
     /// Mesa's software devices leave every loop of a shader, without a word, after so many iterations
