@@ -120,6 +120,13 @@ pub const PLY_HEADER_BYTES: usize = 64 << 10;
 /// Longest safetensors header. A gsplat checkpoint's is under 1 KB.
 pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
 
+/// Bytes that a compressed scene may unpack to, however few it has: tests and toys of equal Gaussians.
+pub const UNPACKED_FREE_BYTES: u64 = 16 << 20;
+
+/// Bytes beyond those that every compressed byte may unpack to. Scenes reach 2 to 8; deflate can
+/// reach 1032 and zstd more.
+pub const UNPACKED_PER_BYTE: u64 = 64;
+
 /// Most Gaussians of one import: their order within the twin is kept as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 

@@ -1,15 +1,21 @@
 //! Outside formats: one file each, picked by what a file starts with, never by its name.
 //!
-//! Everything is streamed in one pass, through small buffers, into [`Gaussians`], and every Gaussian
-//! is checked before anyone sees one. In memory they take about what an uncompressed file takes; a
-//! compressed PLY of 16 bytes per Gaussian becomes columns of 68, as if the scene came uncompressed.
+//! What can be streamed is, in one pass, through small buffers, into [`Gaussians`]; archives, images
+//! and glTF buffers are held whole, up to limits. Every Gaussian is checked before anyone sees one.
+//! In memory they take about what an uncompressed file takes; a compressed PLY of 16 bytes per
+//! Gaussian becomes columns of 68, as if the scene came uncompressed.
 
+mod activated;
 pub mod axes;
 pub mod cameras;
 mod file;
 mod hashing;
 mod ply;
 mod safetensors;
+mod splat;
+mod spz;
+mod told;
+mod unpacked;
 pub mod validate;
 
 use std::io::{self, BufRead, BufReader};
@@ -22,6 +28,7 @@ pub use axes::Axes;
 pub use file::{FileError, read_whole};
 
 use hashing::Hashing;
+use told::Told;
 
 /// Told about bytes done and bytes in all.
 pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
@@ -32,10 +39,10 @@ pub enum IngestError {
     /// It cannot be read, or is no regular file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Neither of the formats.
+    /// None of the formats.
     #[error(
-        "the file starts with {start:?}: neither PLY (\"ply\") nor safetensors (header length, \
-         \"{{\"); convert it to one of them"
+        "the file starts with {start:?}, as no format does that is read: PLY, safetensors, SPZ, \
+         .splat; convert it to one of them, or copy it again"
     )]
     UnknownFormat {
         /// Its first bytes, as text.
@@ -66,6 +73,32 @@ pub enum IngestError {
         held: u128,
         /// The count and size that led to the promise.
         content: String,
+    },
+    /// The body contradicts its header or itself.
+    #[error("{format} body, {place}: {reason}")]
+    Body {
+        /// The format.
+        format: &'static str,
+        /// Where in the body, as `positions` or `means_l.webp`.
+        place: String,
+        /// What is wrong and what must hold instead.
+        reason: String,
+    },
+    /// Compressed further than any scene.
+    #[error(
+        "{format}, {place}: {packed} bytes unpack to {unpacked}; of so few at most {} do in a scene: \
+         convert it to PLY, if it is one",
+        unpacked::limit_bytes(*packed)
+    )]
+    Bomb {
+        /// The format.
+        format: &'static str,
+        /// Where in the file.
+        place: String,
+        /// Compressed bytes.
+        packed: u64,
+        /// Bytes that would come of them.
+        unpacked: u128,
     },
     /// More than a twin can order.
     #[error(
@@ -106,7 +139,7 @@ impl From<io::Error> for IngestError {
     }
 }
 
-/// Reads a scene file: INRIA PLY, PlayCanvas compressed PLY, or safetensors with gsplat's names.
+/// Reads a scene of any of the formats.
 ///
 /// Axes and unit stay the file's; [`Axes::apply`] changes them.
 ///
@@ -127,17 +160,44 @@ pub fn read_hashed(
 ) -> Result<(Gaussians, String), IngestError> {
     let (file, file_bytes) = file::open(path)?;
     let mut input = BufReader::with_capacity(BUFFER_BYTES, Hashing::new(file));
-    let start = input.fill_buf()?;
-    let gaussians = if start.starts_with(b"ply\n") || start.starts_with(b"ply\r\n") {
-        ply::read(&mut input, file_bytes, progress)?
-    } else if start.get(8) == Some(&b'{') {
-        safetensors::read(&mut input, file_bytes, progress)?
-    } else {
-        let start = String::from_utf8_lossy(&start[..start.len().min(9)]).into_owned();
-        return Err(IngestError::UnknownFormat { start });
+    let format = Format::of(input.fill_buf()?)?;
+    let gaussians = match format {
+        Format::Ply => ply::read(&mut input, file_bytes, progress)?,
+        Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
+        Format::Spz => spz::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
+        Format::Gzip => spz::read_gzip(Told::new(&mut input, file_bytes, progress), file_bytes)?,
+        Format::Splat => splat::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
     };
     io::copy(&mut input, &mut io::sink())?;
     Ok((gaussians, input.into_inner().finish()))
+}
+
+/// What a file is.
+#[derive(Clone, Copy, Debug)]
+enum Format {
+    Ply,
+    Safetensors,
+    Spz,
+    Gzip,
+    Splat,
+}
+
+impl Format {
+    /// From the first bytes of a file.
+    fn of(start: &[u8]) -> Result<Self, IngestError> {
+        Ok(match start {
+            [b'p', b'l', b'y', b'\n' | b'\r', ..] => Self::Ply,
+            [b'N', b'G', b'S', b'P', ..] => Self::Spz,
+            [0x1f, 0x8b, ..] => Self::Gzip,
+            _ if start.get(8) == Some(&b'{') => Self::Safetensors,
+            // It has no magic number, so it comes last.
+            _ if splat::is_likely(start) => Self::Splat,
+            _ => {
+                let start = String::from_utf8_lossy(&start[..start.len().min(9)]).into_owned();
+                return Err(IngestError::UnknownFormat { start });
+            }
+        })
+    }
 }
 
 /// Bytes read at once.

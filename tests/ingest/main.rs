@@ -2,10 +2,13 @@
 
 #[path = "../support/data.rs"]
 mod data;
+#[path = "../support/images.rs"]
+mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
 mod axes;
+mod conformance;
 mod damage;
 mod fuzz;
 mod real_scenes;

@@ -1,0 +1,23 @@
+//! How much may come of how little: the limit of everything compressed.
+
+use crate::config;
+
+use super::IngestError;
+
+/// Bytes that so many compressed ones may unpack to.
+pub(super) fn limit_bytes(packed: u64) -> u64 {
+    packed.saturating_mul(config::UNPACKED_PER_BYTE).saturating_add(config::UNPACKED_FREE_BYTES)
+}
+
+/// Refuses what unpacks to more, before memory is asked for.
+pub(super) fn check(
+    format: &'static str,
+    place: &str,
+    packed: u64,
+    unpacked: u128,
+) -> Result<(), IngestError> {
+    if unpacked > u128::from(limit_bytes(packed)) {
+        return Err(IngestError::Bomb { format, place: place.into(), packed, unpacked });
+    }
+    Ok(())
+}
