@@ -127,6 +127,20 @@ pub const UNPACKED_FREE_BYTES: u64 = 16 << 20;
 /// reach 1032 and zstd more.
 pub const UNPACKED_PER_BYTE: u64 = 64;
 
+/// Largest archive, glTF buffer or image of a scene, which are held in memory whole: 100 million
+/// Gaussians in SOG take 2 GiB.
+pub const SCENE_PART_BYTES: u64 = 4 << 30;
+
+/// Largest JSON that describes a scene: SOG's takes 15 kB, its index of levels 200 B per leaf.
+pub const SCENE_JSON_BYTES: u64 = 64 << 20;
+
+/// Files of one scene: eight per block of a streamed SOG.
+pub const SCENE_PARTS: usize = 100_000;
+
+/// Most values beside arrays of a NuRec payload, of 32 bytes each in memory. A log's tracks are
+/// 100,000.
+pub const NUREC_VALUES: usize = 1 << 20;
+
 /// Most Gaussians of one import: their order within the twin is kept as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 

@@ -6,19 +6,27 @@
 //! Gaussian becomes columns of 68, as if the scene came uncompressed.
 
 mod activated;
+mod archive;
 pub mod axes;
 pub mod cameras;
 mod file;
+mod gltf;
 mod hashing;
+mod joined;
+mod ksplat;
+mod nurec;
+mod parts;
 mod ply;
 mod safetensors;
+mod sog;
 mod splat;
 mod spz;
 mod told;
 mod unpacked;
 pub mod validate;
 
-use std::io::{self, BufRead, BufReader};
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read};
 use std::path::Path;
 
 use crate::config;
@@ -28,6 +36,7 @@ pub use axes::Axes;
 pub use file::{FileError, read_whole};
 
 use hashing::Hashing;
+use parts::Folder;
 use told::Told;
 
 /// Told about bytes done and bytes in all.
@@ -42,11 +51,20 @@ pub enum IngestError {
     /// None of the formats.
     #[error(
         "the file starts with {start:?}, as no format does that is read: PLY, safetensors, SPZ, \
-         .splat; convert it to one of them, or copy it again"
+         SOG, KHR_gaussian_splatting, NuRec, \
+         .ksplat, .splat; convert it to one of them, or copy it again"
     )]
     UnknownFormat {
         /// Its first bytes, as text.
         start: String,
+    },
+    /// A file that the given one names.
+    #[error("part {name:?}: {cause}")]
+    Part {
+        /// As it is named.
+        name: String,
+        /// Why it cannot be read.
+        cause: FileError,
     },
     /// A header cannot be understood or is not that of a Gaussian scene.
     #[error("{format} header, {place}: {reason}")]
@@ -152,6 +170,10 @@ pub fn read(path: &Path, progress: Progress<'_>) -> Result<Gaussians, IngestErro
 /// The same, and the BLAKE3 of the bytes that were read, 64 lower-case hex digits: which source a
 /// twin was made of, whatever happens to the file meanwhile.
 ///
+/// Of a scene in several files it is the BLAKE3 of their hashes in hex, a line each: first the given
+/// file, then those that it names, in the order in which they are named. `b3sum --no-names FILE.. |
+/// b3sum` says the same.
+///
 /// # Errors
 /// As [`read`].
 pub fn read_hashed(
@@ -160,16 +182,54 @@ pub fn read_hashed(
 ) -> Result<(Gaussians, String), IngestError> {
     let (file, file_bytes) = file::open(path)?;
     let mut input = BufReader::with_capacity(BUFFER_BYTES, Hashing::new(file));
-    let format = Format::of(input.fill_buf()?)?;
-    let gaussians = match format {
+    let gaussians = match Format::of(input.fill_buf()?)? {
+        Format::Json => return read_parts(path, input, progress, Parted::Json),
+        Format::Glb => return read_parts(path, input, progress, Parted::Glb),
         Format::Ply => ply::read(&mut input, file_bytes, progress)?,
         Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
         Format::Spz => spz::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
         Format::Gzip => spz::read_gzip(Told::new(&mut input, file_bytes, progress), file_bytes)?,
         Format::Splat => splat::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
+        Format::Ksplat => ksplat::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
+        Format::Zip => {
+            let archive = read_whole_part(Told::new(&mut input, file_bytes, progress))?;
+            archive::read(archive)?
+        }
     };
     io::copy(&mut input, &mut io::sink())?;
     Ok((gaussians, input.into_inner().finish()))
+}
+
+/// What may name other files.
+enum Parted {
+    Json,
+    Glb,
+}
+
+/// Reads a scene whose first file may name others.
+fn read_parts(
+    path: &Path,
+    mut input: BufReader<Hashing<File>>,
+    progress: Progress<'_>,
+    parted: Parted,
+) -> Result<(Gaussians, String), IngestError> {
+    let limit_bytes = match parted {
+        Parted::Json => config::SCENE_JSON_BYTES,
+        Parted::Glb => config::SCENE_PART_BYTES,
+    };
+    let first = file::read_at_most(&mut input, limit_bytes)?;
+    let mut folder = Folder::new(path, first.len() as u64, input.into_inner().finish(), progress);
+    let gaussians = match parted {
+        Parted::Glb => gltf::read_glb(&first, &mut folder)?,
+        Parted::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut folder)?,
+        Parted::Json => sog::read(&first, "", &mut folder)?,
+    };
+    Ok((gaussians, folder.finish()))
+}
+
+/// Everything that is left, held in memory.
+fn read_whole_part(input: impl Read) -> Result<Vec<u8>, IngestError> {
+    Ok(file::read_at_most(input, config::SCENE_PART_BYTES)?)
 }
 
 /// What a file is.
@@ -180,6 +240,10 @@ enum Format {
     Spz,
     Gzip,
     Splat,
+    Ksplat,
+    Zip,
+    Json,
+    Glb,
 }
 
 impl Format {
@@ -189,6 +253,16 @@ impl Format {
             [b'p', b'l', b'y', b'\n' | b'\r', ..] => Self::Ply,
             [b'N', b'G', b'S', b'P', ..] => Self::Spz,
             [0x1f, 0x8b, ..] => Self::Gzip,
+            [b'P', b'K', 3, 4, ..] => Self::Zip,
+            [b'g', b'l', b'T', b'F', ..] => Self::Glb,
+            // Version 0.1, and two bytes that are not used.
+            [0, 1, 0, 0, ..] => Self::Ksplat,
+            // A safetensors file starts with a length, of which at most three bytes are not zero.
+            _ if start.trim_ascii_start().starts_with(b"{")
+                && !start.iter().take(8).any(|&b| b == 0) =>
+            {
+                Self::Json
+            }
             _ if start.get(8) == Some(&b'{') => Self::Safetensors,
             // It has no magic number, so it comes last.
             _ if splat::is_likely(start) => Self::Splat,

@@ -111,3 +111,58 @@ fn the_biker_and_the_guitar_are_read_compressed() {
     let Some(guitar) = read("scenes/guitar/guitar.compressed.ply") else { return };
     assert_eq!((guitar.len(), guitar.sh_degree), (90_854, 0));
 }
+
+/// Means within a box.
+fn is_within(g: &Gaussians, low: [f64; 3], high: [f64; 3]) -> bool {
+    g.means_m.iter().all(|m| (0..3).all(|i| (low[i]..=high[i]).contains(&m[i])))
+}
+
+#[test]
+fn a_sog_of_the_first_version_is_read() {
+    let Some(logo) = read("scenes/playcanvas-logo/meta.json") else { return };
+    assert_eq!((logo.len(), logo.sh_degree), (307_128, 0));
+    // What meta.json says, of logarithms: exp(0.93) - 1 = 1.535, and so on.
+    let (low, high) = ([-1.535, -2.782, -0.577], [1.535, 0.296, 0.577]);
+    assert!(is_within(&logo, low, high));
+    // The extremes are there, so nothing is squeezed.
+    let most = |axis: usize| logo.means_m.iter().map(|m| m[axis]).fold(f64::MIN, f64::max);
+    for (axis, wanted) in [(0, 1.5348), (1, 0.2957), (2, 0.5768)] {
+        assert!((most(axis) - wanted).abs() < 1e-4, "{}", most(axis));
+    }
+}
+
+#[test]
+fn a_streamed_sog_is_read_in_full_detail() {
+    let Some(playbot) = read("scenes/playbot/lod-meta.json") else { return };
+    assert_eq!((playbot.len(), playbot.sh_degree), (500_000, 2));
+    let (low, high) = ([-1.033496, -1.083135, -1.039343], [1.03509, 0.05205518, 1.042389]);
+    assert!(is_within(&playbot, low, high));
+    // The finest level alone, in one file, is the same.
+    let finest = read("scenes/playbot/0_0/meta.json").unwrap();
+    assert!(playbot == finest, "the leaves of level 0 are its whole file");
+}
+
+/// Eight corners of a cube and other small files with known content.
+#[test]
+fn small_files_of_other_tools_are_read() {
+    let four = "conformance/splat-transform-fixtures/splat/minimal";
+    for file in [".splat", ".ksplat", "-raw.spz", "-v2.spz", "-v3.spz", "-v4.spz"] {
+        let Some(read) = read(&format!("{four}{file}")) else { return };
+        assert_eq!((read.len(), read.sh_degree), (4, 0), "{file}");
+        println!("{file} {read:?}");
+    }
+    for file in ["splat", "spz"] {
+        let folder = "conformance/metalsplatter/test-splat.3-points-from-train";
+        let (from, ply) =
+            (read(&format!("{folder}.{file}")).unwrap(), read(&format!("{folder}.ply")).unwrap());
+        assert_eq!(from.len(), 3, "{file}");
+        println!("{file} {from:?} {ply:?}");
+    }
+    for file in ["khr_conformance_matrix.glb", "khr_conformance_matrix.gltf"] {
+        let matrix = read(&format!("conformance/khr_fixtures_bevy/{file}")).unwrap();
+        assert_eq!((matrix.len(), matrix.sh_degree), (15, 3), "{file}");
+        println!("{file} {matrix:?}");
+    }
+    let fallback = read("conformance/khr_fixtures_bevy/khr_extensible_fallback.gltf").unwrap();
+    println!("{fallback:?}");
+}
