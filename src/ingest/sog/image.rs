@@ -25,6 +25,15 @@ impl Image {
         count: usize,
         budget: &mut Budget,
     ) -> Result<Self, IngestError> {
+        // The decoder would not miss what pads the end.
+        let promised = file.get(4..8).map_or(0, |size| {
+            8 + u64::from(u32::from_le_bytes([size[0], size[1], size[2], size[3]]))
+        });
+        let held = file.len() as u64;
+        if promised > held {
+            let reason = format!("{held} of {promised} bytes are there: it is truncated");
+            return Err(body(&name, reason));
+        }
         let damaged = |e| body(&name, format!("is no sound WebP image: {e}; copy it again"));
         let mut decoder = WebPDecoder::new(Cursor::new(file)).map_err(damaged)?;
         if decoder.is_lossy() {
