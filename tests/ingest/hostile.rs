@@ -31,9 +31,11 @@ fn what_was_cut_off_anywhere_is_refused() {
         case.write(dir.path());
         for (part, (name, bytes)) in case.files.iter().enumerate() {
             // All ends of small files; of larger ones some, and not always the same of a word.
-            for end in (0..bytes.len()).step_by(bytes.len() / 200 | 1) {
+            for end in (0..bytes.len()).step_by((bytes.len() / 200) | 1) {
                 // A record less is a smaller scene: the format has no count.
                 let is_whole = case.name == ".splat" && end > 0 && end % 32 == 0;
+                // Of a coarse level nothing is read.
+                let is_whole = is_whole || name.starts_with("coarse/");
                 let read = case.read_with(dir.path(), part, &bytes[..end]);
                 let place = format!("{}, {name} cut to {end} of {}", case.name, bytes.len());
                 match read {
@@ -53,7 +55,7 @@ fn a_flipped_bit_is_refused_or_changes_numbers_only() {
         case.write(dir.path());
         for (part, (name, bytes)) in case.files.iter().enumerate() {
             let mut bytes = bytes.clone();
-            for bit in (0..8 * bytes.len()).step_by(bytes.len() / 12 | 1) {
+            for bit in (0..8 * bytes.len()).step_by((bytes.len() / 12) | 1) {
                 bytes[bit / 8] ^= 1 << (bit % 8);
                 if let Ok(g) = case.read_with(dir.path(), part, &bytes) {
                     let place = format!("{}, bit {bit} of {name}", case.name);
@@ -330,22 +332,22 @@ fn a_splat_is_told_by_its_first_record() {
 fn bombs_are_refused_in_bounded_memory() {
     let dir = tempfile::tempdir().unwrap();
     let write = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
-    // 1 GiB of nothing in 1 MB: an honest header for it, and a header that promises nothing of it.
+    // 512 MiB of nothing in 0.5 MB: an honest header for it, and a header that promises nothing of it.
     let nothing = |start: &[u8]| {
         let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
         encoder.write_all(start).unwrap();
         let zeros = vec![0; 1 << 20];
-        (0..1024).for_each(|_| encoder.write_all(&zeros).unwrap());
+        (0..512).for_each(|_| encoder.write_all(&zeros).unwrap());
         encoder.finish().unwrap()
     };
     let header = |count: u32| {
         let count = count.to_le_bytes();
         [&b"NGSP\x03\x00\x00\x00"[..], &count, &[0, 12, 0, 0]].concat()
     };
-    write("honest.spz", &nothing(&header((1 << 30) / 20)));
+    write("honest.spz", &nothing(&header((512 << 20) / 20)));
     write("sly.spz", &nothing(&header(0)));
     write("payload.usdz", &zip_of(&[("x.nurec".into(), nothing(b""))], false));
-    let big = vec![0; 1 << 30];
+    let big = vec![0; 512 << 20];
     write(
         "means.zip",
         &zip_of(
@@ -357,13 +359,13 @@ fn bombs_are_refused_in_bounded_memory() {
             true,
         ),
     );
-    // An image of 16,383 x 16,383 pixels, all alike: 1 GiB in 20 kB.
-    let image = webp(&vec![[128, 128, 128, 255]; 16_383 * 16_383], 16_383);
+    // An image of 8,192 x 8,192 pixels, all alike: 256 MiB in some kB; and six of them.
+    let image = webp(&vec![[128, 128, 128, 255]; 8192 * 8192], 8192);
     assert!(image.len() < 1 << 20);
     let mut files = sog(&gaussians(COUNT, 0, 20.0, 1), 2);
     files[1..].iter_mut().for_each(|file| file.1 = image.clone());
     let meta = String::from_utf8(files[0].1.clone()).unwrap();
-    files[0].1 = meta.replace(r#""count":6"#, r#""count":268402689"#).into_bytes();
+    files[0].1 = meta.replace(r#""count":6"#, r#""count":67108864"#).into_bytes();
     write("images.sog", &zip_of(&files, false));
     // Two nodes of a thousand show one mesh.
     let (json, buffer) = gltf(&gaussians(20_000, 3, 20.0, 1), "", "");
@@ -388,11 +390,12 @@ fn bombs_are_refused_in_bounded_memory() {
         // The shell keeps to the limit of address space, which bounds what is resident.
         let import = Command::new("sh")
             .args(["-c", r#"ulimit -v "$1"; exec "$2" import "$3" --twin bomb --twins "$4""#, "sh"])
-            .arg(((limit_mb + 400) << 10).to_string())
+            .arg(((limit_mb + 150) << 10).to_string())
             .arg(env!("CARGO_BIN_EXE_wildcity"))
             .arg(&path)
             .arg(dir.path().join("twins"))
             .env("RAYON_NUM_THREADS", "2")
+            .env("MALLOC_ARENA_MAX", "1")
             .output()
             .unwrap();
         let said = String::from_utf8_lossy(&import.stderr);

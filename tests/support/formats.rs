@@ -165,8 +165,8 @@ pub(crate) fn ksplat(g: &Gaussians, level: u16) -> Vec<u8> {
                 body.extend((value as f32).to_le_bytes());
             }
         } else {
-            for axis in 0..3 {
-                let steps = (g.means_m[i][axis] - centre_m[axis]) / (f64::from(block_m) / 2.0);
+            for (mean, centre) in g.means_m[i].iter().zip(centre_m) {
+                let steps = (mean - centre) / (f64::from(block_m) / 2.0);
                 body.extend(((steps * 32767.0).round() as i32 + 32767).to_le_bytes()[..2].to_vec());
             }
             body.extend(scales.into_iter().chain(unit(g.quats_wxyz[i])).flat_map(half));

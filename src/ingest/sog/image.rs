@@ -26,9 +26,12 @@ impl Image {
         budget: &mut Budget,
     ) -> Result<Self, IngestError> {
         // The decoder would not miss what pads the end.
-        let promised = file.get(4..8).map_or(0, |size| {
-            8 + u64::from(u32::from_le_bytes([size[0], size[1], size[2], size[3]]))
-        });
+        let promised = match file.as_slice() {
+            [b'R', b'I', b'F', b'F', a, b, c, d, ..] => {
+                8 + u64::from(u32::from_le_bytes([*a, *b, *c, *d]))
+            }
+            _ => 0,
+        };
         let held = file.len() as u64;
         if promised > held {
             let reason = format!("{held} of {promised} bytes are there: it is truncated");
