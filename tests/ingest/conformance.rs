@@ -93,6 +93,23 @@ fn spz() {
 }
 
 #[test]
+fn another_capture_in_spz() {
+    // Both were quantised: the compressed PLY's steps are what is left of a chunk's extremes.
+    let steps = Steps {
+        mean_m: 1e-3,
+        quat: 4e-3,
+        ln_scale: 0.05,
+        opacity: 1.51 / 255.0,
+        dc: 0.03,
+        sh: 0.0,
+        fit: |g| g.ln_scales.as_flattened_mut().iter_mut().for_each(|ln| *ln = ln.max(-10.0)),
+    };
+    let original = "scenes/biker/biker.compressed.ply";
+    let loss = Loss { fitted: 40.0, whole: 40.0 };
+    check("../scenes/biker/biker.spz", RUB, original, 0, steps, loss);
+}
+
+#[test]
 fn sog() {
     // The PLY was made of this very file, less what floats around: only f32 was rounded between.
     let exact = Steps {

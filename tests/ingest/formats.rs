@@ -231,3 +231,19 @@ fn nurec_comes_back_without_what_moves() {
         }
     }
 }
+
+#[test]
+fn progress_of_every_format_ends_at_all_bytes() {
+    for case in crate::corpus::corpus() {
+        let dir = tempfile::tempdir().unwrap();
+        case.write(dir.path());
+        let mut reports = Vec::new();
+        let first = dir.path().join(&case.files[0].0);
+        ingest::read(&first, &mut |done, total| reports.push((done, total))).unwrap();
+        assert!(reports.is_sorted(), "{}: {reports:?}", case.name);
+        // Of a coarse level nothing is read.
+        let read = case.files.iter().filter(|(name, _)| !name.starts_with("coarse/"));
+        let bytes = read.map(|(name, _)| dir.path().join(name).metadata().unwrap().len()).sum();
+        assert_eq!(reports.last(), Some(&(bytes, bytes)), "{}", case.name);
+    }
+}
