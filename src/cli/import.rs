@@ -22,7 +22,7 @@ use super::progress;
 /// first; an import that fails leaves nothing behind.
 ///
 /// Memory: twice what the scene takes uncompressed (56 bytes per Gaussian without SH, 236 with
-/// degree 3), and the file itself where it is an archive or glTF.
+/// degree 3), and what an archive, a glTF buffer or a payload of NuRec holds.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
