@@ -120,6 +120,27 @@ pub const PLY_HEADER_BYTES: usize = 64 << 10;
 /// Longest safetensors header. A gsplat checkpoint's is under 1 KB.
 pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
 
+/// Bytes that a compressed scene may unpack to, however few it has: tests and toys of equal Gaussians.
+pub const UNPACKED_FREE_BYTES: u64 = 16 << 20;
+
+/// Bytes beyond those that every compressed byte may unpack to. Scenes reach 2 to 8; deflate can
+/// reach 1032 and zstd more.
+pub const UNPACKED_PER_BYTE: u64 = 64;
+
+/// Largest archive, glTF buffer or image of a scene, which are held in memory whole: 100 million
+/// Gaussians in SOG take 2 GiB.
+pub const SCENE_PART_BYTES: u64 = 4 << 30;
+
+/// Largest JSON that describes a scene: SOG's takes 15 kB, its index of levels 200 B per leaf.
+pub const SCENE_JSON_BYTES: u64 = 64 << 20;
+
+/// Files of one scene: eight per block of a streamed SOG.
+pub const SCENE_PARTS: usize = 100_000;
+
+/// Most values beside arrays of a NuRec payload, of 32 bytes each in memory. A log's tracks are
+/// 100,000.
+pub const NUREC_VALUES: usize = 1 << 20;
+
 /// Most Gaussians of one import: their order within the twin is kept as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 

@@ -1,5 +1,7 @@
 //! Rendering a view in a test, and comparing images.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use glam::{DQuat, DVec3};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};

@@ -21,6 +21,10 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("rayon", &["render", "scene/chunk.rs", "ingest/validate.rs", "residency/cache.rs"]),
     ("tokio", &["server", "client", "session", "cli"]),
     ("schemars", &["protocol"]),
+    ("flate2", &["ingest"]),
+    ("zip", &["ingest/archive.rs"]),
+    ("image_webp", &["ingest/sog"]),
+    ("data_encoding", &["ingest/gltf"]),
 ];
 
 /// Who may touch files: those of a twin only `store/objects.rs`; the others scenes and settings of
