@@ -2,10 +2,10 @@
 //!
 //! Twin of `render/cpu/bin.rs`; WGSL: `shaders/bin.wgsl`, `shaders/sort.wgsl`, `shaders/ranges.wgsl`.
 
-use wgpu::{Buffer, BufferUsages, ComputePass};
+use wgpu::{Buffer, ComputePass};
 
 use super::device::Device;
-use super::growing::Growing;
+use super::growing::{Growing, HANDED_OVER};
 use super::kernel::{Groups, Kernel, module, slot};
 use super::layout::Job;
 use super::plan::{Plan, job};
@@ -33,8 +33,7 @@ pub(super) struct Bin {
 impl Bin {
     pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
         let kernel = |name, entry| Kernel::new(device, &module(device, shaders, name), entry, &[]);
-        let storage = BufferUsages::STORAGE;
-        let growing = |label| Growing::new(device, label, storage);
+        let growing = |label| Growing::new(device, label, HANDED_OVER);
         Self {
             count: kernel("bin", "count"),
             emit: kernel("bin", "emit"),
@@ -42,7 +41,7 @@ impl Bin {
             offsets: growing("splat offsets"),
             tiles: [growing("instance tiles"), growing("instance tiles")],
             places: [growing("instance places"), growing("instance places")],
-            ranges: Growing::new(device, "ranges", storage | BufferUsages::COPY_DST),
+            ranges: growing("ranges"),
         }
     }
 

@@ -1,5 +1,7 @@
 //! All stages on one device, in order, for all views of a step: one submission per frame.
 
+mod handover;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -12,7 +14,7 @@ use super::growing::Growing;
 use super::kernel::{Recorder, TICKS_BYTES, clock};
 use super::layout::{Counters, Frame as GpuFrame, FrameView};
 use super::mirror::Mirror;
-use super::plan::{Plan, job};
+use super::plan::{Counts, Plan, job};
 use super::project::{Project, Splats, Work};
 use super::rasterize::Rasterize;
 use super::resolve::Planes;
@@ -21,6 +23,7 @@ use super::shaders::Shaders;
 use super::sort::Sort;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
+use crate::render::stage::{Between, Stage};
 use crate::render::{Frame, FrameStats, RenderError};
 
 /// How long a frame may take on the device before it counts as lost.
@@ -57,6 +60,40 @@ pub(super) struct Chain {
 struct Needs {
     splats: u64,
     instances: u64,
+}
+
+/// What a frame begins with.
+#[derive(Clone, Copy, Debug)]
+enum Source<'a> {
+    /// Gaussians: all stages are to be run.
+    Gaussians(&'a Work),
+    /// What another backend did: the stages after it.
+    Between(&'a Between),
+}
+
+impl Source<'_> {
+    /// Whether a stage is still to be run.
+    fn leaves(self, stage: Stage) -> bool {
+        match self {
+            Self::Gaussians(_) => true,
+            Self::Between(between) => between.through() < stage,
+        }
+    }
+
+    /// Clusters in views.
+    fn items(self) -> u32 {
+        match self {
+            Self::Gaussians(work) => work.items(),
+            Self::Between(_) => 0,
+        }
+    }
+}
+
+/// Which of the buffers that a sort goes to and fro between are in order.
+#[derive(Clone, Copy, Debug)]
+struct Sorted {
+    splats: usize,
+    instances: usize,
 }
 
 /// Where a frame reaches the host. A step's images are copied out of one while the next step fills
@@ -119,14 +156,24 @@ impl Chain {
         self.mirror.hold(&self.device, frame.scene);
         let work = Work::new(frame, &self.mirror);
         self.project.upload(&self.device, &work);
+        self.draw_from(Source::Gaussians(&work), frame, planes, start)
+    }
+
+    fn draw_from(
+        &mut self,
+        source: Source<'_>,
+        frame: &Frame<'_>,
+        planes: Planes,
+        start: Instant,
+    ) -> Result<Drawn, RenderError> {
         let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
         let mut gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
         let mut read_back = self.ring.pop().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
         loop {
-            self.reserve(&mut gpu_frame, work.items());
-            let stages = self.submit(&work, &gpu_frame, (planes, tiles_per_page), &read_back);
+            self.reserve(&mut gpu_frame, source.items());
+            let stages = self.submit(source, &gpu_frame, (planes, tiles_per_page), &read_back);
             let (stages, submission) = stages;
             read_back.map(&self.device, submission)?;
             self.device.check()?;
@@ -188,46 +235,19 @@ impl Chain {
 
     fn submit(
         &mut self,
-        work: &Work,
+        source: Source<'_>,
         frame: &GpuFrame,
         (planes, per_page): (Planes, u32),
         read_back: &ReadBack,
     ) -> (Vec<&'static str>, SubmissionIndex) {
-        let Self { device, plan, scan, splats, .. } = self;
-        let (device, plan, scan) = (&*device, &*plan, &*scan);
-        plan.start(device, frame, work.items());
-        let mut recorder = Recorder::new(device, self.clock.clone());
-        recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
-
-        let mut pass = recorder.stage("project");
-        self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
-        drop(pass);
-
-        let mut pass = recorder.stage("sort");
-        let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
-        let depth_bits = DEPTH_BITS + bits(frame.views - 1);
-        let data = (&splats.keys, &splats.places);
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
-        drop(pass);
-
-        let mut pass = recorder.stage("bin");
-        self.bin.run(device, &mut pass, (plan, scan), (splats, sorted));
-        drop(pass);
-
-        let mut pass = recorder.stage("tile sort");
-        let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
-        let data = (&self.bin.tiles, &self.bin.places);
-        // The number after the last tile occurs too.
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, bits(frame.tiles));
-        drop(pass);
-
-        let mut pass = recorder.stage("ranges");
-        self.bin.ranges(device, &mut pass, plan, sorted);
-        drop(pass);
+        let mut recorder = Recorder::new(&self.device, self.clock.clone());
+        let sorted = self.record(&mut recorder, source, frame, Stage::Bin);
+        let Self { device, plan, splats, bin, .. } = self;
 
         let mut pass = recorder.stage("rasterize");
         let output = (planes, frame.tiles, per_page);
-        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin, sorted), output);
+        let input = (&*splats, &*bin, sorted.instances);
+        self.rasterize.run(device, &mut pass, plan, input, output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
@@ -238,6 +258,57 @@ impl Chain {
         self.rasterize.copy(encoder, &read_back.pages, planes, (frame.tiles, per_page));
         let submission = device.queue.submit([recorder.encoder.finish()]);
         (stages, submission)
+    }
+
+    /// Records the stages up to `last` that the source leaves to be run.
+    fn record(
+        &mut self,
+        recorder: &mut Recorder,
+        source: Source<'_>,
+        frame: &GpuFrame,
+        last: Stage,
+    ) -> Sorted {
+        let is_due = |stage| stage <= last && source.leaves(stage);
+        let counts = match source {
+            Source::Gaussians(work) => Counts { items: work.items(), ..Counts::default() },
+            Source::Between(between) => self.fill(between),
+        };
+        let Self { device, plan, scan, splats, .. } = self;
+        let (device, plan, scan) = (&*device, &*plan, &*scan);
+        plan.start(device, frame, &counts);
+        let mut sorted = Sorted { splats: 0, instances: 0 };
+
+        if let Source::Gaussians(work) = source {
+            let mut pass = recorder.stage("project");
+            self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
+        }
+
+        if is_due(Stage::Sort) {
+            let mut pass = recorder.stage("sort");
+            let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
+            let depth_bits = DEPTH_BITS + bits(frame.views - 1);
+            let data = (&splats.keys, &splats.places);
+            sorted.splats = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+        }
+
+        if is_due(Stage::Bin) {
+            recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
+            let mut pass = recorder.stage("bin");
+            self.bin.run(device, &mut pass, (plan, scan), (splats, sorted.splats));
+            drop(pass);
+
+            let mut pass = recorder.stage("tile sort");
+            let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
+            let data = (&self.bin.tiles, &self.bin.places);
+            // The number after the last tile occurs too.
+            let tile_bits = bits(frame.tiles);
+            sorted.instances = self.sort.run(device, &mut pass, scan, jobs, data, tile_bits);
+            drop(pass);
+
+            let mut pass = recorder.stage("ranges");
+            self.bin.ranges(device, &mut pass, plan, sorted.instances);
+        }
+        sorted
     }
 
     fn stats(

@@ -32,6 +32,7 @@ use self::chain::{Chain, Drawn};
 use self::device::Device;
 use self::resolve::{Pixels, Planes};
 use self::shaders::Shaders;
+use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The wgpu backend.
@@ -95,7 +96,42 @@ impl Gpu {
         })
     }
 
-    fn draw(&self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
+    /// Renders the rest of a frame after the stages that another backend did.
+    ///
+    /// # Errors
+    /// As [`Backend::render`].
+    pub fn go_on(
+        &self,
+        between: &Between,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        self.render_with(frame, targets, finished, |chain, planes| {
+            chain.go_on(between, frame, planes)
+        })
+    }
+
+    /// Runs the stages up to and including `last`, from the beginning or after what is `done`, and
+    /// reads what they leave: for tests that compare stages. Normal frames read nothing in mid-frame.
+    ///
+    /// # Errors
+    /// As [`Backend::render`].
+    pub fn through(
+        &self,
+        frame: &Frame<'_>,
+        done: Option<&Between>,
+        last: Stage,
+    ) -> Result<Between, RenderError> {
+        frame.check_views()?;
+        self.pool.install(|| self.on_device(|chain| chain.through(frame, done, last)))
+    }
+
+    /// Does something on the device, which is opened again if it was lost.
+    fn on_device<T>(
+        &self,
+        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
+    ) -> Result<T, RenderError> {
         let mut slot = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let chain = match &mut *slot {
             Some(chain) => chain,
@@ -108,34 +144,26 @@ impl Gpu {
                 slot.insert(Chain::new(device, &self.shaders)?)
             }
         };
-        let drawn = chain.draw(frame, planes);
+        let done = work(chain);
         // Whatever else it was, memory may be half-written: begin anew.
-        if let Err(RenderError::Device { .. }) = drawn {
+        if let Err(RenderError::Device { .. }) = done {
             *slot = None;
         }
-        drawn
-    }
-}
-
-impl Backend for Gpu {
-    fn name(&self) -> &'static str {
-        "gpu"
+        done
     }
 
-    fn detail(&self) -> String {
-        self.detail.clone()
-    }
-
-    fn render(
+    /// Draws a frame, and delivers its pixels.
+    fn render_with(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
+        draw: impl FnOnce(&mut Chain, Planes) -> Result<Drawn, RenderError> + Send,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         let planes = Planes::of(targets);
         self.pool.install(|| {
-            let drawn = self.draw(frame, planes)?;
+            let drawn = self.on_device(|chain| draw(chain, planes))?;
             // From here on the device is free for another session's step.
             let start = Instant::now();
             let words: Result<Vec<&[u32]>, _> =
@@ -158,6 +186,25 @@ impl Backend for Gpu {
             }
             Ok(stats)
         })
+    }
+}
+
+impl Backend for Gpu {
+    fn name(&self) -> &'static str {
+        "gpu"
+    }
+
+    fn detail(&self) -> String {
+        self.detail.clone()
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        self.render_with(frame, targets, finished, |chain, planes| chain.draw(frame, planes))
     }
 }
 
