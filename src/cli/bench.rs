@@ -8,7 +8,7 @@ use serde_json::json;
 use crate::render::{Backend, Frame, FrameStats, Target, View};
 
 use super::progress;
-use super::scene_source::SceneSource;
+use super::scene_source::{Renderer, SceneSource};
 
 /// Time the renderer.
 #[derive(Debug, clap::Args)]
@@ -32,6 +32,9 @@ enum What {
 struct Step {
     #[command(flatten)]
     source: SceneSource,
+
+    #[command(flatten)]
+    renderer: Renderer,
 
     /// Frames to time.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -58,6 +61,7 @@ impl Bench {
 impl Step {
     fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
+        let backend = self.renderer.backend()?;
         let views: Vec<View> = ready.shots.iter().map(|shot| shot.view).collect();
         let profile = ready.shots[0].profile;
         if let Some(other) = ready.shots.iter().find(|shot| shot.profile != profile) {
@@ -79,7 +83,7 @@ impl Step {
             let mut targets: Vec<Target<'_>> =
                 targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
             let start = Instant::now();
-            let stats = ready.backend.render(&frame, &mut targets, &|_, _| {})?;
+            let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
             let step_ms = start.elapsed().as_secs_f64() * 1e3;
             if repeat > 0 {
                 runs.push((step_ms, stats));
@@ -87,7 +91,7 @@ impl Step {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        self.report(&ready.scene, &views, &*ready.backend, &runs)
+        self.report(&ready.scene, &views, &*backend, &runs)
     }
 
     fn report(

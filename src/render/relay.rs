@@ -75,23 +75,19 @@ pub struct Bisection {
 /// # Errors
 /// As [`Backend::render`].
 pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, RenderError> {
-    let rendered =
-        |render: &mut dyn FnMut(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
-            let mut images: Vec<Vec<f32>> = frame.views.iter().map(empty).collect();
-            let targets = images.iter_mut();
-            let mut targets: Vec<Target<'_>> =
-                targets.map(|image| Target { rgba: Some(image), ..Target::default() }).collect();
-            render(&mut targets)?;
-            Ok(images)
-        };
-    let truth = rendered(&mut |targets| cpu.render(frame, targets, &|_, _| {}))?;
+    let draw = |by: &dyn Fn(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
+        let mut images = Images::of(frame.views);
+        by(&mut images.targets())?;
+        Ok(images)
+    };
+    let truth = draw(&|targets| cpu.render(frame, targets, &|_, _| {}))?;
     let mut psnr_db = Vec::new();
     for through in std::iter::once(None).chain(Stage::ALL.map(Some)) {
-        let images = rendered(&mut |targets| match through {
+        let images = draw(&|targets| match through {
             None => gpu.render(frame, targets, &|_, _| {}),
             Some(stage) => render_through(cpu, gpu, stage, frame, targets, &|_, _| {}),
         })?;
-        psnr_db.push((through, psnr(&images, &truth)));
+        psnr_db.push((through, images.psnr_db(&truth)));
     }
     Ok(Bisection { psnr_db })
 }
@@ -107,13 +103,41 @@ impl Bisection {
     }
 }
 
-fn empty(view: &View) -> Vec<f32> {
-    vec![0.0; 4 * view.camera.pixels()]
+/// All views' colours.
+struct Images {
+    rgba: Vec<Vec<f32>>,
+    rgb8: Vec<Vec<u8>>,
 }
 
-/// Of values whose peak is 1. NaN anywhere gives NaN, which is not right.
-fn psnr(images: &[Vec<f32>], truths: &[Vec<f32>]) -> f64 {
-    let values = || images.iter().flatten().zip(truths.iter().flatten());
-    let squares: f64 = values().map(|(a, b)| f64::from(a - b).powi(2)).sum();
-    -10.0 * (squares / values().count() as f64).log10()
+impl Images {
+    fn of(views: &[View]) -> Self {
+        let pixels = || views.iter().map(|view| view.camera.pixels());
+        Self {
+            rgba: pixels().map(|pixels| vec![0.0; 4 * pixels]).collect(),
+            rgb8: pixels().map(|pixels| vec![0; 3 * pixels]).collect(),
+        }
+    }
+
+    fn targets(&mut self) -> Vec<Target<'_>> {
+        let images = self.rgba.iter_mut().zip(&mut self.rgb8);
+        images
+            .map(|(rgba, rgb8)| Target { rgba: Some(rgba), rgb8: Some(rgb8), ..Target::default() })
+            .collect()
+    }
+
+    fn psnr_db(&self, truth: &Self) -> f64 {
+        let rgba = self.rgba.iter().flatten().zip(truth.rgba.iter().flatten());
+        let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
+        let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
+        let written = psnr_db(rgb8.map(|(&a, &b)| f64::from(a.abs_diff(b)) / 255.0));
+        // A NaN is not right, whatever the other is.
+        if linear < written || linear.is_nan() { linear } else { written }
+    }
+}
+
+/// Of differences of values whose peak is 1.
+fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) =
+        differences.fold((0.0, 0_u64), |(sum, count), off| (sum + off * off, count + 1));
+    -10.0 * (sum / count as f64).log10()
 }

@@ -15,9 +15,12 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod command_line;
+mod definition;
 mod determinism;
 mod devices;
 mod extremes;
 mod parity;
 mod slips;
+mod stages;
 mod twins;

@@ -1,0 +1,313 @@
+//! Every stage alone, on the buffers that the cpu backend left: gpu against cpu and against f64. Each
+//! comparison must be able to fail, and to tell the stage that is wrong from those that are not.
+
+use wildcity::render::cpu::Cpu;
+use wildcity::render::gpu::Gpu;
+use wildcity::render::gpu::shaders::Shaders;
+use wildcity::render::layout::Cutoffs;
+use wildcity::render::relay::{RIGHT_DB, Relay, bisect};
+use wildcity::render::stage::{Between, Stage};
+use wildcity::render::{Backend, Frame, View};
+use wildcity::scene::{RenderProfile, Scene};
+
+use crate::definition::{self, Splat};
+use crate::gpu::{gpu, gpu_with};
+use crate::images::{Image, agree, cpu, render};
+use crate::slips::{SLIPS, misty_street};
+use crate::streets::{demo_street, street, street_views};
+
+/// One frame, what the cpu backend makes of it, and what the definition makes of the same buffers.
+struct Truth {
+    scene: Scene,
+    profile: RenderProfile,
+    views: [View; 3],
+    /// What the cpu left after project, sort and bin.
+    cpu: [Between; 3],
+    images: Vec<Image>,
+    /// By definition, in f64.
+    splats: Vec<Splat>,
+    order: Vec<u32>,
+    tiles: Vec<Vec<u32>>,
+    pixels: Vec<Image>,
+}
+
+impl Truth {
+    fn new(cpu: &Cpu) -> Self {
+        let (scene, views) = (Scene::from_gaussians(&misty_street(12_000)), street_views());
+        let profile = RenderProfile::default();
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let stages = Stage::ALL.map(|stage| cpu.through(&frame, stage).unwrap().0);
+        let of_cpu = definition::splats(&stages[0]);
+        let order = definition::sort(&of_cpu);
+        Self {
+            images: render(cpu, &scene, &profile, &views),
+            splats: definition::project(&frame),
+            tiles: definition::bin(&of_cpu, &order, &frame),
+            pixels: definition::rasterize(&of_cpu, &order, &frame),
+            order,
+            cpu: stages,
+            scene,
+            profile,
+            views,
+        }
+    }
+
+    fn frame(&self) -> Frame<'_> {
+        Frame { scene: &self.scene, profile: &self.profile, views: &self.views }
+    }
+
+    /// The stages of a gpu that are wrong, by name, and in what.
+    fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, String)> {
+        let [project, sort, bin] = &self.cpu;
+        let through = |done, last| gpu.through(&self.frame(), done, last).unwrap();
+        let checks = [
+            ("project", self.check_project(&through(None, Stage::Project))),
+            ("sort", self.check_sort(&through(Some(project), Stage::Sort))),
+            ("bin", self.check_bin(&through(Some(sort), Stage::Bin))),
+            ("rasterize", self.check_rasterize(&self.drawn(gpu, bin))),
+        ];
+        checks.into_iter().filter_map(|(name, check)| Some((name, check.err()?))).collect()
+    }
+
+    /// The images that a gpu makes of what was left after a stage.
+    fn drawn(&self, gpu: &Gpu, between: &Between) -> Vec<Image> {
+        render(&GoOn { gpu, between }, &self.scene, &self.profile, &self.views)
+    }
+
+    fn check_project(&self, found: &Between) -> Result<(), String> {
+        let cutoffs = Cutoffs::new(&self.profile);
+        let splats = definition::splats(found);
+        for (splat, (&key, of)) in splats.iter().zip(found.keys.iter().zip(&found.splats)) {
+            let truth = cutoffs.sort_key(splat.view, of.depth_m);
+            if key != truth {
+                return Err(format!("key {key:#x} of a splat of key {truth:#x}"));
+            }
+        }
+        self.same_splats(&splats, &definition::splats(&self.cpu[0]))
+            .map_err(|e| format!("against cpu: {e}"))?;
+        self.same_splats(&splats, &self.splats).map_err(|e| format!("against f64: {e}"))
+    }
+
+    /// Walks along both lists. Truths within 0.01 px of an image's edge may be missing.
+    fn same_splats(&self, found: &[Splat], truths: &[Splat]) -> Result<(), String> {
+        let mut next = found.iter().enumerate().peekable();
+        let (mut exact, mut at_edge) = (0, 0);
+        for truth in truths {
+            let inside_px = truth.inside_px(&self.views[truth.view].camera);
+            let here = next.peek().filter(|(_, splat)| is_same(splat, truth));
+            match here {
+                Some((index, splat)) => {
+                    close(splat, truth).map_err(|e| format!("splat {index}: {e}"))?;
+                    exact += usize::from(splat.depth_m == f64::from(truth.depth_m as f32));
+                    next.next();
+                }
+                None if inside_px > 0.01 => {
+                    return Err(format!("{truth:?} is missing; in its place is {:?}", next.peek()));
+                }
+                None => at_edge += usize::from(inside_px > -0.01),
+            }
+        }
+        if let Some(left) = next.next() {
+            return Err(format!("{left:?} is not visible"));
+        }
+        let few_at_edge = at_edge <= 3;
+        let exact_depths = exact * 2 >= found.len();
+        match few_at_edge && exact_depths {
+            true => Ok(()),
+            false => Err(format!(
+                "{at_edge} missing at the edge, {exact} of {} depths exact",
+                found.len()
+            )),
+        }
+    }
+
+    fn check_sort(&self, found: &Between) -> Result<(), String> {
+        let order = found.order.as_ref();
+        let is_equal = order == self.cpu[1].order.as_ref() && order == Some(&self.order);
+        let kept = found.keys == self.cpu[1].keys && found.splats == self.cpu[1].splats;
+        match is_equal && kept {
+            true => Ok(()),
+            false => Err(format!("equal order: {is_equal}, equal splats: {kept}")),
+        }
+    }
+
+    /// Lists in order; nothing missing that f64 finds; the cpu's lists but for a few roundings; and
+    /// few splats in vain.
+    fn check_bin(&self, found: &Between) -> Result<(), String> {
+        let (found, cpu) = (found.tiles.as_ref().unwrap(), self.cpu[2].tiles.as_ref().unwrap());
+        if found.ranges.len() != self.tiles.len() || cpu.ranges.len() != self.tiles.len() {
+            return Err(format!("{} tiles of {}", found.ranges.len(), self.tiles.len()));
+        }
+        let mut ranks = vec![0; self.order.len()];
+        for (rank, &place) in self.order.iter().enumerate() {
+            ranks[place as usize] = rank;
+        }
+        let (mut listed, mut needed, mut unlike) = (0, 0, 0);
+        for (tile, truth) in self.tiles.iter().enumerate() {
+            let list = found.list(tile);
+            let rank = |place: &u32| ranks.get(*place as usize);
+            if !list.iter().map(rank).is_sorted_by(|a, b| a.is_some() && a < b) {
+                return Err(format!("tile {tile} is out of order"));
+            }
+            let has =
+                |list: &[u32], place: &u32| list.binary_search_by_key(&rank(place), rank).is_ok();
+            if let Some(missing) = truth.iter().find(|place| !has(list, place)) {
+                return Err(format!("tile {tile} misses splat {missing}"));
+            }
+            let cpu_list = cpu.list(tile);
+            unlike += list.iter().filter(|place| !has(cpu_list, place)).count();
+            unlike += cpu_list.iter().filter(|place| !has(list, place)).count();
+            (listed, needed) = (listed + list.len(), needed + truth.len());
+        }
+        let few_in_vain = listed * 100 <= needed * 110;
+        match unlike * 10_000 <= listed && few_in_vain && listed == found.instances.len() {
+            true => Ok(()),
+            false => Err(format!(
+                "{} instances, {listed} listed, {needed} needed, {unlike} unlike the cpu's",
+                found.instances.len()
+            )),
+        }
+    }
+
+    fn check_rasterize(&self, images: &[Image]) -> Result<(), String> {
+        for (view, image) in images.iter().enumerate() {
+            let differs = |what: &str, e: String| format!("view {view} against {what}: {e}");
+            agree(image, &self.images[view]).map_err(|e| differs("cpu", e))?;
+            agree(image, &self.pixels[view]).map_err(|e| differs("f64", e))?;
+        }
+        Ok(())
+    }
+}
+
+/// The rest of a frame as a backend.
+struct GoOn<'a> {
+    gpu: &'a Gpu,
+    between: &'a Between,
+}
+
+impl Backend for GoOn<'_> {
+    fn name(&self) -> &'static str {
+        "the rest on the gpu"
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [wildcity::render::Target<'_>],
+        finished: wildcity::render::Finished<'_>,
+    ) -> Result<wildcity::render::FrameStats, wildcity::render::RenderError> {
+        self.gpu.go_on(self.between, frame, targets, finished)
+    }
+}
+
+/// How far a depth may be off: by one step of f32; and where a device rounds `fma` twice (lavapipe),
+/// each of three products loses half a step at 64 m, where the centres of a chunk end: 3 x 1.9e-6.
+fn depth_bound_m(truth: &Splat) -> f64 {
+    1.2e-7 * truth.depth_m + 6e-6
+}
+
+/// Whether two splats can only be the same Gaussian's.
+fn is_same(a: &Splat, b: &Splat) -> bool {
+    let near_px = 0.05 + depth_bound_m(b) / b.depth_m * (b.mean_px[0].abs() + b.mean_px[1].abs());
+    let near = |k: usize| (a.mean_px[k] - b.mean_px[k]).abs() <= near_px;
+    a.view == b.view && (a.depth_m - b.depth_m).abs() <= depth_bound_m(b) && near(0) && near(1)
+}
+
+fn close(found: &Splat, truth: &Splat) -> Result<(), String> {
+    let [l0, l1, l2] = truth.factor;
+    // Close to the camera, everything follows the depth.
+    let step = depth_bound_m(truth) / truth.depth_m;
+    let mean = |k: usize| 2e-3 + step * (truth.mean_px[k].abs() + 200.0);
+    let reach = |k: usize| 1e-3 + (1e-5 + 2.0 * step) * truth.reach_px[k];
+    let factor = |of: f64| (2e-5 + 2.0 * step) * of;
+    let numbers = [
+        ("depth_m", found.depth_m, truth.depth_m, depth_bound_m(truth)),
+        ("mean_px x", found.mean_px[0], truth.mean_px[0], mean(0)),
+        ("mean_px y", found.mean_px[1], truth.mean_px[1], mean(1)),
+        ("reach_px x", found.reach_px[0], truth.reach_px[0], reach(0)),
+        ("reach_px y", found.reach_px[1], truth.reach_px[1], reach(1)),
+        ("l0", found.factor[0], l0, factor(l0)),
+        ("l1", found.factor[1], l1, factor(l0 + l1.abs())),
+        ("l2", found.factor[2], l2, factor(l2)),
+        ("log2_opacity", found.log2_opacity, truth.log2_opacity, 1e-5),
+        ("red", found.rgb[0], truth.rgb[0], 2e-4),
+        ("green", found.rgb[1], truth.rgb[1], 2e-4),
+        ("blue", found.rgb[2], truth.rgb[2], 2e-4),
+    ];
+    for (name, found, truth, bound) in numbers {
+        let is_close = (found - truth).abs() <= bound;
+        if !is_close {
+            return Err(format!("{name} {found}, truly {truth}"));
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn each_stage_does_what_its_twins_do() {
+    let truth = Truth::new(&cpu());
+    assert_eq!(truth.wrong(&gpu()), []);
+}
+
+#[test]
+fn a_slip_fails_its_own_stage_alone_and_the_bisection_names_it() {
+    let cpu = cpu();
+    let truth = Truth::new(&cpu);
+    for slip in SLIPS {
+        let broken = Shaders::default().with_slip(slip.shader, slip.part, slip.text);
+        let broken = gpu_with(broken.unwrap_or_else(|| panic!("{slip:?} has no place")));
+        let wrong = truth.wrong(&broken);
+        let names: Vec<&str> = wrong.iter().map(|(name, _)| *name).collect();
+        assert_eq!(names, slip.stages, "{slip:?}: {wrong:?}");
+        let bisection = bisect(&cpu, &broken, &truth.frame()).unwrap();
+        // Where several stages are wrong, the last one keeps the image wrong for longest. Depth is
+        // not compared.
+        let is_depth = slip.part.starts_with("sums.depth");
+        let last = slip.stages.last().copied().filter(|_| !is_depth);
+        assert_eq!(bisection.wrong(), last, "{slip:?}: {bisection:?}");
+    }
+}
+
+#[test]
+fn a_healthy_gpu_is_right_from_every_stage_on() {
+    let street = street(30_000, 3, 5);
+    let (demo, demo_views) = demo_street();
+    for (gaussians, views) in [(street, &street_views()[..]), (demo, &demo_views[..])] {
+        let (scene, profile) = (Scene::from_gaussians(&gaussians), RenderProfile::default());
+        let frame = Frame { scene: &scene, profile: &profile, views };
+        let bisection = bisect(&cpu(), &gpu(), &frame).unwrap();
+        assert_eq!(bisection.psnr_db.len(), 4);
+        assert!(bisection.psnr_db.iter().all(|(_, db)| *db >= RIGHT_DB), "{bisection:?}");
+        assert_eq!(bisection.wrong(), None);
+    }
+}
+
+/// With every output, growing buffers, and another frame before that must leave nothing behind.
+#[test]
+fn a_relay_draws_what_the_cpu_draws() {
+    let scene = Scene::from_gaussians(&street(100_000, 1, 43));
+    let (profile, views) = (RenderProfile::default(), street_views());
+    let truths = render(&cpu(), &scene, &profile, &views);
+    let other = Scene::from_gaussians(&street(3_000, 1, 44));
+    for stage in Stage::ALL {
+        let relay = Relay::new(cpu(), gpu(), stage);
+        render(&relay, &other, &profile, &views[..2]);
+        let images = render(&relay, &scene, &profile, &views);
+        for (view, (image, truth)) in images.iter().zip(&truths).enumerate() {
+            agree(image, truth).unwrap_or_else(|e| panic!("{stage:?}, view {view}: {e}"));
+        }
+        render(&relay, &Scene::default(), &profile, &views);
+    }
+}
+
+#[test]
+fn a_gpu_that_hands_over_to_itself_changes_nothing() {
+    let truth = Truth::new(&cpu());
+    let gpu = gpu();
+    let images = render(&gpu, &truth.scene, &truth.profile, &truth.views);
+    for stage in Stage::ALL {
+        let between = gpu.through(&truth.frame(), None, stage).unwrap();
+        assert_eq!(between.through(), stage);
+        assert!(truth.drawn(&gpu, &between) == images, "{stage:?}");
+    }
+}
