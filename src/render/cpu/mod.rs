@@ -114,7 +114,10 @@ impl Cpu {
         self.pool.install(|| {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
-            Ok((handover::between(scratch, last, &cutoffs), stats))
+            let mut clock = Clock::start();
+            let between = handover::between(scratch, last, &cutoffs);
+            clock.stage("hand over", &mut stats);
+            Ok((between, stats))
         })
     }
 }
