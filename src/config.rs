@@ -138,3 +138,6 @@ pub const CAMERA_LIST_BYTES: u64 = 16 << 20;
 /// Memory of all twins in use where the machine does not say how much it has; else they may take
 /// three quarters of it. The demo street is 439,000 Gaussians of 92 bytes, 40 MB.
 pub const RESIDENT_BYTES: u64 = 16 << 30;
+
+/// Most Gaussians of a street of `wildcity bench gpu`: 200 B each while it is made.
+pub const BENCH_GAUSSIANS: i64 = 100_000_000;

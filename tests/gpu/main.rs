@@ -15,6 +15,7 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod bench;
 mod command_line;
 mod definition;
 mod determinism;

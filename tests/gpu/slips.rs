@@ -1,11 +1,12 @@
 //! A comparison that cannot fail proves nothing: every stage is broken, and it must be noticed.
 
-use wildcity::render::Backend;
+use glam::DVec3;
 use wildcity::render::gpu::shaders::Shaders;
+use wildcity::render::{Backend, View};
 use wildcity::scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{gpu, gpu_with};
-use crate::images::{agree, cpu, render};
+use crate::images::{agree, cpu, look, render};
 use crate::streets::{street, street_views};
 
 /// A fault to plant in a shader.
@@ -73,19 +74,27 @@ pub(crate) const SLIPS: &[Slip] = &[
         "countOneBits(beside & own_bit) - 1u",
         SORTS,
     ),
-    slip("sort", "place = next[digit(key)]", "place = offsets[digit(key)]", SORTS),
+    slip("sort", "place = next[own_digit]", "place = offsets[own_digit]", SORTS),
     slip("sort", "is_last = after == 0u", "is_last = beside == own_bit", SORTS),
-    // Tiles have no third digit here.
+    // Macro tiles have no third digit here.
     slip("sort", "(key >> SHIFT)", "(key >> min(SHIFT, 16u))", SORT),
-    slip("bin", "last - first + 1u", "last - first", BIN),
+    slip("bin", "u32(columns.y) / TILE_PX + 1u", "u32(columns.y) / TILE_PX", BIN),
+    slip("bin", "- first_column + 1u", "- first_column", BIN),
+    slip("bin", "1u << (end - left)", "1u << (end - left - 1u)", BIN),
+    slip("bin", "<< (k * MACRO_COLUMNS)", "<< (k * 7u)", BIN),
     slip(
         "bin",
         "half_width(reach, right_dy) + EXTENT_SLACK_PX",
         "0.7 * half_width(reach, right_dy)",
         BIN,
     ),
-    slip("bin", "row_first_tile[holder] + i", "row_first_tile[holder]", BIN),
-    slip("ranges", "ranges[tile].y = i + 1u", "ranges[tile].y = i", BIN),
+    slip("bin", "i - prefix_before(holder)", "i", BIN),
+    slip("sort", "sorted_masks[to] = masks[i]", "sorted_masks[to] = masks[to]", BIN),
+    slip("ranges", "ranges[own].y = i + 1u", "ranges[own].y = i", BIN),
+    slip("expand", "offsets[tile] = atomicLoad(&counts[thread])", "offsets[tile] = 0u", BIN),
+    slip("expand", "word_starts[word] = next", "word_starts[word] = first", BIN),
+    slip("expand", "& (own_bit - 1u)", "& ~(own_bit | (own_bit - 1u))", BIN),
+    slip("expand", "k / MACRO_COLUMNS", "k / 4u", BIN),
     slip("rasterize", "after > vec4f(frame.stop)", "after > vec4f(50.0 * frame.stop)", RASTERIZE),
     slip("rasterize", "instance_places[first + k]", "instance_places[first + (k ^ 1u)]", RASTERIZE),
     slip("rasterize", "sums.green += weight", "sums.green += alpha", RASTERIZE),
@@ -94,7 +103,7 @@ pub(crate) const SLIPS: &[Slip] = &[
     slip("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0", RASTERIZE),
 ];
 
-/// A street of SH degree 3 with mist in it, over more tiles than one thread emits.
+/// A street of SH degree 3 with mist in it, over more macro tiles than one thread emits.
 pub(crate) fn misty_street(n: usize) -> Gaussians {
     let mut street = street(n, 3, 41);
     for i in (0..n).step_by(1_000) {
@@ -104,10 +113,17 @@ pub(crate) fn misty_street(n: usize) -> Gaussians {
     street
 }
 
+/// The street's views, and one of many macro tiles.
+pub(crate) fn wide_views() -> Vec<View> {
+    let [first, ..] = street_views();
+    let wide = look([700, 300], 400.0, first.world_from_camera.position_m, DVec3::Z, DVec3::Y);
+    street_views().into_iter().chain([wide]).collect()
+}
+
 #[test]
 fn a_slip_in_any_stage_is_caught() {
     let scene = Scene::from_gaussians(&misty_street(30_000));
-    let (profile, views) = (RenderProfile::default(), street_views());
+    let (profile, views) = (RenderProfile::default(), wide_views());
     let truths = render(&cpu(), &scene, &profile, &views);
     let caught = |backend: &dyn Backend| {
         let images = render(backend, &scene, &profile, &views);

@@ -13,14 +13,14 @@ use wildcity::scene::{RenderProfile, Scene};
 use crate::definition::{self, Splat};
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{Image, agree, cpu, render};
-use crate::slips::{SLIPS, misty_street};
+use crate::slips::{SLIPS, misty_street, wide_views};
 use crate::streets::{demo_street, street, street_views};
 
 /// One frame, what the cpu backend makes of it, and what the definition makes of the same buffers.
 struct Truth {
     scene: Scene,
     profile: RenderProfile,
-    views: [View; 3],
+    views: Vec<View>,
     /// What the cpu left after project, sort and bin.
     cpu: [Between; 3],
     images: Vec<Image>,
@@ -34,7 +34,7 @@ struct Truth {
 
 impl Truth {
     fn new(cpu: &Cpu) -> Self {
-        let (scene, views) = (Scene::from_gaussians(&misty_street(12_000)), street_views());
+        let (scene, views) = (Scene::from_gaussians(&misty_street(12_000)), wide_views());
         let profile = RenderProfile::default();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         let stages = Stage::ALL.map(|stage| cpu.through(&frame, stage).unwrap().0);

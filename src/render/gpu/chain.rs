@@ -20,7 +20,8 @@ use super::rasterize::Rasterize;
 use super::resolve::Planes;
 use super::scan::Scan;
 use super::shaders::Shaders;
-use super::sort::Sort;
+use super::sort::{Columns, Sort};
+use super::traffic::FrameWork;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
 use crate::render::stage::{Between, Stage};
@@ -29,8 +30,9 @@ use crate::render::{Frame, FrameStats, RenderError};
 /// How long a frame may take on the device before it counts as lost.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Room for splats and instances to begin with; what a frame needs beyond makes it grow.
+/// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
 const FIRST_SPLATS: u64 = 1 << 15;
+const FIRST_TOUCHES: u64 = 1 << 16;
 const FIRST_INSTANCES: u64 = 1 << 17;
 
 /// The renderer on one device.
@@ -54,11 +56,13 @@ pub(super) struct Chain {
     high_water: Needs,
     /// Frames that were drawn again in larger buffers.
     pub(super) retries: u64,
+    pub(super) last: FrameWork,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Needs {
     splats: u64,
+    touches: u64,
     instances: u64,
 }
 
@@ -87,13 +91,6 @@ impl Source<'_> {
             Self::Between(_) => 0,
         }
     }
-}
-
-/// Which of the buffers that a sort goes to and fro between are in order.
-#[derive(Clone, Copy, Debug)]
-struct Sorted {
-    splats: usize,
-    instances: usize,
 }
 
 /// Where a frame reaches the host. A step's images are copied out of one while the next step fills
@@ -138,8 +135,13 @@ impl Chain {
                 BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
             ),
             ring: Vec::new(),
-            high_water: Needs { splats: FIRST_SPLATS, instances: FIRST_INSTANCES },
+            high_water: Needs {
+                splats: FIRST_SPLATS,
+                touches: FIRST_TOUCHES,
+                instances: FIRST_INSTANCES,
+            },
             retries: 0,
+            last: FrameWork::default(),
             device,
         };
         chain.device.check()?;
@@ -180,6 +182,7 @@ impl Chain {
             let (counters, ticks) = read_back.head()?;
             if self.is_enough(&counters, &gpu_frame)? {
                 let pages = read_back.pages()?;
+                self.last = frame_work(frame, planes, source, &gpu_frame, &counters);
                 let stats = self.stats(&counters, prepare_ms, &stages, &ticks, start.elapsed());
                 let views = gpu_frame.view[..frame.views.len()].to_vec();
                 return Ok(Drawn { read_back, pages, tiles_per_page, views, stats });
@@ -188,6 +191,7 @@ impl Chain {
             self.retries += 1;
             tracing::debug!(
                 splats = counters.splats,
+                touches = counters.touches,
                 instances = counters.instances,
                 "drawn again"
             );
@@ -204,33 +208,43 @@ impl Chain {
     }
 
     fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
-        let Needs { splats, instances } = self.high_water;
+        let Needs { splats, touches, instances } = self.high_water;
         let (device, scan) = (&self.device, &mut self.scan);
         frame.splat_capacity = self.splats.reserve(device, splats);
-        let (splats, tiles) = (u64::from(frame.splat_capacity), frame.tiles);
-        frame.instance_capacity = self.bin.reserve(device, splats, instances, tiles);
-        let instances = u64::from(frame.instance_capacity);
-        scan.reserve(device, u64::from(items).max(splats));
-        self.sort.reserve(device, scan, splats.max(instances));
+        let (splats, tiles) = (u64::from(frame.splat_capacity), (frame.macros, frame.tiles));
+        (frame.touch_capacity, frame.instance_capacity) =
+            self.bin.reserve(device, splats, tiles, (touches, instances));
+        scan.reserve(device, splats.max(items.max(frame.tiles).into()));
+        self.sort.reserve(device, scan, splats.max(frame.touch_capacity.into()));
         self.ticks.reserve(device, TICKS_BYTES);
     }
 
     /// Whether everything fitted; if not, the high water rises to what it takes.
     fn is_enough(&mut self, counters: &Counters, frame: &GpuFrame) -> Result<bool, RenderError> {
         let splats = Splats::limit(&self.device);
-        let instances = Bin::limit(&self.device);
+        let listed = Bin::limit(&self.device);
         let checks = [
             ("visible splats", counters.splats, splats),
-            ("(Gaussian, tile) pairs", counters.instances, instances),
+            ("(Gaussian, macro tile) pairs", counters.touches, listed),
+            ("(Gaussian, tile) pairs", counters.instances, listed),
         ];
         for (what, needed, limit) in checks {
             if u64::from(needed) > limit {
                 return Err(RenderError::TooMany { what, limit });
             }
         }
-        self.high_water.splats = self.high_water.splats.max(counters.splats.into());
-        self.high_water.instances = self.high_water.instances.max(counters.instances.into());
-        Ok(counters.splats <= frame.splat_capacity && counters.instances <= frame.instance_capacity)
+        let Needs { splats, touches, instances } = &mut self.high_water;
+        let checks = [
+            (counters.splats, splats, frame.splat_capacity),
+            (counters.touches, touches, frame.touch_capacity),
+            (counters.instances, instances, frame.instance_capacity),
+        ];
+        let mut is_enough = true;
+        for (needed, high_water, capacity) in checks {
+            *high_water = u64::from(needed).max(*high_water);
+            is_enough &= needed <= capacity;
+        }
+        Ok(is_enough)
     }
 
     fn submit(
@@ -241,13 +255,12 @@ impl Chain {
         read_back: &ReadBack,
     ) -> (Vec<&'static str>, SubmissionIndex) {
         let mut recorder = Recorder::new(&self.device, self.clock.clone());
-        let sorted = self.record(&mut recorder, source, frame, Stage::Bin);
+        self.record(&mut recorder, source, frame, Stage::Bin);
         let Self { device, plan, splats, bin, .. } = self;
 
         let mut pass = recorder.stage("rasterize");
         let output = (planes, frame.tiles, per_page);
-        let input = (&*splats, &*bin, sorted.instances);
-        self.rasterize.run(device, &mut pass, plan, input, output);
+        self.rasterize.run(device, &mut pass, plan, (splats, bin), output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
@@ -260,14 +273,15 @@ impl Chain {
         (stages, submission)
     }
 
-    /// Records the stages up to `last` that the source leaves to be run.
+    /// Records the stages up to `last` that the source leaves to be run. Returns which of the buffers
+    /// that the sort of splats goes to and fro between are in order.
     fn record(
         &mut self,
         recorder: &mut Recorder,
         source: Source<'_>,
         frame: &GpuFrame,
         last: Stage,
-    ) -> Sorted {
+    ) -> usize {
         let is_due = |stage| stage <= last && source.leaves(stage);
         let counts = match source {
             Source::Gaussians(work) => Counts { items: work.items(), ..Counts::default() },
@@ -276,37 +290,36 @@ impl Chain {
         let Self { device, plan, scan, splats, .. } = self;
         let (device, plan, scan) = (&*device, &*plan, &*scan);
         plan.start(device, frame, &counts);
-        let mut sorted = Sorted { splats: 0, instances: 0 };
 
         if let Source::Gaussians(work) = source {
             let mut pass = recorder.stage("project");
             self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
         }
 
+        let mut sorted = 0;
         if is_due(Stage::Sort) {
             let mut pass = recorder.stage("sort");
             let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
             let depth_bits = DEPTH_BITS + bits(frame.views - 1);
-            let data = (&splats.keys, &splats.places);
-            sorted.splats = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+            let data = Columns { keys: &splats.keys, values: &splats.places, masks: None };
+            sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
         }
 
         if is_due(Stage::Bin) {
-            recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
+            recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
             let mut pass = recorder.stage("bin");
-            self.bin.run(device, &mut pass, (plan, scan), (splats, sorted.splats));
+            self.bin.touch(device, &mut pass, (plan, scan), (splats, sorted));
             drop(pass);
 
             let mut pass = recorder.stage("tile sort");
-            let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
-            let data = (&self.bin.tiles, &self.bin.places);
-            // The number after the last tile occurs too.
-            let tile_bits = bits(frame.tiles);
-            sorted.instances = self.sort.run(device, &mut pass, scan, jobs, data, tile_bits);
+            let jobs = (plan.jobs(), job::TOUCHES_SORT, job::TOUCHES_DIGITS);
+            // The number after the last macro tile occurs too.
+            let (data, macro_bits) = (self.bin.touches(), bits(frame.macros));
+            let touches = self.sort.run(device, &mut pass, scan, jobs, data, macro_bits);
             drop(pass);
 
-            let mut pass = recorder.stage("ranges");
-            self.bin.ranges(device, &mut pass, plan, sorted.instances);
+            let mut pass = recorder.stage("expand");
+            self.bin.expand(device, &mut pass, (plan, scan), (frame.macros, touches));
         }
         sorted
     }
@@ -338,6 +351,28 @@ impl Chain {
                 * u64::from(super::layout::RASTER_BATCH)
                 * u64::from(TILE_PX * TILE_PX),
         }
+    }
+}
+
+fn frame_work(
+    frame: &Frame<'_>,
+    planes: Planes,
+    source: Source<'_>,
+    gpu_frame: &GpuFrame,
+    counters: &Counters,
+) -> FrameWork {
+    FrameWork {
+        sh_degree: frame.scene.sh_degree(),
+        views: gpu_frame.views,
+        pixels: frame.views.iter().map(|view| view.camera.pixels() as u64).sum(),
+        planes: planes.tile_bytes() / u64::from(4 * TILE_PX * TILE_PX),
+        tiles: gpu_frame.tiles.into(),
+        macros: gpu_frame.macros.into(),
+        clusters: source.items().into(),
+        splats: counters.splats.into(),
+        touches: counters.touches.into(),
+        instances: counters.instances.into(),
+        batches: counters.batches.into(),
     }
 }
 

@@ -15,9 +15,11 @@ mod plan;
 mod project;
 mod rasterize;
 mod resolve;
+mod roofline;
 mod scan;
 pub mod shaders;
 mod sort;
+mod traffic;
 
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
@@ -27,6 +29,8 @@ use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
 pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
+pub use roofline::Roofline;
+pub use traffic::FrameWork;
 
 use self::chain::{Chain, Drawn};
 use self::device::Device;
@@ -56,6 +60,8 @@ pub struct GpuUse {
     pub mirror_bytes: u64,
     /// Frames that were drawn again, since their buffers were too small.
     pub retries: u64,
+    /// What the last frame counted.
+    pub last: FrameWork,
 }
 
 impl Gpu {
@@ -93,7 +99,21 @@ impl Gpu {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
             retries: chain.retries,
+            last: chain.last,
         })
+    }
+
+    /// Measures what the device can do at most, in about a second.
+    ///
+    /// # Errors
+    /// The device fails, or is lost.
+    pub fn roofline(&self) -> Result<Roofline, RenderError> {
+        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let lost = || RenderError::Device {
+            device: "the GPU".to_owned(),
+            reason: "it was lost by the frame before".to_owned(),
+        };
+        Roofline::measure(&chain.as_ref().ok_or_else(lost)?.device, &self.shaders)
     }
 
     /// Renders the rest of a frame after the stages that another backend did.

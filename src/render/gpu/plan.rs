@@ -17,10 +17,12 @@ pub(super) mod job {
     pub(crate) const SPLATS_SCAN: u64 = 2;
     pub(crate) const SPLATS_SORT: u64 = 3;
     pub(crate) const SPLATS_DIGITS: u64 = 4;
-    pub(crate) const INSTANCES: u64 = 5;
-    pub(crate) const INSTANCES_SORT: u64 = 6;
-    pub(crate) const INSTANCES_DIGITS: u64 = 7;
-    pub(crate) const COUNT: usize = 8;
+    pub(crate) const TOUCHES: u64 = 5;
+    pub(crate) const TOUCHES_SORT: u64 = 6;
+    pub(crate) const TOUCHES_DIGITS: u64 = 7;
+    pub(crate) const TILES: u64 = 8;
+    pub(crate) const INSTANCES: u64 = 9;
+    pub(crate) const COUNT: usize = 10;
 }
 
 /// What there is before the first stage of a frame runs; what the device finds for itself is zero.
@@ -38,6 +40,7 @@ pub(super) struct Counts {
 #[derive(Debug)]
 pub(super) struct Plan {
     splats: Kernel,
+    touches: Kernel,
     instances: Kernel,
     frame: Growing,
     jobs: Growing,
@@ -51,6 +54,7 @@ impl Plan {
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let mut plan = Self {
             splats: kernel("splats"),
+            touches: kernel("touches"),
             instances: kernel("instances"),
             frame: Growing::new(device, "frame", BufferUsages::UNIFORM | BufferUsages::COPY_DST),
             jobs: Growing::new(device, "jobs", storage | BufferUsages::INDIRECT),
@@ -71,6 +75,7 @@ impl Plan {
             (job::SPLATS_SCAN, splats, SCAN_BLOCK),
             (job::SPLATS_SORT, splats, SORT_BLOCK),
             (job::SPLATS_DIGITS, DIGITS * splats.div_ceil(SORT_BLOCK), SCAN_BLOCK),
+            (job::TILES, frame.tiles, SCAN_BLOCK),
         ] {
             jobs[slot as usize].job = job(length, per_group);
         }
@@ -98,7 +103,12 @@ impl Plan {
         self.run(&self.splats, device, pass, sums);
     }
 
-    /// After the splats' tiles were summed up.
+    /// After the splats' macro tiles were summed up.
+    pub(super) fn touches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+        self.run(&self.touches, device, pass, sums);
+    }
+
+    /// After the tiles' splats were summed up.
     pub(super) fn instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.instances, device, pass, sums);
     }

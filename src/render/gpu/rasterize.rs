@@ -56,13 +56,13 @@ impl Rasterize {
         per_page
     }
 
-    /// Blends all tiles; `sorted` tells which instances are in order.
+    /// Blends all tiles.
     pub(super) fn run(
         &mut self,
         device: &Device,
         pass: &mut ComputePass<'_>,
         plan: &Plan,
-        (splats, bin, sorted): (&Splats, &Bin, usize),
+        (splats, bin): (&Splats, &Bin),
         (planes, tiles, per_page): (Planes, u32, u32),
     ) {
         let module = &self.module;
@@ -73,7 +73,7 @@ impl Rasterize {
                 (0, plan.frame().as_entire_binding()),
                 (1, slot(self.spans.buffer(), page as u64, size_of::<Span>())),
                 (2, bin.ranges.bind()),
-                (3, bin.places[sorted].bind()),
+                (3, bin.instances.bind()),
                 (4, splats.shapes.bind()),
                 (5, splats.colors.bind()),
                 (6, plan.counters().as_entire_binding()),

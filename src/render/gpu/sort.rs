@@ -1,4 +1,4 @@
-//! Stage sort, of splats by (view, depth) and of instances by tile: a stable radix sort, 8 bits a
+//! Stage sort, of splats by (view, depth) and of touches by macro tile: a stable radix sort, 8 bits a
 //! pass. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`.
 
 use wgpu::{Buffer, BufferUsages, ComputePass};
@@ -11,14 +11,32 @@ use super::scan::Scan;
 use super::shaders::Shaders;
 
 /// Bits of a digit.
-const DIGIT_BITS: u32 = DIGITS.ilog2();
+pub(super) const DIGIT_BITS: u32 = DIGITS.ilog2();
 
 /// The kernels of each pass, and the counters between them.
 #[derive(Debug)]
 pub(super) struct Sort {
-    /// Histogram and scatter, by the digit's number.
-    passes: Vec<[Kernel; 2]>,
+    /// By the digit's number.
+    passes: Vec<Pass>,
     offsets: Growing,
+}
+
+#[derive(Debug)]
+struct Pass {
+    histogram: Kernel,
+    scatter: Kernel,
+    scatter_masked: Kernel,
+}
+
+/// What is sorted, to and fro between two buffers each.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Columns<'a> {
+    /// What it is sorted by.
+    pub(super) keys: &'a [Growing; 2],
+    /// What goes with each key.
+    pub(super) values: &'a [Growing; 2],
+    /// What goes with it beside, perhaps.
+    pub(super) masks: Option<&'a [Growing; 2]>,
 }
 
 impl Sort {
@@ -26,7 +44,12 @@ impl Sort {
         let module = module(device, shaders, "sort");
         let pass = |digit: u32| {
             let constants = [("SHIFT", f64::from(DIGIT_BITS * digit))];
-            ["histogram", "scatter"].map(|entry| Kernel::new(device, &module, entry, &constants))
+            let kernel = |entry| Kernel::new(device, &module, entry, &constants);
+            Pass {
+                histogram: kernel("histogram"),
+                scatter: kernel("scatter"),
+                scatter_masked: kernel("scatter_masked"),
+            }
         };
         Self {
             passes: (0..u32::BITS / DIGIT_BITS).map(pass).collect(),
@@ -41,19 +64,21 @@ impl Sort {
         scan.reserve(device, counters);
     }
 
-    /// Sorts by the lowest `bits` of the keys, to and fro between two buffers each. Returns which of
-    /// the two has the result.
+    /// Sorts by the lowest `bits` of the keys. Returns which of the two buffers has the result.
     pub(super) fn run(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
         scan: &Scan,
         (jobs, sort, digits): (&Buffer, u64, u64),
-        (keys, values): (&[Growing; 2], &[Growing; 2]),
+        columns: Columns<'_>,
         bits: u32,
     ) -> usize {
         let mut from = 0;
-        for [histogram, scatter] in &self.passes[..bits.div_ceil(DIGIT_BITS) as usize] {
+        let Columns { keys, values, masks } = columns;
+        for Pass { histogram, scatter, scatter_masked } in
+            &self.passes[..bits.div_ceil(DIGIT_BITS) as usize]
+        {
             let to = 1 - from;
             let counts = [
                 (0, slot(jobs, sort, size_of::<Job>())),
@@ -63,8 +88,15 @@ impl Sort {
             histogram.run(device, pass, Groups::Job(jobs, sort), &counts);
             scan.run(device, pass, (jobs, digits), self.offsets.buffer());
             let moved = [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];
-            let all: Vec<_> = counts.into_iter().chain(moved).collect();
-            scatter.run(device, pass, Groups::Job(jobs, sort), &all);
+            let mut all: Vec<_> = counts.into_iter().chain(moved).collect();
+            let kernel = match masks {
+                Some(masks) => {
+                    all.extend([(6, masks[from].bind()), (7, masks[to].bind())]);
+                    scatter_masked
+                }
+                None => scatter,
+            };
+            kernel.run(device, pass, Groups::Job(jobs, sort), &all);
             from = to;
         }
         from

@@ -5,7 +5,7 @@ use std::time::Instant;
 use bytemuck::AnyBitPattern;
 use wgpu::{Buffer, CommandEncoderDescriptor};
 
-use super::{Chain, Drawn, Growing, ReadBack, Sorted, Source, TICKS_BYTES, TICKS_OFFSET};
+use super::{Chain, Drawn, ReadBack, Source, TICKS_BYTES, TICKS_OFFSET};
 use crate::render::gpu::bin::Bin;
 use crate::render::gpu::kernel::Recorder;
 use crate::render::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
@@ -115,7 +115,7 @@ impl Chain {
         splats.places[0].fill(device, bytemuck::cast_slice(&places));
         if let Some(Tiles { ranges, instances }) = &between.tiles {
             bin.ranges.fill(device, bytemuck::cast_slice(ranges));
-            bin.places[0].fill(device, bytemuck::cast_slice(instances));
+            bin.instances.fill(device, bytemuck::cast_slice(instances));
         }
         counts(between)
     }
@@ -123,25 +123,22 @@ impl Chain {
     /// Reads what the stages up to `last` left.
     fn read(
         &self,
-        sorted: Sorted,
+        sorted: usize,
         counters: &Counters,
         tiles: u32,
         last: Stage,
     ) -> Result<Between, RenderError> {
         let Self { device, splats, bin, .. } = self;
-        let words = |growing: &[Growing; 2], which: usize, count: u32| {
-            (growing[which].buffer().clone(), 4 * u64::from(count))
-        };
-        let (count, instances) = (u64::from(counters.splats), counters.instances);
-        let mut from: Vec<(Buffer, u64)> = vec![
-            (splats.shapes.buffer().clone(), count * size_of::<SplatShape>() as u64),
-            (splats.colors.buffer().clone(), count * size_of::<SplatColor>() as u64),
-            words(&splats.keys, sorted.splats, counters.splats),
-            words(&splats.places, sorted.splats, counters.splats),
+        let (count, instances) = (u64::from(counters.splats), u64::from(counters.instances));
+        let mut from: Vec<(&Buffer, u64)> = vec![
+            (splats.shapes.buffer(), count * size_of::<SplatShape>() as u64),
+            (splats.colors.buffer(), count * size_of::<SplatColor>() as u64),
+            (splats.keys[sorted].buffer(), 4 * count),
+            (splats.places[sorted].buffer(), 4 * count),
         ];
         if last >= Stage::Bin {
-            from.push((bin.ranges.buffer().clone(), 8 * u64::from(tiles)));
-            from.push(words(&bin.places, sorted.instances, instances));
+            from.push((bin.ranges.buffer(), 8 * u64::from(tiles)));
+            from.push((bin.instances.buffer(), 4 * instances));
         }
         let mut read_back = ReadBack::new(device);
         let descriptor = CommandEncoderDescriptor { label: Some("handover") };
