@@ -177,7 +177,7 @@ mod tests {
             (
                 "scan",
                 "saturating_add(block_sums[block], prefix_before(thread))",
-                "prefix_before(thread)",
+                "max(block_sums[block], prefix_before(thread))",
             ),
             ("bin", "i - prefix_before(holder)", "i"),
             ("expand", "next += countOneBits", "next = first + countOneBits"),
