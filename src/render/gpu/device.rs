@@ -257,11 +257,12 @@ impl Device {
         self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
     }
 
-    /// Most touches of a macro tile that `expand` hands on: 300 iterations for each batch of 1,024, if
-    /// they touch all of its tiles.
+    /// Most touches of a macro tile that `expand` hands on. Half of the iterations are for batches of
+    /// 1,024, 45 each; the other half for tiles that are touched: with at most 64,000 splats a tile
+    /// ([`Device::tile_splats`]), 2 million of a macro tile, twice over 256 threads, 16,000 each.
     pub(super) fn macro_touches(&self) -> u64 {
         let batch = u64::from(EXPAND_BATCH);
-        self.loop_iterations().map_or(u32::MAX.into(), |most| most / 300 * batch)
+        self.loop_iterations().map_or(u32::MAX.into(), |most| most / 2 / 45 * batch)
     }
 
     /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
