@@ -45,7 +45,7 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     let cache = Cache::new(Catalog::open(&twins).unwrap());
     let before = status_bytes("self", "VmRSS").unwrap();
     let resident = cache.open("degree1", None).unwrap();
-    assert_eq!(resident.scene.gaussians(), n);
+    assert!(resident.bytes() >= 92 * n);
     let peak = status_bytes("self", "VmHWM").unwrap();
     // Loading activates in a stream: at its peak it holds the result and one batch per thread.
     let allowed = before + 120 * n as u64 + CONSTANT_BYTES;
