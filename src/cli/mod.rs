@@ -7,6 +7,7 @@ mod demo;
 mod devices;
 mod import;
 mod inspect;
+mod lod;
 mod output;
 mod places;
 mod progress;
@@ -32,6 +33,7 @@ enum Command {
     Serve(serve::Serve),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    Lod(lod::Lod),
     Verify(verify::Verify),
     Render(render::Render),
     Replay(replay::Replay),
@@ -47,6 +49,7 @@ pub fn main() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Lod(command) => command.run(),
         Command::Verify(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),

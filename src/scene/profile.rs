@@ -167,7 +167,17 @@ mod tests {
         profile.set("near=0.2").unwrap();
         profile.set("antialiased=true").unwrap();
         assert_eq!(profile, RenderProfile { near: 0.2, antialiased: true, ..Default::default() });
-        for bad in ["near", "near=x", "nearr=1", "alpha_cap=1", "blur=-1", "far=0.1", "near=NaN", "tau_px=-1", "reach_m=far"] {
+        for bad in [
+            "near",
+            "near=x",
+            "nearr=1",
+            "alpha_cap=1",
+            "blur=-1",
+            "far=0.1",
+            "near=NaN",
+            "tau_px=-1",
+            "reach_m=far",
+        ] {
             assert!(profile.clone().set(bad).is_err(), "{bad}");
         }
     }

@@ -253,11 +253,7 @@ impl Assembly {
         let started = Instant::now();
         let profile = &resident.version.manifest.profile;
         let scene = resident.scene(&eyes(&views), profile);
-        let frame = RenderFrame {
-            scene: &scene,
-            profile,
-            views: &views,
-        };
+        let frame = RenderFrame { scene: &scene, profile, views: &views };
         let stats = backend.render(&frame, &mut targets, &finished)?;
         self.timings.render += started.elapsed();
         for (stage, ms) in stats.stages_ms {

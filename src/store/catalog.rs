@@ -162,7 +162,8 @@ impl Catalog {
             let path = self.objects.record_path(name, number);
             StoreError::Damaged { path, reason }
         };
-        let record: LogRecord = serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
+        let record: LogRecord =
+            serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
         if !is_hash(&record.manifest) {
             return Err(damaged(format!("{:?} is not a hash", record.manifest)));
         }

@@ -191,11 +191,7 @@ pub(super) fn unpack(
 }
 
 /// The table of all chunks.
-pub(super) fn table(
-    chunks: &[ChunkEntry],
-    sh_degree: u8,
-    record: Record,
-) -> io::Result<Vec<u8>> {
+pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io::Result<Vec<u8>> {
     let mut table = Vec::new();
     for chunk in chunks {
         let sections = chunk.sections.iter().map(Row::of).collect();
@@ -240,7 +236,8 @@ pub(super) fn fill(
 /// # Errors
 /// Says what is wrong.
 pub(super) fn check_start(start: &[u8], chunk: &ChunkEntry) -> Result<(), String> {
-    let (page, rest) = start.split_first_chunk::<PAGE_BYTES>().ok_or("it is shorter than a page")?;
+    let (page, rest) =
+        start.split_first_chunk::<PAGE_BYTES>().ok_or("it is shorter than a page")?;
     if page[..8] != MAGIC {
         return Err("it does not start as a chunk".into());
     }
@@ -270,7 +267,10 @@ fn check_levels(chunk: &ChunkEntry) -> Result<(), String> {
                 && section.error_m.is_finite()
         });
         if !(numbered && rising && finite) {
-            return Err(format!("block {} of cell {:?} has wrong levels", block[0].block, chunk.cell));
+            return Err(format!(
+                "block {} of cell {:?} has wrong levels",
+                block[0].block, chunk.cell
+            ));
         }
     }
     Ok(())

@@ -14,9 +14,7 @@ use crate::scene::chunk::{CellRun, Partition};
 use crate::scene::manifest::{ChunkEntry, ObjectRef, Provenance};
 use crate::scene::record::Clamped;
 use crate::scene::rig::is_name;
-use crate::scene::{
-    Chunk, Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory, lod,
-};
+use crate::scene::{Chunk, Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory, lod};
 
 use super::catalog::LogRecord;
 use super::chunk_file::Packed;
@@ -157,9 +155,9 @@ fn put_chunks(
         let together = &cells[first..cells.len().min(first + more + 1)];
         let blocks: Vec<(&CellRun, &(u8, Range<usize>))> =
             together.iter().flat_map(|cell| cell.blocks.iter().map(move |b| (cell, b))).collect();
-        let packed = blocks.into_par_iter().map(|(cell, (block, run))| {
-            pack_block(new, cell, *block, &order[run.clone()])
-        });
+        let packed = blocks
+            .into_par_iter()
+            .map(|(cell, (block, run))| pack_block(new, cell, *block, &order[run.clone()]));
         let packed = packed.collect::<io::Result<Vec<_>>>();
         let mut packed = packed.map_err(StoreError::io("compress for", staging.dir()))?.into_iter();
         for cell in together {

@@ -2,7 +2,7 @@ use std::fs;
 use std::sync::Arc;
 
 use glam::DVec3;
-use wildcity::residency::{Cache, Eye, Resident, ResidencyError};
+use wildcity::residency::{Cache, Eye, ResidencyError, Resident};
 use wildcity::scene::RenderProfile;
 use wildcity::store::Catalog;
 

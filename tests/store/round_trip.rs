@@ -1,7 +1,7 @@
 use glam::DVec3;
 use wildcity::geometry::Pose;
-use wildcity::scene::trajectory::Keyframe;
 use wildcity::scene::chunk::columns;
+use wildcity::scene::trajectory::Keyframe;
 use wildcity::scene::{Chunk, Scene, Trajectory};
 use wildcity::store::{Catalog, Listing, NewVersion, StoreError};
 

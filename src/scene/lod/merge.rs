@@ -83,7 +83,8 @@ impl Node {
 pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_m2: f64) -> f64 {
     let share = if merged.weight > 0.0 { b.weight / merged.weight } else { 0.5 };
     let colour = colours[0].lerp(colours[1], share);
-    let fields = [(a, a.weight, colours[0]), (b, b.weight, colours[1]), (merged, -merged.weight, colour)];
+    let fields =
+        [(a, a.weight, colours[0]), (b, b.weight, colours[1]), (merged, -merged.weight, colour)];
     let term = |i: usize, j: usize| {
         let ((p, weight_p, colour_p), (q, weight_q, colour_q)) = (fields[i], fields[j]);
         weight_p * weight_q * (1.0 + colour_p.dot(colour_q)) * overlap(p, q, blur_m2)

@@ -27,7 +27,8 @@ pub struct Level {
 const FINEST_LIMIT_M: f64 = 1.0 / 1024.0;
 /// The coarsest limit, in metres: a pixel at 29 km.
 const COARSEST_LIMIT_M: f64 = 16.0;
-/// A level is kept if it has at most so much of the Gaussians of the one kept before.
+/// A level is kept if it has at most so much of the Gaussians of the one kept before: all levels
+/// above 0 together take at most 0.65 / 0.35 = 1.9 times level 0, and half of that is usual.
 const KEPT_SHARE: f64 = 0.65;
 /// Nothing is merged below so many: a block is one chunk of the renderer, and one group of lanes.
 const FEWEST: usize = 16;
@@ -37,8 +38,9 @@ const GROUP: usize = 64;
 const PARTNERS: usize = 16;
 /// Rounds of pairing under one limit, at most: each at most halves a block.
 const ROUNDS: usize = 8;
-/// A merger that changes the fields by more than this share is not made.
-const MOST_COST: f64 = 0.5;
+/// A merger that changes the fields by more than this share is not made: on a street, the same image
+/// quality as 0.5 with 1 dB more, and as many Gaussians.
+const MOST_COST: f64 = 0.2;
 /// Variance that the renderer adds on the screen, in px²: what it hides costs nothing.
 const BLUR_PX2: f64 = 0.3;
 
@@ -138,7 +140,9 @@ impl Merging {
                 }
             }
         }
-        pairs.sort_by(|a, b| a.cost.total_cmp(&b.cost).then((a.first, a.second).cmp(&(b.first, b.second))));
+        pairs.sort_by(|a, b| {
+            a.cost.total_cmp(&b.cost).then((a.first, a.second).cmp(&(b.first, b.second)))
+        });
         let mut taken = [false; GROUP];
         for Pair { first, second, .. } in pairs {
             let places = [first - group.start, second - group.start];
@@ -203,7 +207,8 @@ impl Merging {
                 let total = joint.weight;
                 let share = if total > 0.0 { self.nodes[second].weight / total } else { 0.5 };
                 for k in 0..self.stride {
-                    let (a, b) = (self.sh[node * self.stride + k], self.sh[second * self.stride + k]);
+                    let (a, b) =
+                        (self.sh[node * self.stride + k], self.sh[second * self.stride + k]);
                     let mixed = f64::from(a) + share * (f64::from(b) - f64::from(a));
                     self.sh[node * self.stride + k] = mixed as f32;
                 }

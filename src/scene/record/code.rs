@@ -318,8 +318,8 @@ fn from_smallest_three(codes: [u32; 3], bits: u32) -> [f32; 4] {
     let half = ((1_u32 << (bits - 1)) - 1) as f32;
     let step = 1.0 / (SQRT_2 * half);
     let largest = codes[0] >> bits & 3;
-    let [a, b, c] = [codes[0] & ((1 << bits) - 1), codes[1], codes[2]]
-        .map(|code| (code as f32 - half) * step);
+    let [a, b, c] =
+        [codes[0] & ((1 << bits) - 1), codes[1], codes[2]].map(|code| (code as f32 - half) * step);
     let d = (1.0 - a * a - b * b - c * c).max(0.0).sqrt();
     match largest {
         0 => [d, a, b, c],

@@ -80,8 +80,17 @@ impl Record {
     /// surfels of one plane that change places in depth are the first thing that is seen.
     fn fields(self, sh_degree: u8) -> Vec<Field> {
         let ([x, y, z], scale, quat, opacity, dc, bands) = match self {
-            Self::F32 => ([Code::Float; 3], Code::Float, Code::Float, Code::Float, Code::Float, [Code::Float; 3]),
-            Self::H52 => ([Code::Float; 3], Code::Half, Code::Half, Code::Half, Code::Half, [Code::Half; 3]),
+            Self::F32 => (
+                [Code::Float; 3],
+                Code::Float,
+                Code::Float,
+                Code::Float,
+                Code::Float,
+                [Code::Float; 3],
+            ),
+            Self::H52 => {
+                ([Code::Float; 3], Code::Half, Code::Half, Code::Half, Code::Half, [Code::Half; 3])
+            }
             Self::Q32 => (
                 [Code::Binary(23); 3],
                 Code::Steps(10),
@@ -102,7 +111,8 @@ impl Record {
         // F32 keeps what the renderer reads; the others keep what is even to the eye.
         let exact = self == Self::F32;
         let measure = |measure| if exact { Measure::Plain } else { measure };
-        let field = |name, column, columns, measure, code| Field { name, column, columns, measure, code };
+        let field =
+            |name, column, columns, measure, code| Field { name, column, columns, measure, code };
         let mut fields = vec![
             field("x", column::MEAN, 1, Measure::Plain, x),
             field("y", column::MEAN + 1, 1, Measure::Plain, y),
@@ -148,7 +158,8 @@ impl Record {
                 let column = field.column + column;
                 run.clone().map(move |index| chunk.value(index, column))
             };
-            let count = field.code.encode(field.measure, field.columns, &values, &mut grids, &mut planes);
+            let count =
+                field.code.encode(field.measure, field.columns, &values, &mut grids, &mut planes);
             clamped.add(field.name, count);
         }
         grids.append(&mut planes);
