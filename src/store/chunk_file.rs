@@ -311,3 +311,153 @@ fn encoding() -> impl Config {
     const LIMIT: usize = config::CHUNK_TABLE_BYTES;
     bincode::config::standard().with_fixed_int_encoding().with_limit::<LIMIT>()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Gaussians;
+    use crate::scene::chunk::{CellRun, Partition};
+
+    /// 300 Gaussians of one block, a coarse level of 100, and the object that holds them.
+    fn object() -> (Vec<u8>, ChunkEntry) {
+        let n = 300;
+        let gaussians = Gaussians {
+            sh_degree: 0,
+            means_m: (0..n).map(|i| [0.04 * f64::from(i), 1.0, 2.0]).collect(),
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n as usize],
+            ln_scales: vec![[-2.0; 3]; n as usize],
+            logit_opacities: vec![1.0; n as usize],
+            sh: vec![0.25; 3 * n as usize],
+        };
+        let Partition { cells, order } = Partition::new(&gaussians.means_m);
+        let cell: &CellRun = &cells[0];
+        let chunk = |count: usize| {
+            let mut chunk = Chunk::new(cell.cell, cell.origin_m, 0, count);
+            for &index in &order[..count] {
+                chunk.push(&cell.record(&gaussians, index as usize));
+            }
+            chunk
+        };
+        let lost = &mut Clamped::default();
+        let packed = [(0, 0.0, 300), (1, 0.5, 100)].map(|(level, error_m, count)| {
+            pack(&chunk(count), [10, level], error_m, Record::Q32, lost).unwrap()
+        });
+        let mut bytes = Vec::new();
+        let place = (cell.cell, cell.origin_m);
+        let (sections, bounds) = write(&mut bytes, place, 0, Record::Q32, packed.into()).unwrap();
+        let entry = ChunkEntry {
+            cell: cell.cell,
+            object: blake3::hash(&bytes).to_hex().to_string(),
+            count: 300,
+            bytes: bytes.len() as u64,
+            bounds,
+            origin_m: cell.origin_m,
+            sections,
+        };
+        (bytes, entry)
+    }
+
+    fn filled(entry: &ChunkEntry, table: &[u8]) -> Result<Vec<Section>, String> {
+        let mut chunks = [ChunkEntry { sections: Vec::new(), ..entry.clone() }];
+        fill(&mut chunks, 0, Record::Q32, table).map(|()| chunks[0].sections.clone())
+    }
+
+    #[test]
+    fn sections_share_a_page_where_they_fit_and_begin_one_where_not() {
+        assert_eq!(place(8192, 100), 8192);
+        assert_eq!(place(8292, 3996), 8292);
+        assert_eq!(place(8292, 3997), 12288);
+        assert_eq!(place(8292, 50_000), 12288);
+        let (bytes, entry) = object();
+        let [full, coarse] = &entry.sections[..] else { panic!("{:?}", entry.sections) };
+        assert_eq!((coarse.offset_bytes, coarse.level), (8192, 1), "coarse levels come first");
+        for section in [full, coarse] {
+            let start = section.offset_bytes as usize;
+            let own = &bytes[start..start + section.bytes as usize];
+            let chunk = unpack(own, &entry, section, 0, Record::Q32).unwrap();
+            assert_eq!((chunk.cell(), chunk.len()), (entry.cell, section.count as usize));
+        }
+    }
+
+    #[test]
+    fn a_table_comes_back_and_one_that_lies_is_refused() {
+        let (_, entry) = object();
+        let table = table(std::slice::from_ref(&entry), 0, Record::Q32).unwrap();
+        assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
+        // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
+        assert_eq!(table.len(), 42 + 2 * 78);
+        assert!(42 + 16 * 29 * 78 < config::CHUNK_TABLE_BYTES);
+        for cut in 0..table.len() {
+            filled(&entry, &table[..cut]).unwrap_err();
+        }
+        assert!(filled(&entry, &[&table[..], &table].concat()).unwrap_err().contains("more cells"));
+        let refused = |change: &dyn Fn(&mut ChunkEntry)| {
+            let mut other = entry.clone();
+            change(&mut other);
+            let table = super::table(&[other], 0, Record::Q32).unwrap();
+            filled(&entry, &table).unwrap_err()
+        };
+        assert!(refused(&|e| e.cell[0] += 1).contains("something else of cell"));
+        assert!(refused(&|e| e.sections[0].count = 7).contains("it has 7 Gaussians of 300"));
+        for change in [
+            (|e| e.sections[1].level = 2) as fn(&mut ChunkEntry),
+            |e| e.sections[1].error_m = f32::NAN,
+            |e| e.sections[1].error_m = -1.0,
+            |e| e.sections[0].error_m = 0.1,
+            |e| e.sections[1].max_m[2] = f32::INFINITY,
+        ] {
+            assert!(refused(&change).contains("has wrong levels"));
+        }
+        // 2^64 sections: nothing is allocated for them.
+        let mut many = table.clone();
+        many[34..42].fill(255);
+        assert!(filled(&entry, &many).unwrap_err().contains("does not decode"));
+    }
+
+    #[test]
+    fn an_object_says_itself_what_is_in_it() {
+        let (bytes, entry) = object();
+        check_start(&bytes, &entry).unwrap();
+        let refused = |at: usize| {
+            let mut bytes = bytes.clone();
+            bytes[at] ^= 1;
+            check_start(&bytes, &entry).unwrap_err()
+        };
+        assert_eq!(refused(0), "it does not start as a chunk");
+        assert_eq!(refused(8), "it has format 0; this build reads format 1");
+        assert_eq!(refused(15), "its table is longer than it may be");
+        assert_eq!(refused(20), "its table of contents has another hash");
+        assert_eq!(refused(4100), "its table of contents has another hash");
+        assert_eq!(check_start(&bytes[..4000], &entry).unwrap_err(), "it is shorter than a page");
+        let mut other = entry.clone();
+        other.sections[0].hash[0] ^= 1;
+        let said = check_start(&bytes, &other).unwrap_err();
+        assert_eq!(said, "its table of contents is not the manifest's");
+    }
+
+    #[test]
+    fn a_section_that_is_not_what_it_says_is_refused_in_bounded_memory() {
+        let (bytes, entry) = object();
+        let section = entry.sections[0];
+        let start = section.offset_bytes as usize;
+        let own = &bytes[start..start + section.bytes as usize];
+        let refused = |own: &[u8], count: u32| {
+            let section = Section { count, ..section };
+            unpack(own, &entry, &section, 0, Record::Q32).unwrap_err()
+        };
+        for cut in 0..own.len() {
+            refused(&own[..cut], 300);
+        }
+        assert_eq!(refused(&[own, &[0]].concat(), 300), "1 bytes are left over");
+        assert!(refused(own, 299).starts_with("a part does not decompress"));
+        assert!(refused(own, 301).starts_with("301 Gaussians take "));
+        // 4 G Gaussians, 240 GB: the first part is missing.
+        assert!(refused(own, u32::MAX).starts_with("65536 Gaussians take "));
+        for at in 0..own.len() {
+            let mut own = own.to_vec();
+            own[at] ^= 0x40;
+            // The hash is looked at before: here it only must not panic.
+            let _ = unpack(&own, &entry, &section, 0, Record::Q32);
+        }
+    }
+}
