@@ -21,6 +21,9 @@ pub const CELL_M: f64 = 64.0;
 pub const BLOCK_M: f64 = 16.0;
 /// Blocks along the edge of a cell.
 pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
+/// A cell of fewer Gaussians is one block: a cluster for each would be more than there is, and every
+/// chunk costs a frame some work. A skyline's and a sky's cells have a few each.
+pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
 /// Gaussians side by side: one AVX-512 register of f32, two of AVX2, four of SSE.
 pub const LANES: usize = 16;
 /// Gaussians in a cluster, the unit of frustum culling.
@@ -310,7 +313,8 @@ pub struct CellRun {
     pub origin_m: DVec3,
     /// Its part of [`Partition::order`].
     pub run: Range<usize>,
-    /// Its blocks that are not empty, by number, and their parts of [`Partition::order`].
+    /// Its blocks that are not empty, by number, and their parts of [`Partition::order`]. All of a
+    /// sparse cell counts as its first block with anything in it.
     pub blocks: Vec<(u8, Range<usize>)>,
 }
 
@@ -337,7 +341,7 @@ impl Partition {
             let origin_m = CELL_M * DVec3::new(f64::from(x), f64::from(y), level);
             let mut blocks = Vec::new();
             let mut end = start;
-            for block in run.chunk_by(|a, b| a.1 == b.1) {
+            for block in run.chunk_by(|a, b| run.len() < SPARSE_CELL || a.1 == b.1) {
                 blocks.push((block[0].1, end..end + block.len()));
                 end += block.len();
             }
