@@ -1,7 +1,8 @@
-// Stage bin: for every splat, from the nearest, the tiles that its ellipse touches.
+// Stage bin: for every splat, from the nearest, the macro tiles that its ellipse touches, and which of
+// their tiles.
 //
-// `count` counts them; a prefix sum gives each splat its places; `emit` writes (tile, splat) there.
-// Twin of `src/render/cpu/bin.rs`, where the test is documented.
+// `count` counts them; a prefix sum gives each splat its places; `emit` writes (macro tile, splat, bit
+// per tile) there. Twin of `src/render/cpu/bin.rs`, where the test is documented.
 
 #import constants
 #import layout
@@ -10,13 +11,14 @@
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> job: Job;
-@group(0) @binding(2) var<storage, read> instances_job: Job;
+@group(0) @binding(2) var<storage, read> touches_job: Job;
 @group(0) @binding(3) var<storage, read> keys: array<u32>;
 @group(0) @binding(4) var<storage, read> places: array<u32>;
 @group(0) @binding(5) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(6) var<storage, read_write> offsets: array<u32>;
-@group(0) @binding(7) var<storage, read_write> instance_tiles: array<u32>;
-@group(0) @binding(8) var<storage, read_write> instance_places: array<u32>;
+@group(0) @binding(7) var<storage, read_write> touch_macros: array<u32>;
+@group(0) @binding(8) var<storage, read_write> touch_places: array<u32>;
+@group(0) @binding(9) var<storage, read_write> touch_masks: array<u32>;
 
 @compute @workgroup_size(WORKGROUP)
 fn count(
@@ -29,18 +31,19 @@ fn count(
         return;
     }
     let reach = reach_of(rank);
-    var tiles = 0u;
-    for (var row = reach.first_row; row <= reach.last_row; row++) {
-        tiles += columns_of(reach, row).count;
+    let macro_rows = macro_rows_of(reach);
+    var macros = 0u;
+    for (var row = macro_rows.x; row <= macro_rows.y; row++) {
+        macros += band_of(reach, row).count;
     }
-    offsets[rank] = tiles;
+    offsets[rank] = macros;
 }
 
 // Threads whose splat the whole workgroup emits, in any order: places do not depend on it.
 var<workgroup> big: array<u32, WORKGROUP>;
 var<workgroup> big_count: atomic<u32>;
 var<workgroup> big_total: u32;
-var<workgroup> row_first_tile: array<u32, WORKGROUP>;
+var<workgroup> bands: array<Band, WORKGROUP>;
 
 @compute @workgroup_size(WORKGROUP)
 fn emit(
@@ -54,12 +57,12 @@ fn emit(
     }
     workgroupBarrier();
     let rank = first_rank + thread;
-    if rank < job.length && instances_job.length > 0u {
-        let places_of_rank = instance_span(rank);
-        if places_of_rank.count > BIG_SPLAT_TILES {
+    if rank < job.length && touches_job.length > 0u {
+        let span = touch_span(rank);
+        if span.count > BIG_SPLAT_MACROS {
             big[atomicAdd(&big_count, 1u)] = thread;
         } else {
-            emit_alone(rank, places_of_rank);
+            emit_alone(rank, span);
         }
     }
     workgroupBarrier();
@@ -72,10 +75,10 @@ fn emit(
     }
 }
 
-// Where a rank's instances go. `offsets` has no element behind the last one.
-fn instance_span(rank: u32) -> Span {
+// Where a rank's touches go. `offsets` has no element behind the last one.
+fn touch_span(rank: u32) -> Span {
     let first = offsets[rank];
-    var end = instances_job.length;
+    var end = touches_job.length;
     if rank + 1u < job.length {
         end = offsets[rank + 1u];
     }
@@ -84,53 +87,76 @@ fn instance_span(rank: u32) -> Span {
 
 fn emit_alone(rank: u32, span: Span) {
     let reach = reach_of(rank);
+    let macro_rows = macro_rows_of(reach);
     let place = places[rank];
     var at = span.first;
     let end = span.first + span.count;
-    for (var row = reach.first_row; row <= reach.last_row; row++) {
-        let columns = columns_of(reach, row);
-        for (var i = 0u; i < columns.count && at < end; i++) {
-            instance_tiles[at] = columns.first + i;
-            instance_places[at] = place;
+    for (var row = macro_rows.x; row <= macro_rows.y; row++) {
+        let band = band_of(reach, row);
+        for (var i = 0u; i < band.count && at < end; i++) {
+            write_touch(at, band, i, place);
             at++;
         }
     }
-    // Should the two pipelines round a row differently, what is left over belongs to no tile.
+    // Should the two pipelines round a row differently, what is left over belongs to no macro tile.
     for (; at < end; at++) {
-        instance_tiles[at] = frame.tiles;
-        instance_places[at] = place;
+        write_nothing(at, place);
     }
 }
 
-// One row per thread finds its columns; then one instance per thread finds its row.
+// One row of macro tiles per thread finds its columns; then one touch per thread finds its row.
 fn emit_together(rank: u32, thread: u32) {
-    let span = instance_span(rank);
+    let span = touch_span(rank);
     let reach = reach_of(rank);
+    let macro_rows = macro_rows_of(reach);
     let place = places[rank];
     let end = span.first + span.count;
     var at = span.first;
-    for (var first_row = reach.first_row; first_row <= reach.last_row; first_row += i32(WORKGROUP)) {
+    for (var first_row = macro_rows.x; first_row <= macro_rows.y; first_row += i32(WORKGROUP)) {
         let row = first_row + i32(thread);
-        var columns = Span(0u, 0u);
-        if row <= reach.last_row {
-            columns = columns_of(reach, row);
+        var band: Band;
+        if row <= macro_rows.y {
+            band = band_of(reach, row);
         }
-        inclusive_prefix(thread, columns.count);
-        row_first_tile[thread] = columns.first;
+        inclusive_prefix(thread, band.count);
+        bands[thread] = band;
         workgroupBarrier();
         let count = prefix_sums[WORKGROUP - 1u];
         for (var i = thread; i < count && at + i < end; i += WORKGROUP) {
             let holder = first_above(i);
-            instance_tiles[at + i] = row_first_tile[holder] + i - prefix_before(holder);
-            instance_places[at + i] = place;
+            write_touch(at + i, bands[holder], i - prefix_before(holder), place);
         }
         at += count;
         workgroupBarrier();
     }
     for (var i = at + thread; i < end; i += WORKGROUP) {
-        instance_tiles[i] = frame.tiles;
-        instance_places[i] = place;
+        write_nothing(i, place);
     }
+}
+
+// Macro tile `i` of a band.
+fn write_touch(at: u32, band: Band, i: u32, place: u32) {
+    touch_macros[at] = band.first_macro + i;
+    touch_places[at] = place;
+    let left = band.left + i * MACRO_COLUMNS;
+    var mask = 0u;
+    for (var k = 0u; k < MACRO_ROWS; k++) {
+        mask |= row_mask(band.rows[k], left) << (k * MACRO_COLUMNS);
+    }
+    touch_masks[at] = mask;
+}
+
+fn write_nothing(at: u32, place: u32) {
+    touch_macros[at] = frame.macros;
+    touch_places[at] = place;
+    touch_masks[at] = 0u;
+}
+
+// A bit for each column from `left` on that a row of a band has.
+fn row_mask(columns: u32, left: u32) -> u32 {
+    let first = max(columns & 0xFFFFu, left);
+    let end = min(columns >> 16u, left + MACRO_COLUMNS);
+    return select(0u, (1u << (end - left)) - (1u << (first - left)), first < end);
 }
 
 // The first thread whose inclusive prefix sum is above `i`.
@@ -146,6 +172,50 @@ fn first_above(i: u32) -> u32 {
         }
     }
     return low;
+}
+
+// What a splat touches of a row of macro tiles. An ellipse so flat that rows miss each other may have
+// macro tiles between them of which it touches nothing.
+struct Band {
+    // Columns of tiles, row by row: the first in the low half of a word, the end in the high half.
+    rows: array<u32, MACRO_ROWS>,
+    // Column of tiles where the first macro tile begins.
+    left: u32,
+    first_macro: u32,
+    count: u32,
+}
+
+fn band_of(reach: Reach, macro_row: i32) -> Band {
+    var band: Band;
+    var first = reach.view.columns;
+    var end = 0u;
+    for (var k = 0; k < i32(MACRO_ROWS); k++) {
+        let row = macro_row * i32(MACRO_ROWS) + k;
+        if row >= reach.first_row && row <= reach.last_row {
+            let columns = columns_of(reach, row);
+            if columns.x < columns.y {
+                first = min(first, columns.x);
+                end = max(end, columns.y);
+                band.rows[k] = columns.x | (columns.y << 16u);
+            }
+        }
+    }
+    if first < end {
+        let first_column = first / MACRO_COLUMNS;
+        band.left = first_column * MACRO_COLUMNS;
+        band.first_macro =
+            reach.view.first_macro + u32(macro_row) * reach.view.macro_columns + first_column;
+        band.count = (end - 1u) / MACRO_COLUMNS - first_column + 1u;
+    }
+    return band;
+}
+
+// First and last row of macro tiles.
+fn macro_rows_of(reach: Reach) -> vec2i {
+    if reach.first_row > reach.last_row {
+        return vec2i(0, -1);
+    }
+    return vec2i(reach.first_row, reach.last_row) / i32(MACRO_ROWS);
 }
 
 // A splat's box on its view's grid of tiles, and what its rows need.
@@ -183,6 +253,9 @@ fn reach_of(rank: u32) -> Reach {
     }
     reach.thin = reach.first_row == reach.last_row
         || columns.x / i32(TILE_PX) == columns.y / i32(TILE_PX);
+    // Of an image that is drawn in bands, the rows of this one.
+    reach.first_row = max(reach.first_row, i32(reach.view.rows.x));
+    reach.last_row = min(reach.last_row, i32(reach.view.rows.y) - 1);
     let l = reach.shape.factor;
     reach.power = reach.shape.log2_opacity - frame.log2_alpha_cut;
     reach.inverse_l0 = 1.0 / l.x;
@@ -191,8 +264,8 @@ fn reach_of(rank: u32) -> Reach {
     return reach;
 }
 
-// The tiles of one row that the ellipse touches: the first, and how many.
-fn columns_of(reach: Reach, row: i32) -> Span {
+// The tiles of one row that the ellipse touches: the first column, and the one after the last.
+fn columns_of(reach: Reach, row: i32) -> vec2u {
     var columns = vec2i(reach.left, reach.right);
     if !reach.thin {
         let y = reach.shape.mean_px.y;
@@ -206,13 +279,10 @@ fn columns_of(reach: Reach, row: i32) -> Span {
         let low = reach.skew * left_dy - half_width(reach, left_dy) - EXTENT_SLACK_PX;
         columns = pixels(reach.shape.mean_px.x, low, high, i32(reach.view.size_px.x));
         if columns.x > columns.y {
-            return Span(0u, 0u);
+            return vec2u(0u);
         }
     }
-    let first = u32(columns.x) / TILE_PX;
-    let last = u32(columns.y) / TILE_PX;
-    let row_start = reach.view.first_tile + u32(row) * reach.view.columns;
-    return Span(row_start + first, last - first + 1u);
+    return vec2u(u32(columns.x) / TILE_PX, u32(columns.y) / TILE_PX + 1u);
 }
 
 fn half_width(reach: Reach, dy: f32) -> f32 {

@@ -18,10 +18,12 @@ const SPLATS: u32 = 1;
 const SPLATS_SCAN: u32 = 2;
 const SPLATS_SORT: u32 = 3;
 const SPLATS_DIGITS: u32 = 4;
-const INSTANCES: u32 = 5;
-const INSTANCES_SORT: u32 = 6;
-const INSTANCES_DIGITS: u32 = 7;
-const JOB_COUNT: u32 = 8;
+const TOUCHES: u32 = 5;
+const TOUCHES_SORT: u32 = 6;
+const TOUCHES_DIGITS: u32 = 7;
+const TILES: u32 = 8;
+const INSTANCES: u32 = 9;
+const JOB_COUNT: u32 = 10;
 
 // After the visible splats of all items were counted.
 @compute @workgroup_size(1)
@@ -35,15 +37,23 @@ fn splats() {
     jobs[SPLATS_DIGITS].job = job(DIGITS * blocks(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// After the tiles of all splats were counted.
+// After the macro tiles of all splats were counted.
+@compute @workgroup_size(1)
+fn touches() {
+    let total = block_sums[blocks(jobs[SPLATS].job.length, SCAN_BLOCK)];
+    counters.touches = total;
+    let length = select(0u, total, total <= frame.touch_capacity);
+    jobs[TOUCHES].job = job(length, WORKGROUP);
+    jobs[TOUCHES_SORT].job = job(length, SORT_BLOCK);
+    jobs[TOUCHES_DIGITS].job = job(DIGITS * blocks(length, SORT_BLOCK), SCAN_BLOCK);
+}
+
+// After the splats of all tiles were counted.
 @compute @workgroup_size(1)
 fn instances() {
-    let total = block_sums[blocks(jobs[SPLATS].job.length, SCAN_BLOCK)];
+    let total = block_sums[blocks(jobs[TILES].job.length, SCAN_BLOCK)];
     counters.instances = total;
-    let length = select(0u, total, total <= frame.instance_capacity);
-    jobs[INSTANCES].job = job(length, WORKGROUP);
-    jobs[INSTANCES_SORT].job = job(length, SORT_BLOCK);
-    jobs[INSTANCES_DIGITS].job = job(DIGITS * blocks(length, SORT_BLOCK), SCAN_BLOCK);
+    jobs[INSTANCES].job = job(select(0u, total, total <= frame.instance_capacity), WORKGROUP);
 }
 
 fn job(length: u32, per_group: u32) -> Job {

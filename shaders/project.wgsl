@@ -168,13 +168,15 @@ fn project_shape(own: Geometry, view: ChunkView) -> Projected {
     let l0 = unit * root_c / root_det;
     let l1 = -(b * l2) / root_det;
 
-    // The box where alpha reaches the cut, against the image's pixel centres.
+    // The box where alpha reaches the cut, against the pixel centres of what is drawn of the image.
     let power = log2_opacity - frame.log2_alpha_cut;
     let reach = sqrt(max(power, 0.0)) / unit;
     let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
-    let size_px = vec2f(frame.view[view.view].size_px);
-    let on_image = all(mean_px + extent_px >= vec2f(0.5))
-        && all(mean_px - extent_px <= size_px - 0.5);
+    let image = frame.view[view.view];
+    let first_px = vec2u(0u, image.rows.x * TILE_PX);
+    let end_px = vec2u(image.size_px.x, min(image.rows.y * TILE_PX, image.size_px.y));
+    let on_image = all(mean_px + extent_px >= vec2f(first_px) + 0.5)
+        && all(mean_px - extent_px <= vec2f(end_px) - 0.5);
     let shape = SplatShape(mean_px, extent_px, vec3f(l0, l1, l2), log2_opacity);
     return Projected(power >= 0.0 && on_image, shape, z);
 }

@@ -1,4 +1,5 @@
-// Stage ranges: where each tile's instances start and end. Tiles without any keep (0, 0).
+// Stage bin, after its sort: where each macro tile's touches start and end. Macro tiles without any
+// keep (0, 0).
 
 #import constants
 #import layout
@@ -6,7 +7,7 @@
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> job: Job;
-@group(0) @binding(2) var<storage, read> tiles: array<u32>;
+@group(0) @binding(2) var<storage, read> macros: array<u32>;
 @group(0) @binding(3) var<storage, read_write> ranges: array<vec2u>;
 
 @compute @workgroup_size(WORKGROUP)
@@ -19,15 +20,15 @@ fn main(
     if i >= job.length {
         return;
     }
-    // Places that `bin` left over bear the number after the last tile.
-    let tile = tiles[i];
-    if tile >= frame.tiles {
+    // Places that `bin` left over bear the number after the last macro tile.
+    let own = macros[i];
+    if own >= frame.macros {
         return;
     }
-    if i == 0u || tiles[i - 1u] != tile {
-        ranges[tile].x = i;
+    if i == 0u || macros[i - 1u] != own {
+        ranges[own].x = i;
     }
-    if i + 1u == job.length || tiles[i + 1u] != tile {
-        ranges[tile].y = i + 1u;
+    if i + 1u == job.length || macros[i + 1u] != own {
+        ranges[own].y = i + 1u;
     }
 }

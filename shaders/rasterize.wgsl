@@ -112,6 +112,7 @@ fn main(
     }
     if thread == 0u {
         atomicAdd(&counters.batches, batches);
+        atomicMax(&counters.most_batches, batches);
     }
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }

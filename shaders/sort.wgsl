@@ -1,8 +1,8 @@
 // Stage sort: one pass of a stable radix sort over 8 bits of the keys, from the least significant.
 //
 // `histogram` counts each block's digits, digit-major; their prefix sum says where each block's keys
-// of each digit go; `scatter` puts them there. Twin: `src/render/cpu/sort.rs`, which sorts by the
-// same keys at once.
+// of each digit go; `scatter` puts them there, `scatter_masked` with two values each. Twin:
+// `src/render/cpu/sort.rs`, which sorts by the same keys at once.
 
 #import constants
 #import layout
@@ -19,6 +19,8 @@ override SHIFT: u32;
 @group(0) @binding(3) var<storage, read> values: array<u32>;
 @group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
+@group(0) @binding(6) var<storage, read> masks: array<u32>;
+@group(0) @binding(7) var<storage, read_write> sorted_masks: array<u32>;
 
 var<workgroup> counts: array<atomic<u32>, DIGITS>;
 
@@ -50,60 +52,99 @@ var<workgroup> holders: array<atomic<u32>, DIGITS * MASK_WORDS>;
 // For each digit, where its next key goes.
 var<workgroup> next: array<u32, DIGITS>;
 
-// A key's rank among the equal digits of its round is the number of holders before its thread:
-// stable for subgroups of any size, whatever the order in which the bits were set. The last holder
-// moves the digit's place on, and each clears the word that it set a bit of.
 @compute @workgroup_size(WORKGROUP)
 fn scatter(
     @builtin(workgroup_id) group: vec3u,
     @builtin(num_workgroups) groups: vec3u,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let block = group_index(group, groups);
+    let block = start_block(group_index(group, groups), thread);
+    for (var at = block.x; at < block.y; at += WORKGROUP) {
+        let i = at + thread;
+        let held = i < block.y;
+        var key = 0u;
+        if held {
+            key = keys[i];
+        }
+        let to = place_of(key, held, thread);
+        if held {
+            sorted_keys[to] = key;
+            sorted_values[to] = values[i];
+        }
+    }
+}
+
+// The same for keys with two values.
+@compute @workgroup_size(WORKGROUP)
+fn scatter_masked(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(num_workgroups) groups: vec3u,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let block = start_block(group_index(group, groups), thread);
+    for (var at = block.x; at < block.y; at += WORKGROUP) {
+        let i = at + thread;
+        let held = i < block.y;
+        var key = 0u;
+        if held {
+            key = keys[i];
+        }
+        let to = place_of(key, held, thread);
+        if held {
+            sorted_keys[to] = key;
+            sorted_values[to] = values[i];
+            sorted_masks[to] = masks[i];
+        }
+    }
+}
+
+// First key and end of a block; none for a group too many.
+fn start_block(block: u32, thread: u32) -> vec2u {
     let block_count = blocks(job.length, SORT_BLOCK);
     if block >= block_count {
-        return;
+        return vec2u(0u);
     }
     next[thread] = offsets[thread * block_count + block];
     for (var word = 0u; word < MASK_WORDS; word++) {
         atomicStore(&holders[word * DIGITS + thread], 0u);
     }
-    let first = block * SORT_BLOCK;
+    return vec2u(block * SORT_BLOCK, min((block + 1u) * SORT_BLOCK, job.length));
+}
+
+// Where a thread's key goes, if it holds one, round after round. A key's rank among the equal digits of
+// its round is the number of holders before its thread: stable for subgroups of any size, whatever the
+// order in which the bits were set. The last holder moves the digit's place on, and each clears the
+// word that it set a bit of.
+fn place_of(key: u32, held: bool, thread: u32) -> u32 {
     let own_word = thread / 32u;
     let own_bit = 1u << (thread % 32u);
-    for (var at = first; at < min(first + SORT_BLOCK, job.length); at += WORKGROUP) {
-        workgroupBarrier();
-        let i = at + thread;
-        let held = i < job.length;
-        var key = 0u;
-        if held {
-            key = keys[i];
-            atomicOr(&holders[own_word * DIGITS + digit(key)], own_bit);
+    let own_digit = digit(key);
+    workgroupBarrier();
+    if held {
+        atomicOr(&holders[own_word * DIGITS + own_digit], own_bit);
+    }
+    workgroupBarrier();
+    var place = 0u;
+    var is_last = false;
+    if held {
+        let beside = atomicLoad(&holders[own_word * DIGITS + own_digit]);
+        place = next[own_digit] + countOneBits(beside & (own_bit - 1u));
+        var after = beside & ~(own_bit | (own_bit - 1u));
+        for (var word = 0u; word < MASK_WORDS; word++) {
+            let others = atomicLoad(&holders[word * DIGITS + own_digit]);
+            place += select(0u, countOneBits(others), word < own_word);
+            after |= select(0u, others, word > own_word);
         }
-        workgroupBarrier();
-        var place = 0u;
-        var is_last = false;
-        if held {
-            let beside = atomicLoad(&holders[own_word * DIGITS + digit(key)]);
-            place = next[digit(key)] + countOneBits(beside & (own_bit - 1u));
-            var after = beside & ~(own_bit | (own_bit - 1u));
-            for (var word = 0u; word < MASK_WORDS; word++) {
-                let others = atomicLoad(&holders[word * DIGITS + digit(key)]);
-                place += select(0u, countOneBits(others), word < own_word);
-                after |= select(0u, others, word > own_word);
-            }
-            is_last = after == 0u;
-            sorted_keys[place] = key;
-            sorted_values[place] = values[i];
-        }
-        workgroupBarrier();
-        if held {
-            atomicStore(&holders[own_word * DIGITS + digit(key)], 0u);
-            if is_last {
-                next[digit(key)] = place + 1u;
-            }
+        is_last = after == 0u;
+    }
+    workgroupBarrier();
+    if held {
+        atomicStore(&holders[own_word * DIGITS + own_digit], 0u);
+        if is_last {
+            next[own_digit] = place + 1u;
         }
     }
+    return place;
 }
 
 fn digit(key: u32) -> u32 {

@@ -120,6 +120,27 @@ pub const PLY_HEADER_BYTES: usize = 64 << 10;
 /// Longest safetensors header. A gsplat checkpoint's is under 1 KB.
 pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
 
+/// Bytes that a compressed scene may unpack to, however few it has: tests and toys of equal Gaussians.
+pub const UNPACKED_FREE_BYTES: u64 = 16 << 20;
+
+/// Bytes beyond those that every compressed byte may unpack to. Scenes reach 2 to 8; deflate can
+/// reach 1032 and zstd more.
+pub const UNPACKED_PER_BYTE: u64 = 64;
+
+/// Largest archive, glTF buffer or image of a scene, which are held in memory whole: 100 million
+/// Gaussians in SOG take 2 GiB.
+pub const SCENE_PART_BYTES: u64 = 4 << 30;
+
+/// Largest JSON that describes a scene: SOG's takes 15 kB, its index of levels 200 B per leaf.
+pub const SCENE_JSON_BYTES: u64 = 64 << 20;
+
+/// Files of one scene: eight per block of a streamed SOG.
+pub const SCENE_PARTS: usize = 100_000;
+
+/// Most values beside arrays of a NuRec payload, of 32 bytes each in memory. A log's tracks are
+/// 100,000.
+pub const NUREC_VALUES: usize = 1 << 20;
+
 /// Most Gaussians of one import: their order within the twin is kept as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 
@@ -147,3 +168,19 @@ pub const CAMERA_LIST_BYTES: u64 = 16 << 20;
 /// Memory of all twins in use where the machine does not say how much it has; else they may take
 /// three quarters of it. The demo street is 439,000 Gaussians of 92 bytes, 40 MB.
 pub const RESIDENT_BYTES: u64 = 16 << 30;
+
+/// Most Gaussians of a street of `wildcity bench gpu`: 200 B each while it is made.
+pub const BENCH_GAUSSIANS: i64 = 100_000_000;
+
+/// Frames that a GPU has in hand at once: one is drawn, one is encoded, and one is ready to be drawn
+/// the moment the first is done. Six JPEGs take longer than a fast GPU takes to draw them. Each
+/// holds its images, 27 MB of six full cameras.
+pub const GPU_FRAMES: usize = 3;
+
+/// Frames that did not fit a GPU at once, and are known in which parts they do: a few kB, for more
+/// rigs than drive at once.
+pub const REMEMBERED_CUTS: usize = 64;
+
+/// Smallest limit of a binding that the gpu backend is made to live with: one cluster of SH degree 3
+/// takes 34 kB of one.
+pub const BINDING_BYTES_MIN: u64 = 64 << 10;

@@ -4,13 +4,18 @@ struct FrameView {
     size_px: vec2u,
     columns: u32,
     first_tile: u32,
+    macro_columns: u32,
+    first_macro: u32,
+    rows: vec2u,
 }
 
 struct Frame {
     splat_capacity: u32,
+    touch_capacity: u32,
     instance_capacity: u32,
-    tiles: u32,
     views: u32,
+    tiles: u32,
+    macros: u32,
     near_m: f32,
     far_m: f32,
     blur_px2: f32,
@@ -18,7 +23,9 @@ struct Frame {
     alpha_cap: f32,
     log2_alpha_cut: f32,
     stop: f32,
-    pad: f32,
+    pad0: u32,
+    pad1: u32,
+    pad2: u32,
     view: array<FrameView, MAX_VIEWS>,
 }
 
@@ -56,9 +63,10 @@ struct JobSlot {
 
 struct Counters {
     splats: u32,
+    touches: u32,
     instances: u32,
     batches: atomic<u32>,
-    pad: u32,
+    most_batches: atomic<u32>,
 }
 
 struct SplatShape {

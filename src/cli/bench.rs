@@ -1,14 +1,7 @@
 //! `wildcity bench`.
 
-use std::io::{self, Write};
-use std::time::Instant;
-
-use serde_json::json;
-
-use crate::render::{Backend, Frame, FrameStats, Target, View};
-
-use super::progress;
-use super::scene_source::SceneSource;
+mod gpu;
+mod step;
 
 /// Time the renderer.
 #[derive(Debug, clap::Args)]
@@ -19,143 +12,23 @@ pub(super) struct Bench {
 
 #[derive(Debug, clap::Subcommand)]
 enum What {
-    Step(Step),
+    Step(step::Step),
+    Gpu(gpu::Gpu),
 }
-
-/// Time one step: all cameras of the list in one frame, to 8-bit colour.
-///
-/// Reports the median and the extremes of the repeats, after one that is not counted, and medians
-/// per stage; (Gaussian, view)
-/// pairs that are visible, (Gaussian, tile) pairs after binning, and Gaussian-pixel evaluations.
-#[derive(Debug, clap::Args)]
-#[command(after_long_help = EXAMPLES)]
-struct Step {
-    #[command(flatten)]
-    source: SceneSource,
-
-    /// Frames to time.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    repeat: u32,
-
-    /// Print one JSON object on standard output.
-    #[arg(long)]
-    json: bool,
-}
-
-const EXAMPLES: &str = "\
-Examples:
-  wildcity bench step street.ply --cameras cameras.json --repeat 9
-  wildcity bench step street --cameras cameras.json --json | jq .step_ms";
 
 impl Bench {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.what {
             What::Step(step) => step.run(),
+            What::Gpu(gpu) => gpu.run(),
         }
     }
 }
 
-impl Step {
-    fn run(self) -> anyhow::Result<()> {
-        let ready = self.source.open()?;
-        let views: Vec<View> = ready.shots.iter().map(|shot| shot.view).collect();
-        let profile = ready.shots[0].profile;
-        if let Some(other) = ready.shots.iter().find(|shot| shot.profile != profile) {
-            anyhow::bail!(
-                "camera {:?} has another near than {:?}; one step has one profile: give \
-                 --profile near=...",
-                other.name,
-                ready.shots[0].name
-            );
-        }
-        let frame = Frame { scene: &ready.scene, profile: &profile, views: &views };
-        let mut images: Vec<Vec<u8>> =
-            views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-        let bar = progress::count("rendering");
-        bar.set_length(u64::from(self.repeat) + 1);
-        let mut runs = Vec::with_capacity(self.repeat as usize);
-        for repeat in 0..=self.repeat {
-            let targets = images.iter_mut();
-            let mut targets: Vec<Target<'_>> =
-                targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
-            let start = Instant::now();
-            let stats = ready.backend.render(&frame, &mut targets, &|_, _| {})?;
-            let step_ms = start.elapsed().as_secs_f64() * 1e3;
-            if repeat > 0 {
-                runs.push((step_ms, stats));
-            }
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        self.report(&ready.scene, &views, &*ready.backend, &runs)
-    }
-
-    fn report(
-        &self,
-        scene: &crate::scene::Scene,
-        views: &[View],
-        backend: &dyn Backend,
-        runs: &[(f64, FrameStats)],
-    ) -> anyhow::Result<()> {
-        let steps_ms = || runs.iter().map(|(step_ms, _)| *step_ms);
-        let step_ms = median(steps_ms());
-        let (min_ms, max_ms) =
-            (steps_ms().fold(step_ms, f64::min), steps_ms().fold(step_ms, f64::max));
-        let (name, simd, threads) = (backend.name(), backend.detail(), backend.threads());
-        let (_, stats) = &runs[0];
-        let stages: Vec<(&str, f64)> = (0..stats.stages_ms.len())
-            .map(|k| (stats.stages_ms[k].0, median(runs.iter().map(|(_, s)| s.stages_ms[k].1))))
-            .collect();
-        let pixels: usize = views.iter().map(|view| view.camera.pixels()).sum();
-        let mut out = io::stdout().lock();
-        if self.json {
-            let stages: serde_json::Map<_, _> =
-                stages.iter().map(|(name, ms)| (name.to_string(), json!(ms))).collect();
-            let report = json!({
-                "backend": name,
-                "simd": simd,
-                "threads": threads,
-                "gaussians": scene.gaussians(),
-                "sh_degree": scene.sh_degree(),
-                "resident_bytes": scene.bytes(),
-                "cameras": views.len(),
-                "pixels": pixels,
-                "repeat": self.repeat,
-                "step_ms": step_ms,
-                "step_ms_min": min_ms,
-                "step_ms_max": max_ms,
-                "stages_ms": stages,
-                "visible_pairs": stats.visible_pairs,
-                "instances": stats.instances,
-                "evaluations": stats.evaluations,
-            });
-            writeln!(out, "{report}")?;
-            return Ok(());
-        }
-        writeln!(
-            out,
-            "{} Gaussians, {} cameras, {pixels} px, {name} {simd}, {threads} threads",
-            scene.gaussians(),
-            views.len()
-        )?;
-        writeln!(out, "visible pairs  {:>14}", stats.visible_pairs)?;
-        writeln!(out, "instances      {:>14}", stats.instances)?;
-        writeln!(out, "evaluations    {:>14}", stats.evaluations)?;
-        for (name, ms) in stages {
-            writeln!(out, "{name:<14} {ms:>11.1} ms")?;
-        }
-        writeln!(
-            out,
-            "{:<14} {step_ms:>11.1} ms   (median of {}, from {min_ms:.1} to {max_ms:.1})",
-            "step", self.repeat
-        )?;
-        Ok(())
-    }
-}
-
+/// The one in the middle, or the mean of the two in the middle.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    if values.len() % 2 == 1 { values[middle] } else { 0.5 * (values[middle - 1] + values[middle]) }
+    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
+    0.5 * (values.get(low).unwrap_or(&f64::NAN) + values.get(high).unwrap_or(&f64::NAN))
 }

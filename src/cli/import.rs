@@ -18,16 +18,15 @@ use super::progress;
 
 /// Make a twin of a trained scene, or a new version of one.
 ///
-/// SRC is a PLY of 3D Gaussian splatting (INRIA's columns in any order, SH degree 0 to 3, or
-/// PlayCanvas' compressed kind) or safetensors with gsplat's names. Every Gaussian is checked first;
-/// an import that fails leaves nothing behind.
+/// SRC is told by how it starts, never by its name; below is what is read. Every Gaussian is checked
+/// first; an import that fails leaves nothing behind.
 ///
-/// Memory: twice the file at most; of a compressed PLY, twice what the scene takes uncompressed
-/// (56 bytes per Gaussian without SH, 236 with degree 3).
+/// Memory: twice what the scene takes uncompressed (56 bytes per Gaussian without SH, 236 with
+/// degree 3), and what an archive, a glTF buffer or a payload of NuRec holds.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The scene file.
+    /// The scene file; of a scene in a folder, its meta.json, lod-meta.json or .gltf.
     #[arg(value_name = "SRC")]
     source: PathBuf,
 
@@ -77,6 +76,22 @@ pub(super) struct Import {
 }
 
 const EXAMPLES: &str = "\
+Formats, and the axes that they usually have; files of one extension differ, so look at a render:
+  PLY                 INRIA's columns in any order, SH degree 0 to 3        y-down-z-forward
+  compressed PLY      PlayCanvas, SuperSplat                                y-down-z-forward
+  safetensors         gsplat's names: means, quats, scales, opacities, ..   y-down-z-forward
+  checkpoint (.pt)    python -m wildcity.convert CKPT.pt OUT.safetensors    y-down-z-forward
+  .splat              antimatter15                                          y-down-z-forward
+  .ksplat             mkkellogg, levels 0 to 2                              y-down-z-forward
+  SPZ 2, 3, 4         Niantic; right, up, back by its description, but      y-up-z-back
+                      some tools keep those of the PLY
+  SOG 1 and 2         PlayCanvas; meta.json, or one .sog or .zip            y-down-z-forward
+  streamed SOG        lod-meta.json, or one .zip; the finest level is read  y-down-z-forward
+  glTF, GLB           KHR_gaussian_splatting, where its nodes put it; the   '-1 0 0 0 0 1 0 1 0'
+                      standard has x left, y up, z to the front
+  NuRec (.usdz)       NVIDIA; what stands still. Axes are the payload's:    y-down-z-forward
+                      what the USD layers around it turn is not looked at
+
 Examples:
   wildcity import skull.ply --twin skull --axes y-down-z-forward --profile near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json

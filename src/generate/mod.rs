@@ -19,6 +19,7 @@
 
 mod backdrop;
 mod buildings;
+mod canyon;
 mod car_kinds;
 mod cars;
 mod facade;
@@ -32,6 +33,7 @@ mod route;
 mod street;
 mod surface;
 
+pub use canyon::canyon;
 use serde::{Deserialize, Serialize};
 
 use crate::scene::{Gaussians, Trajectory};

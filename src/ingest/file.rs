@@ -16,6 +16,15 @@ pub enum FileError {
         /// What it is.
         found: &'static str,
     },
+    /// Named by another file, and not within its folder.
+    #[error("is not a plain path below the folder of the file that names it; move it there")]
+    Outside,
+    /// One of more files than are read for one scene.
+    #[error("one more than the {limit} files that a scene may have; split the scene")]
+    TooMany {
+        /// The most that are read.
+        limit: usize,
+    },
     /// Larger than any honest one.
     #[error("larger than {limit_bytes} bytes")]
     TooLarge {
@@ -46,9 +55,14 @@ pub(super) fn open(path: &Path) -> Result<(File, u64), FileError> {
 /// It cannot be read, is not a regular file, or is larger.
 pub fn read_whole(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
     let (file, _) = open(path)?;
+    read_at_most(file, limit_bytes)
+}
+
+/// Reads to the end, which must come within so many bytes.
+pub(super) fn read_at_most(input: impl Read, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
     let mut bytes = Vec::new();
     // One more, to tell a file of the limit from a larger one.
-    file.take(limit_bytes + 1).read_to_end(&mut bytes)?;
+    input.take(limit_bytes + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit_bytes {
         return Err(FileError::TooLarge { limit_bytes });
     }

@@ -37,6 +37,18 @@ pub enum Field {
 }
 
 impl Field {
+    /// The field of a file whose format names none; scales and opacities as they are kept.
+    pub(super) fn plain_name(self) -> String {
+        match self {
+            Self::Mean(axis) => format!("position[{axis}]"),
+            Self::Quat(i) => format!("rotation[{i}] (of w, x, y, z)"),
+            Self::QuatLength => "length of the rotation".into(),
+            Self::Scale(axis) => format!("ln of scale[{axis}]"),
+            Self::Opacity => "logit of the opacity".into(),
+            Self::Sh(k, channel) => format!("colour coefficient [{k}][{channel}]"),
+        }
+    }
+
     /// The field of a Gaussian that comes from no file.
     pub fn twin_name(self) -> String {
         match self {

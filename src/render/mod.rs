@@ -130,6 +130,12 @@ pub trait Backend: Send + Sync {
         1
     }
 
+    /// Frames that it has in hand at once: as many callers of [`Backend::render`] get on faster
+    /// than one, and more do not. A backend that uses the whole machine for a frame says 1.
+    fn frames_at_once(&self) -> usize {
+        1
+    }
+
     /// Renders all views into their targets, `targets[i]` for `views[i]`.
     ///
     /// # Errors

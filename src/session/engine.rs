@@ -2,8 +2,8 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
@@ -34,9 +34,10 @@ pub struct EngineSettings {
 
 /// The renderer and the twins, shared by all sessions.
 ///
-/// One frame is drawn at a time, on all cores: two at once would take as long together and hold
-/// twice the memory. Frames wait in the order in which they were asked for, and a session asks for
-/// one at a time, so that sessions take turns.
+/// As many frames are drawn at a time as the backend wants. The cpu backend draws one, on all cores:
+/// two at once would take as long together and hold twice the memory. A GPU draws one while the one
+/// before is encoded. Frames are begun in the order in which they were asked for, and a session asks
+/// for one at a time, so that sessions take turns.
 pub struct Engine {
     listings: Arc<Listings>,
     cache: Cache,
@@ -64,23 +65,22 @@ pub(super) struct Hold {
 }
 
 impl Engine {
-    /// Starts the render thread. It ends when the engine is dropped.
+    /// Starts the render threads, one for each frame that the backend takes at once. They end when
+    /// the engine is dropped.
     ///
     /// # Errors
-    /// The thread cannot be started.
+    /// A thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
-        let (jobs, mut queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
-        std::thread::Builder::new()
-            .name("render".to_owned())
-            .spawn(move || {
-                let mut scratch = Scratch::new();
-                while let Some(job) = queue.blocking_recv() {
-                    job(&mut scratch);
-                    shrink(&mut scratch);
-                }
-            })
-            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        let (jobs, queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
+        let queue = Arc::new(Mutex::new(queue));
+        for number in 0..backend.frames_at_once().max(1) {
+            let queue = queue.clone();
+            std::thread::Builder::new()
+                .name(format!("render-{number}"))
+                .spawn(move || draw_all(&queue))
+                .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        }
         let listings = Arc::new(Listings::new(catalog.clone()));
         let (cache, answers) = (Cache::limited(catalog, resident_bytes), Answers::default());
         Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
@@ -128,7 +128,7 @@ impl Engine {
         Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
 
-    /// Does some work on the render thread when its turn comes, and tells how long it waited.
+    /// Does some work on a render thread when its turn comes, and tells how long it waited.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if too much is queued, [`SessionError::DeadlineExceeded`] if the
@@ -182,6 +182,17 @@ impl std::fmt::Debug for Engine {
     }
 }
 
+/// What a render thread does: the next job in its turn, until there is no engine any more.
+fn draw_all(queue: &Mutex<mpsc::Receiver<Job>>) {
+    let mut scratch = Scratch::new();
+    // The lock is held while waiting: whoever holds it takes the next job, and lets the next in.
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).blocking_recv();
+    while let Some(job) = next() {
+        job(&mut scratch);
+        shrink(&mut scratch);
+    }
+}
+
 /// Gives back what one session's huge images left behind.
 fn shrink(scratch: &mut Scratch) {
     scratch.retain(|image| image.capacity() <= config::SCRATCH_IMAGE_BYTES);
@@ -218,12 +229,73 @@ impl Drop for Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render;
 
     #[test]
     fn huge_images_are_not_kept() {
         let mut scratch = vec![vec![0; config::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
         shrink(&mut scratch);
         assert_eq!(scratch, [vec![0; 1000]]);
+    }
+
+    struct Takes(usize);
+
+    impl Backend for Takes {
+        fn name(&self) -> &'static str {
+            "takes"
+        }
+
+        fn frames_at_once(&self) -> usize {
+            self.0
+        }
+
+        fn render(
+            &self,
+            _: &render::Frame<'_>,
+            _: &mut [render::Target<'_>],
+            _: render::Finished<'_>,
+        ) -> Result<render::FrameStats, render::RenderError> {
+            Ok(render::FrameStats::default())
+        }
+    }
+
+    #[tokio::test]
+    async fn as_many_frames_at_once_as_the_backend_takes() {
+        for at_once in [1, 3] {
+            let dir = tempfile::tempdir().unwrap();
+            let engine = Engine::start(EngineSettings {
+                catalog: Catalog::open(dir.path()).unwrap(),
+                resident_bytes: None,
+                episodes: dir.path().to_owned(),
+                backend: Arc::new(Takes(at_once)),
+                step_timeout: config::STEP_TIMEOUT,
+            });
+            let engine = engine.unwrap();
+            // How many run now, and how many ever ran at once.
+            let counts = Arc::new(Mutex::new((0, 0)));
+            let jobs = (0..at_once + 3).map(|_| {
+                let counts = counts.clone();
+                engine.run(Instant::now() + config::STEP_TIMEOUT, move |_, _| {
+                    let begun = Instant::now();
+                    let most = || {
+                        let mut counts = counts.lock().unwrap();
+                        counts.1 = counts.0.max(counts.1);
+                        counts.1
+                    };
+                    counts.lock().unwrap().0 += 1;
+                    while most() < at_once && begun.elapsed() < Duration::from_secs(10) {
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    std::thread::sleep(Duration::from_millis(20));
+                    most();
+                    counts.lock().unwrap().0 -= 1;
+                })
+            });
+            for done in futures_util::future::join_all(jobs).await {
+                done.unwrap();
+            }
+            assert_eq!(*counts.lock().unwrap(), (0, at_once));
+        }
     }
 
     #[test]

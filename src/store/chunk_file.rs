@@ -386,7 +386,7 @@ mod tests {
         assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
         // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
         assert_eq!(table.len(), 42 + 2 * 78);
-        assert!(42 + 16 * 29 * 78 < config::CHUNK_TABLE_BYTES);
+        const { assert!(42 + 16 * 29 * 78 < config::CHUNK_TABLE_BYTES) };
         for cut in 0..table.len() {
             filled(&entry, &table[..cut]).unwrap_err();
         }

@@ -24,7 +24,7 @@ fn a_frame_that_outgrows_its_buffers_is_the_same_frame() {
     let (profile, backend) = (RenderProfile::default(), gpu());
     let grown = render(&backend, &scene, &profile, &views());
     let retries = backend.usage().unwrap().retries;
-    assert!(retries >= 2, "splats and instances both fitted at once: {retries} retries");
+    assert!(retries >= 3, "splats, touches and instances did not all grow: {retries} retries");
     let fitting = render(&backend, &scene, &profile, &views());
     assert_eq!(backend.usage().unwrap().retries, retries, "the second frame grew too");
     assert!(grown == fitting);

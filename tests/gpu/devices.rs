@@ -2,6 +2,8 @@
 
 use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError, devices};
 
+use crate::gpu::gpu;
+
 #[test]
 fn a_device_goes_by_number_and_by_a_part_of_its_name() {
     let found = devices();
@@ -54,7 +56,7 @@ fn a_device_is_for_the_gpu_backend() {
 fn a_shader_that_does_not_compile_is_an_error() {
     let broken = wildcity::render::gpu::shaders::Shaders::default();
     let broken =
-        broken.with_slip("ranges", "let tile = tiles[i];", "let tile = nothing[i];").unwrap();
+        broken.with_slip("ranges", "let own = macros[i];", "let own = nothing[i];").unwrap();
     let error = Gpu::with_shaders(&AdapterChoice::Best, 1, broken).unwrap_err();
     assert!(error.to_string().contains("nothing"), "{error}");
 }
@@ -78,4 +80,22 @@ fn without_a_driver_it_is_an_ordinary_error() {
     let test = "devices::software_is_not_taken_for_hardware";
     let (passed, said) = without(&this.to_string_lossy(), &["--exact", test]);
     assert!(passed && said.contains("1 passed"), "{said}");
+}
+
+/// What no test may hear must be heard.
+#[test]
+fn a_warning_fails_its_test() {
+    let output = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "devices::warns", "--ignored"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(!output.status.success() && said.contains("WARN wgpu_hal: a trial"), "{said}");
+}
+
+#[test]
+#[ignore = "fails on purpose, started by a_warning_fails_its_test"]
+fn warns() {
+    let _gpu = gpu();
+    log::warn!(target: "wgpu_hal", "a trial");
 }

@@ -8,7 +8,7 @@ use wildcity::scene::{RenderProfile, Scene};
 
 use crate::blobs::{Blob, ahead, raw, scene};
 use crate::gpu::gpu;
-use crate::images::{Image, agree, cpu, look, max_difference, render_one};
+use crate::images::{Image, agree, cpu, crop, crop_difference, look, max_difference, render_one};
 use crate::streets::street;
 
 /// The image, after it was made sure that the definition gives it too.
@@ -50,7 +50,7 @@ fn t2_t3_beside_the_view_and_larger_than_the_screen() {
         }]);
         agreed(&gpu, &long, &profile, ahead([320, 240], 200.0), &format!("({x}, {y})"));
     }
-    // 1,300 tiles wide in all: the whole workgroup emits them.
+    // On 4 x 5 macro tiles: a whole workgroup emits them.
     for sigma_m in [2.0, 10.0, 1e3, 1e4] {
         let walls: Vec<Blob> = (0..40)
             .map(|i| Blob {
@@ -60,7 +60,7 @@ fn t2_t3_beside_the_view_and_larger_than_the_screen() {
                 ..Blob::default()
             })
             .collect();
-        let view = ahead([333, 250], 300.0);
+        let view = ahead([444, 280], 300.0);
         let image = agreed(&gpu, &scene(&walls), &profile, view, &format!("{sigma_m} m"));
         assert!(image.opacity.iter().any(|&o| o > 0.5), "{sigma_m} m");
     }
@@ -193,6 +193,19 @@ fn t17_an_8k_image() {
     let image = render_one(&gpu(), &street, &RenderProfile::default(), view);
     let truth = render_one(&cpu(), &street, &RenderProfile::default(), view);
     agree(&image, &truth).unwrap();
+}
+
+#[test]
+fn t18_a_principal_point_far_off_centre() {
+    let (gpu, profile, whole) = (gpu(), RenderProfile::default(), ahead([600, 400], 200.0));
+    let street = Scene::from_gaussians(&street(20_000, 1, 23));
+    let image = render_one(&gpu, &street, &profile, whole);
+    for at in [[0, 0], [430, 300]] {
+        let part = crop(whole, at, [170, 100]);
+        let own = agreed(&gpu, &street, &profile, part, &format!("crop at {at:?}"));
+        let off = crop_difference((&own, part), (&image, whole), at, 40);
+        assert!(off <= 2e-3, "crop at {at:?}: off by {off}");
+    }
 }
 
 #[test]

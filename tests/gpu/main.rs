@@ -15,9 +15,13 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod bench;
 mod determinism;
 mod devices;
 mod extremes;
+mod flat;
+mod overlap;
 mod parity;
+mod parts;
 mod slips;
 mod twins;

@@ -130,6 +130,12 @@ fn real_captures() {
             DVec3::NEG_Z,
             DVec3::NEG_Y,
         ),
+        (
+            "scenes/guitar/guitar.compressed.ply",
+            DVec3::new(0.0, -0.8, 2.2),
+            DVec3::NEG_Z,
+            DVec3::NEG_Y,
+        ),
     ] {
         let Some(path) = real(file) else { return };
         let view = look([640, 480], 600.0, at, forward, down);

@@ -35,7 +35,10 @@ fn constants_are_the_same() {
         ("DIGITS", Literal::U32(layout::DIGITS)),
         ("MAX_GROUPS", Literal::U32(layout::MAX_GROUPS)),
         ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
-        ("BIG_SPLAT_TILES", Literal::U32(layout::BIG_SPLAT_TILES)),
+        ("MACRO_COLUMNS", Literal::U32(layout::MACRO_COLUMNS)),
+        ("MACRO_ROWS", Literal::U32(layout::MACRO_ROWS)),
+        ("BIG_SPLAT_MACROS", Literal::U32(layout::BIG_SPLAT_MACROS)),
+        ("EXPAND_BATCH", Literal::U32(layout::EXPAND_BATCH)),
     ]);
     let module = shared();
     let wgsl: BTreeMap<&str, Literal> = (module.constants.iter())
@@ -69,10 +72,10 @@ macro_rules! layouts {
 #[test]
 fn layouts_are_the_same() {
     let mut rust: Vec<Layout> = layouts! {
-        FrameView { size_px, columns, first_tile }
+        FrameView { size_px, columns, first_tile, macro_columns, first_macro, rows }
         Frame {
-            splat_capacity, instance_capacity, tiles, views, near_m, far_m, blur_px2, antialiased,
-            alpha_cap, log2_alpha_cut, stop, pad, view,
+            splat_capacity, touch_capacity, instance_capacity, views, tiles, macros, near_m, far_m,
+            blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
         }
         ChunkView {
             camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
@@ -81,7 +84,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, instances, batches, pad }
+        Counters { splats, touches, instances, batches, most_batches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

@@ -1,6 +1,21 @@
 //! Arbitrary and nearly right bytes never panic and never ask for absurd memory.
+//!
+//! [`every_parser_survives_what_chance_makes`] is the fuzz target of every parser: it damages the
+//! corpus, one small scene per format, beneath checksums. By default for a second; for a night:
+//!
+//! ```text
+//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release --test ingest chance
+//! ```
+//!
+//! A failure prints seed, round, format and the damaged file's bytes in hex.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
+
+use crate::corpus::corpus;
+use crate::scene_files::Random;
 
 use crate::read;
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
@@ -57,5 +72,88 @@ proptest! {
                 prop_assert_eq!(read.sh.len(), read.len() * 3 * wildcity::scene::sh::coefficients(read.sh_degree));
             }
         }
+    }
+}
+
+/// A number of the environment.
+fn setting(name: &str, default: u64) -> u64 {
+    std::env::var(name).map_or(default, |text| text.parse().unwrap())
+}
+
+/// Bytes that formats are afraid of.
+const WORDS: [&[u8]; 10] = [
+    &[0],
+    &[0xff],
+    &[0x7f],
+    &[0xff; 4],
+    &[0xff; 8],
+    &[0, 0, 0, 0x80],
+    &[0, 0, 0xc0, 0x7f],
+    &[0, 0, 0, 0, 0, 0, 0, 0x10],
+    b"18446744073709551615",
+    b"-1",
+];
+
+/// Changes up to four places.
+fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
+    let mut below = |n: usize| (random.unit() * n as f64) as usize;
+    for _ in 0..=below(4) {
+        let at = below(bytes.len() + 1);
+        let end = (at + below(16)).min(bytes.len());
+        match below(6) {
+            0 if at < bytes.len() => bytes[at] ^= 1 << below(8),
+            1 => {
+                let word = WORDS[below(WORDS.len())];
+                let end = (at + word.len()).min(bytes.len());
+                bytes.splice(at..end, word.iter().copied());
+            }
+            2 => drop(bytes.drain(at..end)),
+            3 => {
+                let again = bytes[at..end].to_vec();
+                bytes.splice(at..at, again);
+            }
+            4 if !other.is_empty() => {
+                let from = below(other.len());
+                let piece = &other[from..(from + below(32)).min(other.len())];
+                bytes.splice(at..end, piece.iter().copied());
+            }
+            _ => bytes.truncate(at),
+        }
+    }
+}
+
+#[test]
+fn every_parser_survives_what_chance_makes() {
+    let seed = setting("WILDCITY_FUZZ_SEED", 1);
+    let end = Instant::now() + Duration::from_secs(setting("WILDCITY_FUZZ_SECONDS", 1));
+    let mut random = Random(seed);
+    let cases = corpus();
+    let folders: Vec<_> = cases.iter().map(|_| tempfile::tempdir().unwrap()).collect();
+    cases.iter().zip(&folders).for_each(|(case, folder)| case.write(folder.path()));
+    let mut rounds = 0;
+    while Instant::now() < end || rounds < 50 {
+        for (case, folder) in cases.iter().zip(&folders) {
+            let part = (random.unit() * case.files.len() as f64) as usize;
+            let other = &case.files[(random.unit() * case.files.len() as f64) as usize].1;
+            let mut bytes = case.files[part].1.clone();
+            damage(&mut bytes, other, &mut random);
+            let read = || case.read_with(folder.path(), part, &bytes);
+            let survived = catch_unwind(AssertUnwindSafe(|| match read() {
+                Ok(g) => {
+                    let colours = 3 * wildcity::scene::sh::coefficients(g.sh_degree);
+                    assert_eq!(g.sh.len(), g.len() * colours);
+                    assert!(g.len() < 10_000, "{} Gaussians", g.len());
+                }
+                Err(error) => assert!(!error.to_string().is_empty()),
+            }));
+            if survived.is_err() {
+                let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+                let name = &case.files[part].0;
+                panic!("seed {seed}, round {rounds}, {}, {name}: {hex}", case.name);
+            }
+            // As it was, for the other parts' turns.
+            let _ = case.read_with(folder.path(), part, &case.files[part].1);
+        }
+        rounds += 1;
     }
 }

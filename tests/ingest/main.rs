@@ -2,12 +2,20 @@
 
 #[path = "../support/data.rs"]
 mod data;
+#[path = "../support/formats.rs"]
+mod format_files;
+#[path = "../support/images.rs"]
+mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
 mod axes;
+mod conformance;
+mod corpus;
 mod damage;
+mod formats;
 mod fuzz;
+mod hostile;
 mod real_scenes;
 mod round_trip;
 

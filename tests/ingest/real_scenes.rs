@@ -111,3 +111,105 @@ fn the_biker_and_the_guitar_are_read_compressed() {
     let Some(guitar) = read("scenes/guitar/guitar.compressed.ply") else { return };
     assert_eq!((guitar.len(), guitar.sh_degree), (90_854, 0));
 }
+
+/// Means within a box.
+fn is_within(g: &Gaussians, low: [f64; 3], high: [f64; 3]) -> bool {
+    g.means_m.iter().all(|m| (0..3).all(|i| (low[i]..=high[i]).contains(&m[i])))
+}
+
+#[test]
+fn a_sog_of_the_first_version_is_read() {
+    let Some(logo) = read("scenes/playcanvas-logo/meta.json") else { return };
+    assert_eq!((logo.len(), logo.sh_degree), (307_128, 0));
+    // What meta.json says, of logarithms: exp(0.93) - 1 = 1.535, and so on.
+    let (low, high) = ([-1.535, -2.782, -0.577], [1.535, 0.296, 0.577]);
+    assert!(is_within(&logo, low, high));
+    // The extremes are there, so nothing is squeezed.
+    let most = |axis: usize| logo.means_m.iter().map(|m| m[axis]).fold(f64::MIN, f64::max);
+    for (axis, wanted) in [(0, 1.5348), (1, 0.2957), (2, 0.5768)] {
+        assert!((most(axis) - wanted).abs() < 1e-4, "{}", most(axis));
+    }
+}
+
+#[test]
+fn a_streamed_sog_is_read_in_full_detail() {
+    let Some(playbot) = read("scenes/playbot/lod-meta.json") else { return };
+    assert_eq!((playbot.len(), playbot.sh_degree), (500_000, 2));
+    let (low, high) = ([-1.033496, -1.083135, -1.039343], [1.03509, 0.05205518, 1.042389]);
+    assert!(is_within(&playbot, low, high));
+    // The finest level alone, in one file, is the same.
+    let finest = read("scenes/playbot/0_0/meta.json").unwrap();
+    assert!(playbot == finest, "the leaves of level 0 are its whole file");
+}
+
+#[test]
+fn small_files_of_other_tools_are_read() {
+    // Four corners of a square of 1, at opacity 0.9 (230/255), with a deviation of 0.1.
+    let four = "conformance/splat-transform-fixtures/splat/minimal";
+    for (file, z) in [
+        (".splat", -1.0),
+        (".ksplat", -1.0),
+        ("-raw.spz", -1.0),
+        ("-v2.spz", -1.0),
+        ("-v3.spz", 1.0),
+        ("-v4.spz", 1.0),
+    ] {
+        let Some(g) = read(&format!("{four}{file}")) else { return };
+        assert_eq!(g.sh_degree, 0, "{file}");
+        let corners = [[-1.0, 0.0, z], [0.0, 0.0, z], [-1.0, 0.0, 0.0], [0.0; 3]];
+        assert_eq!(g.means_m, corners, "{file}");
+        let ln = g.ln_scales.as_flattened().iter();
+        assert!(ln.copied().all(|ln| (ln - 0.1_f32.ln()).abs() < 1.0 / 32.0), "{file}");
+        assert!(g.logit_opacities.iter().all(|logit| (logit - 2.2192).abs() < 1e-4), "{file}");
+    }
+    let folder = "conformance/metalsplatter/test-splat.3-points-from-train";
+    let ply = read(&format!("{folder}.ply")).unwrap();
+    for (file, flip) in [("splat", 1.0), ("spz", -1.0)] {
+        let g = read(&format!("{folder}.{file}")).unwrap();
+        assert_eq!(g.len(), 3);
+        for (mean, wanted) in g.means_m.iter().zip(&ply.means_m) {
+            let wanted = [wanted[0], flip * wanted[1], flip * wanted[2]];
+            assert!((0..3).all(|i| (mean[i] - wanted[i]).abs() < 1.3e-4), "{file}");
+        }
+        for (i, quat) in g.quats_wxyz.iter().enumerate() {
+            let wanted = ply.quats_wxyz[i];
+            let length = wanted.iter().map(|q| q * q).sum::<f32>().sqrt();
+            let dot = quat[0] * wanted[0] + quat[1] * wanted[1];
+            let dot = dot + flip as f32 * (quat[2] * wanted[2] + quat[3] * wanted[3]);
+            assert!((dot / length).abs() > 0.99, "{file} {quat:?} {wanted:?}");
+        }
+    }
+}
+
+#[test]
+fn every_component_type_of_gltf_is_read() {
+    let folder = "conformance/khr_fixtures_bevy";
+    for file in ["khr_conformance_matrix.glb", "khr_conformance_matrix.gltf"] {
+        let Some(g) = read(&format!("{folder}/{file}")) else { return };
+        assert_eq!((g.len(), g.sh_degree), (15, 3));
+        assert!(g.means_m.iter().all(|m| *m == [1.0, 2.0, 3.0]));
+        // x alone, as f32 and as normalised i8 and i16.
+        assert!(g.quats_wxyz.iter().all(|q| *q == [0.0, 1.0, 0.0, 0.0]));
+        // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised i16.
+        let scales = [[0.2, -0.1, 0.7], [1., -2., 3.], [1., 0., -1.], [2., -3., 4.], [1., 0., -1.]];
+        assert_eq!(g.ln_scales[3..8], scales);
+        let opacities = g.logit_opacities.iter().map(|logit| 1.0 / (1.0 + (-logit).exp()));
+        let opacities: Vec<f32> = opacities.collect();
+        for (index, wanted) in [(8, 0.75), (9, 64.0 / 255.0), (10, 16384.0 / 65535.0)] {
+            assert!((opacities[index] - wanted).abs() < 1e-6, "{opacities:?}");
+        }
+        // 0.1, 0.2, 0.3, then 1.1, 1.2, 1.3 and so on; zeros above the primitive's degree.
+        for (index, coefficients) in [(11, 1), (12, 4), (13, 9), (14, 16)] {
+            for (k, &value) in g.sh_of(index).iter().enumerate() {
+                let wanted = (k / 3) as f32 + 0.1 * (k % 3 + 1) as f32;
+                let wanted = if k / 3 < coefficients { wanted } else { 0.0 };
+                assert!((value - wanted).abs() < 1e-5, "{index} {k}: {value}");
+            }
+        }
+    }
+    // Without SH it has COLOR_0 alone.
+    let fallback = read(&format!("{folder}/khr_extensible_fallback.gltf")).unwrap();
+    let colour: Vec<f32> = fallback.sh.iter().map(|c| 0.282_094_8 * c + 0.5).collect();
+    let wanted = [0.282_094_8, 0.564_189_6, 0.846_284_4];
+    assert!(colour.iter().zip(wanted).all(|(c, w)| (c - w).abs() < 1e-5), "{colour:?}");
+}

@@ -231,7 +231,8 @@ fn what_the_options_made_of_a_sound_file_is_said_to_be_their_doing() {
 fn help_teaches_with_examples() {
     for (command, wanted) in [
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
-        ("import", "Memory: twice the file"),
+        ("import", "Memory: twice what the scene takes uncompressed"),
+        ("import", "streamed SOG        lod-meta.json, or one .zip"),
         ("inspect", "wildcity inspect street@2"),
         ("verify", "wildcity verify street"),
     ] {

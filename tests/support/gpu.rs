@@ -1,18 +1,93 @@
 //! A GPU for tests. Lavapipe counts as one, so every machine can have one and no test skips.
 
+use std::ops::Deref;
+use std::sync::{Mutex, Once, PoisonError};
+
 use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
+use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError};
+use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The best device of this machine.
-pub(crate) fn gpu() -> Gpu {
+pub(crate) fn gpu() -> Watched {
     gpu_with(Shaders::default())
 }
 
 /// The same with other shaders.
-pub(crate) fn gpu_with(shaders: Shaders) -> Gpu {
-    Gpu::with_shaders(&AdapterChoice::Best, 0, shaders).unwrap_or_else(|error| {
+pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
+    watched(|| Gpu::with_shaders(&AdapterChoice::Best, 0, shaders))
+}
+
+/// The same with smaller bindings.
+pub(crate) fn gpu_with_binding_limit(binding_bytes: u64) -> Watched {
+    watched(|| Gpu::with_binding_limit(&AdapterChoice::Best, 0, binding_bytes))
+}
+
+fn watched(open: impl FnOnce() -> Result<Gpu, GpuError>) -> Watched {
+    static LISTEN: Once = Once::new();
+    LISTEN.call_once(|| {
+        log::set_logger(&Listener).unwrap();
+        log::set_max_level(log::LevelFilter::Warn);
+    });
+    Watched(open().unwrap_or_else(|error| {
         panic!(
             "{error}\n(the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers)"
         )
-    })
+    }))
+}
+
+/// A backend whose test fails if wgpu, its validation or Vulkan's has had anything to say: with
+/// `WGPU_VALIDATION=1` Vulkan's validation layer speaks too, where it is installed.
+#[derive(Debug)]
+pub(crate) struct Watched(Gpu);
+
+impl Deref for Watched {
+    type Target = Gpu;
+
+    fn deref(&self) -> &Gpu {
+        &self.0
+    }
+}
+
+impl Backend for Watched {
+    fn name(&self) -> &'static str {
+        self.0.name()
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        self.0.render(frame, targets, finished)
+    }
+}
+
+impl Drop for Watched {
+    fn drop(&mut self) {
+        let said = SAID.lock().unwrap_or_else(PoisonError::into_inner);
+        if !std::thread::panicking() {
+            assert!(said.is_empty(), "in this test or one beside it:\n{}", said.join("\n"));
+        }
+    }
+}
+
+/// Warnings and errors of this process' tests.
+static SAID: Mutex<Vec<String>> = Mutex::new(Vec::new());
+
+struct Listener;
+
+impl log::Log for Listener {
+    fn enabled(&self, metadata: &log::Metadata<'_>) -> bool {
+        metadata.level() <= log::Level::Warn
+    }
+
+    fn log(&self, record: &log::Record<'_>) {
+        if self.enabled(record.metadata()) {
+            let line = format!("{} {}: {}", record.level(), record.target(), record.args());
+            SAID.lock().unwrap_or_else(PoisonError::into_inner).push(line);
+        }
+    }
+
+    fn flush(&self) {}
 }

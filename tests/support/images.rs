@@ -1,5 +1,7 @@
 //! Rendering a view in a test, and comparing images.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use glam::{DQuat, DVec3};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
@@ -144,4 +146,31 @@ pub(crate) fn agree(image: &Image, truth: &Image) -> Result<f64, String> {
         return Err(format!("depth off by {:.1e} on average", off / covered));
     }
     Ok(db)
+}
+
+/// A part of a view's image, as a view of its own.
+pub(crate) fn crop(whole: View, [left, top]: [u32; 2], [width_px, height_px]: [u32; 2]) -> View {
+    let p = whole.camera.pinhole;
+    let pinhole = Pinhole { cx: p.cx - f64::from(left), cy: p.cy - f64::from(top), ..p };
+    View { camera: Camera { width_px, height_px, pinhole }, ..whole }
+}
+
+/// Largest difference between a crop and the same part of the whole, inside a margin: the slope clamp
+/// of the projection follows the image's own edges (gsplat's rule), so a crop draws otherwise what
+/// is centred beyond its edges.
+pub(crate) fn crop_difference(
+    (part, crop): (&Image, View),
+    (image, whole): (&Image, View),
+    [left, top]: [u32; 2],
+    margin: u32,
+) -> f32 {
+    let Camera { width_px, height_px, .. } = crop.camera;
+    let row = |image: &Image, width: u32, x: u32, y: u32| {
+        let start = 4 * (y * width + x + margin) as usize;
+        image.rgba[start..start + 4 * (width_px - 2 * margin) as usize].to_vec()
+    };
+    (margin..height_px - margin).fold(0.0, |most, y| {
+        let of_whole = row(image, whole.camera.width_px, left, top + y);
+        most.max(max_difference(&row(part, width_px, 0, y), &of_whole))
+    })
 }

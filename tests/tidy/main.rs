@@ -22,9 +22,12 @@ const PACKAGES: &[(&str, &[&str])] = &[
         "rayon",
         &["render", "scene/chunk.rs", "ingest/validate.rs", "store/push.rs", "residency/cache.rs"],
     ),
-    ("half", &["scene/record"]),
     ("tokio", &["server", "client", "session", "cli"]),
     ("schemars", &["protocol"]),
+    ("flate2", &["ingest"]),
+    ("zip", &["ingest/archive.rs"]),
+    ("image_webp", &["ingest/sog"]),
+    ("data_encoding", &["ingest/gltf"]),
 ];
 
 /// Who may touch files: those of a twin only `store/objects.rs`; the others scenes and settings of

@@ -11,13 +11,12 @@ use crate::scene::{Gaussians, sh};
 
 use super::header::{Element, Header, Property, error};
 use super::{Body, degree, file_name};
+use crate::ingest::activated;
 use crate::ingest::validate::{self, Field};
 use crate::ingest::{IngestError, Progress, check_count};
 
 /// Gaussians that share extremes.
 const CHUNK: usize = 256;
-/// Largest logit made of an 8-bit opacity: 255 means 1, whose logit is infinite; 20's is 1 in f32.
-const MAX_LOGIT: f64 = 20.0;
 
 /// Reads the body.
 pub(super) fn read(
@@ -54,10 +53,8 @@ pub(super) fn read(
         let scale = between(3, unpack_11_10_11(word(&scale)));
         gaussians.ln_scales.push(scale.map(|ln| ln as f32));
         let [r, g, b, opacity] = word(&color).to_be_bytes().map(|byte| f64::from(byte) / 255.0);
-        let logit = (opacity / (1.0 - opacity)).ln().clamp(-MAX_LOGIT, MAX_LOGIT);
-        gaussians.logit_opacities.push(logit as f32);
-        let dc = between(6, [r, g, b]).map(|c| ((c - 0.5) / sh::C0) as f32);
-        gaussians.sh.extend(dc);
+        gaussians.logit_opacities.push(activated::logit(opacity));
+        gaussians.sh.extend(between(6, [r, g, b]).map(activated::dc));
         gaussians.sh.extend(std::iter::repeat_n(0.0, 3 * (coefficients - 1)));
     })?;
     if let Some(colour) = colour {
@@ -134,10 +131,7 @@ fn unpack_11_10_11(word: u32) -> [f64; 3] {
 /// The largest component is left out, so the others are within ±√½.
 fn unpack_rotation(word: u32) -> [f32; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word >> shift, 10) - 0.5) * 2f64.sqrt());
-    let largest = (1.0 - others.iter().map(|q| q * q).sum::<f64>()).max(0.0).sqrt();
-    let mut quat = others.to_vec();
-    quat.insert((word >> 30) as usize, largest);
-    std::array::from_fn(|i| quat[i] as f32)
+    activated::quat_of_smallest_three((word >> 30) as usize, others)
 }
 
 /// 8 bits over [-4, 4]: the ends exactly, the others at the middle of their step.

@@ -1,6 +1,10 @@
-//! Stage bin: the tiles of every splat, from the nearest, and then tile after tile.
+//! Stage bin: the splats of every tile, from the nearest.
 //!
-//! Twin of `render/cpu/bin.rs`; WGSL: `shaders/bin.wgsl`, `shaders/sort.wgsl`, `shaders/ranges.wgsl`.
+//! In two levels: each splat is listed with the macro tiles of 8 x 4 tiles that it touches, a bit per
+//! tile; the radix sort brings these touches, a quarter as many as instances, in order of macro tiles;
+//! and then each macro tile hands its splats to its tiles.
+//!
+//! Twin of `render/cpu/bin.rs`; WGSL: `bin`, `sort`, `ranges` and `expand` in `shaders`.
 
 use wgpu::{Buffer, BufferUsages, ComputePass};
 
@@ -12,22 +16,33 @@ use super::plan::{Plan, job};
 use super::project::Splats;
 use super::scan::Scan;
 use super::shaders::Shaders;
+use super::sort::Columns;
 use crate::render::constants::MAX_INSTANCES;
 
-/// The stage on the device, and the instances that it leaves.
+/// The stage on the device, and the lists that it leaves.
 #[derive(Debug)]
 pub(super) struct Bin {
-    count: Kernel,
-    emit: Kernel,
+    count_touches: Kernel,
+    emit_touches: Kernel,
     ranges_of: Kernel,
-    /// Per splat, where its instances go.
-    offsets: Growing,
-    /// Tile of each instance, before and after each pass of the sort.
-    pub(super) tiles: [Growing; 2],
-    /// Splat of each instance.
-    pub(super) places: [Growing; 2],
+    count_instances: Kernel,
+    list_instances: Kernel,
+    /// Per splat, where its touches go.
+    splat_offsets: Growing,
+    /// Of each touch, before and after each pass of the sort: the macro tile, ...
+    macros: [Growing; 2],
+    /// ... the splat, ...
+    places: [Growing; 2],
+    /// ... and a bit for each of the macro tile's tiles that it touches.
+    masks: [Growing; 2],
+    /// First and end of each macro tile's touches.
+    macro_ranges: Growing,
+    /// Per tile, where its instances go.
+    tile_offsets: Growing,
     /// First and end of each tile's instances.
     pub(super) ranges: Growing,
+    /// The splat of each instance, tile after tile.
+    pub(super) instances: Growing,
 }
 
 impl Bin {
@@ -36,41 +51,50 @@ impl Bin {
         let storage = BufferUsages::STORAGE;
         let growing = |label| Growing::new(device, label, storage);
         Self {
-            count: kernel("bin", "count"),
-            emit: kernel("bin", "emit"),
+            count_touches: kernel("bin", "count"),
+            emit_touches: kernel("bin", "emit"),
             ranges_of: kernel("ranges", "main"),
-            offsets: growing("splat offsets"),
-            tiles: [growing("instance tiles"), growing("instance tiles")],
-            places: [growing("instance places"), growing("instance places")],
-            ranges: Growing::new(device, "ranges", storage | BufferUsages::COPY_DST),
+            count_instances: kernel("expand", "count"),
+            list_instances: kernel("expand", "list"),
+            splat_offsets: growing("splat offsets"),
+            macros: [growing("touch macros"), growing("touch macros")],
+            places: [growing("touch places"), growing("touch places")],
+            masks: [growing("touch masks"), growing("touch masks")],
+            macro_ranges: Growing::new(device, "macro ranges", storage | BufferUsages::COPY_DST),
+            tile_offsets: growing("tile offsets"),
+            ranges: growing("ranges"),
+            instances: growing("instances"),
         }
     }
 
-    /// Most instances that a device can hold.
+    /// Most instances, and likewise most touches, that a device can hold.
     pub(super) fn limit(device: &Device) -> u64 {
         MAX_INSTANCES.min(device.binding_bytes() / 4)
     }
 
-    /// Makes room for the offsets of splats, for instances and for ranges of tiles, and tells how
-    /// many instances fit then.
+    /// Makes room for the offsets and ranges of a frame, for touches and for instances, and tells how
+    /// many of the latter two fit then.
     pub(super) fn reserve(
         &mut self,
         device: &Device,
         splats: u64,
-        instances: u64,
-        tiles: u32,
-    ) -> u32 {
-        self.offsets.reserve(device, 4 * splats);
+        (macros, tiles): (u32, u32),
+        (touches, instances): (u64, u64),
+    ) -> (u32, u32) {
+        self.splat_offsets.reserve(device, 4 * splats);
+        self.macro_ranges.reserve(device, 8 * u64::from(macros));
+        self.tile_offsets.reserve(device, 4 * u64::from(tiles));
         self.ranges.reserve(device, 8 * u64::from(tiles));
-        for words in self.tiles.iter_mut().chain(&mut self.places) {
-            words.reserve(device, 4 * instances);
+        self.instances.reserve(device, 4 * instances);
+        for words in [&mut self.macros, &mut self.places, &mut self.masks].into_iter().flatten() {
+            words.reserve(device, 4 * touches);
         }
-        // A total of 2^32 - 1 stands for more, which no buffer holds.
-        (self.tiles[0].buffer().size() / 4).min(u64::from(u32::MAX) - 1) as u32
+        let held = |words: &Growing| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
+        (held(&self.macros[0]), held(&self.instances))
     }
 
-    /// Lists the tiles of all splats; `sorted` tells which of their buffers are in order.
-    pub(super) fn run(
+    /// Lists the touches of all splats; `sorted` tells which of their buffers are in order.
+    pub(super) fn touch(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
@@ -84,40 +108,67 @@ impl Bin {
             (3, splats.keys[sorted].bind()),
             (4, splats.places[sorted].bind()),
             (5, splats.shapes.bind()),
-            (6, self.offsets.bind()),
+            (6, self.splat_offsets.bind()),
         ];
         let groups = Groups::Job(jobs, job::SPLATS);
-        self.count.run(device, pass, groups, &common);
-        scan.run(device, pass, (jobs, job::SPLATS_SCAN), self.offsets.buffer());
-        plan.instances(device, pass, scan.block_sums());
+        self.count_touches.run(device, pass, groups, &common);
+        scan.run(device, pass, (jobs, job::SPLATS_SCAN), self.splat_offsets.buffer());
+        plan.touches(device, pass, scan.block_sums());
         let emitted = [
-            (2, slot(jobs, job::INSTANCES, size_of::<Job>())),
-            (7, self.tiles[0].bind()),
+            (2, slot(jobs, job::TOUCHES, size_of::<Job>())),
+            (7, self.macros[0].bind()),
             (8, self.places[0].bind()),
+            (9, self.masks[0].bind()),
         ];
         let all: Vec<_> = common.into_iter().chain(emitted).collect();
-        self.emit.run(device, pass, groups, &all);
+        self.emit_touches.run(device, pass, groups, &all);
     }
 
-    /// Finds each tile's part of the sorted instances.
-    pub(super) fn ranges(
+    /// What is to be sorted between [`Bin::touch`] and [`Bin::expand`].
+    pub(super) fn touches(&self) -> Columns<'_> {
+        Columns { keys: &self.macros, values: &self.places, masks: Some(&self.masks) }
+    }
+
+    /// Lists the splats of all tiles; `sorted` tells which touches are in order.
+    pub(super) fn expand(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
-        plan: &Plan,
-        sorted: usize,
+        (plan, scan): (&Plan, &Scan),
+        (macros, sorted): (u32, usize),
     ) {
-        let all = [
-            (0, plan.frame().as_entire_binding()),
-            (1, slot(plan.jobs(), job::INSTANCES, size_of::<Job>())),
-            (2, self.tiles[sorted].bind()),
-            (3, self.ranges.bind()),
+        let jobs = plan.jobs();
+        let frame = (0, plan.frame().as_entire_binding());
+        let found = [
+            frame.clone(),
+            (1, slot(jobs, job::TOUCHES, size_of::<Job>())),
+            (2, self.macros[sorted].bind()),
+            (3, self.macro_ranges.bind()),
         ];
-        self.ranges_of.run(device, pass, Groups::Job(plan.jobs(), job::INSTANCES), &all);
+        self.ranges_of.run(device, pass, Groups::Job(jobs, job::TOUCHES), &found);
+
+        let groups = Groups::Count(macros);
+        let counted = [
+            frame,
+            (1, self.macro_ranges.bind()),
+            (2, self.masks[sorted].bind()),
+            (4, self.tile_offsets.bind()),
+        ];
+        self.count_instances.run(device, pass, groups, &counted);
+        scan.run(device, pass, (jobs, job::TILES), self.tile_offsets.buffer());
+        plan.instances(device, pass, scan.block_sums());
+        let listed = [
+            (3, self.places[sorted].bind()),
+            (5, slot(jobs, job::INSTANCES, size_of::<Job>())),
+            (6, self.ranges.bind()),
+            (7, self.instances.bind()),
+        ];
+        let all: Vec<_> = counted.into_iter().chain(listed).collect();
+        self.list_instances.run(device, pass, groups, &all);
     }
 
-    /// The buffer that must be zero before [`Bin::ranges`].
-    pub(super) fn ranges_buffer(&self) -> &Buffer {
-        self.ranges.buffer()
+    /// The buffer that must be zero before [`Bin::expand`].
+    pub(super) fn macro_ranges(&self) -> &Buffer {
+        self.macro_ranges.buffer()
     }
 }

@@ -1,24 +1,29 @@
 //! All stages on one device, in order, for all views of a step: one submission per frame.
 
-use std::sync::Arc;
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use rayon::ThreadPool;
 use wgpu::{BufferUsages, BufferView, MapMode, PollType, QuerySet, SubmissionIndex};
 
 use super::bin::Bin;
 use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Recorder, TICKS_BYTES, clock};
-use super::layout::{Counters, Frame as GpuFrame, FrameView};
+use super::layout::{Counters, Frame as GpuFrame, FrameView, RASTER_BATCH};
 use super::mirror::Mirror;
+use super::parts::{Cuts, Needs, Rows, Subject};
 use super::plan::{Plan, job};
 use super::project::{Project, Splats, Work};
-use super::rasterize::Rasterize;
+use super::rasterize::{Rasterize, pages};
 use super::resolve::Planes;
 use super::scan::Scan;
 use super::shaders::Shaders;
-use super::sort::Sort;
+use super::sort::{Columns, Sort};
+use super::traffic::FrameWork;
+use crate::config;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
 use crate::render::{Frame, FrameStats, RenderError};
@@ -26,8 +31,9 @@ use crate::render::{Frame, FrameStats, RenderError};
 /// How long a frame may take on the device before it counts as lost.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Room for splats and instances to begin with; what a frame needs beyond makes it grow.
+/// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
 const FIRST_SPLATS: u64 = 1 << 15;
+const FIRST_TOUCHES: u64 = 1 << 16;
 const FIRST_INSTANCES: u64 = 1 << 17;
 
 /// The renderer on one device.
@@ -45,18 +51,17 @@ pub(super) struct Chain {
     clock: Option<QuerySet>,
     /// Resolved ticks, on their way to the host.
     ticks: Growing,
-    /// Read-back buffers that nobody reads.
-    ring: Vec<ReadBack>,
-    /// The most that any frame needed.
+    ring: Ring,
+    /// The most that any part of a frame needed.
     high_water: Needs,
-    /// Frames that were drawn again in larger buffers.
+    /// How frames are cut that do not fit.
+    cuts: Cuts,
+    /// Attempts that drew nothing, since buffers were too small.
     pub(super) retries: u64,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Needs {
-    splats: u64,
-    instances: u64,
+    /// Parts that frames were drawn in.
+    pub(super) parts: u64,
+    /// What the last frame counted.
+    pub(super) last: FrameWork,
 }
 
 /// Where a frame reaches the host. A step's images are copied out of one while the next step fills
@@ -68,10 +73,15 @@ pub(super) struct ReadBack {
     pages: Vec<Growing>,
 }
 
+/// Read-back buffers of one device that nobody reads.
+#[derive(Clone, Debug, Default)]
+struct Ring(Arc<Mutex<Vec<ReadBack>>>);
+
 /// A frame that is done, in mapped memory.
 #[derive(Debug)]
 pub(super) struct Drawn {
     read_back: ReadBack,
+    ring: Ring,
     /// Pixels, page by page.
     pub(super) pages: Vec<BufferView>,
     pub(super) tiles_per_page: u32,
@@ -100,104 +110,173 @@ impl Chain {
                 "ticks",
                 BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
             ),
-            ring: Vec::new(),
-            high_water: Needs { splats: FIRST_SPLATS, instances: FIRST_INSTANCES },
+            ring: Ring::default(),
+            high_water: Needs {
+                splats: FIRST_SPLATS.min(Splats::limit(&device)),
+                touches: FIRST_TOUCHES.min(Bin::limit(&device)),
+                instances: FIRST_INSTANCES.min(Bin::limit(&device)),
+            },
+            cuts: Cuts::default(),
             retries: 0,
+            parts: 0,
+            last: FrameWork::default(),
             device,
         };
         chain.device.check()?;
         Ok(chain)
     }
 
-    /// Draws a frame, again in larger buffers where they were too small: the device never drops
-    /// what does not fit, it draws nothing then.
+    /// Draws a frame: at once if it fits, part by part if it does not.
     ///
     /// # Errors
-    /// The device fails, or the frame needs more than it can hold.
-    pub(super) fn draw(&mut self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
+    /// The device fails, or one row of tiles needs more than it can hold.
+    pub(super) fn draw(
+        &mut self,
+        frame: &Frame<'_>,
+        planes: Planes,
+        cull: &ThreadPool,
+    ) -> Result<Drawn, RenderError> {
         let start = Instant::now();
         self.mirror.hold(&self.device, frame.scene);
-        let work = Work::new(frame, &self.mirror);
-        self.project.upload(&self.device, &work);
-        let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
+        let mut stats = FrameStats::default();
+        add(&mut stats, "prepare", start.elapsed());
         let mut gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
-        let mut read_back = self.ring.pop().unwrap_or_else(|| ReadBack::new(&self.device));
+        let mut read_back = self.ring.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
+
+        self.last = FrameWork::new(frame, planes, &gpu_frame);
+        let (subject, rows) = (Subject::of(frame), Rows::of(frame));
+        let mut rest = self.cuts.recall(&subject, &rows);
+        // From the end, so that pieces can take the place of what they are pieces of.
+        rest.reverse();
+        let mut drawn = Vec::with_capacity(rest.len());
+        while let Some(part) = rest.pop() {
+            let views = rows.views(&part);
+            let columns = |view: usize| u64::from(gpu_frame.view[view].columns);
+            let tiles =
+                views.clone().map(|view| columns(view) * rows.of_view(view, &part).len() as u64);
+            let pieces = tiles.max().unwrap_or(0).div_ceil(self.device.view_tiles());
+            if pieces > 1
+                && let Some(cut) = rows.cut(&part, pieces)
+            {
+                rest.extend(cut.into_iter().rev());
+                continue;
+            }
+            let start = Instant::now();
+            let work = cull.install(|| Work::new(frame, views, &self.mirror));
+            self.project.upload(&self.device, &work);
+            add(&mut stats, "prepare", start.elapsed());
+            let tiles = gpu_frame.restrict(&rows, &part);
+            let output = (planes, &tiles, tiles_per_page);
+            let needs = self.draw_part(&work, &mut gpu_frame, output, &read_back, &mut stats)?;
+            let pieces = needs.pieces(self.limit());
+            if pieces <= 1 {
+                drawn.push((part, needs));
+            } else {
+                let cut = rows.cut(&part, pieces).ok_or_else(|| self.too_many(needs))?;
+                rest.extend(cut.into_iter().rev());
+            }
+            if !rest.is_empty() {
+                read_back.unmap();
+            }
+        }
+        self.parts += drawn.len() as u64;
+        self.cuts.remember(subject, drawn, self.limit());
+        let pages = read_back.pages()?;
+        let views = gpu_frame.view[..frame.views.len()].to_vec();
+        let ring = self.ring.clone();
+        Ok(Drawn { read_back, ring, pages, tiles_per_page, views, stats })
+    }
+
+    /// Draws one part, again in larger buffers where they were too small: the device never drops
+    /// what does not fit, it draws nothing then. Returns what the part needs: where that is above
+    /// the limit, nothing was drawn.
+    fn draw_part(
+        &mut self,
+        work: &Work,
+        frame: &mut GpuFrame,
+        output: Output<'_>,
+        read_back: &ReadBack,
+        stats: &mut FrameStats,
+    ) -> Result<Needs, RenderError> {
         loop {
-            self.reserve(&mut gpu_frame, work.items());
-            let stages = self.submit(&work, &gpu_frame, (planes, tiles_per_page), &read_back);
-            let (stages, submission) = stages;
+            let start = Instant::now();
+            self.reserve(frame, work.items());
+            let (stages, submission) = self.submit(work, frame, output, read_back);
+            add(stats, "record", start.elapsed());
             read_back.map(&self.device, submission)?;
             self.device.check()?;
             let (counters, ticks) = read_back.head()?;
-            if self.is_enough(&counters, &gpu_frame)? {
-                let pages = read_back.pages()?;
-                let stats = self.stats(&counters, prepare_ms, &stages, &ticks, start.elapsed());
-                let views = gpu_frame.view[..frame.views.len()].to_vec();
-                return Ok(Drawn { read_back, pages, tiles_per_page, views, stats });
+            self.time(stats, &stages, &ticks, start.elapsed());
+            let needs = Needs {
+                splats: counters.splats.into(),
+                touches: counters.touches.into(),
+                instances: counters.instances.into(),
+            };
+            let fits = counters.splats <= frame.splat_capacity
+                && counters.touches <= frame.touch_capacity
+                && counters.instances <= frame.instance_capacity;
+            if fits {
+                let limit = self.device.tile_splats();
+                if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
+                    let what = "visible splats in one tile (of a device in software)";
+                    return Err(RenderError::TooMany { what, limit });
+                }
+                count(stats, &counters);
+                self.last.add(work.items(), &counters);
+                return Ok(needs);
             }
-            read_back.unmap();
             self.retries += 1;
-            tracing::debug!(
-                splats = counters.splats,
-                instances = counters.instances,
-                "drawn again"
-            );
+            tracing::debug!(?needs, "not enough room on the device");
+            if needs.pieces(self.limit()) > 1 {
+                return Ok(needs);
+            }
+            self.high_water = self.high_water.max(needs);
+            read_back.unmap();
         }
-    }
-
-    /// Takes a frame's memory back for another one.
-    pub(super) fn recycle(&mut self, drawn: Drawn) {
-        let Drawn { read_back, pages, .. } = drawn;
-        // A buffer stays mapped for as long as a view of it lives.
-        drop(pages);
-        read_back.unmap();
-        self.ring.push(read_back);
     }
 
     fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
-        let Needs { splats, instances } = self.high_water;
+        let Needs { splats, touches, instances } = self.high_water;
         let (device, scan) = (&self.device, &mut self.scan);
         frame.splat_capacity = self.splats.reserve(device, splats);
-        let (splats, tiles) = (u64::from(frame.splat_capacity), frame.tiles);
-        frame.instance_capacity = self.bin.reserve(device, splats, instances, tiles);
-        let instances = u64::from(frame.instance_capacity);
-        scan.reserve(device, u64::from(items).max(splats));
-        self.sort.reserve(device, scan, splats.max(instances));
+        let (splats, tiles) = (u64::from(frame.splat_capacity), (frame.macros, frame.tiles));
+        (frame.touch_capacity, frame.instance_capacity) =
+            self.bin.reserve(device, splats, tiles, (touches, instances));
+        scan.reserve(device, splats.max(items.max(frame.tiles).into()));
+        self.sort.reserve(device, scan, splats.max(frame.touch_capacity.into()));
         self.ticks.reserve(device, TICKS_BYTES);
     }
 
-    /// Whether everything fitted; if not, the high water rises to what it takes.
-    fn is_enough(&mut self, counters: &Counters, frame: &GpuFrame) -> Result<bool, RenderError> {
-        let splats = Splats::limit(&self.device);
-        let instances = Bin::limit(&self.device);
-        let checks = [
-            ("visible splats", counters.splats, splats),
-            ("(Gaussian, tile) pairs", counters.instances, instances),
-        ];
-        for (what, needed, limit) in checks {
-            if u64::from(needed) > limit {
-                return Err(RenderError::TooMany { what, limit });
-            }
-        }
-        self.high_water.splats = self.high_water.splats.max(counters.splats.into());
-        self.high_water.instances = self.high_water.instances.max(counters.instances.into());
-        Ok(counters.splats <= frame.splat_capacity && counters.instances <= frame.instance_capacity)
+    /// The most that the device holds at once.
+    fn limit(&self) -> Needs {
+        let listed = Bin::limit(&self.device);
+        Needs { splats: Splats::limit(&self.device), touches: listed, instances: listed }
+    }
+
+    fn too_many(&self, needs: Needs) -> RenderError {
+        let limit = self.limit();
+        let (what, limit) = if needs.splats > limit.splats {
+            ("visible splats in one row of tiles", limit.splats)
+        } else {
+            ("(Gaussian, tile) pairs in one row of tiles", limit.instances)
+        };
+        RenderError::TooMany { what, limit }
     }
 
     fn submit(
         &mut self,
         work: &Work,
         frame: &GpuFrame,
-        (planes, per_page): (Planes, u32),
+        output: Output<'_>,
         read_back: &ReadBack,
     ) -> (Vec<&'static str>, SubmissionIndex) {
         let Self { device, plan, scan, splats, .. } = self;
         let (device, plan, scan) = (&*device, &*plan, &*scan);
         plan.start(device, frame, work.items());
         let mut recorder = Recorder::new(device, self.clock.clone());
-        recorder.encoder.clear_buffer(self.bin.ranges_buffer(), 0, None);
+        recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
 
         let mut pass = recorder.stage("project");
         self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
@@ -206,28 +285,27 @@ impl Chain {
         let mut pass = recorder.stage("sort");
         let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
         let depth_bits = DEPTH_BITS + bits(frame.views - 1);
-        let data = (&splats.keys, &splats.places);
+        let data = Columns { keys: &splats.keys, values: &splats.places, masks: None };
         let sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
         drop(pass);
 
         let mut pass = recorder.stage("bin");
-        self.bin.run(device, &mut pass, (plan, scan), (splats, sorted));
+        self.bin.touch(device, &mut pass, (plan, scan), (splats, sorted));
         drop(pass);
 
         let mut pass = recorder.stage("tile sort");
-        let jobs = (plan.jobs(), job::INSTANCES_SORT, job::INSTANCES_DIGITS);
-        let data = (&self.bin.tiles, &self.bin.places);
-        // The number after the last tile occurs too.
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, bits(frame.tiles));
+        let jobs = (plan.jobs(), job::TOUCHES_SORT, job::TOUCHES_DIGITS);
+        // The number after the last macro tile occurs too.
+        let (data, macro_bits) = (self.bin.touches(), bits(frame.macros));
+        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, macro_bits);
         drop(pass);
 
-        let mut pass = recorder.stage("ranges");
-        self.bin.ranges(device, &mut pass, plan, sorted);
+        let mut pass = recorder.stage("expand");
+        self.bin.expand(device, &mut pass, (plan, scan), (frame.macros, sorted));
         drop(pass);
 
         let mut pass = recorder.stage("rasterize");
-        let output = (planes, frame.tiles, per_page);
-        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin, sorted), output);
+        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin), output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
@@ -235,38 +313,71 @@ impl Chain {
         let head = read_back.head.buffer();
         encoder.copy_buffer_to_buffer(plan.counters(), 0, head, 0, size_of::<Counters>() as u64);
         encoder.copy_buffer_to_buffer(self.ticks.buffer(), 0, head, TICKS_OFFSET, TICKS_BYTES);
-        self.rasterize.copy(encoder, &read_back.pages, planes, (frame.tiles, per_page));
+        self.rasterize.copy(encoder, &read_back.pages, output);
         let submission = device.queue.submit([recorder.encoder.finish()]);
         (stages, submission)
     }
 
-    fn stats(
+    /// Adds what the device took, by its own clock if it has one.
+    fn time(
         &self,
-        counters: &Counters,
-        prepare_ms: f64,
+        stats: &mut FrameStats,
         stages: &[&'static str],
         ticks: &[u64],
         whole: Duration,
-    ) -> FrameStats {
-        let mut stages_ms = vec![("prepare", prepare_ms)];
-        match self.device.tick_ns() {
-            Some(tick_ns) => {
-                let spans = stages.iter().zip(ticks.chunks_exact(2));
-                stages_ms.extend(spans.map(|(name, tick)| {
-                    let ticks = tick[1].saturating_sub(tick[0]);
-                    (*name, ticks as f64 * f64::from(tick_ns) * 1e-6)
-                }));
-            }
-            None => stages_ms.push(("device", whole.as_secs_f64() * 1e3 - prepare_ms)),
+    ) {
+        let Some(tick_ns) = self.device.tick_ns() else {
+            add(stats, "device", whole);
+            return;
+        };
+        for (stage, tick) in stages.iter().zip(ticks.chunks_exact(2)) {
+            let ns = tick[1].saturating_sub(tick[0]) as f64 * f64::from(tick_ns);
+            add(stats, stage, Duration::from_nanos(ns as u64));
         }
-        FrameStats {
-            stages_ms,
-            visible_pairs: counters.splats.into(),
-            instances: counters.instances.into(),
-            evaluations: u64::from(counters.batches)
-                * u64::from(super::layout::RASTER_BATCH)
-                * u64::from(TILE_PX * TILE_PX),
+    }
+}
+
+/// The planes of the output, the tiles that are drawn, and how many of them a page holds.
+type Output<'a> = (Planes, &'a Range<u32>, u32);
+
+/// Adds to the time of a stage.
+fn add(stats: &mut FrameStats, stage: &'static str, time: Duration) {
+    let ms = time.as_secs_f64() * 1e3;
+    match stats.stages_ms.iter_mut().find(|(name, _)| *name == stage) {
+        Some((_, sum)) => *sum += ms,
+        None => stats.stages_ms.push((stage, ms)),
+    }
+}
+
+/// Adds the counts of a part. What reaches into two bands of a view counts twice.
+fn count(stats: &mut FrameStats, counters: &Counters) {
+    let evaluations_per_batch = u64::from(RASTER_BATCH * TILE_PX * TILE_PX);
+    stats.visible_pairs += u64::from(counters.splats);
+    stats.instances += u64::from(counters.instances);
+    stats.evaluations += u64::from(counters.batches) * evaluations_per_batch;
+}
+
+impl Drawn {
+    /// Gives the memory back for another frame, which may be drawn by now.
+    pub(super) fn recycle(self) {
+        let Self { read_back, ring, pages, .. } = self;
+        // A buffer stays mapped for as long as a view of it lives.
+        drop(pages);
+        read_back.unmap();
+        let mut unused = ring.lock();
+        if unused.len() < config::GPU_FRAMES {
+            unused.push(read_back);
         }
+    }
+}
+
+impl Ring {
+    fn take(&self) -> Option<ReadBack> {
+        self.lock().pop()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<ReadBack>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -284,10 +395,10 @@ impl ReadBack {
 
     fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32, per_page: u32) {
         self.head.reserve(device, TICKS_OFFSET + TICKS_BYTES);
-        let firsts = (0..tiles).step_by(per_page as usize);
-        self.pages.resize_with(firsts.len(), || Self::buffer(device, "pixels read back"));
-        for (page, first) in self.pages.iter_mut().zip(firsts) {
-            page.reserve(device, planes.tile_bytes() * u64::from(per_page.min(tiles - first)));
+        let count = tiles.div_ceil(per_page) as usize;
+        self.pages.resize_with(count, || Self::buffer(device, "pixels read back"));
+        for (page, tiles) in pages(&(0..tiles), per_page) {
+            self.pages[page].reserve(device, planes.tile_bytes() * tiles.len() as u64);
         }
     }
 

@@ -11,6 +11,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
 };
 
+use super::layout::{MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -120,7 +121,8 @@ fn adapters() -> Vec<Adapter> {
         backends: Backends::VULKAN,
         // Every group count is computed by `plan.wgsl` within the limits that the validation would
         // check, at the price of one more dispatch per indirect one.
-        flags: InstanceFlags::default() - InstanceFlags::VALIDATION_INDIRECT_CALL,
+        // WGPU_VALIDATION=1 in the environment asks for the Vulkan validation layer.
+        flags: InstanceFlags::default().with_env() - InstanceFlags::VALIDATION_INDIRECT_CALL,
         ..InstanceDescriptor::new_without_display_handle()
     });
     // Outside of browsers the answer is there at once.
@@ -179,16 +181,19 @@ pub(super) struct Device {
     pub(super) queue: Queue,
     pub(super) info: AdapterInfo,
     limits: Limits,
+    /// Most bytes of a binding, however many the adapter's own limits allow.
+    binding_limit: u64,
     /// The first thing that went wrong since the last look.
     fault: Arc<Mutex<Option<String>>>,
 }
 
 impl Device {
-    /// Opens a device with all that its adapter can do.
+    /// Opens a device with all that its adapter can do, but for bindings of at most `binding_limit`
+    /// bytes.
     ///
     /// # Errors
     /// There is none, or it does not open.
-    pub(super) fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
+    pub(super) fn open(choice: &AdapterChoice, binding_limit: u64) -> Result<Self, GpuError> {
         let adapter = choice.find()?;
         let (info, limits) = (adapter.get_info(), adapter.limits());
         let descriptor = DeviceDescriptor {
@@ -212,7 +217,7 @@ impl Device {
             note(&refused, error.to_string());
         }));
         device.set_device_lost_callback(move |_, message| note(&lost, message));
-        Ok(Self { device, queue, info, limits, fault })
+        Ok(Self { device, queue, info, limits, binding_limit, fault })
     }
 
     /// Tells of what went wrong since the last call.
@@ -234,7 +239,36 @@ impl Device {
 
     /// Most bytes that a shader sees at once: 128 MiB on lavapipe, 2 GiB on cards.
     pub(super) fn binding_bytes(&self) -> u64 {
-        self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size) / 256 * 256
+        let own = self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size);
+        own.min(self.binding_limit) / 256 * 256
+    }
+
+    /// Bytes of the device's memory that its buffers take, as the allocator counts them.
+    pub(super) fn allocated_bytes(&self) -> Option<u64> {
+        self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
+    }
+
+    /// Most splats of a tile that are blended. A batch of `rasterize` takes one iteration, one for
+    /// each of its splats, and two that load them.
+    pub(super) fn tile_splats(&self) -> u64 {
+        let batch = u64::from(RASTER_BATCH);
+        self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
+    }
+
+    /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
+    /// cover all of them: each takes 20 iterations, and 13 for every 256 macro tiles. Those at the
+    /// edges of an image may be of a few tiles: half of a macro tile is counted on.
+    pub(super) fn view_tiles(&self) -> u64 {
+        let splats = u64::from(WORKGROUP);
+        let macros = |most: u64| (most / splats - 20) / 13 * 256;
+        let tiles = u64::from(MACRO_COLUMNS * MACRO_ROWS / 2);
+        self.loop_iterations().map_or(u64::MAX, |most| macros(most) * tiles)
+    }
+
+    /// Mesa's software devices leave every loop of a shader, without a word, after so many iterations
+    /// in all of its loops together (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+    fn loop_iterations(&self) -> Option<u64> {
+        (self.info.device_type == DeviceType::Cpu).then_some(65_535)
     }
 
     /// Nanoseconds per tick of the clock, where the device has one.

@@ -1,8 +1,11 @@
 //! What lies in GPU buffers. WGSL copy: `shaders/shared/{constants,layout}.wgsl`, held equal by
 //! `tests/gpu/twins.rs`.
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 
+use super::parts::{Part, Rows};
 use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
 use crate::render::{MAX_VIEWS, View, constants};
 
@@ -16,8 +19,14 @@ pub const SORT_BLOCK: u32 = 4096;
 pub const DIGITS: u32 = 256;
 /// Most groups of one dimension of a dispatch, on any device.
 pub const MAX_GROUPS: u32 = 65_535;
-/// Splats over more tiles are emitted by a whole workgroup.
-pub const BIG_SPLAT_TILES: u32 = 64;
+/// Tiles side by side in a macro tile, ...
+pub const MACRO_COLUMNS: u32 = 8;
+/// ... and one above the other: a word has a bit for each.
+pub const MACRO_ROWS: u32 = 4;
+/// Splats over more macro tiles are emitted by a whole workgroup.
+pub const BIG_SPLAT_MACROS: u32 = 16;
+/// Splats of a macro tile that are handed to its tiles at a time: 8 KiB of workgroup memory.
+pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile blends at a time.
 pub const RASTER_BATCH: u32 = 128;
 /// Words before a cluster's columns: two are used, 128 B keep the columns aligned.
@@ -25,7 +34,7 @@ pub const CLUSTER_HEADER_WORDS: u32 = 32;
 /// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
 pub const GEOMETRY_WORDS: u32 = 9;
 
-/// The grid of tiles of one view (16 bytes).
+/// The grid of tiles of one view, and what is drawn of it (32 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct FrameView {
@@ -35,20 +44,30 @@ pub struct FrameView {
     pub columns: u32,
     /// Index of the first tile among those of all views.
     pub first_tile: u32,
+    /// Macro tiles per row.
+    pub macro_columns: u32,
+    /// Index of the first macro tile among those of all views.
+    pub first_macro: u32,
+    /// The first row of tiles that is drawn, and the one after the last.
+    pub rows: [u32; 2],
 }
 
-/// What all stages know of a frame (304 bytes).
+/// What all stages know of a frame (576 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Frame {
     /// Splats that the buffers hold.
     pub splat_capacity: u32,
+    /// (Splat, macro tile) pairs that the buffers hold.
+    pub touch_capacity: u32,
     /// Instances that the buffers hold.
     pub instance_capacity: u32,
-    /// Tiles of all views.
-    pub tiles: u32,
     /// How many of `view` are used.
     pub views: u32,
+    /// Tiles of all views.
+    pub tiles: u32,
+    /// Macro tiles of all views.
+    pub macros: u32,
     /// As in [`Cutoffs`], likewise the fields that follow.
     pub near_m: f32,
     /// In metres.
@@ -64,7 +83,11 @@ pub struct Frame {
     /// Transmittance that ends a pixel.
     pub stop: f32,
     /// Zero.
-    pub pad: f32,
+    pub pad0: u32,
+    /// Zero.
+    pub pad1: u32,
+    /// Zero.
+    pub pad2: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
 }
@@ -86,11 +109,32 @@ impl Frame {
         for (slot, view) in frame.view.iter_mut().zip(views) {
             let size_px = [view.camera.width_px, view.camera.height_px];
             let [columns, rows] = size_px.map(|size| size.div_ceil(constants::TILE_PX));
-            *slot = FrameView { size_px, columns, first_tile: frame.tiles };
+            let macro_columns = columns.div_ceil(MACRO_COLUMNS);
+            *slot = FrameView {
+                size_px,
+                columns,
+                first_tile: frame.tiles,
+                macro_columns,
+                first_macro: frame.macros,
+                rows: [0, rows],
+            };
             // At most 16 views of 1024 x 1024 tiles: 2^24.
             frame.tiles += columns * rows;
+            frame.macros += macro_columns * rows.div_ceil(MACRO_ROWS);
         }
         frame
+    }
+
+    /// Draws these rows alone. Returns the tiles that they are.
+    pub(super) fn restrict(&mut self, rows: &Rows, part: &Part) -> Range<u32> {
+        let views = rows.views(part);
+        for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
+            let Range { start, end } = rows.of_view(index, part);
+            view.rows = [start, end];
+        }
+        let (first, last) = (&self.view[views.start], &self.view[views.end - 1]);
+        let start = first.first_tile + first.rows[0] * first.columns;
+        start..last.first_tile + last.rows[1] * last.columns
     }
 }
 
@@ -185,12 +229,14 @@ pub struct JobSlot {
 pub struct Counters {
     /// (Gaussian, view) pairs that survived culling, whether or not they fit.
     pub splats: u32,
-    /// (Gaussian, tile) pairs, whether or not they fit; 2^32 - 1 stands for more.
+    /// (Splat, macro tile) pairs, whether or not they fit; 2^32 - 1 stands for more.
+    pub touches: u32,
+    /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
     /// Batches of [`RASTER_BATCH`] splats that tiles blended.
     pub batches: u32,
-    /// Zero.
-    pub pad: u32,
+    /// Those of the tile that blended the most.
+    pub most_batches: u32,
 }
 
 /// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.

@@ -2,7 +2,7 @@
 //!
 //! Deterministic: sorts are stable, sums of floats keep one order per pixel, and what threads do in
 //! any order commutes. Nothing is read back in mid-frame: a frame that does not fit its buffers is
-//! drawn again in larger ones.
+//! drawn again in larger ones, and one that does not fit the device is drawn part by part.
 
 mod bin;
 mod chain;
@@ -11,13 +11,17 @@ mod growing;
 mod kernel;
 pub mod layout;
 mod mirror;
+mod parts;
 mod plan;
 mod project;
 mod rasterize;
 mod resolve;
+mod roofline;
 mod scan;
 pub mod shaders;
 mod sort;
+mod traffic;
+mod turns;
 
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
@@ -27,12 +31,16 @@ use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
 pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
+pub use roofline::Roofline;
+pub use traffic::FrameWork;
 
 use self::chain::{Chain, Drawn};
 use self::device::Device;
 use self::resolve::{Pixels, Planes};
 use self::shaders::Shaders;
+use self::turns::Turns;
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use crate::config;
 
 /// The wgpu backend.
 #[derive(Debug)]
@@ -41,7 +49,13 @@ pub struct Gpu {
     /// The device and its driver.
     detail: String,
     shaders: Shaders,
-    pool: ThreadPool,
+    binding_limit: u64,
+    /// Delivers images, and runs what `finished` does with them.
+    deliver: ThreadPool,
+    /// Culls clusters: threads of its own, so that a frame that is drawn does not wait for one that
+    /// is encoded.
+    cull: ThreadPool,
+    turns: Turns,
     /// Gone after the device failed, and made again by the next frame.
     chain: Mutex<Option<Chain>>,
 }
@@ -53,8 +67,14 @@ pub struct GpuUse {
     pub name: String,
     /// Bytes of resident Gaussians.
     pub mirror_bytes: u64,
-    /// Frames that were drawn again, since their buffers were too small.
+    /// Bytes of all buffers, if the driver's memory is counted.
+    pub allocated_bytes: Option<u64>,
+    /// Attempts at drawing that drew nothing, since buffers were too small.
     pub retries: u64,
+    /// Parts that frames were drawn in: one for each that fits.
+    pub parts: u64,
+    /// What the last frame counted.
+    pub last: FrameWork,
 }
 
 impl Gpu {
@@ -75,14 +95,53 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
     ) -> Result<Self, GpuError> {
-        let name = |i| format!("gpu-{i}");
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build();
-        let pool = pool.map_err(|error| GpuError::Threads { reason: error.to_string() })?;
-        let device = Device::open(choice)?;
+        Self::open(choice, threads, shaders, u64::MAX)
+    }
+
+    /// The same as if a binding held no more than so many bytes: for tests of frames that do not
+    /// fit a device at once. Below `config::BINDING_BYTES_MIN` it is that.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`].
+    pub fn with_binding_limit(
+        choice: &AdapterChoice,
+        threads: usize,
+        binding_bytes: u64,
+    ) -> Result<Self, GpuError> {
+        let limit = binding_bytes.max(config::BINDING_BYTES_MIN);
+        Self::open(choice, threads, Shaders::default(), limit)
+    }
+
+    fn open(
+        choice: &AdapterChoice,
+        threads: usize,
+        shaders: Shaders,
+        binding_limit: u64,
+    ) -> Result<Self, GpuError> {
+        if threads > config::RENDER_THREADS {
+            let limit = config::RENDER_THREADS;
+            let reason = format!("{threads} are too many; 0 to {limit} are accepted");
+            return Err(GpuError::Threads { reason });
+        }
+        let device = Device::open(choice, binding_limit)?;
+        let pool = |name: &'static str| {
+            let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
+            let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
+            pool.map_err(|error| GpuError::Threads { reason: error.to_string() })
+        };
+        let (deliver, cull) = (pool("deliver")?, pool("cull")?);
         let AdapterInfo { name, driver, driver_info, .. } = &device.info;
         let detail = format!("{name}, {driver} {driver_info}");
-        let chain = Mutex::new(Some(Chain::new(device, &shaders)?));
-        Ok(Self { choice: choice.clone(), detail, shaders, pool, chain })
+        Ok(Self {
+            choice: choice.clone(),
+            detail,
+            binding_limit,
+            deliver,
+            cull,
+            turns: Turns::default(),
+            chain: Mutex::new(Some(Chain::new(device, &shaders)?)),
+            shaders,
+        })
     }
 
     /// What the device holds; `None` while it is lost.
@@ -91,16 +150,37 @@ impl Gpu {
         chain.as_ref().map(|chain| GpuUse {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
+            allocated_bytes: chain.device.allocated_bytes(),
             retries: chain.retries,
+            parts: chain.parts,
+            last: chain.last,
         })
     }
 
+    /// Measures what the device can do at most, in about a second.
+    ///
+    /// # Errors
+    /// The device fails, or is lost.
+    pub fn roofline(&self) -> Result<Roofline, RenderError> {
+        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let lost = || RenderError::Device {
+            device: "the GPU".to_owned(),
+            reason: "it was lost by the frame before".to_owned(),
+        };
+        Roofline::measure(&chain.as_ref().ok_or_else(lost)?.device, &self.shaders)
+    }
+
+    /// Draws a frame in its turn. The device is free for the next one when this returns.
     fn draw(&self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
+        let start = Instant::now();
+        let _turn = self.turns.wait();
+        let waited = start.elapsed();
         let mut slot = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let chain = match &mut *slot {
             Some(chain) => chain,
             None => {
-                let device = Device::open(&self.choice).map_err(|error| RenderError::Device {
+                let device = Device::open(&self.choice, self.binding_limit);
+                let device = device.map_err(|error| RenderError::Device {
                     device: "the GPU".to_owned(),
                     reason: error.to_string(),
                 })?;
@@ -108,18 +188,29 @@ impl Gpu {
                 slot.insert(Chain::new(device, &self.shaders)?)
             }
         };
-        let drawn = chain.draw(frame, planes);
+        let drawn = chain.draw(frame, planes, &self.cull);
         // Whatever else it was, memory may be half-written: begin anew.
         if let Err(RenderError::Device { .. }) = drawn {
             *slot = None;
         }
-        drawn
+        drawn.map(|mut drawn| {
+            drawn.stats.stages_ms.insert(0, ("wait", waited.as_secs_f64() * 1e3));
+            drawn
+        })
     }
 }
 
 impl Backend for Gpu {
     fn name(&self) -> &'static str {
         "gpu"
+    }
+
+    fn threads(&self) -> usize {
+        self.deliver.current_num_threads()
+    }
+
+    fn frames_at_once(&self) -> usize {
+        config::GPU_FRAMES
     }
 
     fn detail(&self) -> String {
@@ -134,30 +225,27 @@ impl Backend for Gpu {
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         let planes = Planes::of(targets);
-        self.pool.install(|| {
-            let drawn = self.draw(frame, planes)?;
-            // From here on the device is free for another session's step.
-            let start = Instant::now();
-            let words: Result<Vec<&[u32]>, _> =
-                drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
-            let words = words.map_err(|error| RenderError::Device {
-                device: "the GPU".to_owned(),
-                reason: format!("its memory cannot be read: {error}"),
-            })?;
-            let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
+        // Not in a pool: a thread that waits for its own pool may take up another frame there.
+        let drawn = self.draw(frame, planes)?;
+        let start = Instant::now();
+        let words: Result<Vec<&[u32]>, _> =
+            drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
+        let words = words.map_err(|error| RenderError::Device {
+            device: "the GPU".to_owned(),
+            reason: format!("its memory cannot be read: {error}"),
+        })?;
+        let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
+        self.deliver.install(|| {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
                 pixels.deliver(view, target);
                 finished(index, target);
             });
-            let mut stats = drawn.stats.clone();
-            stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
-            let mut chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(chain) = &mut *chain {
-                chain.recycle(drawn);
-            }
-            Ok(stats)
-        })
+        });
+        let mut stats = drawn.stats.clone();
+        stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
+        drawn.recycle();
+        Ok(stats)
     }
 }
 

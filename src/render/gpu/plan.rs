@@ -15,16 +15,19 @@ pub(super) mod job {
     pub(crate) const SPLATS_SCAN: u64 = 2;
     pub(crate) const SPLATS_SORT: u64 = 3;
     pub(crate) const SPLATS_DIGITS: u64 = 4;
-    pub(crate) const INSTANCES: u64 = 5;
-    pub(crate) const INSTANCES_SORT: u64 = 6;
-    pub(crate) const INSTANCES_DIGITS: u64 = 7;
-    pub(crate) const COUNT: usize = 8;
+    pub(crate) const TOUCHES: u64 = 5;
+    pub(crate) const TOUCHES_SORT: u64 = 6;
+    pub(crate) const TOUCHES_DIGITS: u64 = 7;
+    pub(crate) const TILES: u64 = 8;
+    pub(crate) const INSTANCES: u64 = 9;
+    pub(crate) const COUNT: usize = 10;
 }
 
 /// What a frame is, what it counts, and what is to do.
 #[derive(Debug)]
 pub(super) struct Plan {
     splats: Kernel,
+    touches: Kernel,
     instances: Kernel,
     frame: Growing,
     jobs: Growing,
@@ -38,6 +41,7 @@ impl Plan {
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let mut plan = Self {
             splats: kernel("splats"),
+            touches: kernel("touches"),
             instances: kernel("instances"),
             frame: Growing::new(device, "frame", BufferUsages::UNIFORM | BufferUsages::COPY_DST),
             jobs: Growing::new(device, "jobs", storage | BufferUsages::INDIRECT),
@@ -51,8 +55,11 @@ impl Plan {
     /// Starts a frame of this many items.
     pub(super) fn start(&self, device: &Device, frame: &Frame, items: u32) {
         let mut jobs: [JobSlot; job::COUNT] = bytemuck::Zeroable::zeroed();
-        jobs[job::ITEMS as usize].job =
-            Job { length: items, groups: [items.div_ceil(SCAN_BLOCK), 1, 1] };
+        for (slot, length) in [(job::ITEMS, items), (job::TILES, frame.tiles)] {
+            // At most 2^24 tiles, and 2^27 items of 8 B: one dimension holds their groups.
+            let groups = [length.div_ceil(SCAN_BLOCK), 1, 1];
+            jobs[slot as usize].job = Job { length, groups };
+        }
         let counters: Counters = bytemuck::Zeroable::zeroed();
         let write = |to: &Growing, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);
         write(&self.frame, bytemuck::bytes_of(frame));
@@ -77,7 +84,12 @@ impl Plan {
         self.run(&self.splats, device, pass, sums);
     }
 
-    /// After the splats' tiles were summed up.
+    /// After the splats' macro tiles were summed up.
+    pub(super) fn touches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+        self.run(&self.touches, device, pass, sums);
+    }
+
+    /// After the tiles' splats were summed up.
     pub(super) fn instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.instances, device, pass, sums);
     }

@@ -1,6 +1,7 @@
 //! Stage project: the host culls clusters, the device projects the rest, in order of (view, global
 //! id). Twin of `render/cpu/project.rs`; WGSL: `shaders/project.wgsl`.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -31,9 +32,9 @@ pub(super) struct Work {
 }
 
 impl Work {
-    /// Tests every cluster against every view, and keeps what may be seen.
-    pub(super) fn new(frame: &Frame<'_>, mirror: &Mirror) -> Self {
-        let pairs: Vec<(usize, &Arc<Chunk>)> = (0..frame.views.len())
+    /// Tests every cluster against some views, and keeps what may be seen.
+    pub(super) fn new(frame: &Frame<'_>, views: Range<usize>, mirror: &Mirror) -> Self {
+        let pairs: Vec<(usize, &Arc<Chunk>)> = views
             .flat_map(|view| frame.scene.chunks.iter().map(move |chunk| (view, chunk)))
             .collect();
         let visible: Vec<Vec<(usize, u32)>> =
@@ -114,7 +115,7 @@ impl Splats {
         }
         let bytes = [(&self.shapes, size_of::<SplatShape>()), (&self.keys[0], 4)];
         let held = bytes.map(|(growing, each)| growing.buffer().size() / each as u64);
-        held[0].min(held[1]).min(u64::from(u32::MAX)) as u32
+        held[0].min(held[1]).min(Self::limit(device)) as u32
     }
 
     /// Most splats that a device can hold: the largest array decides.

@@ -2,7 +2,12 @@
 //!
 //! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`.
 
-use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePass, ShaderModule};
+use std::ops::Range;
+
+use wgpu::{
+    BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass,
+    ShaderModule,
+};
 
 use super::bin::Bin;
 use super::device::Device;
@@ -40,61 +45,84 @@ impl Rasterize {
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32) -> u32 {
         let tile_bytes = planes.tile_bytes();
         let per_page = (device.binding_bytes() / tile_bytes).min(u64::from(u32::MAX)) as u32;
-        let mut spans = Vec::new();
-        for first in (0..tiles).step_by(per_page as usize) {
-            let count = per_page.min(tiles - first);
-            let mut slot = [0; SLOT_BYTES as usize / 4];
-            slot[..2].copy_from_slice(&[first, count]);
-            spans.push(slot);
-            if self.pages.len() < spans.len() {
+        for (page, tiles) in pages(&(0..tiles), per_page) {
+            if page == self.pages.len() {
                 let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
                 self.pages.push(Growing::new(device, "pixels", usage));
             }
-            self.pages[spans.len() - 1].reserve(device, tile_bytes * u64::from(count));
+            self.pages[page].reserve(device, tile_bytes * tiles.len() as u64);
         }
-        self.spans.fill(device, bytemuck::cast_slice(&spans));
         per_page
     }
 
-    /// Blends all tiles; `sorted` tells which instances are in order.
+    /// Blends some tiles.
     pub(super) fn run(
         &mut self,
         device: &Device,
         pass: &mut ComputePass<'_>,
         plan: &Plan,
-        (splats, bin, sorted): (&Splats, &Bin, usize),
-        (planes, tiles, per_page): (Planes, u32, u32),
+        (splats, bin): (&Splats, &Bin),
+        (planes, tiles, per_page): (Planes, &Range<u32>, u32),
     ) {
         let module = &self.module;
         let kernel = self.kernels[planes.variant()]
             .get_or_insert_with(|| Kernel::new(device, module, "main", &planes.constants()));
-        for (page, first) in (0..tiles).step_by(per_page as usize).enumerate() {
+        let spans = pages(tiles, per_page).map(|(_, tiles)| {
+            let mut slot = [0; SLOT_BYTES as usize / 4];
+            slot[..2].copy_from_slice(&[tiles.start, tiles.len() as u32]);
+            slot
+        });
+        self.spans.fill(device, bytemuck::cast_slice(&spans.collect::<Vec<_>>()));
+        for (index, (page, tiles)) in pages(tiles, per_page).enumerate() {
+            let [first, bytes] = place(planes, &tiles, per_page);
+            let pixels = BufferBinding {
+                buffer: self.pages[page].buffer(),
+                // Of 1 KiB or more each, so that a binding may start at any tile.
+                offset: first,
+                size: BufferSize::new(bytes),
+            };
             let all = [
                 (0, plan.frame().as_entire_binding()),
-                (1, slot(self.spans.buffer(), page as u64, size_of::<Span>())),
+                (1, slot(self.spans.buffer(), index as u64, size_of::<Span>())),
                 (2, bin.ranges.bind()),
-                (3, bin.places[sorted].bind()),
+                (3, bin.instances.bind()),
                 (4, splats.shapes.bind()),
                 (5, splats.colors.bind()),
                 (6, plan.counters().as_entire_binding()),
-                (7, self.pages[page].bind()),
+                (7, BindingResource::Buffer(pixels)),
             ];
-            kernel.run(device, pass, Groups::Count(per_page.min(tiles - first)), &all);
+            kernel.run(device, pass, Groups::Count(tiles.len() as u32), &all);
         }
     }
 
-    /// Copies the pixels to where the host can read them, page by page.
+    /// Copies the pixels of some tiles to where the host can read them, page by page.
     pub(super) fn copy(
         &self,
         encoder: &mut CommandEncoder,
         to: &[Growing],
-        planes: Planes,
-        (tiles, per_page): (u32, u32),
+        (planes, tiles, per_page): (Planes, &Range<u32>, u32),
     ) {
-        for (page, first) in (0..tiles).step_by(per_page as usize).enumerate() {
-            let bytes = planes.tile_bytes() * u64::from(per_page.min(tiles - first));
+        for (page, tiles) in pages(tiles, per_page) {
+            let [first, bytes] = place(planes, &tiles, per_page);
             let (from, to): (&Buffer, &Buffer) = (self.pages[page].buffer(), to[page].buffer());
-            encoder.copy_buffer_to_buffer(from, 0, to, 0, bytes);
+            encoder.copy_buffer_to_buffer(from, first, to, first, bytes);
         }
     }
+}
+
+/// The pages that hold some tiles, and which of the tiles each holds.
+pub(super) fn pages(
+    tiles: &Range<u32>,
+    per_page: u32,
+) -> impl Iterator<Item = (usize, Range<u32>)> {
+    let Range { start, end } = *tiles;
+    (start / per_page..end.div_ceil(per_page)).map(move |page| {
+        let first = page * per_page;
+        (page as usize, start.max(first)..end.min(first.saturating_add(per_page)))
+    })
+}
+
+/// Where the pixels of some tiles start on their page, and how many bytes they are.
+fn place(planes: Planes, tiles: &Range<u32>, per_page: u32) -> [u64; 2] {
+    [tiles.start % per_page, tiles.len() as u32].map(|tiles| planes.tile_bytes() * u64::from(tiles))
 }

@@ -16,7 +16,9 @@ impl Default for Shaders {
             ("sort", include_str!("../../../shaders/sort.wgsl")),
             ("bin", include_str!("../../../shaders/bin.wgsl")),
             ("ranges", include_str!("../../../shaders/ranges.wgsl")),
+            ("expand", include_str!("../../../shaders/expand.wgsl")),
             ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+            ("roofline", include_str!("../../../shaders/roofline.wgsl")),
         ];
         Self { stages: stages.map(|(name, source)| (name, link(source))).to_vec() }
     }

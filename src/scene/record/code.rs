@@ -209,13 +209,12 @@ impl Code {
             }
             Self::Rotation(bits) => {
                 let bytes = self.planes(columns);
-                let stored: [Vec<[u32; LANES]>; 3] =
-                    [0, 1, 2].map(|k| widen(take(bytes[k]), bytes[k], count));
-                for block in 0..count.div_ceil(LANES) {
+                let [a, b, c] = [0, 1, 2].map(|k: usize| widen(take(bytes[k]), bytes[k], count));
+                for (block, codes) in a.iter().zip(b.iter().zip(&c)).enumerate() {
+                    let (a, (b, c)) = codes;
                     let mut quats = [[0.0; LANES]; 4];
                     for lane in 0..LANES {
-                        let code = [0, 1, 2].map(|k: usize| stored[k][block][lane]);
-                        let quat = from_smallest_three(code, bits);
+                        let quat = from_smallest_three([a[lane], b[lane], c[lane]], bits);
                         for (column, q) in quats.iter_mut().zip(quat) {
                             column[lane] = q;
                         }
@@ -271,7 +270,8 @@ impl Grid {
         let steps = f64::from((1_u32 << bits) - 2);
         let finest = low.abs().max(high.abs()) / f64::from(1 << 30);
         let step = ((high - low) / steps).max(finest);
-        if !(step > 1e-30) {
+        let spans = step > 1e-30;
+        if !spans {
             // All zero, or none.
             return Self { first: 0, step: 1.0 };
         }

@@ -1,0 +1,181 @@
+"""Reads what `torch.save` wrote, with numpy alone and without running anything of it.
+
+A checkpoint of PyTorch 1.6 or later is a zip archive of a pickle and the bytes of its tensors. A
+pickle is a program that may call any function by name. Here it can call five: those that rebuild
+tensors and ordered dictionaries. Every other class becomes an `Opaque`, which holds nothing.
+"""
+
+from __future__ import annotations
+
+import collections
+import math
+import pickle
+import zipfile
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import WildCityError
+
+PICKLE_BYTES = 64 << 20
+"""Largest pickle that is read; that of a gsplat checkpoint has 2 kB."""
+
+
+class CheckpointError(WildCityError):
+    """A file is no checkpoint that can be read, or not one of Gaussians."""
+
+
+class Opaque:
+    """An object of a class that is not known, left empty."""
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        pass
+
+    def __setitem__(self, key: object, value: object) -> None:
+        pass
+
+    def __call__(self, *args: object, **kwargs: object) -> Opaque:
+        return self
+
+    def append(self, item: object) -> None:
+        pass
+
+    def extend(self, items: object) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class _Dtype:
+    numpy: np.dtype[Any]
+    is_bfloat16: bool = False
+
+
+_DTYPES = {
+    "DoubleStorage": _Dtype(np.dtype("<f8")),
+    "FloatStorage": _Dtype(np.dtype("<f4")),
+    "HalfStorage": _Dtype(np.dtype("<f2")),
+    "BFloat16Storage": _Dtype(np.dtype("<u2"), is_bfloat16=True),
+    "LongStorage": _Dtype(np.dtype("<i8")),
+    "IntStorage": _Dtype(np.dtype("<i4")),
+    "ShortStorage": _Dtype(np.dtype("<i2")),
+    "CharStorage": _Dtype(np.dtype("i1")),
+    "ByteStorage": _Dtype(np.dtype("u1")),
+    "BoolStorage": _Dtype(np.dtype("?")),
+}
+
+
+@dataclass(frozen=True)
+class _Storage:
+    dtype: _Dtype
+    values: npt.NDArray[Any]
+
+
+def load(path: str | PathLike[str]) -> Any:
+    """What was saved: dictionaries, lists and numbers, with numpy arrays for tensors.
+
+    bfloat16 becomes float32. Raises `CheckpointError`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _load(archive)
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    except zipfile.BadZipFile as error:
+        reason = "save it with PyTorch 1.6 or later, or copy it again"
+        raise CheckpointError(f"{path} is no zip archive ({error}): {reason}") from error
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error}") from error
+    except (pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError) as error:
+        raise CheckpointError(f"{path}: its pickle is damaged: {error!r}") from error
+    except (AttributeError, OverflowError, RecursionError, NotImplementedError) as error:
+        raise CheckpointError(f"{path}: its pickle is damaged: {error!r}") from error
+
+
+def _load(archive: zipfile.ZipFile) -> Any:
+    names = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
+    if len(names) != 1:
+        raise CheckpointError(f"it has {len(names)} files data.pkl, not one: no torch.save")
+    folder = names[0].removesuffix("data.pkl")
+    if f"{folder}byteorder" in archive.namelist():
+        order = _read(archive, f"{folder}byteorder")
+        if order != b"little":
+            raise CheckpointError(f"its byte order is {order!r}; little is read")
+    if archive.getinfo(names[0]).file_size > PICKLE_BYTES:
+        raise CheckpointError(f"its pickle is larger than {PICKLE_BYTES} bytes")
+    with archive.open(names[0]) as file:
+        return _Unpickler(file, archive, folder).load()
+
+
+def _read(archive: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        info = archive.getinfo(name)
+    except KeyError as error:
+        raise CheckpointError(f"{name} is missing") from error
+    # torch.save never compresses; what is stored cannot be more than the file.
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise CheckpointError(f"{name} is compressed, as torch.save does not do")
+    return archive.read(name)
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: Any, archive: zipfile.ZipFile, folder: str) -> None:
+        super().__init__(file, encoding="utf-8")
+        self._archive = archive
+        self._folder = folder
+        self._storages: dict[str, _Storage] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("collections", "OrderedDict"):
+            return collections.OrderedDict
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            return _rebuild_tensor
+        if (module, name) == ("torch._utils", "_rebuild_parameter"):
+            return _rebuild_parameter
+        if (module, name) == ("torch", "Size"):
+            return tuple
+        if module == "torch" and name in _DTYPES:
+            return _DTYPES[name]
+        # A class, so that the pickle may also make it with NEWOBJ.
+        return type(name, (Opaque,), {})
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        match pid:
+            case ("storage", _Dtype() as dtype, str(key), _, int(_)):
+                if key not in self._storages:
+                    values = _read(self._archive, f"{self._folder}data/{key}")
+                    size = dtype.numpy.itemsize
+                    whole = values[: len(values) // size * size]
+                    self._storages[key] = _Storage(dtype, np.frombuffer(whole, dtype.numpy))
+                return self._storages[key]
+        raise CheckpointError(f"it names a tensor's bytes as {pid!r}")
+
+
+def _rebuild_tensor(
+    storage: _Storage, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object
+) -> npt.NDArray[Any]:
+    numbers = [offset, *size, *stride]
+    if not all(isinstance(number, int) and number >= 0 for number in numbers):
+        raise CheckpointError(f"a tensor of size {size}, stride {stride}, offset {offset}")
+    count, held = math.prod(size), len(storage.values)
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    # A stride of 0 could make much of nothing.
+    if count > held or (count > 0 and last >= held):
+        raise CheckpointError(f"a tensor of size {size} in {held} numbers")
+    if count == 0:
+        values = np.empty(size, storage.values.dtype)
+    else:
+        steps = [step * storage.values.itemsize for step in stride]
+        values = np.lib.stride_tricks.as_strided(storage.values[offset:], size, steps)
+    if storage.dtype.is_bfloat16:
+        return (values.astype("<u4") << 16).view("<f4")
+    return values
+
+
+def _rebuild_parameter(data: npt.NDArray[Any], *_: object) -> npt.NDArray[Any]:
+    return data

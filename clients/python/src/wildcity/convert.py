@@ -1,0 +1,176 @@
+"""Makes safetensors, which `wildcity import` reads, of the checkpoints of trainers.
+
+    python -m wildcity.convert ckpt_29999.pt street.safetensors
+    python -m wildcity.convert checkpoint_final.pth street.safetensors --model Background
+
+It knows gsplat (`splats`), drivestudio (`models`, of which one is taken), nerfstudio's splatfacto
+and INRIA's tuple. It needs numpy and no PyTorch, and runs nothing that is in the file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import struct
+import sys
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .checkpoint import CheckpointError, load
+
+__all__ = ["CheckpointError", "convert", "load", "models", "splats"]
+
+_NAMES = {
+    "means": ("means", "xyz"),
+    "quats": ("quats", "rotation"),
+    "scales": ("scales", "scaling"),
+    "opacities": ("opacities", "opacity"),
+    "sh0": ("sh0", "features_dc"),
+    "shN": ("shN", "features_rest"),
+}
+"""gsplat's names, and what others call the same."""
+
+_Arrays = dict[str, npt.NDArray[Any]]
+
+
+def convert(
+    source: str | PathLike[str], target: str | PathLike[str], model: str | None = None
+) -> int:
+    """Writes the Gaussians of a checkpoint as safetensors, and returns how many they are.
+
+    `model` chooses one where a checkpoint has several. `target` appears whole or not at all.
+    Raises `CheckpointError`.
+    """
+    tensors = splats(source, model)
+    _write_safetensors(target, tensors)
+    return len(tensors["means"])
+
+
+def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
+    """The Gaussians of a checkpoint, with gsplat's names and shapes: means [N,3], quats [N,4]
+    (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3], shN [N,K,3].
+    """
+    found = models(source)
+    if model is None:
+        if len(found) != 1:
+            names = ", ".join(repr(name) for name in found) or "none"
+            raise CheckpointError(f"{source}: models of Gaussians: {names}; name one of them")
+        return next(iter(found.values()))
+    if model not in found:
+        names = ", ".join(repr(name) for name in found)
+        raise CheckpointError(f"{source}: there is no model {model!r}, only {names}")
+    return found[model]
+
+
+def models(source: str | PathLike[str]) -> dict[str, _Arrays]:
+    """All models of Gaussians of a checkpoint, by name, as `splats` gives one."""
+    found: dict[str, _Arrays] = {}
+    for name, arrays in _candidates(load(source), ""):
+        try:
+            found[name or "splats"] = _shaped(arrays)
+        except CheckpointError as error:
+            raise CheckpointError(f"{source}, model {name!r}: {error}") from error
+    return found
+
+
+def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _Arrays]]:
+    """Whatever has means, scales, quats and the rest, with the name that it is under."""
+    if depth > 8:
+        return
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], tuple):
+        # INRIA's (capture(), iteration): degree, xyz, dc, rest, scaling, rotation, opacity, ...
+        keys = ("xyz", "features_dc", "features_rest", "scaling", "rotation", "opacity")
+        value = dict(zip(keys, value[0][1:7], strict=False))
+    if not isinstance(value, Mapping):
+        return
+    groups: dict[str, _Arrays] = {}
+    for key, item in value.items():
+        if isinstance(key, str) and isinstance(item, np.ndarray):
+            prefix, _, field = key.rpartition(".")
+            known = (ours for ours, theirs in _NAMES.items() if field.lstrip("_") in theirs)
+            for ours in known:
+                groups.setdefault(prefix, {})[ours] = item
+        elif isinstance(key, str):
+            yield from _candidates(item, key, depth + 1)
+    for prefix, arrays in groups.items():
+        if _NAMES.keys() - {"shN"} <= arrays.keys():
+            yield ".".join(part for part in (name, prefix) if part), arrays
+
+
+def _shaped(arrays: _Arrays) -> _Arrays:
+    """With gsplat's shapes, as float32; means of float64 stay so."""
+    means = arrays["means"]
+    n = len(means)
+    rest = arrays.get("shN")
+    rest = np.zeros((n, 0, 3), np.float32) if rest is None or rest.size == 0 else rest
+    wanted: dict[str, tuple[npt.NDArray[Any], tuple[int, ...]]] = {
+        "means": (means, (n, 3)),
+        "quats": (arrays["quats"], (n, 4)),
+        "scales": (arrays["scales"], (n, 3)),
+        "opacities": (arrays["opacities"], (n,)),
+        "sh0": (arrays["sh0"], (n, 1, 3)),
+        "shN": (rest, (n, rest.size // (3 * n) if n else 0, 3)),
+    }
+    shaped = {}
+    for name, (values, shape) in wanted.items():
+        if values.size != np.prod(shape) or (values.ndim > 0 and len(values) != n):
+            raise CheckpointError(f"{name} has shape {values.shape}, not {shape}")
+        if not np.issubdtype(values.dtype, np.floating):
+            raise CheckpointError(f"{name} is {values.dtype}, not a floating-point number")
+        is_double = name == "means" and values.dtype == np.float64
+        shaped[name] = values.reshape(shape).astype("<f8" if is_double else "<f4")
+    if shaped["shN"].shape[1] == 0:
+        del shaped["shN"]
+    return shaped
+
+
+def _write_safetensors(target: str | PathLike[str], tensors: _Arrays) -> None:
+    header, offset = {}, 0
+    for name, values in tensors.items():
+        header[name] = {
+            "dtype": f"F{8 * values.itemsize}",
+            "shape": list(values.shape),
+            "data_offsets": [offset, offset + values.nbytes],
+        }
+        offset += values.nbytes
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    path = os.fspath(target)
+    part = f"{path}.{os.getpid()}.part"
+    try:
+        with open(part, "xb") as file:
+            file.write(struct.pack("<Q", len(text)) + text)
+            for values in tensors.values():
+                file.write(np.ascontiguousarray(values).data)
+        os.replace(part, path)
+    except OSError as error:
+        raise CheckpointError(f"cannot write {path}: {error}") from error
+    finally:
+        if os.path.exists(part):
+            os.remove(part)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m wildcity.convert", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("source", help="checkpoint of gsplat, drivestudio, splatfacto or INRIA")
+    parser.add_argument("target", help="safetensors file to write")
+    parser.add_argument("--model", help="which model, where there are several")
+    chosen = parser.parse_args(arguments)
+    try:
+        count = convert(chosen.source, chosen.target, chosen.model)
+    except CheckpointError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"{chosen.target}: {count} Gaussians")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,327 @@
+"""Checkpoints to safetensors: what trainers save, and what nobody should run."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import types
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wildcity import convert
+from wildcity.convert import CheckpointError
+
+N = 20
+
+
+@pytest.fixture(autouse=True)
+def fake_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Just enough of PyTorch to be named in a pickle."""
+    torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
+    for module, name in [
+        (torch, "FloatStorage"),
+        (torch, "DoubleStorage"),
+        (torch, "BFloat16Storage"),
+        (utils, "_rebuild_tensor_v2"),
+        (utils, "_rebuild_parameter"),
+    ]:
+        stand_in = type(name, (), {"__module__": module.__name__})
+        stand_in.__qualname__ = name
+        setattr(module, name, stand_in)
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    monkeypatch.setitem(sys.modules, "torch._utils", utils)
+
+
+class Tensor:
+    """To be saved as torch saves one; some numbers can be made wrong."""
+
+    def __init__(self, values: Any, storage: str = "FloatStorage", **wrong: Any) -> None:
+        self.values = np.asarray(values)
+        self.storage, self.wrong = storage, wrong
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        return tuple(step // self.values.itemsize for step in self.values.strides)
+
+
+class Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=2)
+        self.data: list[bytes] = []
+
+    def reducer_override(self, item: Any) -> Any:
+        if not isinstance(item, Tensor):
+            return NotImplemented
+        utils = sys.modules["torch._utils"]
+        size = item.wrong.get("size", item.values.shape)
+        stride = item.wrong.get("stride", item.strides)
+        args = (Storage(item), item.wrong.get("offset", 0), size, stride, False, OrderedDict())
+        return utils._rebuild_tensor_v2, args
+
+    def persistent_id(self, item: Any) -> Any:
+        if not isinstance(item, Storage):
+            return None
+        tensor = item.tensor
+        self.data.append(tensor.values.tobytes())
+        kind = getattr(sys.modules["torch"], tensor.storage)
+        return ("storage", kind, str(len(self.data) - 1), "cuda:0", tensor.values.size)
+
+
+class Storage:
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+
+def save(path: Path, value: Any, compression: int = zipfile.ZIP_STORED) -> Path:
+    file = io.BytesIO()
+    pickler = Pickler(file)
+    pickler.dump(value)
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("archive/data.pkl", file.getvalue())
+        archive.writestr("archive/byteorder", "little", zipfile.ZIP_STORED)
+        for index, data in enumerate(pickler.data):
+            archive.writestr(f"archive/data/{index}", data)
+    return path
+
+
+def gaussians(n: int = N, rest: int = 15) -> dict[str, np.ndarray[Any, Any]]:
+    random = np.random.default_rng(1)
+
+    def draw(*shape: int) -> np.ndarray[Any, Any]:
+        return random.normal(size=shape).astype("<f4")
+
+    return {
+        "means": draw(n, 3),
+        "quats": draw(n, 4),
+        "scales": draw(n, 3),
+        "opacities": draw(n),
+        "sh0": draw(n, 1, 3),
+        "shN": draw(n, rest, 3),
+    }
+
+
+def safetensors(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    data = path.read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    body = data[8 + length :]
+    tensors = {}
+    for name, info in json.loads(data[8 : 8 + length]).items():
+        start, end = info["data_offsets"]
+        dtype = {"F32": "<f4", "F64": "<f8"}[info["dtype"]]
+        tensors[name] = np.frombuffer(body[start:end], dtype).reshape(info["shape"])
+    return tensors
+
+
+def assert_same(found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    assert found.keys() == wanted.keys()
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def tensors(g: dict[str, np.ndarray[Any, Any]]) -> dict[str, Tensor]:
+    return {name: Tensor(values) for name, values in g.items()}
+
+
+def test_gsplat(tmp_path: Path) -> None:
+    g = gaussians()
+    source = save(tmp_path / "ckpt.pt", {"step": 29999, "splats": tensors(g)})
+    assert convert.convert(source, tmp_path / "out.safetensors") == N
+    assert_same(safetensors(tmp_path / "out.safetensors"), g)
+    assert sorted(os.listdir(tmp_path)) == ["ckpt.pt", "out.safetensors"]
+
+
+def test_drivestudio_names_its_models(tmp_path: Path) -> None:
+    g = gaussians()
+    theirs = {"sh0": "features_dc", "shN": "features_rest"}
+
+    def state(g: dict[str, np.ndarray[Any, Any]]) -> OrderedDict[str, Tensor]:
+        state = OrderedDict((f"_{theirs.get(k, k)}", Tensor(v)) for k, v in g.items())
+        state["_opacities"] = Tensor(g["opacities"][:, None])
+        state["_features_dc"] = Tensor(g["sh0"][:, 0])
+        return state
+
+    saved = {"models": {"Background": state(g), "RigidNodes": state(gaussians(5)), "Sky": {}}}
+    source = save(tmp_path / "checkpoint_final.pth", saved)
+    with pytest.raises(CheckpointError, match="'Background', 'RigidNodes'; name one"):
+        convert.splats(source)
+    assert_same(convert.splats(source, "Background"), g)
+    assert len(convert.splats(source, "RigidNodes")["means"]) == 5
+    with pytest.raises(CheckpointError, match="no model 'Sky'"):
+        convert.splats(source, "Sky")
+
+
+def test_splatfacto_and_inria(tmp_path: Path) -> None:
+    g = gaussians(rest=8)
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    flat = {f"_model.gauss_params.{names.get(k, k)}": Tensor(v) for k, v in g.items()}
+    assert_same(convert.splats(save(tmp_path / "a.ckpt", {"pipeline": flat})), g)
+    order = ("means", "sh0", "shN", "scales", "quats", "opacities")
+    captured = (2, *(Tensor(g[name]) for name in order), Tensor([1.0]), {}, 5.0)
+    assert_same(convert.splats(save(tmp_path / "chkpnt.pth", (captured, 30000))), g)
+
+
+def test_dtypes_strides_and_degree_0(tmp_path: Path) -> None:
+    g = gaussians(rest=0)
+    del g["shN"]
+    saved = tensors(g)
+    saved["means"] = Tensor(g["means"].astype("<f8") + 4.5e6, "DoubleStorage")
+    # bfloat16 is the upper half of float32.
+    halves = (g["scales"].view("<u4") >> 16).astype("<u2")
+    saved["scales"] = Tensor(halves, "BFloat16Storage")
+    saved["quats"] = Tensor(g["quats"].T.copy(), size=(N, 4), stride=(1, N))
+    found = convert.splats(save(tmp_path / "ckpt.pt", {"splats": saved}))
+    assert found["means"].dtype == np.float64
+    np.testing.assert_array_equal(found["means"], saved["means"].values)
+    np.testing.assert_array_equal(found["scales"].view("<u4") >> 16, halves)
+    np.testing.assert_array_equal(found["quats"], g["quats"])
+    assert "shN" not in found
+
+
+class Evil:
+    def __reduce__(self) -> Any:
+        return os.mkdir, (os.environ["EVIL"],)
+
+
+def test_nothing_in_a_checkpoint_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "made"
+    monkeypatch.setenv("EVIL", str(made))
+    saved = {"splats": tensors(gaussians()), "optimizer": Evil(), "list": [Evil(), {"a": Evil()}]}
+    source = save(tmp_path / "ckpt.pt", saved)
+    assert len(convert.splats(source)["means"]) == N
+    assert not made.exists()
+    # It would have: the pickle is what it seems.
+    pickle.loads(pickle.dumps(Evil()))
+    assert made.exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"size": (2**60, 3)}, "in 60 numbers"),
+        ({"size": (2**40, 3), "stride": (0, 1)}, "in 60 numbers"),
+        ({"offset": 1}, "in 60 numbers"),
+        ({"offset": -3}, "offset -3"),
+        ({"stride": (-3, 1)}, "stride"),
+        ({"stride": (2**62, 1)}, "in 60 numbers"),
+        ({"stride": (3,)}, "damaged"),
+        ({"size": ("a", 3)}, "size"),
+    ],
+)
+def test_tensors_that_leave_their_bytes(tmp_path: Path, wrong: Any, said: str) -> None:
+    saved = tensors(gaussians())
+    saved["means"] = Tensor(gaussians()["means"], **wrong)
+    source = save(tmp_path / "ckpt.pt", {"splats": saved})
+    with pytest.raises(CheckpointError, match=said):
+        convert.splats(source)
+
+
+def test_shapes_that_do_not_fit(tmp_path: Path) -> None:
+    saved = tensors(gaussians())
+    saved["quats"] = Tensor(gaussians(N - 1)["quats"])
+    with pytest.raises(CheckpointError, match=r"quats has shape \(19, 4\), not \(20, 4\)"):
+        convert.splats(save(tmp_path / "ckpt.pt", {"splats": saved}))
+    del saved["quats"]
+    with pytest.raises(CheckpointError, match="models of Gaussians: none"):
+        convert.splats(save(tmp_path / "ckpt.pt", {"splats": saved}))
+
+
+def test_compression_is_refused(tmp_path: Path) -> None:
+    source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(CheckpointError, match="compressed"):
+        convert.splats(source)
+
+
+def test_damage_anywhere_is_one_kind_of_error(tmp_path: Path) -> None:
+    whole = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians(3))}).read_bytes()
+    broken = tmp_path / "broken.pt"
+    for end in range(0, len(whole), 7):
+        broken.write_bytes(whole[:end])
+        with pytest.raises(CheckpointError):
+            convert.splats(broken)
+    # Beneath the archive's checksums: the pickle itself.
+    with zipfile.ZipFile(tmp_path / "ckpt.pt") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    program = files["archive/data.pkl"]
+    refused = 0
+    for at in range(len(program)):
+        files["archive/data.pkl"] = program[:at] + bytes([program[at] ^ 0x15]) + program[at + 1 :]
+        with zipfile.ZipFile(broken, "w") as archive:
+            for name, data in files.items():
+                archive.writestr(name, data)
+        try:
+            convert.splats(broken)
+        except CheckpointError:
+            refused += 1
+    assert refused > len(program) // 2
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
+    source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())})
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(CheckpointError, match="cannot write"):
+        convert.convert(source, tmp_path / "taken")
+    assert sorted(os.listdir(tmp_path)) == ["ckpt.pt", "taken"]
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())})
+    target = tmp_path / "out.safetensors"
+    assert convert.main([str(source), str(target)]) == 0
+    assert capsys.readouterr().out == f"{target}: 20 Gaussians\n"
+    assert convert.main([str(tmp_path / "none.pt"), str(target)]) == 1
+    assert "error: cannot read" in capsys.readouterr().err
+
+
+def data() -> Path | None:
+    """The real data, or None, said on standard error, where it is absent."""
+    beside = Path(__file__).parents[3] / "../shared/data"
+    root = Path(os.environ.get("WILDCITY_DATA", beside))
+    if root.is_dir():
+        return root
+    assert os.environ.get("WILDCITY_DATA_REQUIRED") != "1", f"no real data at {root}"
+    print(f"NOT RUN: no real data at {root}", file=sys.stderr)
+    return None
+
+
+def test_what_torch_itself_saved() -> None:
+    root = data()
+    if root is None:
+        return
+    folder = root / "conformance/pt_gsplat"
+    means = convert.load(folder / "means.pt")
+    quats, scales = convert.load(folder / "quats.pt"), convert.load(folder / "scales.pt")
+    assert means.shape == scales.shape == (54_275, 3)
+    assert quats.shape == (54_275, 4)
+    with zipfile.ZipFile(folder / "means.pt") as archive:
+        np.testing.assert_array_equal(means.ravel(), np.frombuffer(archive.read("archive/data/0"), "<f4"))
+    lengths = np.linalg.norm(quats, axis=1)
+    assert 0.05 < lengths.min() < 0.5 and 1.5 < lengths.max() < 4, "quaternions as trained"
+    poses = convert.load(folder / "camtoworlds.pt")
+    assert poses.shape[-2:] == (4, 4)
+    np.testing.assert_array_equal(poses.reshape(-1, 4, 4)[:, 3], [[0, 0, 0, 1]])
+    assert np.isfinite(means).all()
+
+
+def test_what_was_converted_is_imported(tmp_path: Path) -> None:
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the wildcity binary"
+    source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())})
+    convert.convert(source, tmp_path / "out.safetensors")
+    command = [binary, "import", tmp_path / "out.safetensors", "--twin", "converted"]
+    done = subprocess.run(
+        [*command, "--twins", tmp_path / "twins"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "20 Gaussians of SH degree 3" in done.stdout

@@ -1,0 +1,192 @@
+//! `wildcity bench gpu`: the whole measurement of a device, in one command.
+
+mod report;
+
+use std::io::{self, Write};
+use std::time::Instant;
+
+use anyhow::{Context, ensure};
+
+use self::report::{Report, SceneReport, StageReport};
+use super::median;
+use crate::cli::progress;
+use crate::config;
+use crate::generate;
+use crate::geometry::Pose;
+use crate::render::cpu::{Cpu, Simd};
+use crate::render::gpu::{self, AdapterChoice, FrameWork, Roofline};
+use crate::render::{Backend, Frame, FrameStats, Target, View};
+use crate::scene::{RenderProfile, Rig, Scene};
+
+/// Measure a device: steps of six full cameras in streets of several sizes, stage by stage, beside
+/// what its memory and arithmetic allow.
+///
+/// Prints tables in Markdown. The streets are made in memory, the same on every machine. What the
+/// device can do at most is measured in the same run, by a copy and by a loop of multiply-adds; what
+/// a stage must move is computed from what the frame counted (`src/render/gpu/traffic.rs` has the
+/// sums). The cpu backend draws the same step for comparison, and the first image of both is compared,
+/// so that a device that is fast and wrong is noticed.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Gpu {
+    /// Sizes of the streets.
+    #[arg(
+        long,
+        value_name = "COUNT,...",
+        value_delimiter = ',',
+        default_value = "1000000,5000000,20000000",
+        value_parser = clap::value_parser!(u32).range(1..=config::BENCH_GAUSSIANS)
+    )]
+    gaussians: Vec<u32>,
+
+    /// The device: its number in `wildcity devices`, or a part of its name; the fastest kind if not
+    /// given.
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<String>,
+
+    /// Frames to time, after two that are not counted.
+    #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    repeat: u32,
+
+    /// Leave out the cpu backend, and with it the comparison of images.
+    #[arg(long)]
+    no_cpu: bool,
+
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity bench gpu
+  wildcity bench gpu --gaussians 100000 --repeat 3 --device llvmpipe
+  wildcity bench gpu --json > report.json";
+
+/// Frames before those that are timed: the first uploads the scene and makes room.
+const WARM_UP: u32 = 2;
+
+impl Gpu {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let named = |name: &String| AdapterChoice::Named(name.clone());
+        let choice = self.device.as_ref().map_or(AdapterChoice::Best, named);
+        let device = gpu::Gpu::new(&choice, 0)?;
+        let cpu = (!self.no_cpu).then(|| Cpu::new(0, Simd::Best)).transpose()?;
+        let roofline = device.roofline()?;
+        let usage = device.usage().context("the device was lost")?;
+        let mut report = Report { device: usage.name, roofline, scenes: Vec::new() };
+        for &gaussians in &self.gaussians {
+            let scene = self.scene(gaussians, &device, cpu.as_ref(), &roofline);
+            report.scenes.push(scene.with_context(|| format!("{gaussians} Gaussians"))?);
+        }
+        let mut out = io::stdout().lock();
+        match self.json {
+            true => writeln!(out, "{}", serde_json::to_string(&report)?)?,
+            false => write!(out, "{report}")?,
+        }
+        Ok(())
+    }
+
+    fn scene(
+        &self,
+        gaussians: u32,
+        device: &gpu::Gpu,
+        cpu: Option<&Cpu>,
+        roofline: &Roofline,
+    ) -> anyhow::Result<SceneReport> {
+        let bar = progress::count("making");
+        let scene =
+            Scene::from_gaussians(&generate::canyon(gaussians as usize, &mut progress::show(&bar)));
+        bar.finish_and_clear();
+        let views = views()?;
+        let own = self.time(device, &scene, &views)?;
+        let usage = device.usage().context("the device was lost")?;
+        let cpu = cpu.map(|cpu| self.time(cpu, &scene, &views)).transpose()?;
+        Ok(SceneReport {
+            gaussians,
+            mirror_bytes: usage.mirror_bytes,
+            visible_pairs: usage.last.splats,
+            touches: usage.last.touches,
+            instances: usage.last.instances,
+            evaluations: own.stats.evaluations,
+            stages: stages(&own, &usage.last, roofline),
+            host_ms: host(&own, &usage.last),
+            step_ms: own.step_ms,
+            cpu_step_ms: cpu.as_ref().map(|cpu| cpu.step_ms),
+            psnr_db: cpu.map(|cpu| psnr_db(&own.first_image, &cpu.first_image)),
+        })
+    }
+
+    /// The median step of a backend, and the medians of its stages.
+    fn time(&self, backend: &dyn Backend, scene: &Scene, views: &[View]) -> anyhow::Result<Timed> {
+        let profile = RenderProfile::default();
+        let frame = Frame { scene, profile: &profile, views };
+        let mut images: Vec<Vec<u8>> =
+            views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
+        let bar = progress::count(backend.name());
+        bar.set_length(u64::from(WARM_UP + self.repeat));
+        let mut runs: Vec<(f64, FrameStats)> = Vec::new();
+        for _ in 0..WARM_UP + self.repeat {
+            let targets = images.iter_mut();
+            let mut targets: Vec<Target<'_>> =
+                targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
+            let start = Instant::now();
+            let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
+            runs.push((start.elapsed().as_secs_f64() * 1e3, stats));
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        let runs = &runs[WARM_UP as usize..];
+        let mut stats = runs[0].1.clone();
+        for (name, ms) in &mut stats.stages_ms {
+            let of = |(_, stats): &(f64, FrameStats)| {
+                stats.stages_ms.iter().filter(|(other, _)| other == name).map(|(_, ms)| ms).sum()
+            };
+            *ms = median(runs.iter().map(of));
+        }
+        let step_ms = median(runs.iter().map(|(step_ms, _)| *step_ms));
+        Ok(Timed { step_ms, stats, first_image: images.swap_remove(0) })
+    }
+}
+
+struct Timed {
+    step_ms: f64,
+    stats: FrameStats,
+    first_image: Vec<u8>,
+}
+
+/// What a vehicle sees from the middle of the street: 3 x 1440x928 and 3 x 1240x728.
+fn views() -> anyhow::Result<Vec<View>> {
+    let rig = Rig::preset("vehicle6").context("the rig vehicle6 comes with the program")?;
+    ensure!(!rig.cameras.is_empty(), "the rig vehicle6 has no cameras");
+    let world_from_rig = Pose::IDENTITY;
+    let view = |mounted: &crate::scene::rig::RigCamera| View {
+        camera: mounted.camera,
+        world_from_camera: world_from_rig * mounted.rig_from_camera,
+    };
+    Ok(rig.cameras.iter().map(view).collect())
+}
+
+fn stages(own: &Timed, work: &FrameWork, roofline: &Roofline) -> Vec<StageReport> {
+    let bytes = work.bytes().into_iter();
+    let stages = bytes.filter_map(|(stage, bytes)| {
+        let device_ms = own.stats.stages_ms.iter().find(|(name, _)| *name == stage)?.1;
+        let operations = if stage == "rasterize" { work.operations() } else { 0 };
+        Some(StageReport::new(stage, device_ms, bytes, operations, roofline))
+    });
+    stages.collect()
+}
+
+/// What is not the device's own time.
+fn host(own: &Timed, work: &FrameWork) -> Vec<(&'static str, f64)> {
+    let bytes = work.bytes();
+    let is_host = |name: &str| bytes.iter().all(|(stage, _)| *stage != name);
+    own.stats.stages_ms.iter().filter(|(name, _)| is_host(name)).copied().collect()
+}
+
+/// Infinite for equal images.
+fn psnr_db(a: &[u8], b: &[u8]) -> f64 {
+    let square = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b)).powi(2);
+    let mean = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
+    10.0 * (255.0 * 255.0 / mean).log10()
+}

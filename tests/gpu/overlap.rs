@@ -1,0 +1,80 @@
+//! Frames in hand at once: one is drawn while others are encoded.
+
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+use wildcity::render::gpu::{AdapterChoice, Gpu};
+use wildcity::render::{Backend, Finished, Frame, Target};
+use wildcity::scene::{RenderProfile, Scene};
+
+use crate::images::render_one;
+use crate::streets::{street, turning_views};
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Renders the first view to 8-bit colour.
+fn draw(gpu: &Gpu, scene: &Scene, finished: Finished<'_>) -> Vec<u8> {
+    let (profile, views) = (RenderProfile::default(), &turning_views()[..1]);
+    let mut image = vec![77; 3 * views[0].camera.pixels()];
+    let target = Target { rgb8: Some(&mut image), ..Target::default() };
+    gpu.render(&Frame { scene, profile: &profile, views }, &mut [target], finished).unwrap();
+    image
+}
+
+#[test]
+fn a_frame_is_drawn_while_another_is_encoded() {
+    // The encoder of the first frame waits until all that the backend takes beside it are drawn.
+    let gpu = Gpu::new(&AdapterChoice::Best, 1).unwrap();
+    let beside = gpu.frames_at_once() - 1;
+    assert!(beside > 0);
+    let gpu = Gpu::new(&AdapterChoice::Best, gpu.frames_at_once()).unwrap();
+    let scene = Scene::from_gaussians(&street(5_000, 1, 51));
+    let alone = render_one(&gpu, &scene, &RenderProfile::default(), turning_views()[0]).rgb8;
+    let ((encoding, is_encoding), (drawn, all_drawn)) = (mpsc::channel(), mpsc::channel());
+    thread::scope(|scope| {
+        let all_drawn = std::sync::Mutex::new(all_drawn);
+        let (gpu, scene, alone) = (&gpu, &scene, &alone);
+        let first = scope.spawn(move || {
+            draw(gpu, scene, &|_, _| {
+                encoding.send(()).unwrap();
+                for _ in 0..beside {
+                    all_drawn.lock().unwrap().recv_timeout(PATIENCE).expect("another frame");
+                }
+            })
+        });
+        is_encoding.recv_timeout(PATIENCE).unwrap();
+        for _ in 0..beside {
+            let drawn = drawn.clone();
+            scope.spawn(move || {
+                assert!(draw(gpu, scene, &|_, _| {}) == *alone);
+                drawn.send(()).unwrap();
+            });
+        }
+        assert!(first.join().unwrap() == *alone);
+    });
+}
+
+/// Threads of pools take up other work while they wait: more callers than threads must not wait for
+/// themselves.
+#[test]
+fn many_callers_of_few_threads_get_on() {
+    let gpu = Gpu::new(&AdapterChoice::Best, 1).unwrap();
+    let scene = Scene::from_gaussians(&street(5_000, 1, 52));
+    let alone = draw(&gpu, &scene, &|_, _| {});
+    let (done, all_done) = mpsc::channel();
+    thread::scope(|scope| {
+        for _ in 0..8 {
+            let (gpu, scene, alone, done) = (&gpu, &scene, &alone, done.clone());
+            scope.spawn(move || {
+                for _ in 0..10 {
+                    assert!(draw(gpu, scene, &|_, _| {}) == *alone);
+                }
+                done.send(()).unwrap();
+            });
+        }
+        for _ in 0..8 {
+            all_done.recv_timeout(3 * PATIENCE).expect("they wait for each other");
+        }
+    });
+}

@@ -1,0 +1,249 @@
+//! What small writers of every format wrote comes back, within what the format keeps.
+
+use wildcity::ingest;
+use wildcity::scene::Gaussians;
+
+use crate::format_files::{
+    Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,
+};
+use crate::scene_files::gaussians;
+use crate::{read, refusal};
+
+/// How far numbers may be off.
+#[derive(Clone, Copy)]
+struct Within {
+    mean_m: f64,
+    quat: f64,
+    ln_scale: f64,
+    opacity: f64,
+    dc: f64,
+    sh: f64,
+}
+
+const EXACT: Within =
+    Within { mean_m: 1e-6, quat: 1e-6, ln_scale: 1e-5, opacity: 1e-6, dc: 1e-6, sh: 1e-6 };
+
+fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &str) {
+    assert_eq!((read.len(), read.sh_degree), (written.len(), written.sh_degree), "{name}");
+    let near = |a: &[f32], b: &[f32], by: f64, field: &str| {
+        for (a, b) in a.iter().zip(b) {
+            assert!(f64::from((a - b).abs()) <= by, "{name}: {field} is {a}, not {b}");
+        }
+    };
+    for i in 0..read.len() {
+        for axis in 0..3 {
+            let (a, b) = (read.means_m[i][axis], written.means_m[i][axis]);
+            assert!((a - b).abs() <= within.mean_m, "{name}: position is {a}, not {b}");
+        }
+        let unit = |q: [f32; 4]| {
+            let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
+            q.map(|q| q / length)
+        };
+        let (p, q) = (unit(read.quats_wxyz[i]), unit(written.quats_wxyz[i]));
+        let same_side = p.iter().zip(q).map(|(p, q)| p * q).sum::<f32>() > 0.0;
+        near(&p, &q.map(|q| if same_side { q } else { -q }), within.quat, "rotation");
+        near(&read.ln_scales[i], &written.ln_scales[i], within.ln_scale, "ln scale");
+        let opacities = [read, written].map(|g| opacity(g.logit_opacities[i]) as f32);
+        near(&opacities[..1], &opacities[1..], within.opacity, "opacity");
+        near(&read.sh_of(i)[..3], &written.sh_of(i)[..3], within.dc, "colour");
+        near(&read.sh_of(i)[3..], &written.sh_of(i)[3..], within.sh, "colour coefficient");
+    }
+}
+
+/// Reads a scene of several files, and says the hash.
+fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError> {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in files {
+        let path = dir.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    }
+    ingest::read_hashed(&dir.path().join(&files[0].0), &mut |_, _| {})
+}
+
+#[test]
+fn splat_comes_back() {
+    let g = gaussians(50, 0, 20.0, 1);
+    // A byte of colour is 1/255 of 1/0.282; rotations are cut.
+    let within = Within { quat: 0.02, opacity: 0.002, dc: 0.007, ..EXACT };
+    assert_alike(&read(&splat(&g)).unwrap(), &g, within, ".splat");
+}
+
+#[test]
+fn spz_comes_back() {
+    for sh_degree in 0..=3 {
+        let g = gaussians(50, sh_degree, 20.0, 2);
+        let within = Within {
+            mean_m: 0.5 / 4096.0,
+            quat: 0.003,
+            ln_scale: 0.51 / 16.0,
+            opacity: 0.002,
+            dc: 0.0131,
+            sh: 0.0079,
+        };
+        // w is what x, y and z leave to length 1: off by √(2 √3 0.5/127.5) where it is nearly 0.
+        let two = Within { quat: 0.118, ..within };
+        for (name, file, within) in [
+            ("2", gzip(&spz_plain(&g, 2)), two),
+            ("plain 2", spz_plain(&g, 2), two),
+            ("3", gzip(&spz_plain(&g, 3)), within),
+            ("plain 3", spz_plain(&g, 3), within),
+            ("4", spz4(&g), within),
+        ] {
+            assert_alike(&read(&file).unwrap(), &g, within, &format!("SPZ {name}, {sh_degree}"));
+        }
+    }
+}
+
+#[test]
+fn ksplat_comes_back() {
+    for sh_degree in 0..=2 {
+        // 50 is no multiple of the bucket's 4.
+        let g = gaussians(50, sh_degree, 20.0, 3);
+        let zero = Within { opacity: 0.002, dc: 0.007, ..EXACT };
+        let one =
+            Within { mean_m: 0.51 * 128.0 / 32767.0, quat: 5e-4, ln_scale: 6e-4, sh: 5e-4, ..zero };
+        let two = Within { sh: 0.51 * 4.0 / 255.0, ..one };
+        for (level, within) in [(0, zero), (1, one), (2, two)] {
+            let name = format!(".ksplat {level}, {sh_degree}");
+            assert_alike(&read(&ksplat(&g, level)).unwrap(), &g, within, &name);
+        }
+    }
+}
+
+#[test]
+fn gltf_comes_back_in_one_file_and_in_two() {
+    for sh_degree in 0..=3 {
+        let g = gaussians(50, sh_degree, 20.0, 4);
+        assert_alike(&read(&glb(gltf(&g, "", ""))).unwrap(), &g, EXACT, "GLB");
+        let (json, buffer) = gltf(&g, "", r#""uri":"data/splats.bin","#);
+        let files = vec![
+            ("scene.gltf".to_owned(), json.into_bytes()),
+            ("data/splats.bin".to_owned(), buffer),
+        ];
+        let (two, hash) = read_files(&files).unwrap();
+        assert_alike(&two, &g, EXACT, "glTF");
+        let lines: String = files.iter().map(|f| format!("{}\n", blake3::hash(&f.1))).collect();
+        assert_eq!(hash, blake3::hash(lines.as_bytes()).to_string());
+    }
+}
+
+#[test]
+fn nodes_turn_scale_and_move_splats() {
+    let g = gaussians(50, 1, 20.0, 5);
+    // A quarter turn around z: x to y, y to -x; twice as large; 10 m up.
+    let node = r#","translation":[0,0,10],"rotation":[0,0,0.7071067811865476,0.7071067811865476],
+        "scale":[2,2,2]"#;
+    let read = read(&glb(gltf(&g, node, ""))).unwrap();
+    let mut wanted = g.clone();
+    let axes = "0 -1 0 1 0 0 0 0 1".parse::<ingest::Axes>().unwrap().scaled(2.0).unwrap();
+    axes.apply(&mut wanted);
+    wanted.means_m.iter_mut().for_each(|m| m[2] += 10.0);
+    let within = Within { mean_m: 1e-5, ..EXACT };
+    assert_alike(&read, &wanted, within, "node");
+
+    let text = refusal(&glb(gltf(&g, r#","scale":[1,2,1]"#, "")));
+    assert!(text.starts_with("glTF header, node 0: its matrix is no rotation"), "{text}");
+    let text = refusal(&glb(gltf(&g, r#","children":[0]"#, "")));
+    assert_eq!(text, "glTF header, node 0: is reached twice; a tree has one way to each");
+}
+
+#[test]
+fn sog_comes_back_as_folder_and_archive() {
+    for (version, sh_degree) in [1, 2].into_iter().flat_map(|v| (0..=3).map(move |d| (v, d))) {
+        let g = gaussians(50, sh_degree, 20.0, 6);
+        let within = Within {
+            // 16 bits of twice ln(21) = 6.1, times 21 of the way back.
+            mean_m: 0.51 * 6.1 / 65535.0 * 21.0,
+            quat: 0.01,
+            ln_scale: 0.51 * 7.1 / 255.0,
+            opacity: if version == 1 { 0.51 * 10.0 / 255.0 / 4.0 } else { 0.002 },
+            dc: 0.0041,
+            sh: 0.0041,
+        };
+        let name = format!("SOG {version}, {sh_degree}");
+        let files = sog(&g, version);
+        let (folder, hash) = read_files(&files).unwrap();
+        assert_alike(&folder, &g, within, &name);
+        let lines: String = files.iter().map(|f| format!("{}\n", blake3::hash(&f.1))).collect();
+        assert_eq!(hash, blake3::hash(lines.as_bytes()).to_string());
+        for is_packed in [false, true] {
+            let inside = |(n, bytes): &(String, Vec<u8>)| (format!("scene/{n}"), bytes.clone());
+            let files: Files = files.iter().map(inside).collect();
+            assert_eq!(read(&zip_of(&files, is_packed)).unwrap(), folder, "{name}");
+        }
+    }
+}
+
+/// Two blocks with two levels, 50 Gaussians of which the finest has 20 + 20, and an environment.
+pub(crate) fn streamed() -> Files {
+    let place = |file: usize, offset: usize, count: usize| {
+        format!(r#"{{"file":{file},"offset":{offset},"count":{count}}}"#)
+    };
+    let leaf = |fine: String, coarse: String| format!(r#"{{"lods":{{"1":{coarse},"0":{fine}}}}}"#);
+    let tree = format!(
+        r#"{{"children":[{},{}]}}"#,
+        leaf(place(1, 20, 20), place(0, 5, 5)),
+        leaf(place(1, 0, 20), place(0, 0, 5))
+    );
+    let json = format!(
+        r#"{{"lodLevels":2,"filenames":["coarse/meta.json","0/meta.json"],
+        "environment":"sky/meta.json","tree":{tree}}}"#
+    );
+    let mut files = vec![("lod-meta.json".to_owned(), json.into_bytes())];
+    for (folder, count, sh_degree) in [("0", 45, 2), ("sky", 10, 0), ("coarse", 10, 2)] {
+        let part = sog(&gaussians(count, sh_degree, 20.0, 7), 2).into_iter();
+        files.extend(part.map(|(name, bytes)| (format!("{folder}/{name}"), bytes)));
+    }
+    files
+}
+
+#[test]
+fn streamed_sog_gives_its_finest_level_and_its_environment() {
+    let files = streamed();
+    let (all, _) = read_files(&files).unwrap();
+    assert_eq!((all.len(), all.sh_degree), (50, 2));
+    let sog_in = |folder: &str| {
+        let part = files.iter().filter_map(|(name, bytes)| {
+            Some((name.strip_prefix(folder)?.to_owned(), bytes.clone()))
+        });
+        read_files(&part.collect()).unwrap().0
+    };
+    let (fine, sky) = (sog_in("0/"), sog_in("sky/"));
+    assert_eq!(all.means_m[..40], fine.means_m[..40]);
+    assert_eq!(all.sh[..40 * 27], fine.sh[..40 * 27]);
+    assert_eq!(all.means_m[40..], sky.means_m[..]);
+    // The sky has no higher degrees: zeros.
+    assert!((40..50).all(|i| all.sh_of(i)[..3] == *sky.sh_of(i - 40)));
+    assert!((40..50).all(|i| all.sh_of(i)[3..].iter().all(|&c| c == 0.0)));
+    assert_eq!(read(&zip_of(&files, true)).unwrap(), all);
+}
+
+#[test]
+fn nurec_comes_back_without_what_moves() {
+    for sh_degree in 0..=3 {
+        let g = gaussians(50, sh_degree, 20.0, 8);
+        let within =
+            Within { mean_m: 0.01, quat: 5e-4, opacity: 6e-4, dc: 5e-4, sh: 5e-4, ..EXACT };
+        for with_cars in [false, true] {
+            let file = usdz(nurec_plain(&g, with_cars));
+            assert_alike(&read(&file).unwrap(), &g, within, "NuRec");
+        }
+    }
+}
+
+#[test]
+fn progress_of_every_format_ends_at_all_bytes() {
+    for case in crate::corpus::corpus() {
+        let dir = tempfile::tempdir().unwrap();
+        case.write(dir.path());
+        let mut reports = Vec::new();
+        let first = dir.path().join(&case.files[0].0);
+        ingest::read(&first, &mut |done, total| reports.push((done, total))).unwrap();
+        assert!(reports.is_sorted(), "{}: {reports:?}", case.name);
+        // Of a coarse level nothing is read.
+        let read = case.files.iter().filter(|(name, _)| !name.starts_with("coarse/"));
+        let bytes = read.map(|(name, _)| dir.path().join(name).metadata().unwrap().len()).sum();
+        assert_eq!(reports.last(), Some(&(bytes, bytes)), "{}", case.name);
+    }
+}

@@ -1,0 +1,405 @@
+//! Files that were cut, flipped, or made to harm.
+
+use std::io::Write;
+use std::process::Command;
+
+use wildcity::scene::Gaussians;
+
+use crate::corpus::{COUNT, corpus};
+use crate::format_files::{
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, usdz, webp, zip_of,
+};
+use crate::formats::streamed;
+use crate::refusal;
+use crate::scene_files::gaussians;
+
+#[test]
+fn every_case_is_sound_before_it_is_damaged() {
+    for case in corpus() {
+        let dir = tempfile::tempdir().unwrap();
+        case.write(dir.path());
+        let read = case.read_with(dir.path(), 0, &case.files[0].1);
+        let count = if case.name == "streamed SOG" { 50 } else { COUNT };
+        assert_eq!(read.unwrap().len(), count, "{}", case.name);
+    }
+}
+
+#[test]
+fn what_was_cut_off_anywhere_is_refused() {
+    for case in corpus() {
+        let dir = tempfile::tempdir().unwrap();
+        case.write(dir.path());
+        for (part, (name, bytes)) in case.files.iter().enumerate() {
+            // All ends of small files; of larger ones some, and not always the same of a word.
+            for end in (0..bytes.len()).step_by((bytes.len() / 40) | 1) {
+                // A record less is a smaller scene: the format has no count.
+                let is_whole = case.name == ".splat" && end > 0 && end % 32 == 0;
+                // Of a coarse level nothing is read.
+                let is_whole = is_whole || name.starts_with("coarse/");
+                let read = case.read_with(dir.path(), part, &bytes[..end]);
+                let place = format!("{}, {name} cut to {end} of {}", case.name, bytes.len());
+                match read {
+                    Ok(read) => assert!(is_whole, "{place}: read as {} Gaussians", read.len()),
+                    Err(error) => assert!(error.to_string().len() > 20, "{place}: {error}"),
+                }
+            }
+            case.read_with(dir.path(), part, bytes).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_flipped_bit_is_refused_or_changes_numbers_only() {
+    for case in corpus() {
+        let dir = tempfile::tempdir().unwrap();
+        case.write(dir.path());
+        for (part, (name, bytes)) in case.files.iter().enumerate() {
+            let mut bytes = bytes.clone();
+            for bit in (0..8 * bytes.len()).step_by((bytes.len() / 12) | 1) {
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                if let Ok(g) = case.read_with(dir.path(), part, &bytes) {
+                    let place = format!("{}, bit {bit} of {name}", case.name);
+                    assert!(g.len() <= 64, "{place}: {} Gaussians", g.len());
+                    assert_columns(&g, &place);
+                }
+                bytes[bit / 8] ^= 1 << (bit % 8);
+            }
+        }
+    }
+}
+
+/// All columns are equally long, and every number is within the gate.
+fn assert_columns(g: &Gaussians, place: &str) {
+    let n = g.len();
+    let colours = n * 3 * wildcity::scene::sh::coefficients(g.sh_degree);
+    let lengths = [g.quats_wxyz.len(), g.ln_scales.len(), g.logit_opacities.len()];
+    assert_eq!((lengths, g.sh.len()), ([n; 3], colours), "{place}");
+    let name = &|field| format!("{field:?}");
+    assert!(wildcity::ingest::validate::check(g, name).is_ok(), "{place}");
+}
+
+#[test]
+fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
+    let g = gaussians(COUNT, 0, 20.0, 1);
+    let changed = |mut file: Vec<u8>, at: usize, bytes: &[u8]| {
+        file[at..at + bytes.len()].copy_from_slice(bytes);
+        file
+    };
+    let huge = u32::MAX.to_le_bytes();
+    let cases = [
+        (changed(spz_plain(&g, 3), 8, &huge), "SPZ body: the header promises 85899345916 bytes"),
+        (gzip(&changed(spz_plain(&g, 3), 8, &huge)), "SPZ, the gzip stream: "),
+        (changed(spz4(&g), 8, &huge), "SPZ header, stream of positions: 54 bytes; 4294967295"),
+        // Four streams of version 4, and a length of 2^60 for one.
+        (changed(spz4(&g), 15, &[4]), "SPZ header, byte 15: 4 streams; SH degree 0 has 5"),
+        (
+            changed(spz4(&g), 44, &(1u64 << 60).to_le_bytes()),
+            "SPZ body: the header promises 1152921",
+        ),
+        (changed(spz4(&g), 16, &huge), "SPZ header, bytes 16 to 19: 4294967295 is no place"),
+        (changed(ksplat(&g, 0), 4, &huge), ".ksplat body: the header promises 4398046514176 bytes"),
+        (
+            changed(ksplat(&g, 0), 4096, &huge),
+            ".ksplat header, section 0: 4294967295 Gaussians, but",
+        ),
+        (changed(ksplat(&g, 0), 4096 + 4, &huge), ".ksplat body: the header promises 188978"),
+        (changed(ksplat(&g, 1), 4096 + 12, &huge), ".ksplat body: the header promises 515396"),
+        (changed(ksplat(&g, 1), 4096 + 8, &[0; 4]), ".ksplat header, section 0: its Gaussian 2 is"),
+    ];
+    for (file, wanted) in cases {
+        let text = refusal(&file);
+        assert!(text.starts_with(wanted), "{text}\n{wanted}");
+    }
+    let (json, buffer) = gltf(&g, "", "");
+    let count = 1u64 << 60;
+    let json = |from: &str, to: &str| glb((json.replacen(from, to, 1), buffer.clone()));
+    for (file, wanted) in [
+        (
+            json(r#""count":6"#, &format!(r#""count":{count}"#)),
+            "1152921504606846976 rows of 12 bytes",
+        ),
+        (
+            json(r#""byteOffset":0"#, r#""byteOffset":18446744073709551615"#),
+            "18446744073709551615 of buffer",
+        ),
+        (
+            json(r#""byteLength":72"#, r#""byteLength":18446744073709551615"#),
+            "18446744073709551615 bytes from 0",
+        ),
+        (
+            json(r#""bufferView":0"#, r#""bufferView":99"#),
+            "accessor 0 has no bufferView that is there",
+        ),
+        (
+            json(r#""buffer":0"#, r#""buffer":0,"byteStride":4"#),
+            "byteStride 4; 12 to 252 are possible",
+        ),
+        (json(r#""VEC3""#, r#""SCALAR""#), "accessor 0 is \"SCALAR\", not VEC3"),
+        (
+            json(r#"KHR_gaussian_splatting:SCALE"#, r#"SCALE"#),
+            "has no attribute KHR_gaussian_splatting:SCALE",
+        ),
+        (
+            json(r#""kernel":"ellipse""#, r#""extensions":{"KHR_x_compression_spz_2":{}}"#),
+            "is packed by KHR_x_compression_spz_2",
+        ),
+    ] {
+        let text = refusal(&file);
+        assert!(text.starts_with("glTF header, node 0, primitive 0"), "{text}");
+        assert!(text.contains(wanted), "{text}\n{wanted}");
+    }
+}
+
+/// What is said about a scene of several files, one of which was changed.
+fn refusal_of(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in files {
+        let mut bytes = bytes.clone();
+        if name == part {
+            change(&mut bytes);
+        }
+        let path = dir.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    }
+    let read = wildcity::ingest::read(&dir.path().join(&files[0].0), &mut |_, _| {});
+    read.unwrap_err().to_string()
+}
+
+fn text_change(from: &str, to: &str) -> impl Fn(&mut Vec<u8>) {
+    move |bytes| {
+        let text = String::from_utf8(std::mem::take(bytes)).unwrap();
+        let changed = text.replacen(from, to, 1);
+        assert_ne!(text, changed, "there is no {from}");
+        *bytes = changed.into_bytes();
+    }
+}
+
+#[test]
+fn a_sog_that_contradicts_itself_is_named_by_file() {
+    let files = sog(&gaussians(COUNT, 1, 20.0, 1), 2);
+    let meta = |from: &str, to: &str| refusal_of(&files, "meta.json", &text_change(from, to));
+    let many = format!(r#""count":{}"#, 1u64 << 60);
+    for (text, wanted) in [
+        (meta(r#""version":2"#, r#""version":3"#), "SOG header, meta.json: version 3; 2, and 1"),
+        (meta(r#""count":6"#, &many), "1152921504606846976 Gaussians; at most 4294967295 fit"),
+        (
+            meta(r#""count":6"#, r#""count":9"#),
+            "SOG body, means_l.webp: 4x2 pixels for 9 Gaussians",
+        ),
+        (
+            meta(r#""bands":1"#, r#""bands":2"#),
+            "SOG body, centroids.webp: is 192 pixels wide for 2 b",
+        ),
+        (meta(r#""bands":1"#, r#""bands":9"#), "SOG header, meta.json: shN has 9 bands; 1 to 3"),
+        (
+            meta(r#""count":6,"bands""#, r#""count":3,"bands""#),
+            "SOG body, centroids.webp: there is no entry 3,",
+        ),
+        (
+            meta(r#""count":6,"bands""#, r#""count":99,"bands""#),
+            "SOG body, centroids.webp: has room for 64 entries",
+        ),
+        (
+            meta(r#""codebook":["#, r#""codebook":[1.0,"#),
+            "SOG header, meta.json: scales has a codebook of 257",
+        ),
+        (meta("quats.webp", "../quats.webp"), "part \"../quats.webp\": is not a plain path below"),
+        (meta("quats.webp", "/etc/passwd"), "part \"/etc/passwd\": is not a plain path below"),
+        (meta("quats.webp", "none.webp"), "part \"none.webp\": cannot read: No such file"),
+        (
+            meta(r#""means":"#, r#""moons":"#),
+            "SOG header, meta.json: has neither means nor lodLevels",
+        ),
+        (meta(r#""maxs":["#, r#""maxs":[1e999,"#), "SOG header, meta.json: number out of range"),
+        (meta(r#""maxs":["#, r#""maxs":[1e300,"#), "SOG header, meta.json: trailing characters"),
+    ] {
+        assert!(text.starts_with(wanted), "{text}\n{wanted}");
+    }
+    let image = |name: &str, pixels: &[[u8; 4]]| {
+        refusal_of(&files, name, &|bytes| *bytes = webp(pixels, 4))
+    };
+    let text = image("quats.webp", &[[0, 0, 0, 251]; 6]);
+    assert!(text.starts_with("SOG body, quats.webp: Gaussian 0: alpha is 251"), "{text}");
+    let text = refusal_of(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
+    assert!(text.starts_with("SOG body, quats.webp: is no sound WebP image: "), "{text}");
+
+    let files = streamed();
+    let meta = |from: &str, to: &str| refusal_of(&files, "lod-meta.json", &text_change(from, to));
+    for (text, wanted) in [
+        (
+            meta(r#""file":1,"offset":0"#, r#""file":9,"offset":0"#),
+            "SOG header, lod-meta.json: file 9; there are 2",
+        ),
+        (
+            meta(r#""file":1,"offset":0"#, r#""file":1,"offset":1"#),
+            "SOG header, lod-meta.json: two leaves have",
+        ),
+        (meta(r#""offset":20"#, r#""offset":26"#), "SOG header, lod-meta.json: Gaussians to 46 of"),
+        (
+            meta(r#""offset":20"#, r#""offset":18446744073709551615"#),
+            "SOG header, lod-meta.json: Gaussians to",
+        ),
+        (
+            meta("coarse/meta.json", "0/meta.json"),
+            "SOG header, lod-meta.json: file \"0/meta.json\" is named twice",
+        ),
+        (
+            meta("sky/meta.json", "sky/../sky/meta.json"),
+            "part \"sky/../sky/meta.json\": is not a plain",
+        ),
+    ] {
+        assert!(text.starts_with(wanted), "{text}\n{wanted}");
+    }
+}
+
+#[test]
+fn archives_and_payloads_say_what_they_lack() {
+    let g = gaussians(COUNT, 0, 20.0, 1);
+    let file = |name: &str, bytes: &[u8]| vec![(name.to_owned(), bytes.to_vec())];
+    let text = refusal(&zip_of(&file("readme.txt", b"hello"), false));
+    assert!(
+        text.starts_with("zip body, directory: it holds no meta.json or lod-meta.json"),
+        "{text}"
+    );
+    let text = refusal(&zip_of(&file("archive/data.pkl", b"hello"), false));
+    assert!(text.contains("python -m wildcity.convert"), "{text}");
+    let text = refusal(&zip_of(&sog(&g, 2)[..3], false));
+    assert_eq!(text, "zip body, scales.webp: is not in the archive");
+    let mut zip = zip_of(&sog(&g, 2), false);
+    let at = zip.windows(4).position(|w| w == b"RIFF").unwrap() + 20;
+    zip[at] ^= 1;
+    assert!(
+        refusal(&zip).contains("means_l.webp: it is damaged: Invalid checksum"),
+        "{}",
+        refusal(&zip)
+    );
+
+    let plain = nurec_plain(&g, false);
+    let with = |from: &[u8], to: &[u8]| {
+        let at = plain.windows(from.len()).position(|w| w == from).unwrap();
+        refusal(&usdz([&plain[..at], to, &plain[at + from.len()..]].concat()))
+    };
+    for (text, wanted) in [
+        (
+            with(b"sigmoid", b"sigmois"),
+            "config.layers.street.density_activation: is \"sigmois\"; \"sigm",
+        ),
+        (with(b"state_dict", b"state_dick"), "nre_data.state_dict: is missing"),
+        (
+            with(b"street.rotations.shape", b"street.rotations.shade"),
+            "rotations.shape: is not two numbers",
+        ),
+        (with(&[0xce, 0, 0, 0, 6], &[0xce, 0xff, 0xff, 0xff, 6]), "positions: 36 bytes; 128849"),
+        (with(&[0xde, 0, 1], &[0xde, 0, 9]), "MessagePack: byte "),
+        (with(&[0xde, 0, 1], &[0xc1, 0, 1]), "MessagePack: byte 0: 0xc1 begins no value"),
+    ] {
+        assert!(text.starts_with("NuRec body, ") && text.contains(wanted), "{text}\n{wanted}");
+    }
+    let text = refusal(&usdz([0x91; 5000].to_vec()));
+    assert!(text.contains("more than 32 values in each other"), "{text}");
+    let many = [&[0xdd, 0xff, 0xff, 0xff, 0xff][..], &vec![0xc0; 3 << 20]].concat();
+    assert!(refusal(&usdz(many)).contains("more than 1048576 values"));
+}
+
+#[test]
+fn a_splat_is_told_by_its_first_record() {
+    let g = gaussians(4, 0, 20.0, 1);
+    let file = splat(&g);
+    let text = refusal(&file[..100]);
+    assert_eq!(
+        text,
+        ".splat body: the header promises 128 bytes (4 records of 32 bytes), the file holds 100; it \
+         is truncated: write or copy it again"
+    );
+    let mut negative = file.clone();
+    negative[32 + 12..32 + 16].copy_from_slice(&(-1.0f32).to_le_bytes());
+    assert!(
+        refusal(&negative).starts_with("Gaussian 1: ln of scale[0] is NaN"),
+        "{}",
+        refusal(&negative)
+    );
+    for text in
+        ["0.1234 0.5678 0.9012 0.3456 0.7890 0.1234", "id;x;y;z;opacity;1;2;3;4;5;6;7;8;9;10"]
+    {
+        assert!(refusal(text.as_bytes()).contains("as no format does that is read"), "{text}");
+    }
+}
+
+/// Bombs: little that unpacks to much. Refused by what they claim, or at the limit; and in a process
+/// of its own, in bounded memory.
+#[test]
+fn bombs_are_refused_in_bounded_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let write = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
+    // 512 MiB of nothing in 0.5 MB: an honest header for it, and a header that promises nothing of it.
+    let nothing = |start: &[u8]| {
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+        encoder.write_all(start).unwrap();
+        let zeros = vec![0; 1 << 20];
+        (0..512).for_each(|_| encoder.write_all(&zeros).unwrap());
+        encoder.finish().unwrap()
+    };
+    let header = |count: u32| {
+        let count = count.to_le_bytes();
+        [&b"NGSP\x03\x00\x00\x00"[..], &count, &[0, 12, 0, 0]].concat()
+    };
+    write("honest.spz", &nothing(&header((512 << 20) / 20)));
+    write("sly.spz", &nothing(&header(0)));
+    write("payload.usdz", &zip_of(&[("x.nurec".into(), nothing(b""))], false));
+    let big = vec![0; 512 << 20];
+    write(
+        "means.zip",
+        &zip_of(
+            &{
+                let mut files = sog(&gaussians(COUNT, 0, 20.0, 1), 2);
+                files[1].1 = big;
+                files
+            },
+            true,
+        ),
+    );
+    // An image of 8,192 x 8,192 pixels, all alike: 256 MiB in some kB; and six of them.
+    let image = webp(&vec![[128, 128, 128, 255]; 8192 * 8192], 8192);
+    assert!(image.len() < 1 << 20);
+    let mut files = sog(&gaussians(COUNT, 0, 20.0, 1), 2);
+    files[1..].iter_mut().for_each(|file| file.1 = image.clone());
+    let meta = String::from_utf8(files[0].1.clone()).unwrap();
+    files[0].1 = meta.replace(r#""count":6"#, r#""count":67108864"#).into_bytes();
+    write("images.sog", &zip_of(&files, false));
+    // Two nodes of a thousand show one mesh.
+    let (json, buffer) = gltf(&gaussians(20_000, 3, 20.0, 1), "", "");
+    let nodes = vec![r#"{"mesh":0}"#; 1000].join(",");
+    let shown: Vec<String> = (0..1000).map(|node| node.to_string()).collect();
+    let json = json.replacen(r#"[{"mesh":0}]"#, &format!("[{nodes}]"), 1);
+    let json =
+        json.replacen(r#"{"nodes":[0]}"#, &format!(r#"{{"nodes":[{}]}}"#, shown.join(",")), 1);
+    write("instances.glb", &glb((json, buffer)));
+
+    for (name, wanted, limit_mb) in [
+        ("honest.spz", "SPZ, the gzip stream: ", 60),
+        ("sly.spz", "SPZ body, the end: more than the 16 bytes", 60),
+        ("payload.usdz", "NuRec, the gzip stream: ", 250),
+        ("means.zip", "zip, means_l.webp: ", 60),
+        ("images.sog", "SOG, means_l.webp: ", 60),
+        ("instances.glb", "glTF, node ", 700),
+    ] {
+        let path = dir.path().join(name);
+        let file_mb = std::fs::metadata(&path).unwrap().len() >> 20;
+        assert!(file_mb < 6, "{name} is {file_mb} MB: no bomb");
+        // The shell keeps to the limit of address space, which bounds what is resident.
+        let import = Command::new("sh")
+            .args(["-c", r#"ulimit -v "$1"; exec "$2" import "$3" --twin bomb --twins "$4""#, "sh"])
+            .arg(((limit_mb + 150) << 10).to_string())
+            .arg(env!("CARGO_BIN_EXE_wildcity"))
+            .arg(&path)
+            .arg(dir.path().join("twins"))
+            .env("RAYON_NUM_THREADS", "2")
+            .env("MALLOC_ARENA_MAX", "1")
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&import.stderr);
+        assert_eq!(import.status.code(), Some(1), "{name}: {said}");
+        assert!(said.contains(wanted), "{name}: {said}");
+    }
+}
