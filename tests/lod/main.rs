@@ -4,7 +4,6 @@
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/images.rs"]
-#[allow(dead_code, reason = "tests/render uses the rest of it")]
 mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
