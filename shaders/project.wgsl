@@ -104,20 +104,34 @@ struct Projected {
 
 // Camera-space z, as if computed exactly and rounded once: splats are blended in order of it, and
 // surfels of one facade must not be ordered by rounding errors. Products and sums carry what their
-// rounding loses (Dekker 1971; two-sum by Knuth); where `fma` rounds twice, what products lose is lost.
+// rounding loses (Dekker 1971; two-sum by Knuth). Not by `fma`, which may round twice: lavapipe's does.
 fn depth(mean: vec3f, view: ChunkView) -> f32 {
     var sum = view.forward_high.w;
     var lost = view.forward_low.w;
     for (var axis = 0; axis < 3; axis++) {
         let product = mean[axis] * view.forward_high[axis];
-        lost += fma(mean[axis], view.forward_high[axis], -product);
+        let a = halves(mean[axis]);
+        let b = halves(view.forward_high[axis]);
+        lost += ((a.x * b.x - product) + a.x * b.y + a.y * b.x) + a.y * b.y;
         lost += mean[axis] * view.forward_low[axis];
-        let next = sum + product;
-        let part = next - sum;
+        let next = rounded(sum + product);
+        let part = rounded(next - sum);
         lost += (sum - (next - part)) + (product - part);
         sum = next;
     }
     return sum + lost;
+}
+
+// Keeps a compiler from calculating with what was to be rounded: WGSL has no `precise`, and Mesa takes
+// (a + b) - a for b. No camera sees as far.
+fn rounded(x: f32) -> f32 {
+    return max(x, -3e38);
+}
+
+// A number as the sum of two of 12 bits each, whose products are exact in the 24 bits of f32.
+fn halves(x: f32) -> vec2f {
+    let high = bitcast<f32>(bitcast<u32>(x) & 0xFFFFF000u);
+    return vec2f(high, x - high);
 }
 
 fn project_shape(own: Geometry, view: ChunkView) -> Projected {

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 mod bench;
+mod bisect;
 mod demo;
 mod devices;
 mod import;
@@ -38,6 +39,7 @@ enum Command {
     Render(render::Render),
     Replay(replay::Replay),
     Bench(bench::Bench),
+    Bisect(bisect::Bisect),
     Devices(devices::Devices),
 }
 
@@ -54,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Bench(command) => command.run(),
+        Command::Bisect(command) => command.run(),
         Command::Devices(command) => command.run(),
     };
     match result {

@@ -9,7 +9,7 @@ use crate::config;
 use crate::render::{Frame, Target};
 use crate::session;
 
-use super::scene_source::{SceneSource, Shot};
+use super::scene_source::{Renderer, SceneSource, Shot};
 use super::{output, progress};
 
 /// Render cameras of a file to images.
@@ -22,6 +22,9 @@ use super::{output, progress};
 pub(super) struct Render {
     #[command(flatten)]
     source: SceneSource,
+
+    #[command(flatten)]
+    renderer: Renderer,
 
     /// Directory for the images; made if it is missing.
     #[arg(long, value_name = "DIR")]
@@ -36,6 +39,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity render skull.ply --cameras front.json --out pictures
   wildcity render street --cameras views.json --out truth --backend reference --format npy
+  wildcity render street --cameras views.json --out half --cpu-through sort
   wildcity render scene.ply --cameras views.json --out p --profile near=0.2 --profile alpha_cap=0.999";
 
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
@@ -49,6 +53,7 @@ enum Format {
 impl Render {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
+        let backend = self.renderer.backend()?;
         output::make_dir(&self.out)?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
@@ -73,7 +78,7 @@ impl Render {
                     Target { rgb8: Some(&mut rgb8), ..Target::default() }
                 }
             };
-            ready.backend.render(&frame, &mut [target], &|_, _| {})?;
+            backend.render(&frame, &mut [target], &|_, _| {})?;
             let file = self.format.file(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
             let file = file.with_context(|| format!("cannot write {}", path.display()))?;
             output::write(&path, &file)?;

@@ -14,6 +14,8 @@ use crate::render::automatic::{Automatic, automatic};
 use crate::render::cpu::{Cpu, Simd};
 use crate::render::gpu::{AdapterChoice, Gpu};
 use crate::render::reference::Reference;
+use crate::render::relay::Relay;
+use crate::render::stage::Stage;
 use crate::render::{Backend, View};
 use crate::residency::{Cache, Resident};
 use crate::scene::{RenderProfile, Scene};
@@ -42,9 +44,19 @@ pub(super) struct SceneSource {
     /// far, blur, antialiased, alpha_cap, alpha_cut, stop, tau_px, reach_m.
     #[arg(long = "profile", value_name = "KEY=VALUE")]
     settings: Vec<String>,
+}
 
+/// Who renders, for the commands that look at the renderer itself.
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Renderer {
     #[command(flatten)]
     engine: Engine,
+
+    /// Run the stages up to and including this one on the cpu backend, and the rest on --device (one in
+    /// software too). An image that is wrong with --cpu-through project and right with
+    /// --cpu-through sort was spoilt by the GPU's sort; `wildcity bisect` tries them all.
+    #[arg(long, value_name = "STAGE", value_enum)]
+    cpu_through: Option<StageName>,
 }
 
 /// Which backend, on what.
@@ -54,6 +66,13 @@ pub(super) struct Engine {
     #[arg(long, value_enum, default_value_t)]
     backend: BackendName,
 
+    #[command(flatten)]
+    machine: Machine,
+}
+
+/// What the backends run on.
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Machine {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
     #[arg(long, default_value_t = 0, value_parser = threads)]
     threads: usize,
@@ -81,6 +100,27 @@ enum BackendName {
     Cpu,
     /// f64 by definition: slow.
     Reference,
+}
+
+/// [`Stage`] on the command line.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum StageName {
+    /// Gaussians become splats.
+    Project,
+    /// Splats are put in order of depth.
+    Sort,
+    /// Every tile gets its list of splats: only rasterize is left to the GPU.
+    Bin,
+}
+
+impl From<StageName> for Stage {
+    fn from(name: StageName) -> Self {
+        match name {
+            StageName::Project => Self::Project,
+            StageName::Sort => Self::Sort,
+            StageName::Bin => Self::Bin,
+        }
+    }
 }
 
 /// The instruction sets of [`Simd`].
@@ -111,17 +151,18 @@ impl From<SimdName> for Simd {
 impl Engine {
     /// Makes the backend, and says on standard error which one it is if nobody named it.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        match (self.backend, &self.device) {
+        let Machine { threads, device, simd } = &self.machine;
+        match (self.backend, device) {
             (BackendName::Auto, None) => {
-                let Automatic { backend, reason } = automatic(self.threads, self.simd.into())?;
+                let Automatic { backend, reason } = automatic(*threads, (*simd).into())?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
-            (BackendName::Auto | BackendName::Gpu, device) => self.gpu(device.as_deref()),
+            (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.machine.gpu()?)),
             (_, Some(device)) => {
                 anyhow::bail!("--device {device:?} is one of the gpu backend: add --backend gpu")
             }
-            (BackendName::Cpu, None) => Ok(Box::new(Cpu::new(self.threads, self.simd.into())?)),
+            (BackendName::Cpu, None) => Ok(Box::new(self.machine.cpu()?)),
             (BackendName::Reference, None) => Ok(Box::new(Reference)),
         }
     }
@@ -134,10 +175,35 @@ impl Engine {
             _ => self.backend(),
         }
     }
+}
 
-    fn gpu(&self, device: Option<&str>) -> anyhow::Result<Box<dyn Backend>> {
-        let named = |name: &str| AdapterChoice::Named(name.to_owned());
-        Ok(Box::new(Gpu::new(&device.map_or(AdapterChoice::Best, named), self.threads)?))
+impl Machine {
+    /// The cpu backend.
+    pub(super) fn cpu(&self) -> anyhow::Result<Cpu> {
+        Ok(Cpu::new(self.threads, self.simd.into())?)
+    }
+
+    /// The gpu backend.
+    pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
+        let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
+        Ok(Gpu::new(&choice, self.threads)?)
+    }
+}
+
+impl Renderer {
+    /// Makes the backend.
+    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+        let Engine { backend, machine } = &self.engine;
+        match (self.cpu_through, backend) {
+            (None, _) => self.engine.backend(),
+            (Some(stage), BackendName::Auto | BackendName::Gpu) => {
+                Ok(Box::new(Relay::new(machine.cpu()?, machine.gpu()?, stage.into())))
+            }
+            (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
+                "--cpu-through leaves the stages after it to the GPU: leave --backend away, or give \
+                 --backend gpu"
+            ),
+        }
     }
 }
 
@@ -148,13 +214,12 @@ fn threads(text: &str) -> Result<usize, String> {
     }
 }
 
-/// Everything that a rendering command needs.
+/// What a rendering command draws.
 pub(super) struct Ready {
     source: Source,
     /// What one frame of all shots draws.
     pub(super) scene: Scene,
     pub(super) shots: Vec<Shot>,
-    pub(super) backend: Box<dyn Backend>,
 }
 
 /// A camera with the profile that it is rendered with.
@@ -193,7 +258,7 @@ impl Ready {
 }
 
 impl SceneSource {
-    /// Reads the scene and the cameras, and makes the backend.
+    /// Reads the scene and the cameras.
     pub(super) fn open(&self) -> anyhow::Result<Ready> {
         let cameras =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
@@ -201,7 +266,7 @@ impl SceneSource {
         let shots = cameras.into_iter().map(|camera| self.shot(camera, profile));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
         let scene = source.scene(&shots);
-        Ok(Ready { source, scene, shots, backend: self.engine.backend()? })
+        Ok(Ready { source, scene, shots })
     }
 
     /// A camera's own near counts more than the twin's, and less than one on the command line.

@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 
 use super::View;
-use super::constants::SLOPE_SLACK;
+use super::constants::{DEPTH_BITS, SLOPE_SLACK};
 use crate::scene::{Chunk, RenderProfile};
 
 /// A splat: a Gaussian on the screen of one view (48 bytes).
@@ -60,6 +60,13 @@ impl Cutoffs {
             log2_alpha_cut: profile.alpha_cut.log2() as f32,
             stop: profile.stop as f32,
         }
+    }
+
+    /// What splats are sorted by: `view (4 bits) | depth (28 bits)`, from the nearest.
+    #[inline(always)]
+    pub fn sort_key(&self, view: usize, depth_m: f32) -> u32 {
+        let depth = depth_m.to_bits() - self.near_m.to_bits();
+        (view as u32) << DEPTH_BITS | depth.min((1 << DEPTH_BITS) - 1)
     }
 
     /// Largest extent of any splat, in standard deviations: 3.33 for 1/255.

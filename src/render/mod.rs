@@ -9,6 +9,8 @@ pub mod cpu;
 pub mod gpu;
 pub mod layout;
 pub mod reference;
+pub mod relay;
+pub mod stage;
 
 use crate::geometry::{Camera, Pose};
 use crate::scene::{RenderProfile, Rig, Scene};
@@ -152,10 +154,8 @@ impl Frame<'_> {
     /// # Errors
     /// Names the first view whose target does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
+        self.check_views()?;
         let count = self.views.len();
-        if !(1..=MAX_VIEWS).contains(&count) {
-            return Err(RenderError::Views { count });
-        }
         if targets.len() != count {
             return Err(RenderError::Targets { targets: targets.len(), views: count });
         }
@@ -174,5 +174,15 @@ impl Frame<'_> {
             }
         }
         Ok(())
+    }
+
+    /// # Errors
+    /// No view, or too many.
+    pub fn check_views(&self) -> Result<(), RenderError> {
+        let count = self.views.len();
+        match (1..=MAX_VIEWS).contains(&count) {
+            true => Ok(()),
+            false => Err(RenderError::Views { count }),
+        }
     }
 }

@@ -16,6 +16,8 @@ mod streets;
 mod truths;
 
 mod bench;
+mod command_line;
+mod definition;
 mod determinism;
 mod devices;
 mod extremes;
@@ -24,4 +26,5 @@ mod overlap;
 mod parity;
 mod parts;
 mod slips;
+mod stages;
 mod twins;

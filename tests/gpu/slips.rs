@@ -3,74 +3,136 @@
 use glam::DVec3;
 use wildcity::render::gpu::shaders::Shaders;
 use wildcity::render::{Backend, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity::scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, look, render};
 use crate::streets::{street, street_views};
 
-#[test]
-fn a_slip_in_any_stage_is_caught() {
-    let mut street = street(30_000, 3, 41);
-    // And mist over more macro tiles than one thread emits.
-    for i in (0..street.len()).step_by(1_000) {
+/// A fault to plant in a shader.
+#[derive(Debug)]
+pub(crate) struct Slip {
+    /// Which shader.
+    pub(crate) shader: &'static str,
+    /// What of it is replaced.
+    pub(crate) part: &'static str,
+    /// By what.
+    pub(crate) text: &'static str,
+    /// The stages that are wrong then: more than one where they share the shader.
+    pub(crate) stages: &'static [&'static str],
+}
+
+const fn slip(
+    shader: &'static str,
+    part: &'static str,
+    text: &'static str,
+    stages: &'static [&'static str],
+) -> Slip {
+    Slip { shader, part, text, stages }
+}
+
+const PROJECT: &[&str] = &["project"];
+const SORT: &[&str] = &["sort"];
+const BIN: &[&str] = &["bin"];
+const RASTERIZE: &[&str] = &["rasterize"];
+const SORTS: &[&str] = &["sort", "bin"];
+
+pub(crate) const SLIPS: &[Slip] = &[
+    slip(
+        "project",
+        "let clamped = clamp(slope, view.slope_min, view.slope_max);",
+        "let clamped = slope * 0.9;",
+        PROJECT,
+    ),
+    slip("project", "let l1 = -(b * l2)", "let l1 = (b * l2)", PROJECT),
+    slip("project", "x.y + turn.z", "x.y - turn.z", PROJECT),
+    slip("project", "(high & 0xFFu) << 12u", "(high & 0xFFu) << 11u", PROJECT),
+    slip("project", "2.890611442640554", "2.0", PROJECT),
+    slip("project", "-d.y * coefficient(at, 1u)", "d.y * coefficient(at, 1u)", PROJECT),
+    slip("project", "min(depth, (1u << DEPTH_BITS) - 1u)", "0u", PROJECT),
+    slip(
+        "project",
+        "(own_word & own_bit) == 0u",
+        "(own_word & own_bit & 0x7FFFFFFFu) == 0u",
+        PROJECT,
+    ),
+    slip(
+        "scan",
+        "sum = saturating_add(sum, before);",
+        "sum = max(sum, before);",
+        &["project", "sort", "bin"],
+    ),
+    slip(
+        "scan",
+        "block_sums[count] = before;",
+        "block_sums[count] = before / 2u;",
+        &["project", "bin"],
+    ),
+    slip(
+        "sort",
+        "countOneBits(beside & (own_bit - 1u))",
+        "countOneBits(beside & own_bit) - 1u",
+        SORTS,
+    ),
+    slip("sort", "place = next[own_digit]", "place = offsets[own_digit]", SORTS),
+    slip("sort", "is_last = after == 0u", "is_last = beside == own_bit", SORTS),
+    // Macro tiles have no third digit here.
+    slip("sort", "(key >> SHIFT)", "(key >> min(SHIFT, 16u))", SORT),
+    slip("bin", "u32(columns.y) / TILE_PX + 1u", "u32(columns.y) / TILE_PX", BIN),
+    slip("bin", "- first_column + 1u", "- first_column", BIN),
+    slip("bin", "1u << (end - left)", "1u << (end - left - 1u)", BIN),
+    slip("bin", "<< (k * MACRO_COLUMNS)", "<< (k * 7u)", BIN),
+    slip(
+        "bin",
+        "half_width(reach, right_dy) + EXTENT_SLACK_PX",
+        "0.7 * half_width(reach, right_dy)",
+        BIN,
+    ),
+    slip("bin", "i - prefix_before(holder)", "i", BIN),
+    slip("sort", "sorted_masks[to] = masks[i]", "sorted_masks[to] = masks[to]", BIN),
+    slip("ranges", "ranges[own].y = i + 1u", "ranges[own].y = i", BIN),
+    slip("expand", "offsets[tile] = atomicLoad(&counts[thread])", "offsets[tile] = 0u", BIN),
+    slip("expand", "word_starts[word] = next", "word_starts[word] = first", BIN),
+    slip("expand", "& (own_bit - 1u)", "& ~(own_bit | (own_bit - 1u))", BIN),
+    slip("expand", "k / MACRO_COLUMNS", "k / 4u", BIN),
+    slip("rasterize", "after > vec4f(frame.stop)", "after > vec4f(50.0 * frame.stop)", RASTERIZE),
+    slip("rasterize", "instance_places[first + k]", "instance_places[first + (k ^ 1u)]", RASTERIZE),
+    slip("rasterize", "sums.green += weight", "sums.green += alpha", RASTERIZE),
+    slip("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)", RASTERIZE),
+    slip("rasterize", "sums.depth / select", "sums.depth * select", RASTERIZE),
+    slip("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0", RASTERIZE),
+];
+
+/// A street of SH degree 3 with mist in it, over more macro tiles than one thread emits.
+pub(crate) fn misty_street(n: usize) -> Gaussians {
+    let mut street = street(n, 3, 41);
+    for i in (0..n).step_by(1_000) {
         street.ln_scales[i] = [2.0; 3];
         street.logit_opacities[i] = -3.0;
     }
-    let scene = Scene::from_gaussians(&street);
-    let profile = RenderProfile::default();
+    street
+}
+
+/// The street's views, and one of many macro tiles.
+pub(crate) fn wide_views() -> Vec<View> {
     let [first, ..] = street_views();
     let wide = look([700, 300], 400.0, first.world_from_camera.position_m, DVec3::Z, DVec3::Y);
-    let views: Vec<View> = street_views().into_iter().chain([wide]).collect();
+    street_views().into_iter().chain([wide]).collect()
+}
+
+#[test]
+fn a_slip_in_any_stage_is_caught() {
+    let scene = Scene::from_gaussians(&misty_street(30_000));
+    let (profile, views) = (RenderProfile::default(), wide_views());
     let truths = render(&cpu(), &scene, &profile, &views);
     let caught = |backend: &dyn Backend| {
         let images = render(backend, &scene, &profile, &views);
         images.iter().zip(&truths).any(|(image, truth)| agree(image, truth).is_err())
     };
     assert!(!caught(&gpu()), "nothing is broken, and something was found");
-    for (stage, part, slip) in [
-        (
-            "project",
-            "let clamped = clamp(slope, view.slope_min, view.slope_max);",
-            "let clamped = slope * 0.9;",
-        ),
-        ("project", "let l1 = -(b * l2)", "let l1 = (b * l2)"),
-        ("project", "x.y + turn.z", "x.y - turn.z"),
-        ("project", "(high & 0xFFu) << 12u", "(high & 0xFFu) << 11u"),
-        ("project", "2.890611442640554", "2.0"),
-        ("project", "-d.y * coefficient(at, 1u)", "d.y * coefficient(at, 1u)"),
-        ("project", "min(depth, (1u << DEPTH_BITS) - 1u)", "0u"),
-        ("project", "(own_word & own_bit) == 0u", "(own_word & own_bit & 0x7FFFFFFFu) == 0u"),
-        ("scan", "sum = saturating_add(sum, before);", "sum = max(sum, before);"),
-        ("scan", "block_sums[count] = before;", "block_sums[count] = before / 2u;"),
-        ("sort", "countOneBits(beside & (own_bit - 1u))", "countOneBits(beside & own_bit) - 1u"),
-        ("sort", "place = next[own_digit]", "place = offsets[own_digit]"),
-        ("sort", "is_last = after == 0u", "is_last = beside == own_bit"),
-        ("bin", "u32(columns.y) / TILE_PX + 1u", "u32(columns.y) / TILE_PX"),
-        ("bin", "- first_column + 1u", "- first_column"),
-        ("bin", "1u << (end - left)", "1u << (end - left - 1u)"),
-        ("bin", "<< (k * MACRO_COLUMNS)", "<< (k * 7u)"),
-        (
-            "bin",
-            "half_width(reach, right_dy) + EXTENT_SLACK_PX",
-            "0.7 * half_width(reach, right_dy)",
-        ),
-        ("bin", "i - prefix_before(holder)", "i"),
-        ("sort", "sorted_masks[to] = masks[i]", "sorted_masks[to] = masks[to]"),
-        ("ranges", "ranges[own].y = i + 1u", "ranges[own].y = i"),
-        ("expand", "offsets[tile] = atomicLoad(&counts[thread])", "offsets[tile] = 0u"),
-        ("expand", "word_starts[word] = next", "word_starts[word] = first"),
-        ("expand", "& (own_bit - 1u)", "& ~(own_bit | (own_bit - 1u))"),
-        ("expand", "k / MACRO_COLUMNS", "k / 4u"),
-        ("rasterize", "after > vec4f(frame.stop)", "after > vec4f(50.0 * frame.stop)"),
-        ("rasterize", "instance_places[first + k]", "instance_places[first + (k ^ 1u)]"),
-        ("rasterize", "sums.green += weight", "sums.green += alpha"),
-        ("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)"),
-        ("rasterize", "sums.depth / select", "sums.depth * select"),
-        ("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0"),
-    ] {
-        let broken = Shaders::default().with_slip(stage, part, slip);
-        let broken = broken.unwrap_or_else(|| panic!("{part:?} is no longer in {stage}"));
-        assert!(caught(&gpu_with(broken)), "{stage}: {slip:?} went unnoticed");
+    for slip in SLIPS {
+        let broken = Shaders::default().with_slip(slip.shader, slip.part, slip.text);
+        let broken = broken.unwrap_or_else(|| panic!("{slip:?}: the part is no longer there"));
+        assert!(caught(&gpu_with(broken)), "{slip:?} went unnoticed");
     }
 }

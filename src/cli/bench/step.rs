@@ -9,7 +9,7 @@ use crate::render::{Backend, Frame, FrameStats, Target, View};
 
 use super::median;
 use crate::cli::progress;
-use crate::cli::scene_source::SceneSource;
+use crate::cli::scene_source::{Renderer, SceneSource};
 
 /// Time one step: all cameras of the list in one frame, to 8-bit colour.
 ///
@@ -21,6 +21,9 @@ use crate::cli::scene_source::SceneSource;
 pub(super) struct Step {
     #[command(flatten)]
     source: SceneSource,
+
+    #[command(flatten)]
+    renderer: Renderer,
 
     /// Frames to time.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -39,6 +42,7 @@ Examples:
 impl Step {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
+        let backend = self.renderer.backend()?;
         let views: Vec<View> = ready.shots.iter().map(|shot| shot.view).collect();
         let profile = ready.shots[0].profile;
         if let Some(other) = ready.shots.iter().find(|shot| shot.profile != profile) {
@@ -60,7 +64,7 @@ impl Step {
             let mut targets: Vec<Target<'_>> =
                 targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
             let start = Instant::now();
-            let stats = ready.backend.render(&frame, &mut targets, &|_, _| {})?;
+            let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
             let step_ms = start.elapsed().as_secs_f64() * 1e3;
             if repeat > 0 {
                 runs.push((step_ms, stats));
@@ -68,7 +72,7 @@ impl Step {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        self.report(&ready.scene, &views, &*ready.backend, &runs)
+        self.report(&ready.scene, &views, &*backend, &runs)
     }
 
     fn report(

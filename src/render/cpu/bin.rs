@@ -182,6 +182,16 @@ impl Bins {
         self.used
     }
 
+    /// Where each tile's list starts, all views one after the other, and the end of the last.
+    pub(super) fn starts(&self) -> &[u32] {
+        &self.starts
+    }
+
+    /// The lists of all tiles, one after the other: places in the projection.
+    pub(super) fn places(&self) -> impl Iterator<Item = u32> {
+        self.instances[..self.used].iter().map(|place| place.load(Relaxed))
+    }
+
     /// Places in the projection of the splats of one tile of one view, from the nearest.
     pub(super) fn tile(&self, view: usize, tile: usize) -> &[AtomicU32] {
         let tile = self.first_tile[view] + tile;

@@ -4,6 +4,7 @@
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
 mod bin;
+mod handover;
 mod lanes;
 mod project;
 mod rasterize;
@@ -19,6 +20,7 @@ use rayon::ThreadPool;
 use crate::config;
 
 use super::layout::Cutoffs;
+use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The f32 backend.
@@ -95,6 +97,58 @@ impl Cpu {
         let pool = pool.map_err(CpuError::Threads)?;
         Ok(Self { pool, level, scratch: Mutex::default() })
     }
+
+    /// Runs the stages up to and including `last`, for another backend to go on or to compare with.
+    ///
+    /// # Errors
+    /// The views are none or too many, or there are too many instances.
+    pub fn through(
+        &self,
+        frame: &Frame<'_>,
+        last: Stage,
+    ) -> Result<(Between, FrameStats), RenderError> {
+        frame.check_views()?;
+        let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
+        let scratch = &mut *scratch;
+        let cutoffs = Cutoffs::new(frame.profile);
+        self.pool.install(|| {
+            let mut stats = FrameStats::default();
+            scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
+            let mut clock = Clock::start();
+            let between = handover::between(scratch, last, &cutoffs);
+            clock.stage("hand over", &mut stats);
+            Ok((between, stats))
+        })
+    }
+}
+
+impl Scratch {
+    /// Runs the stages up to `last`. Each fills its part from the start, so what a frame before left
+    /// there, or a panic, does no harm.
+    fn run(
+        &mut self,
+        level: Level,
+        frame: &Frame<'_>,
+        cutoffs: &Cutoffs,
+        last: Stage,
+        stats: &mut FrameStats,
+    ) -> Result<(), RenderError> {
+        let Self { projected, sorted, bins } = self;
+        let mut clock = Clock::start();
+        projected.project(level, frame, cutoffs);
+        clock.stage("project", stats);
+        stats.visible_pairs = projected.len() as u64;
+        if last >= Stage::Sort {
+            sorted.sort(projected, cutoffs);
+            clock.stage("sort", stats);
+        }
+        if last >= Stage::Bin {
+            bins.bin(level, projected, sorted, frame.views, cutoffs)?;
+            clock.stage("bin", stats);
+            stats.instances = bins.instances() as u64;
+        }
+        Ok(())
+    }
 }
 
 impl Backend for Cpu {
@@ -119,41 +173,35 @@ impl Backend for Cpu {
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
-        // Every stage fills its scratch from the start, so a panic elsewhere left nothing harmful.
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
-        let Scratch { projected, sorted, bins } = &mut *scratch;
-        let (level, cutoffs) = (self.level, Cutoffs::new(frame.profile));
+        let scratch = &mut *scratch;
+        let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
-            let mut clock = Clock { start: Instant::now(), stages_ms: Vec::with_capacity(4) };
-            projected.project(level, frame, &cutoffs);
-            clock.stage("project");
-            sorted.sort(projected, &cutoffs);
-            clock.stage("sort");
-            bins.bin(level, projected, sorted, frame.views, &cutoffs)?;
-            clock.stage("bin");
-            let views = frame.views;
-            let input = rasterize::Input { projected, bins, views, cutoffs: &cutoffs };
-            let evaluations = rasterize::rasterize(level, input, targets, finished);
-            clock.stage("rasterize");
-            Ok(FrameStats {
-                stages_ms: clock.stages_ms,
-                visible_pairs: sorted.len() as u64,
-                instances: bins.instances() as u64,
-                evaluations,
-            })
+            let mut stats = FrameStats::default();
+            scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
+            let mut clock = Clock::start();
+            let Scratch { projected, bins, .. } = scratch;
+            let input = rasterize::Input { projected, bins, views: frame.views, cutoffs: &cutoffs };
+            stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
+            clock.stage("rasterize", &mut stats);
+            Ok(stats)
         })
     }
 }
 
 struct Clock {
     start: Instant,
-    stages_ms: Vec<(&'static str, f64)>,
 }
 
 impl Clock {
-    fn stage(&mut self, name: &'static str) {
+    fn start() -> Self {
+        Self { start: Instant::now() }
+    }
+
+    /// What has passed since the last stage is this one's.
+    fn stage(&mut self, name: &'static str, stats: &mut FrameStats) {
         let now = Instant::now();
-        self.stages_ms.push((name, (now - self.start).as_secs_f64() * 1e3));
+        stats.stages_ms.push((name, (now - self.start).as_secs_f64() * 1e3));
         self.start = now;
     }
 }

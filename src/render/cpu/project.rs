@@ -81,6 +81,11 @@ impl Projected {
         self.units.iter().map(|unit| unit.len).sum()
     }
 
+    /// Places, of which the last ones of a unit may be empty.
+    pub(super) fn places(&self) -> usize {
+        self.pages.len() * PAGE
+    }
+
     /// The units in order of (view, global id).
     pub(super) fn units(&self) -> &[Unit] {
         &self.units

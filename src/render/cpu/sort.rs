@@ -9,7 +9,7 @@ use crate::render::layout::Cutoffs;
 /// The order of a frame's splats.
 #[derive(Debug, Default)]
 pub(super) struct Sorted {
-    /// `view (4 bits) | depth (28 bits) | place in the projection (32 bits)`.
+    /// [`Cutoffs::sort_key`] (32 bits), then the place in the projection (32 bits).
     keys: Vec<u64>,
 }
 
@@ -17,7 +17,6 @@ impl Sorted {
     /// Sorts what the projection left. Keys differ by their place, so any sort gives one order,
     /// and the place counts through (view, global id): equal depths keep the order of ids.
     pub(super) fn sort(&mut self, projected: &Projected, cutoffs: &Cutoffs) {
-        let near = cutoffs.near_m.to_bits();
         let len = projected.len();
         self.keys.clear();
         self.keys.reserve_exact(len);
@@ -29,18 +28,17 @@ impl Sorted {
             (unit, keys)
         });
         units.collect::<Vec<_>>().into_par_iter().for_each(|(unit, keys)| {
-            let view = (unit.view as u64) << (DEPTH_BITS + 32);
             for (key, (place, splat)) in keys.iter_mut().zip(projected.unit(unit)) {
-                let depth = (splat.depth_m.to_bits() - near).min((1 << DEPTH_BITS) - 1);
-                *key = view | u64::from(depth) << 32 | u64::from(place);
+                let by = cutoffs.sort_key(unit.view, splat.depth_m);
+                *key = u64::from(by) << 32 | u64::from(place);
             }
         });
         self.keys.par_sort_unstable();
     }
 
-    /// How many splats.
-    pub(super) fn len(&self) -> usize {
-        self.keys.len()
+    /// Places in the projection of all views' splats, in order.
+    pub(super) fn places(&self) -> impl Iterator<Item = u32> {
+        self.keys.iter().map(|&key| key as u32)
     }
 
     /// Keys of one view's splats, from the nearest; the low half is the place in the projection.

@@ -6,10 +6,10 @@
 //!
 //! Twin of `render/cpu/bin.rs`; WGSL: `bin`, `sort`, `ranges` and `expand` in `shaders`.
 
-use wgpu::{Buffer, BufferUsages, ComputePass};
+use wgpu::{Buffer, ComputePass};
 
 use super::device::Device;
-use super::growing::Growing;
+use super::growing::{Growing, HANDED_OVER};
 use super::kernel::{Groups, Kernel, module, slot};
 use super::layout::Job;
 use super::plan::{Plan, job};
@@ -48,8 +48,7 @@ pub(super) struct Bin {
 impl Bin {
     pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
         let kernel = |name, entry| Kernel::new(device, &module(device, shaders, name), entry, &[]);
-        let storage = BufferUsages::STORAGE;
-        let growing = |label| Growing::new(device, label, storage);
+        let growing = |label| Growing::new(device, label, HANDED_OVER);
         Self {
             count_touches: kernel("bin", "count"),
             emit_touches: kernel("bin", "emit"),
@@ -60,7 +59,7 @@ impl Bin {
             macros: [growing("touch macros"), growing("touch macros")],
             places: [growing("touch places"), growing("touch places")],
             masks: [growing("touch masks"), growing("touch masks")],
-            macro_ranges: Growing::new(device, "macro ranges", storage | BufferUsages::COPY_DST),
+            macro_ranges: growing("macro ranges"),
             tile_offsets: growing("tile offsets"),
             ranges: growing("ranges"),
             instances: growing("instances"),

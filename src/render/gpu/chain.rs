@@ -1,5 +1,7 @@
 //! All stages on one device, in order, for all views of a step: one submission per frame.
 
+mod handover;
+
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,7 +17,7 @@ use super::kernel::{Recorder, TICKS_BYTES, clock};
 use super::layout::{Counters, Frame as GpuFrame, FrameView, RASTER_BATCH};
 use super::mirror::Mirror;
 use super::parts::{Cuts, Needs, Rows, Subject};
-use super::plan::{Plan, job};
+use super::plan::{Counts, Plan, job};
 use super::project::{Project, Splats, Work};
 use super::rasterize::{Rasterize, pages};
 use super::resolve::Planes;
@@ -26,6 +28,7 @@ use super::traffic::FrameWork;
 use crate::config;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
+use crate::render::stage::{Between, Stage};
 use crate::render::{Frame, FrameStats, RenderError};
 
 /// How long a frame may take on the device before it counts as lost.
@@ -64,6 +67,33 @@ pub(super) struct Chain {
     pub(super) last: FrameWork,
 }
 
+/// What a frame begins with.
+#[derive(Clone, Copy, Debug)]
+enum Source<'a> {
+    /// Gaussians: all stages are to be run.
+    Gaussians(&'a Work),
+    /// What another backend did: the stages after it.
+    Between(&'a Between),
+}
+
+impl Source<'_> {
+    /// Whether a stage is still to be run.
+    fn leaves(self, stage: Stage) -> bool {
+        match self {
+            Self::Gaussians(_) => true,
+            Self::Between(between) => between.through() < stage,
+        }
+    }
+
+    /// Clusters in views.
+    fn items(self) -> u32 {
+        match self {
+            Self::Gaussians(work) => work.items(),
+            Self::Between(_) => 0,
+        }
+    }
+}
+
 /// Where a frame reaches the host. A step's images are copied out of one while the next step fills
 /// another.
 #[derive(Debug)]
@@ -71,6 +101,7 @@ pub(super) struct ReadBack {
     /// Counters, then ticks.
     head: Growing,
     pages: Vec<Growing>,
+    tiles_per_page: u32,
 }
 
 /// Read-back buffers of one device that nobody reads.
@@ -84,7 +115,6 @@ pub(super) struct Drawn {
     ring: Ring,
     /// Pixels, page by page.
     pub(super) pages: Vec<BufferView>,
-    pub(super) tiles_per_page: u32,
     pub(super) views: Vec<FrameView>,
     pub(super) stats: FrameStats,
 }
@@ -138,14 +168,9 @@ impl Chain {
     ) -> Result<Drawn, RenderError> {
         let start = Instant::now();
         self.mirror.hold(&self.device, frame.scene);
+        let (mut gpu_frame, read_back) = self.begin(frame, planes);
         let mut stats = FrameStats::default();
         add(&mut stats, "prepare", start.elapsed());
-        let mut gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
-        let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
-        let mut read_back = self.ring.take().unwrap_or_else(|| ReadBack::new(&self.device));
-        read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
-
-        self.last = FrameWork::new(frame, planes, &gpu_frame);
         let (subject, rows) = (Subject::of(frame), Rows::of(frame));
         let mut rest = self.cuts.recall(&subject, &rows);
         // From the end, so that pieces can take the place of what they are pieces of.
@@ -168,8 +193,9 @@ impl Chain {
             self.project.upload(&self.device, &work);
             add(&mut stats, "prepare", start.elapsed());
             let tiles = gpu_frame.restrict(&rows, &part);
-            let output = (planes, &tiles, tiles_per_page);
-            let needs = self.draw_part(&work, &mut gpu_frame, output, &read_back, &mut stats)?;
+            let output = (planes, &tiles, read_back.tiles_per_page);
+            let source = Source::Gaussians(&work);
+            let needs = self.draw_part(source, &mut gpu_frame, output, &read_back, &mut stats)?;
             let pieces = needs.pieces(self.limit());
             if pieces <= 1 {
                 drawn.push((part, needs));
@@ -183,10 +209,29 @@ impl Chain {
         }
         self.parts += drawn.len() as u64;
         self.cuts.remember(subject, drawn, self.limit());
+        self.finish(read_back, &gpu_frame, stats)
+    }
+
+    /// Makes room for the pixels of a frame, of which nothing is drawn yet.
+    fn begin(&mut self, frame: &Frame<'_>, planes: Planes) -> (GpuFrame, ReadBack) {
+        let gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
+        let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
+        let mut read_back = self.ring.take().unwrap_or_else(|| ReadBack::new(&self.device));
+        read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
+        self.last = FrameWork::new(frame, planes, &gpu_frame);
+        (gpu_frame, read_back)
+    }
+
+    /// Hands out a frame of which everything is drawn and mapped.
+    fn finish(
+        &self,
+        read_back: ReadBack,
+        frame: &GpuFrame,
+        stats: FrameStats,
+    ) -> Result<Drawn, RenderError> {
         let pages = read_back.pages()?;
-        let views = gpu_frame.view[..frame.views.len()].to_vec();
-        let ring = self.ring.clone();
-        Ok(Drawn { read_back, ring, pages, tiles_per_page, views, stats })
+        let views = frame.view[..frame.views as usize].to_vec();
+        Ok(Drawn { read_back, ring: self.ring.clone(), pages, views, stats })
     }
 
     /// Draws one part, again in larger buffers where they were too small: the device never drops
@@ -194,7 +239,7 @@ impl Chain {
     /// the limit, nothing was drawn.
     fn draw_part(
         &mut self,
-        work: &Work,
+        source: Source<'_>,
         frame: &mut GpuFrame,
         output: Output<'_>,
         read_back: &ReadBack,
@@ -202,21 +247,14 @@ impl Chain {
     ) -> Result<Needs, RenderError> {
         loop {
             let start = Instant::now();
-            self.reserve(frame, work.items());
-            let (stages, submission) = self.submit(work, frame, output, read_back);
+            self.reserve(frame, source.items());
+            let (stages, submission) = self.submit(source, frame, output, read_back);
             add(stats, "record", start.elapsed());
             read_back.map(&self.device, submission)?;
             self.device.check()?;
             let (counters, ticks) = read_back.head()?;
             self.time(stats, &stages, &ticks, start.elapsed());
-            let needs = Needs {
-                splats: counters.splats.into(),
-                touches: counters.touches.into(),
-                instances: counters.instances.into(),
-            };
-            let fits = counters.splats <= frame.splat_capacity
-                && counters.touches <= frame.touch_capacity
-                && counters.instances <= frame.instance_capacity;
+            let (needs, fits) = self.learn(&counters, frame);
             if fits {
                 let limit = self.device.tile_splats();
                 if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
@@ -224,17 +262,35 @@ impl Chain {
                     return Err(RenderError::TooMany { what, limit });
                 }
                 count(stats, &counters);
-                self.last.add(work.items(), &counters);
+                self.last.add(source.items(), &counters);
                 return Ok(needs);
             }
-            self.retries += 1;
-            tracing::debug!(?needs, "not enough room on the device");
             if needs.pieces(self.limit()) > 1 {
                 return Ok(needs);
             }
-            self.high_water = self.high_water.max(needs);
             read_back.unmap();
         }
+    }
+
+    /// What was needed, and whether it was there; if not, it will be the next time, unless no buffer
+    /// of the device is that large.
+    fn learn(&mut self, counters: &Counters, frame: &GpuFrame) -> (Needs, bool) {
+        let needs = Needs {
+            splats: counters.splats.into(),
+            touches: counters.touches.into(),
+            instances: counters.instances.into(),
+        };
+        let fits = counters.splats <= frame.splat_capacity
+            && counters.touches <= frame.touch_capacity
+            && counters.instances <= frame.instance_capacity;
+        if !fits {
+            self.retries += 1;
+            tracing::debug!(?needs, "not enough room on the device");
+            if needs.pieces(self.limit()) <= 1 {
+                self.high_water = self.high_water.max(needs);
+            }
+        }
+        (needs, fits)
     }
 
     fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
@@ -267,45 +323,17 @@ impl Chain {
 
     fn submit(
         &mut self,
-        work: &Work,
+        source: Source<'_>,
         frame: &GpuFrame,
         output: Output<'_>,
         read_back: &ReadBack,
     ) -> (Vec<&'static str>, SubmissionIndex) {
-        let Self { device, plan, scan, splats, .. } = self;
-        let (device, plan, scan) = (&*device, &*plan, &*scan);
-        plan.start(device, frame, work.items());
-        let mut recorder = Recorder::new(device, self.clock.clone());
-        recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
-
-        let mut pass = recorder.stage("project");
-        self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
-        drop(pass);
-
-        let mut pass = recorder.stage("sort");
-        let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
-        let depth_bits = DEPTH_BITS + bits(frame.views - 1);
-        let data = Columns { keys: &splats.keys, values: &splats.places, masks: None };
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
-        drop(pass);
-
-        let mut pass = recorder.stage("bin");
-        self.bin.touch(device, &mut pass, (plan, scan), (splats, sorted));
-        drop(pass);
-
-        let mut pass = recorder.stage("tile sort");
-        let jobs = (plan.jobs(), job::TOUCHES_SORT, job::TOUCHES_DIGITS);
-        // The number after the last macro tile occurs too.
-        let (data, macro_bits) = (self.bin.touches(), bits(frame.macros));
-        let sorted = self.sort.run(device, &mut pass, scan, jobs, data, macro_bits);
-        drop(pass);
-
-        let mut pass = recorder.stage("expand");
-        self.bin.expand(device, &mut pass, (plan, scan), (frame.macros, sorted));
-        drop(pass);
+        let mut recorder = Recorder::new(&self.device, self.clock.clone());
+        self.record(&mut recorder, source, frame, Stage::Bin);
+        let Self { device, plan, splats, bin, .. } = self;
 
         let mut pass = recorder.stage("rasterize");
-        self.rasterize.run(device, &mut pass, plan, (splats, &self.bin), output);
+        self.rasterize.run(device, &mut pass, plan, (splats, bin), output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
@@ -316,6 +344,57 @@ impl Chain {
         self.rasterize.copy(encoder, &read_back.pages, output);
         let submission = device.queue.submit([recorder.encoder.finish()]);
         (stages, submission)
+    }
+
+    /// Records the stages up to `last` that the source leaves to be run. Returns which of the buffers
+    /// that the sort of splats goes to and fro between are in order.
+    fn record(
+        &mut self,
+        recorder: &mut Recorder,
+        source: Source<'_>,
+        frame: &GpuFrame,
+        last: Stage,
+    ) -> usize {
+        let is_due = |stage| stage <= last && source.leaves(stage);
+        let counts = match source {
+            Source::Gaussians(work) => Counts { items: work.items(), ..Counts::default() },
+            Source::Between(between) => self.fill(between),
+        };
+        let Self { device, plan, scan, splats, .. } = self;
+        let (device, plan, scan) = (&*device, &*plan, &*scan);
+        plan.start(device, frame, &counts);
+
+        if let Source::Gaussians(work) = source {
+            let mut pass = recorder.stage("project");
+            self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
+        }
+
+        let mut sorted = 0;
+        if is_due(Stage::Sort) {
+            let mut pass = recorder.stage("sort");
+            let jobs = (plan.jobs(), job::SPLATS_SORT, job::SPLATS_DIGITS);
+            let depth_bits = DEPTH_BITS + bits(frame.views - 1);
+            let data = Columns { keys: &splats.keys, values: &splats.places, masks: None };
+            sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+        }
+
+        if is_due(Stage::Bin) {
+            recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
+            let mut pass = recorder.stage("bin");
+            self.bin.touch(device, &mut pass, (plan, scan), (splats, sorted));
+            drop(pass);
+
+            let mut pass = recorder.stage("tile sort");
+            let jobs = (plan.jobs(), job::TOUCHES_SORT, job::TOUCHES_DIGITS);
+            // The number after the last macro tile occurs too.
+            let (data, macro_bits) = (self.bin.touches(), bits(frame.macros));
+            let touches = self.sort.run(device, &mut pass, scan, jobs, data, macro_bits);
+            drop(pass);
+
+            let mut pass = recorder.stage("expand");
+            self.bin.expand(device, &mut pass, (plan, scan), (frame.macros, touches));
+        }
+        sorted
     }
 
     /// Adds what the device took, by its own clock if it has one.
@@ -358,6 +437,11 @@ fn count(stats: &mut FrameStats, counters: &Counters) {
 }
 
 impl Drawn {
+    /// Tiles of a page, of the last one perhaps fewer.
+    pub(super) fn tiles_per_page(&self) -> u32 {
+        self.read_back.tiles_per_page
+    }
+
     /// Gives the memory back for another frame, which may be drawn by now.
     pub(super) fn recycle(self) {
         let Self { read_back, ring, pages, .. } = self;
@@ -386,7 +470,8 @@ const TICKS_OFFSET: u64 = 256;
 
 impl ReadBack {
     fn new(device: &Device) -> Self {
-        Self { head: Self::buffer(device, "counters read back"), pages: Vec::new() }
+        let head = Self::buffer(device, "counters read back");
+        Self { head, pages: Vec::new(), tiles_per_page: 1 }
     }
 
     fn buffer(device: &Device, label: &'static str) -> Growing {
@@ -394,6 +479,7 @@ impl ReadBack {
     }
 
     fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32, per_page: u32) {
+        self.tiles_per_page = per_page;
         self.head.reserve(device, TICKS_OFFSET + TICKS_BYTES);
         let count = tiles.div_ceil(per_page) as usize;
         self.pages.resize_with(count, || Self::buffer(device, "pixels read back"));

@@ -4,6 +4,10 @@ use wgpu::{BindingResource, Buffer, BufferUsages};
 
 use super::device::Device;
 
+/// What lies between stages: another backend may have filled it, and tests read it.
+pub(super) const HANDED_OVER: BufferUsages =
+    BufferUsages::STORAGE.union(BufferUsages::COPY_DST).union(BufferUsages::COPY_SRC);
+
 /// A buffer that grows and never shrinks. Its content does not outlive growing.
 #[derive(Debug)]
 pub(super) struct Growing {

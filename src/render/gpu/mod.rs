@@ -39,6 +39,7 @@ use self::device::Device;
 use self::resolve::{Pixels, Planes};
 use self::shaders::Shaders;
 use self::turns::Turns;
+use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 use crate::config;
 
@@ -170,11 +171,44 @@ impl Gpu {
         Roofline::measure(&chain.as_ref().ok_or_else(lost)?.device, &self.shaders)
     }
 
-    /// Draws a frame in its turn. The device is free for the next one when this returns.
-    fn draw(&self, frame: &Frame<'_>, planes: Planes) -> Result<Drawn, RenderError> {
-        let start = Instant::now();
+    /// Renders the rest of a frame after the stages that another backend did.
+    ///
+    /// # Errors
+    /// As [`Backend::render`]; and what is handed over must fit the device at once.
+    pub fn go_on(
+        &self,
+        between: &Between,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        self.render_with(frame, targets, finished, |chain, planes| {
+            chain.go_on(between, frame, planes)
+        })
+    }
+
+    /// Runs the stages up to and including `last`, from the beginning or after what is `done`, and
+    /// reads what they leave: for tests that compare stages. Normal frames read nothing in mid-frame.
+    ///
+    /// # Errors
+    /// As [`Gpu::go_on`].
+    pub fn through(
+        &self,
+        frame: &Frame<'_>,
+        done: Option<&Between>,
+        last: Stage,
+    ) -> Result<Between, RenderError> {
+        frame.check_views()?;
+        self.in_turn(|chain| chain.through(frame, done, last, &self.cull))
+    }
+
+    /// Does something on the device, which is opened again if it was lost. The device is free for
+    /// the next one when this returns.
+    fn in_turn<T>(
+        &self,
+        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
+    ) -> Result<T, RenderError> {
         let _turn = self.turns.wait();
-        let waited = start.elapsed();
         let mut slot = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let chain = match &mut *slot {
             Some(chain) => chain,
@@ -188,21 +222,61 @@ impl Gpu {
                 slot.insert(Chain::new(device, &self.shaders)?)
             }
         };
-        let drawn = chain.draw(frame, planes, &self.cull);
+        let done = work(chain);
         // Whatever else it was, memory may be half-written: begin anew.
-        if let Err(RenderError::Device { .. }) = drawn {
+        if let Err(RenderError::Device { .. }) = done {
             *slot = None;
         }
-        drawn.map(|mut drawn| {
-            drawn.stats.stages_ms.insert(0, ("wait", waited.as_secs_f64() * 1e3));
-            drawn
-        })
+        done
+    }
+
+    /// Draws a frame, and delivers its pixels.
+    fn render_with(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+        draw: impl FnOnce(&mut Chain, Planes) -> Result<Drawn, RenderError>,
+    ) -> Result<FrameStats, RenderError> {
+        frame.check(targets)?;
+        let planes = Planes::of(targets);
+        let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
+        let asked = Instant::now();
+        // Not in a pool: a thread that waits for its own pool may take up another frame there.
+        let (drawn, wait_ms) = self.in_turn(|chain| {
+            let wait_ms = ms(asked);
+            Ok((draw(chain, planes)?, wait_ms))
+        })?;
+        let start = Instant::now();
+        let words: Result<Vec<&[u32]>, _> =
+            drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
+        let words = words.map_err(|error| RenderError::Device {
+            device: "the GPU".to_owned(),
+            reason: format!("its memory cannot be read: {error}"),
+        })?;
+        let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page(), planes };
+        self.deliver.install(|| {
+            let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
+            views.with_max_len(1).for_each(|(index, (view, target))| {
+                pixels.deliver(view, target);
+                finished(index, target);
+            });
+        });
+        let mut stats = drawn.stats.clone();
+        stats.stages_ms.insert(0, ("wait", wait_ms));
+        stats.stages_ms.push(("deliver", ms(start)));
+        drawn.recycle();
+        Ok(stats)
     }
 }
 
 impl Backend for Gpu {
     fn name(&self) -> &'static str {
         "gpu"
+    }
+
+    fn detail(&self) -> String {
+        self.detail.clone()
     }
 
     fn threads(&self) -> usize {
@@ -213,39 +287,15 @@ impl Backend for Gpu {
         config::GPU_FRAMES
     }
 
-    fn detail(&self) -> String {
-        self.detail.clone()
-    }
-
     fn render(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
-        frame.check(targets)?;
-        let planes = Planes::of(targets);
-        // Not in a pool: a thread that waits for its own pool may take up another frame there.
-        let drawn = self.draw(frame, planes)?;
-        let start = Instant::now();
-        let words: Result<Vec<&[u32]>, _> =
-            drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
-        let words = words.map_err(|error| RenderError::Device {
-            device: "the GPU".to_owned(),
-            reason: format!("its memory cannot be read: {error}"),
-        })?;
-        let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page, planes };
-        self.deliver.install(|| {
-            let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
-            views.with_max_len(1).for_each(|(index, (view, target))| {
-                pixels.deliver(view, target);
-                finished(index, target);
-            });
-        });
-        let mut stats = drawn.stats.clone();
-        stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
-        drawn.recycle();
-        Ok(stats)
+        self.render_with(frame, targets, finished, |chain, planes| {
+            chain.draw(frame, planes, &self.cull)
+        })
     }
 }
 

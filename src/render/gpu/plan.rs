@@ -5,7 +5,9 @@ use wgpu::{Buffer, BufferUsages, ComputePass};
 use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Groups, Kernel, module};
-use super::layout::{Counters, Frame, Job, JobSlot, SCAN_BLOCK};
+use super::layout::{
+    Counters, DIGITS, Frame, Job, JobSlot, MAX_GROUPS, SCAN_BLOCK, SORT_BLOCK, WORKGROUP,
+};
 use super::shaders::Shaders;
 
 /// Slots of the jobs, as `plan.wgsl` names them.
@@ -21,6 +23,17 @@ pub(super) mod job {
     pub(crate) const TILES: u64 = 8;
     pub(crate) const INSTANCES: u64 = 9;
     pub(crate) const COUNT: usize = 10;
+}
+
+/// What there is before the first stage of a frame runs; what the device finds for itself is zero.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Counts {
+    /// Clusters in views.
+    pub(super) items: u32,
+    /// Splats that another backend projected.
+    pub(super) splats: u32,
+    /// Instances that another backend binned.
+    pub(super) instances: u32,
 }
 
 /// What a frame is, what it counts, and what is to do.
@@ -52,15 +65,21 @@ impl Plan {
         plan
     }
 
-    /// Starts a frame of this many items.
-    pub(super) fn start(&self, device: &Device, frame: &Frame, items: u32) {
+    /// Starts a frame.
+    pub(super) fn start(&self, device: &Device, frame: &Frame, counts: &Counts) {
+        let Counts { items, splats, instances } = *counts;
         let mut jobs: [JobSlot; job::COUNT] = bytemuck::Zeroable::zeroed();
-        for (slot, length) in [(job::ITEMS, items), (job::TILES, frame.tiles)] {
-            // At most 2^24 tiles, and 2^27 items of 8 B: one dimension holds their groups.
-            let groups = [length.div_ceil(SCAN_BLOCK), 1, 1];
-            jobs[slot as usize].job = Job { length, groups };
+        for (slot, length, per_group) in [
+            (job::ITEMS, items, SCAN_BLOCK),
+            (job::SPLATS, splats, WORKGROUP),
+            (job::SPLATS_SCAN, splats, SCAN_BLOCK),
+            (job::SPLATS_SORT, splats, SORT_BLOCK),
+            (job::SPLATS_DIGITS, DIGITS * splats.div_ceil(SORT_BLOCK), SCAN_BLOCK),
+            (job::TILES, frame.tiles, SCAN_BLOCK),
+        ] {
+            jobs[slot as usize].job = job(length, per_group);
         }
-        let counters: Counters = bytemuck::Zeroable::zeroed();
+        let counters = Counters { splats, instances, ..bytemuck::Zeroable::zeroed() };
         let write = |to: &Growing, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);
         write(&self.frame, bytemuck::bytes_of(frame));
         write(&self.jobs, bytemuck::bytes_of(&jobs));
@@ -99,4 +118,11 @@ impl Plan {
         let all = [0, 1, 2, 3].map(|k| (k, buffers[k as usize].as_entire_binding()));
         kernel.run(device, pass, Groups::Count(1), &all);
     }
+}
+
+/// As `plan.wgsl` folds groups into two dimensions.
+fn job(length: u32, per_group: u32) -> Job {
+    let groups = length.div_ceil(per_group);
+    let rows = groups.div_ceil(MAX_GROUPS).max(1);
+    Job { length, groups: [groups.div_ceil(rows), rows, 1] }
 }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use wgpu::{BufferUsages, ComputePass, ShaderModule};
 
 use super::device::Device;
-use super::growing::Growing;
+use super::growing::{Growing, HANDED_OVER};
 use super::kernel::{Groups, Kernel, SLOT_BYTES, module, slot};
 use super::layout::{ChunkView, Item, Span, SplatColor, SplatShape};
 use super::mirror::Mirror;
@@ -97,7 +97,7 @@ pub(super) struct Splats {
 
 impl Splats {
     pub(super) fn new(device: &Device) -> Self {
-        let growing = |label| Growing::new(device, label, BufferUsages::STORAGE);
+        let growing = |label| Growing::new(device, label, HANDED_OVER);
         Self {
             shapes: growing("shapes"),
             colors: growing("colors"),

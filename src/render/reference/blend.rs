@@ -22,7 +22,7 @@ pub(super) struct Pixel {
 /// twenty times sooner.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
-    let near_row = |splat: &&Splat| (splat.mean_px.y - y_px).abs() <= splat.reach_y_px + 1e-6;
+    let near_row = |splat: &&Splat| (splat.mean_px.y - y_px).abs() <= splat.reach_px.y + 1e-6;
     let here: Vec<Splat> = splats.iter().filter(near_row).copied().collect();
     (0..width).map(|column| pixel(&here, DVec2::new(column as f64 + 0.5, y_px), profile)).collect()
 }

@@ -10,6 +10,8 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
+pub use project::{Splat, project};
+
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The f64 backend.
@@ -32,7 +34,8 @@ impl Backend for Reference {
         let mut stats = FrameStats::default();
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
             let start = Instant::now();
-            let splats = project::project(frame.scene, frame.profile, view);
+            let mut splats = project(frame.scene, frame.profile, view);
+            project::sort(&mut splats);
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
 

@@ -13,33 +13,36 @@ use crate::scene::{Chunk, RenderProfile, Scene, sh};
 
 /// A Gaussian on screen.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Splat {
+pub struct Splat {
     /// Camera-space z of the centre, in metres: what is sorted.
-    pub(super) depth_m: f64,
+    pub depth_m: f64,
     /// Centre, in pixels.
-    pub(super) mean_px: DVec2,
+    pub mean_px: DVec2,
     /// Inverse screen covariance (xx, xy, yy), in px⁻².
-    pub(super) conic: DVec3,
+    pub conic: DVec3,
     /// Peak opacity.
-    pub(super) opacity: f64,
+    pub opacity: f64,
     /// Colour seen from the camera, linear.
-    pub(super) rgb: DVec3,
-    /// How far from the centre's row anything can reach alpha_cut, in pixels.
-    pub(super) reach_y_px: f64,
+    pub rgb: DVec3,
+    /// How far from the centre's column and row anything can reach alpha_cut, in pixels.
+    pub reach_px: DVec2,
 }
 
-/// Every Gaussian between near and far, in order of depth rounded to f32; ties keep the order of
-/// global ids. The rounding is part of the definition: backends sort 32 bits.
-pub(super) fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
-    let mut splats: Vec<Splat> = scene
-        .chunks
-        .par_iter()
+/// Every Gaussian between near and far that can be seen at all, on the image or beside it, in order
+/// of global ids.
+pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
+    let chunks = scene.chunks.par_iter();
+    chunks
         .flat_map_iter(|chunk| {
             (0..chunk.len()).filter_map(|i| project_one(chunk, i, profile, view))
         })
-        .collect();
+        .collect()
+}
+
+/// By depth rounded to f32; ties keep the order of global ids. The rounding is part of the
+/// definition: backends sort 32 bits.
+pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
-    splats
 }
 
 fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View) -> Option<Splat> {
@@ -77,7 +80,7 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
         conic: DVec3::new(yy, -xy, xx) / det,
         opacity,
         rgb: color(chunk, index, mean_world - view.world_from_camera.position_m),
-        reach_y_px: (2.0 * (opacity / profile.alpha_cut).ln() * yy).sqrt(),
+        reach_px: (2.0 * (opacity / profile.alpha_cut).ln() * DVec2::new(xx, yy)).map(f64::sqrt),
     })
 }
 

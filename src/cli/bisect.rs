@@ -1,0 +1,66 @@
+//! `wildcity bisect`.
+
+use std::io::{self, Write};
+
+use crate::render::relay::{RIGHT_DB, bisect};
+use crate::render::{Backend, Frame};
+
+use super::progress;
+use super::scene_source::{Machine, SceneSource};
+
+/// Find the stage of the gpu backend that is wrong, if one is.
+///
+/// Draws every camera of the list on the cpu backend, on the gpu backend, and with the stages up to
+/// project, sort and bin on the cpu and the rest on the GPU. Prints how close each comes to the cpu's
+/// colours, as PSNR in dB (inf where no value differs). A stage is wrong if the image is wrong, below
+/// 60 dB, for as long as the GPU runs it, and right as soon as the cpu does. Exit code 1 if a camera
+/// has one. `wildcity render --cpu-through STAGE` shows the images.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Bisect {
+    #[command(flatten)]
+    source: SceneSource,
+
+    #[command(flatten)]
+    machine: Machine,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity bisect street --cameras views.json
+  wildcity bisect scene.ply --cameras views.json --device llvmpipe";
+
+impl Bisect {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let ready = self.source.open()?;
+        let (cpu, gpu) = (self.machine.cpu()?, self.machine.gpu()?);
+        let bar = progress::count("rendering");
+        bar.set_length(ready.shots.len() as u64);
+        let mut out = io::stdout().lock();
+        writeln!(out, "device       {}", gpu.detail())?;
+        writeln!(out, "cpu through      none  project     sort      bin")?;
+        let mut wrong = None;
+        for shot in &ready.shots {
+            let views = std::slice::from_ref(&shot.view);
+            let frame = Frame { scene: &ready.scene_of(shot), profile: &shot.profile, views };
+            let bisection = bisect(&cpu, &gpu, &frame)?;
+            write!(out, "{:<12}", shot.name)?;
+            for (_, db) in &bisection.psnr_db {
+                write!(out, " {db:>8.1}")?;
+            }
+            match bisection.wrong() {
+                None => writeln!(out, "  right")?,
+                Some(stage) => writeln!(out, "  {stage} is wrong")?,
+            }
+            wrong = wrong.or(bisection.wrong().map(|stage| (&shot.name, stage)));
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        match wrong {
+            None => Ok(()),
+            Some((camera, stage)) => anyhow::bail!(
+                "camera {camera:?} is below {RIGHT_DB} dB while the GPU runs stage {stage}"
+            ),
+        }
+    }
+}

@@ -1,0 +1,149 @@
+//! The cpu backend up to a stage, and the gpu backend from there: to find which stage is wrong.
+
+use super::cpu::Cpu;
+use super::gpu::Gpu;
+use super::stage::Stage;
+use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
+
+/// One frame by two backends.
+#[derive(Debug)]
+pub struct Relay {
+    cpu: Cpu,
+    gpu: Gpu,
+    through: Stage,
+}
+
+impl Relay {
+    /// The cpu backend runs the stages up to and including `through`.
+    pub fn new(cpu: Cpu, gpu: Gpu, through: Stage) -> Self {
+        Self { cpu, gpu, through }
+    }
+}
+
+impl Backend for Relay {
+    fn name(&self) -> &'static str {
+        "cpu+gpu"
+    }
+
+    fn detail(&self) -> String {
+        let (cpu, gpu) = (self.cpu.detail(), self.gpu.detail());
+        format!("{cpu} through {}, then {gpu}", self.through.name())
+    }
+
+    fn threads(&self) -> usize {
+        self.cpu.threads()
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        render_through(&self.cpu, &self.gpu, self.through, frame, targets, finished)
+    }
+}
+
+fn render_through(
+    cpu: &Cpu,
+    gpu: &Gpu,
+    through: Stage,
+    frame: &Frame<'_>,
+    targets: &mut [Target<'_>],
+    finished: Finished<'_>,
+) -> Result<FrameStats, RenderError> {
+    frame.check(targets)?;
+    let (between, before) = cpu.through(frame, through)?;
+    let mut stats = gpu.go_on(&between, frame, targets, finished)?;
+    stats.stages_ms.splice(0..0, before.stages_ms);
+    Ok(stats)
+}
+
+/// Least PSNR at which an image counts as right, in dB: what backends promise each other.
+pub const RIGHT_DB: f64 = 60.0;
+
+/// How close the gpu backend comes to the cpu backend, by the stages that the latter runs for it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Bisection {
+    /// The last stage on the cpu, if any, and PSNR of the colour and opacity of all views, in dB;
+    /// infinite where no value differs.
+    pub psnr_db: Vec<(Option<Stage>, f64)>,
+}
+
+/// Renders a frame on the cpu, on the gpu, and with every stage in turn as the last one on the cpu.
+///
+/// # Errors
+/// As [`Backend::render`].
+pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, RenderError> {
+    let draw = |by: &dyn Fn(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
+        let mut images = Images::of(frame.views);
+        by(&mut images.targets())?;
+        Ok(images)
+    };
+    let truth = draw(&|targets| cpu.render(frame, targets, &|_, _| {}))?;
+    let mut psnr_db = Vec::new();
+    for through in std::iter::once(None).chain(Stage::ALL.map(Some)) {
+        let images = draw(&|targets| match through {
+            None => gpu.render(frame, targets, &|_, _| {}),
+            Some(stage) => render_through(cpu, gpu, stage, frame, targets, &|_, _| {}),
+        });
+        let db = match images {
+            Ok(images) => images.psnr_db(&truth),
+            // A stage that counts wrong asks for more than there is; after bin nothing counts.
+            Err(RenderError::TooMany { .. }) if through != Some(Stage::Bin) => f64::NAN,
+            Err(error) => return Err(error),
+        };
+        psnr_db.push((through, db));
+    }
+    Ok(Bisection { psnr_db })
+}
+
+impl Bisection {
+    /// The gpu's stage that is wrong, by name: the first one that the gpu runs where the image is
+    /// still wrong for the last time. `None` if every image is right.
+    pub fn wrong(&self) -> Option<&'static str> {
+        let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= RIGHT_DB;
+        let right = self.psnr_db.iter().rev().take_while(is_right).count();
+        let names = ["rasterize", "bin", "sort", "project"];
+        names.get(right).copied()
+    }
+}
+
+/// All views' colours.
+struct Images {
+    rgba: Vec<Vec<f32>>,
+    rgb8: Vec<Vec<u8>>,
+}
+
+impl Images {
+    fn of(views: &[View]) -> Self {
+        let pixels = || views.iter().map(|view| view.camera.pixels());
+        Self {
+            rgba: pixels().map(|pixels| vec![0.0; 4 * pixels]).collect(),
+            rgb8: pixels().map(|pixels| vec![0; 3 * pixels]).collect(),
+        }
+    }
+
+    fn targets(&mut self) -> Vec<Target<'_>> {
+        let images = self.rgba.iter_mut().zip(&mut self.rgb8);
+        images
+            .map(|(rgba, rgb8)| Target { rgba: Some(rgba), rgb8: Some(rgb8), ..Target::default() })
+            .collect()
+    }
+
+    fn psnr_db(&self, truth: &Self) -> f64 {
+        let rgba = self.rgba.iter().flatten().zip(truth.rgba.iter().flatten());
+        let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
+        let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
+        let written = psnr_db(rgb8.map(|(&a, &b)| f64::from(a.abs_diff(b)) / 255.0));
+        // A NaN is not right, whatever the other is.
+        if linear < written || linear.is_nan() { linear } else { written }
+    }
+}
+
+/// Of differences of values whose peak is 1.
+fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) =
+        differences.fold((0.0, 0_u64), |(sum, count), off| (sum + off * off, count + 1));
+    -10.0 * (sum / count as f64).log10()
+}
