@@ -144,8 +144,17 @@ pub const NUREC_VALUES: usize = 1 << 20;
 /// Most Gaussians of one import: their order within the twin is kept as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 
-/// Largest manifest: a log's 20,000 chunks are 6 MB, its 170,000 keyframes 30 MB.
+/// Largest manifest: a log's 20,000 chunks are 7 MB, its 170,000 keyframes 30 MB.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
+
+/// Largest table of contents of one chunk: 16 blocks of 29 levels are 464 rows of 78 bytes.
+pub const CHUNK_TABLE_BYTES: usize = 64 << 10;
+
+/// Largest table of a whole twin: a log's 20,000 chunks of 100 sections of 78 bytes are 156 MB.
+pub const TABLE_BYTES: u64 = 256 << 20;
+
+/// Share of the Gaussians that may have a value of one field clamped when a twin is stored.
+pub const CLAMPED_SHARE: f64 = 1e-4;
 
 /// Largest record of a twin's log. One is about 150 bytes.
 pub const LOG_RECORD_BYTES: u64 = 4 << 10;

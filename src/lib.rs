@@ -6,11 +6,11 @@
 //! |---|---|---|
 //! | [`config`] | every default and every limit | nothing |
 //! | [`geometry`] | poses, cameras, boxes | nothing |
-//! | [`scene`] | what a city twin is | geometry |
+//! | [`scene`] | what a city twin is, its records and levels of detail | geometry |
 //! | [`generate`] | the procedural demo twin | geometry, scene |
 //! | [`ingest`] | one file per outside format | config, geometry, scene |
 //! | [`store`] | twins on disk, versioned, content-addressed | config, geometry, scene, ingest |
-//! | [`residency`] | what is in memory now | config, scene, store |
+//! | [`residency`] | what is in memory now, what a frame draws | config, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
 //! | [`protocol`] | the wire, and only the wire | nothing |

@@ -43,7 +43,7 @@ impl Bisect {
         let mut wrong = None;
         for shot in &ready.shots {
             let views = std::slice::from_ref(&shot.view);
-            let frame = Frame { scene: &ready.scene, profile: &shot.profile, views };
+            let frame = Frame { scene: &ready.scene_of(shot), profile: &shot.profile, views };
             let bisection = bisect(&cpu, &gpu, &frame)?;
             write!(out, "{:<12}", shot.name)?;
             for (_, db) in &bisection.psnr_db {

@@ -15,7 +15,7 @@ use crate::generate::{self, StreetSettings};
 use crate::scene::manifest::Provenance;
 use crate::scene::{RenderProfile, Rig, Trajectory};
 use crate::server::{self, Limits};
-use crate::store::{Catalog, NewVersion, StoreError, Version};
+use crate::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -204,6 +204,7 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
             rig: Rig::preset("vehicle6"),
             trajectories: vec![street.trajectory],
             provenance,
+            storage: Storage::default(),
         },
         &mut progress::show(&bar),
     )?;
@@ -223,7 +224,8 @@ fn built(
     let version = match catalog.version(TWIN, None) {
         Ok(version) => version,
         Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
-        Err(StoreError::Damaged { .. } | StoreError::Format { .. }) => return Ok(Err(DAMAGED)),
+        Err(StoreError::Damaged { .. }) => return Ok(Err(DAMAGED)),
+        Err(StoreError::Format { .. }) => return Ok(Err("anew, in this build's format")),
         Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
             return Ok(Err(DAMAGED));
         }

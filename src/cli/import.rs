@@ -10,8 +10,8 @@ use crate::config;
 use crate::ingest::{self, Axes};
 use crate::scene::manifest::Provenance;
 use crate::scene::rig::is_name;
-use crate::scene::{RenderProfile, Rig, Trajectory};
-use crate::store::{Catalog, NewVersion, StoreError};
+use crate::scene::{Record, RenderProfile, Rig, Trajectory};
+use crate::store::{Catalog, NewVersion, Storage, StoreError};
 
 use super::places::Twins;
 use super::progress;
@@ -60,9 +60,19 @@ pub(super) struct Import {
     trajectory: Vec<PathBuf>,
 
     /// How the scene's trainer rendered, where it differs from gsplat; may be given again. Keys:
-    /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop.
+    /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop; and how much detail is drawn:
+    /// tau_px (0 for all of it), reach_m.
     #[arg(long, value_name = "KEY=VALUE")]
     profile: Vec<String>,
+
+    /// In how many bits Gaussians are stored: f32 (exact), h52, q32, q24; the number is bytes at SH
+    /// degree 1, before compression.
+    #[arg(long, default_value_t)]
+    record: Record,
+
+    /// Makes no levels of detail: everything is drawn in full, however far away.
+    #[arg(long)]
+    no_lod: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -125,6 +135,10 @@ impl Import {
             writeln!(std::io::stderr(), "warning: {source} holds no Gaussians: nothing to see")?;
         }
 
+        let mut options = vec![format!("axes={}", self.axes), format!("scale={}", self.scale)];
+        if self.no_lod {
+            options.push("lod=off".to_owned());
+        }
         let bar = progress::count("writing");
         let new = NewVersion {
             name: &self.twin,
@@ -135,8 +149,9 @@ impl Import {
             provenance: Provenance {
                 source: format!("blake3:{source}"),
                 builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
-                options: vec![format!("axes={}", self.axes), format!("scale={}", self.scale)],
+                options,
             },
+            storage: Storage { record: self.record, levels: !self.no_lod },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
         // The file was sound, so what cannot be used now was made by the options.
@@ -149,7 +164,7 @@ impl Import {
         bar.finish_and_clear();
 
         let manifest = &version.manifest;
-        let stored_bytes: u64 = manifest.chunks.iter().map(|chunk| chunk.bytes).sum();
+        let stored_bytes = manifest.stored_bytes();
         writeln!(
             std::io::stdout().lock(),
             "twin {} version {}: {} Gaussians of SH degree {} in {} chunks, {:.1} MB\n\

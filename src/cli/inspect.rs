@@ -54,19 +54,25 @@ impl Inspect {
 
 fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
     let Version { number, hash, created_us, manifest } = version;
-    let stored_bytes: u64 = manifest.chunks.iter().map(|chunk| chunk.bytes).sum();
+    let stored_bytes = manifest.stored_bytes();
     writeln!(out, "twin        {} version {number}", manifest.twin)?;
     writeln!(out, "manifest    {hash}")?;
     writeln!(out, "created     {}", utc(*created_us))?;
     writeln!(out, "gaussians   {}, SH degree {}", manifest.gaussians(), manifest.sh_degree)?;
     writeln!(out, "objects     {} chunks, {stored_bytes} bytes", manifest.chunks.len())?;
+    let (record, bits) = (manifest.record, manifest.record.bits(manifest.sh_degree));
+    writeln!(out, "record      {record}, {bits} bits each before compression")?;
+    let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
+    let (count, most) = levels.fold((0, 0), |(count, most), s| (count + 1, most.max(s.level)));
+    writeln!(out, "sections    {count}, levels of detail 0 to {most} (see `wildcity lod`)")?;
     if !manifest.chunks.is_empty() {
         writeln!(out, "bounds      {}", metres(&manifest.bounds()))?;
     }
     let profile = &manifest.profile;
     writeln!(
         out,
-        "profile     near={} far={} blur={} antialiased={} alpha_cap={} alpha_cut={} stop={}",
+        "profile     near={} far={} blur={} antialiased={} alpha_cap={} alpha_cut={} stop={} \
+         tau_px={} reach_m={}",
         profile.near,
         profile.far,
         profile.blur,
@@ -74,6 +80,8 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
         profile.alpha_cap,
         profile.alpha_cut,
         profile.stop,
+        profile.tau_px,
+        profile.reach_m.map_or("none".to_owned(), |reach_m| reach_m.to_string()),
     )?;
     if let Some(rig) = &manifest.rig {
         let names: Vec<_> = rig.cameras.iter().map(|camera| camera.name.as_str()).collect();

@@ -8,6 +8,7 @@ mod demo;
 mod devices;
 mod import;
 mod inspect;
+mod lod;
 mod output;
 mod places;
 mod progress;
@@ -33,6 +34,7 @@ enum Command {
     Serve(serve::Serve),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    Lod(lod::Lod),
     Verify(verify::Verify),
     Render(render::Render),
     Replay(replay::Replay),
@@ -49,6 +51,7 @@ pub fn main() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Lod(command) => command.run(),
         Command::Verify(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),

@@ -61,7 +61,7 @@ impl Render {
         for shot in &ready.shots {
             let pixels = shot.view.camera.pixels();
             let frame = Frame {
-                scene: &ready.scene,
+                scene: &ready.scene_of(shot),
                 profile: &shot.profile,
                 views: std::slice::from_ref(&shot.view),
             };

@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Context;
 use clap::ValueEnum;
@@ -16,8 +17,9 @@ use crate::render::reference::Reference;
 use crate::render::relay::Relay;
 use crate::render::stage::Stage;
 use crate::render::{Backend, View};
-use crate::residency::Cache;
+use crate::residency::{Cache, Resident};
 use crate::scene::{RenderProfile, Scene};
+use crate::session;
 use crate::store::Catalog;
 
 use super::places::{TwinVersion, Twins};
@@ -39,7 +41,7 @@ pub(super) struct SceneSource {
     twins: Twins,
 
     /// A setting of the render profile, over the twin's or gsplat's; may be given again. Keys: near,
-    /// far, blur, antialiased, alpha_cap, alpha_cut, stop.
+    /// far, blur, antialiased, alpha_cap, alpha_cut, stop, tau_px, reach_m.
     #[arg(long = "profile", value_name = "KEY=VALUE")]
     settings: Vec<String>,
 }
@@ -214,6 +216,8 @@ fn threads(text: &str) -> Result<usize, String> {
 
 /// What a rendering command draws.
 pub(super) struct Ready {
+    source: Source,
+    /// What one frame of all shots draws.
     pub(super) scene: Scene,
     pub(super) shots: Vec<Shot>,
 }
@@ -225,15 +229,44 @@ pub(super) struct Shot {
     pub(super) profile: RenderProfile,
 }
 
+/// Where scenes come from.
+enum Source {
+    /// A file: always drawn in full.
+    File(Scene),
+    /// A twin: drawn with as much detail as the cameras need.
+    Twin(Arc<Resident>),
+}
+
+impl Source {
+    fn scene(&self, shots: &[Shot]) -> Scene {
+        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
+        match (self, shots) {
+            (Self::Twin(resident), [first, ..]) => {
+                resident.scene(&session::eyes(&views), &first.profile)
+            }
+            (Self::Twin(_), []) => Scene::default(),
+            (Self::File(scene), _) => scene.clone(),
+        }
+    }
+}
+
+impl Ready {
+    /// What a frame of one shot draws.
+    pub(super) fn scene_of(&self, shot: &Shot) -> Scene {
+        self.source.scene(std::slice::from_ref(shot))
+    }
+}
+
 impl SceneSource {
     /// Reads the scene and the cameras.
     pub(super) fn open(&self) -> anyhow::Result<Ready> {
         let cameras =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
-        let (scene, profile) = self.scene()?;
+        let (source, profile) = self.source()?;
         let shots = cameras.into_iter().map(|camera| self.shot(camera, profile));
-        let shots = shots.collect::<anyhow::Result<_>>()?;
-        Ok(Ready { scene, shots })
+        let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
+        let scene = source.scene(&shots);
+        Ok(Ready { source, scene, shots })
     }
 
     /// A camera's own near counts more than the twin's, and less than one on the command line.
@@ -247,7 +280,7 @@ impl SceneSource {
         Ok(Shot { name, view: View { camera, world_from_camera }, profile })
     }
 
-    fn scene(&self) -> anyhow::Result<(Scene, RenderProfile)> {
+    fn source(&self) -> anyhow::Result<(Source, RenderProfile)> {
         let path = Path::new(&self.scene);
         // A pipe or a device too, so that it is refused as one; a directory may share a twin's name.
         if path.exists() && !path.is_dir() {
@@ -255,13 +288,15 @@ impl SceneSource {
             let gaussians = ingest::read(path, &mut progress::show(&bar))
                 .with_context(|| format!("{}", path.display()))?;
             bar.finish_and_clear();
-            return Ok((Scene::from_gaussians(&gaussians), RenderProfile::default()));
+            let scene = Scene::from_gaussians(&gaussians);
+            return Ok((Source::File(scene), RenderProfile::default()));
         }
         let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
         let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
         let resident = cache.open(&named.name, named.number).with_context(|| {
             format!("{:?} is no file, and as the name of a twin it fails", self.scene)
         })?;
-        Ok((resident.scene.clone(), resident.version.manifest.profile))
+        let profile = resident.version.manifest.profile;
+        Ok((Source::Twin(resident), profile))
     }
 }

@@ -32,6 +32,11 @@ impl Bounds {
         Self { min_m: self.min_m.min(other.min_m), max_m: self.max_m.max(other.max_m) }
     }
 
+    /// How far a point is from the nearest one of the box, in metres; 0 within.
+    pub fn distance_m(&self, point_m: DVec3) -> f64 {
+        point_m.clamp(self.min_m, self.max_m).distance(point_m)
+    }
+
     /// The middle, in metres; meaningless for an empty box.
     pub fn center_m(&self) -> DVec3 {
         0.5 * (self.min_m + self.max_m)

@@ -40,7 +40,8 @@ impl Budget {
     pub(super) fn take(&self, manifest: &Manifest) -> Result<Room, ResidencyError> {
         let chunks = manifest.chunks.iter();
         let bytes: u64 = chunks
-            .map(|chunk| Chunk::bytes_of(manifest.sh_degree, chunk.count))
+            .flat_map(|chunk| &chunk.sections)
+            .map(|section| Chunk::bytes_of(manifest.sh_degree, section.count.into()))
             .fold(0, u64::saturating_add);
         let fits = |held: u64| held.checked_add(bytes).filter(|sum| *sum <= self.limit_bytes);
         match self.held_bytes.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {

@@ -5,20 +5,35 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use rayon::prelude::*;
 
-use crate::scene::Scene;
+use crate::scene::manifest::ChunkEntry;
+use crate::scene::{Chunk, RenderProfile, Scene};
 use crate::store::{Catalog, Listing, StoreError, Version};
 
-use super::ResidencyError;
 use super::budget::{Budget, Room};
+use super::{Eye, Needed, ResidencyError, demand};
 
 /// A version of a twin, ready to be rendered.
 #[derive(Debug)]
 pub struct Resident {
     /// What was loaded.
     pub version: Version,
-    /// Its chunks, in the manifest's order.
-    pub scene: Scene,
+    /// `[chunk][section]`, as in the manifest.
+    sections: Vec<Vec<Arc<Chunk>>>,
     _room: Room,
+}
+
+impl Resident {
+    /// What a frame of these cameras draws; `profile` is the version's unless somebody knows better.
+    pub fn scene(&self, eyes: &[Eye], profile: &RenderProfile) -> Scene {
+        let needed = demand(&self.version.manifest, eyes, profile);
+        let chunk = |n: Needed| self.sections[n.chunk][n.section].clone();
+        Scene { chunks: needed.into_iter().map(chunk).collect() }
+    }
+
+    /// Memory that its Gaussians take, all levels, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.sections.iter().flatten().map(|chunk| chunk.bytes()).sum()
+    }
 }
 
 /// Loads twin versions and shares them between sessions for as long as one holds them; the one that
@@ -59,7 +74,7 @@ impl Cache {
     /// One version of a twin, or the latest, loaded if nobody holds it. Blocks while it loads.
     ///
     /// # Errors
-    /// As [`Catalog::version`] and [`Catalog::chunk`]; [`ResidencyError::NoRoom`], before anything
+    /// As [`Catalog::version`] and [`Catalog::section`]; [`ResidencyError::NoRoom`], before anything
     /// is loaded, if it does not fit beside the twins in use.
     pub fn open(&self, name: &str, number: Option<u64>) -> Result<Arc<Resident>, ResidencyError> {
         let version = self.catalog.version(name, number)?;
@@ -88,10 +103,14 @@ impl Cache {
 
     fn load(&self, version: Version) -> Result<Resident, ResidencyError> {
         let room = self.budget.take(&version.manifest)?;
-        let chunks = version.manifest.chunks.par_iter();
-        let chunks = chunks.map(|entry| self.catalog.chunk(&version, entry).map(Arc::new));
-        let scene = Scene { chunks: chunks.collect::<Result<_, StoreError>>()? };
-        Ok(Resident { version, scene, _room: room })
+        let load = |chunk: &ChunkEntry| {
+            let sections = chunk.sections.par_iter();
+            let loaded = sections.map(|s| self.catalog.section(&version, chunk, s).map(Arc::new));
+            loaded.collect::<Result<Vec<_>, StoreError>>()
+        };
+        let sections = version.manifest.chunks.par_iter().map(load);
+        let sections = sections.collect::<Result<_, StoreError>>()?;
+        Ok(Resident { version, sections, _room: room })
     }
 }
 

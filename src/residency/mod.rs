@@ -2,7 +2,9 @@
 
 mod budget;
 mod cache;
+mod demand;
 mod error;
 
 pub use cache::{Cache, Resident};
+pub use demand::{Eye, Needed, demand, gaussians};
 pub use error::ResidencyError;

@@ -1,20 +1,30 @@
-//! Chunks: the Gaussians of one 64 m cell, activated and laid out for the renderer.
+//! Chunks: Gaussians that share an origin, activated and laid out for the renderer.
 //!
-//! A chunk keeps 16 Gaussians side by side ("a block"), one column of 16 floats per parameter, so
-//! that a vector instruction treats 16 at once and a culled block costs three columns of reads.
+//! A twin's chunk is one level of detail of a square of 16 m within a cell of 64 m (`lod`); a scene
+//! file's is a whole cell. A chunk keeps 16 Gaussians side by side, one column of 16 floats per
+//! parameter, so that a vector instruction treats 16 at once and culled ones cost three columns of
+//! reads.
 //! 256 Gaussians in Morton order form a cluster with a box, which is culled as one.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::{Gaussians, sh};
 
 /// Edge of a cell, in metres.
 pub const CELL_M: f64 = 64.0;
-/// Gaussians in a block: one AVX-512 register of f32, two of AVX2, four of SSE.
+/// Edge of a block, which has one level of detail at a time, in metres.
+pub const BLOCK_M: f64 = 16.0;
+/// Blocks along the edge of a cell.
+pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
+/// A cell of fewer Gaussians is one block: a cluster for each would be more than there is, and every
+/// chunk costs a frame some work. A skyline's and a sky's cells have a few each.
+pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
+/// Gaussians side by side: one AVX-512 register of f32, two of AVX2, four of SSE.
 pub const LANES: usize = 16;
 /// Gaussians in a cluster, the unit of frustum culling.
 pub const CLUSTER: usize = 256;
@@ -32,7 +42,8 @@ pub mod column {
     pub const SCALE: usize = 3;
     /// Unit quaternion (w, x, y, z), world from own axes: four columns.
     pub const QUAT: usize = 6;
-    /// Base-2 logarithm of the peak opacity, at most 0; minus infinity in lanes without a Gaussian.
+    /// Base-2 logarithm of the peak opacity; minus infinity in lanes without a Gaussian. Above 0
+    /// only for merged Gaussians, which cover more than they are high.
     pub const LOG2_OPACITY: usize = 10;
     /// First colour coefficient.
     pub const SH: usize = 11;
@@ -58,6 +69,21 @@ pub struct RawRecord<'a> {
     pub sh: &'a [f32],
 }
 
+/// One Gaussian as the renderer reads it, relative to its chunk's origin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ActiveRecord<'a> {
+    /// Centre relative to the chunk's origin, in metres.
+    pub mean_m: [f32; 3],
+    /// Standard deviation along each own axis, in metres.
+    pub scale_m: [f32; 3],
+    /// Unit quaternion (w, x, y, z).
+    pub quat_wxyz: [f32; 4],
+    /// Base-2 logarithm of the peak opacity.
+    pub log2_opacity: f32,
+    /// `[(sh_degree + 1)², 3]`.
+    pub sh: &'a [f32],
+}
+
 /// What bounds the Gaussians of a cluster.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cluster {
@@ -72,6 +98,13 @@ pub struct Cluster {
 impl Cluster {
     /// Contains nothing and is seen by nobody.
     const EMPTY: Self = Self { min_m: Vec3::INFINITY, max_m: Vec3::NEG_INFINITY, sigma_m: 0.0 };
+
+    fn add(&mut self, mean_m: [f32; 3], scale_m: [f32; 3]) {
+        let mean_m = Vec3::from_array(mean_m);
+        self.min_m = self.min_m.min(mean_m);
+        self.max_m = self.max_m.max(mean_m);
+        self.sigma_m = self.sigma_m.max(Vec3::from_array(scale_m).max_element());
+    }
 }
 
 /// The Gaussians of one cell, ready to be rendered.
@@ -93,6 +126,45 @@ impl Chunk {
         Self { cell, origin_m, sh_degree, count: 0, lanes, clusters }
     }
 
+    /// A chunk whose columns are already laid out, as `lanes[block * columns(sh_degree) + column]`.
+    ///
+    /// Lanes past `count` are made empty, and so is what holds a number that is not finite.
+    ///
+    /// # Panics
+    /// If there are not as many lanes as `count` Gaussians of the degree take.
+    pub fn from_lanes(
+        cell: [i32; 2],
+        origin_m: DVec3,
+        sh_degree: u8,
+        count: usize,
+        mut lanes: Vec<Lanes>,
+    ) -> Self {
+        let width = columns(sh_degree);
+        assert_eq!(lanes.len(), count.div_ceil(LANES) * width, "lanes of another count");
+        let mut clusters = vec![Cluster::EMPTY; count.div_ceil(CLUSTER)];
+        for (index, block) in lanes.chunks_exact_mut(width).enumerate() {
+            let cluster = &mut clusters[index * LANES / CLUSTER];
+            for lane in 0..LANES {
+                let sound = |(column, lanes): (usize, &Lanes)| {
+                    let value = lanes.0[lane];
+                    // Minus infinity is an opacity: it is never drawn.
+                    value.is_finite()
+                        || column == column::LOG2_OPACITY && value == f32::NEG_INFINITY
+                };
+                if index * LANES + lane < count && block.iter().enumerate().all(sound) {
+                    cluster.add(
+                        [0, 1, 2].map(|axis| block[column::MEAN + axis].0[lane]),
+                        [0, 1, 2].map(|axis| block[column::SCALE + axis].0[lane]),
+                    );
+                } else {
+                    block.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
+                    block[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
+                }
+            }
+        }
+        Self { cell, origin_m, sh_degree, count, lanes, clusters }
+    }
+
     /// Activates one Gaussian and appends it.
     ///
     /// The gate at import keeps everything finite. What slips past it becomes an empty lane: it
@@ -101,6 +173,21 @@ impl Chunk {
     /// # Panics
     /// If the record's colour is not of the chunk's degree.
     pub fn push(&mut self, record: &RawRecord<'_>) {
+        let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
+        self.push_active(&ActiveRecord {
+            mean_m: record.mean_m,
+            scale_m: record.ln_scale.map(|ln| f64::from(ln).exp() as f32),
+            quat_wxyz: record.quat_wxyz.map(|q| (f64::from(q) / length) as f32),
+            log2_opacity: log2_sigmoid(record.logit_opacity),
+            sh: record.sh,
+        });
+    }
+
+    /// Appends one Gaussian that is activated already; one that is not finite, as an empty lane.
+    ///
+    /// # Panics
+    /// If the record's colour is not of the chunk's degree.
+    pub fn push_active(&mut self, record: &ActiveRecord<'_>) {
         let width = columns(self.sh_degree);
         assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
         let (slot, lane) = (self.count / LANES * width, self.count % LANES);
@@ -113,11 +200,8 @@ impl Chunk {
         }
         self.count += 1;
 
-        let scale = record.ln_scale.map(|ln| f64::from(ln).exp() as f32);
-        let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
-        let quat = record.quat_wxyz.map(|q| (f64::from(q) / length) as f32);
-        let log2_opacity = log2_sigmoid(record.logit_opacity);
-        let mut values = record.mean_m.iter().chain(&scale).chain(&quat).chain(record.sh);
+        let ActiveRecord { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
+        let mut values = mean_m.iter().chain(scale_m).chain(quat_wxyz).chain(*sh);
         if !values.all(|value| value.is_finite()) || log2_opacity.is_nan() {
             return;
         }
@@ -127,16 +211,13 @@ impl Chunk {
                 column.0[lane] = value;
             }
         };
-        set(column::MEAN, &record.mean_m);
-        set(column::SCALE, &scale);
-        set(column::QUAT, &quat);
-        set(column::LOG2_OPACITY, &[log2_opacity]);
-        set(column::SH, record.sh);
+        set(column::MEAN, mean_m);
+        set(column::SCALE, scale_m);
+        set(column::QUAT, quat_wxyz);
+        set(column::LOG2_OPACITY, &[*log2_opacity]);
+        set(column::SH, sh);
         if let Some(cluster) = self.clusters.last_mut() {
-            let mean = Vec3::from_array(record.mean_m);
-            cluster.min_m = cluster.min_m.min(mean);
-            cluster.max_m = cluster.max_m.max(mean);
-            cluster.sigma_m = cluster.sigma_m.max(scale[0]).max(scale[1]).max(scale[2]);
+            cluster.add(*mean_m, *scale_m);
         }
     }
 
@@ -176,6 +257,18 @@ impl Chunk {
         &self.lanes[block * width..(block + 1) * width]
     }
 
+    /// Half-size of the box around 3 standard deviations of one Gaussian, in metres: per axis
+    /// `3 sqrt(cov_ii)`, where `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of row i of
+    /// `R S`.
+    pub fn reach_m(&self, index: usize) -> DVec3 {
+        let value = |column| f64::from(self.value(index, column));
+        let [w, x, y, z] = [0, 1, 2, 3].map(|i| value(column::QUAT + i));
+        let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        let scale_m = DVec3::from_array([0, 1, 2].map(|axis| value(column::SCALE + axis)));
+        let rows = (rotation * DMat3::from_diagonal(scale_m)).transpose();
+        3.0 * DVec3::new(rows.x_axis.length(), rows.y_axis.length(), rows.z_axis.length())
+    }
+
     /// One parameter of one Gaussian, by its column.
     pub fn value(&self, index: usize, column: usize) -> f32 {
         self.block(index / LANES)[column].0[index % LANES]
@@ -200,7 +293,8 @@ fn log2_sigmoid(logit: f32) -> f32 {
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
 }
 
-/// Where each Gaussian of a file goes: its cell, and its place in Morton order within.
+/// Where each Gaussian of a file goes: its cell, its 16 m block of the cell, and its place in Morton
+/// order within.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Partition {
     /// Cells in order of (y, x).
@@ -218,18 +312,21 @@ pub struct CellRun {
     /// of 64 m. Subtracting it from an f32 mean near the world's origin is exact.
     pub origin_m: DVec3,
     /// Its part of [`Partition::order`].
-    pub run: std::ops::Range<usize>,
+    pub run: Range<usize>,
+    /// Its blocks that are not empty, by number, and their parts of [`Partition::order`]. All of a
+    /// sparse cell counts as its first block with anything in it.
+    pub blocks: Vec<(u8, Range<usize>)>,
 }
 
 impl Partition {
     /// Sorts centres, in metres, into cells. Ties keep the order of the file.
     pub fn new(means_m: &[[f64; 3]]) -> Self {
-        let mut keys: Vec<([i32; 2], u64, u32)> = means_m
+        let mut keys: Vec<([i32; 2], u8, u64, u32)> = means_m
             .par_iter()
             .enumerate()
             .map(|(index, mean)| {
                 let cell = [cell_of(mean[1]), cell_of(mean[0])];
-                (cell, morton(mean), index as u32)
+                (cell, block_of(mean, cell), morton(mean), index as u32)
             })
             .collect();
         keys.par_sort_unstable();
@@ -237,15 +334,21 @@ impl Partition {
         let mut start = 0;
         for run in keys.chunk_by(|a, b| a.0 == b.0) {
             let [y, x] = run[0].0;
-            let heights = run.iter().map(|&(_, _, index)| means_m[index as usize][2]);
+            let heights = run.iter().map(|&(.., index)| means_m[index as usize][2]);
             let (low, high) =
                 heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), z| (l.min(z), h.max(z)));
             let level = (0.5 * (low + high) / CELL_M).round();
             let origin_m = CELL_M * DVec3::new(f64::from(x), f64::from(y), level);
-            cells.push(CellRun { cell: [x, y], origin_m, run: start..start + run.len() });
-            start += run.len();
+            let mut blocks = Vec::new();
+            let mut end = start;
+            for block in run.chunk_by(|a, b| run.len() < SPARSE_CELL || a.1 == b.1) {
+                blocks.push((block[0].1, end..end + block.len()));
+                end += block.len();
+            }
+            cells.push(CellRun { cell: [x, y], origin_m, run: start..end, blocks });
+            start = end;
         }
-        Self { cells, order: keys.into_iter().map(|(_, _, index)| index).collect() }
+        Self { cells, order: keys.into_iter().map(|(.., index)| index).collect() }
     }
 }
 
@@ -266,6 +369,15 @@ impl CellRun {
 /// The cell index along one axis; the gate keeps coordinates below 1e8 m, far inside i32.
 fn cell_of(coordinate_m: f64) -> i32 {
     (coordinate_m / CELL_M).round() as i32
+}
+
+/// The block of a centre within its cell (y, x): 4 y + x, from the south-west.
+fn block_of(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
+    let step = |m: f64, cell: i32| {
+        let from_edge_m = m - CELL_M * (f64::from(cell) - 0.5);
+        (from_edge_m / BLOCK_M).floor().clamp(0.0, BLOCKS as f64 - 1.0) as u8
+    };
+    BLOCKS as u8 * step(mean_m[1], y) + step(mean_m[0], x)
 }
 
 /// Interleaves the bits of a position at 1/1024 of a cell, modulo 128 km.

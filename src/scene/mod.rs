@@ -1,9 +1,11 @@
-//! What a city twin is made of: Gaussians in chunks, a rig, recorded trajectories, a manifest.
+//! What a city twin is made of: Gaussians in chunks and levels of detail, a rig, recorded trajectories, a manifest.
 
 pub mod chunk;
 pub mod gaussian;
+pub mod lod;
 pub mod manifest;
 pub mod profile;
+pub mod record;
 pub mod rig;
 pub mod sh;
 pub mod trajectory;
@@ -12,5 +14,6 @@ pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;
 pub use profile::RenderProfile;
+pub use record::Record;
 pub use rig::Rig;
 pub use trajectory::Trajectory;

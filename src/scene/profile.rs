@@ -23,6 +23,12 @@ pub struct RenderProfile {
     pub alpha_cut: f64,
     /// A Gaussian that would bring the transmittance to this or below ends its pixel, unblended.
     pub stop: f64,
+    /// Largest error of a level of detail on the screen, in pixels: a block of 16 m is drawn at the
+    /// coarsest level that keeps below it. 0 is full detail everywhere.
+    pub tau_px: f64,
+    /// Distance from the nearest camera beyond which a block is not drawn, in metres; none, and
+    /// everything is.
+    pub reach_m: Option<f64>,
 }
 
 impl Default for RenderProfile {
@@ -35,6 +41,8 @@ impl Default for RenderProfile {
             alpha_cap: 0.99,
             alpha_cut: 1.0 / 255.0,
             stop: 1e-4,
+            tau_px: 1.0,
+            reach_m: None,
         }
     }
 }
@@ -64,8 +72,17 @@ pub enum ProfileError {
 
 impl RenderProfile {
     /// Names of the fields, as `--profile` and manifests spell them.
-    pub const KEYS: [&'static str; 7] =
-        ["near", "far", "blur", "antialiased", "alpha_cap", "alpha_cut", "stop"];
+    pub const KEYS: [&'static str; 9] = [
+        "near",
+        "far",
+        "blur",
+        "antialiased",
+        "alpha_cap",
+        "alpha_cut",
+        "stop",
+        "tau_px",
+        "reach_m",
+    ];
 
     /// # Errors
     /// Names the first field out of range. The bounds keep every stage's f32 arithmetic finite.
@@ -92,6 +109,18 @@ impl RenderProfile {
                 "alpha_cut is from 1e-5 to 0.1",
             ),
             ("stop", self.stop, (1e-8..=0.1).contains(&self.stop), "stop is from 1e-8 to 0.1"),
+            (
+                "tau_px",
+                self.tau_px,
+                (0.0..=1e3).contains(&self.tau_px),
+                "tau_px is from 0 (full detail) to 1000 px",
+            ),
+            (
+                "reach_m",
+                self.reach_m.unwrap_or(f64::INFINITY),
+                self.reach_m.is_none_or(|reach_m| (0.0..=1e9).contains(&reach_m)),
+                "reach_m is from 0 to 1e9 m, or none",
+            ),
         ];
         match holds.into_iter().find(|(_, _, holds, _)| !holds) {
             Some((field, value, _, must)) => Err(ProfileError::Value { field, value, must }),
@@ -119,6 +148,9 @@ impl RenderProfile {
             "alpha_cap" => self.alpha_cap = number()?,
             "alpha_cut" => self.alpha_cut = number()?,
             "stop" => self.stop = number()?,
+            "tau_px" => self.tau_px = number()?,
+            "reach_m" if value == "none" => self.reach_m = None,
+            "reach_m" => self.reach_m = Some(number()?),
             _ => return Err(bad(format!("there is no field {key:?}"))),
         }
         self.check()
@@ -135,7 +167,17 @@ mod tests {
         profile.set("near=0.2").unwrap();
         profile.set("antialiased=true").unwrap();
         assert_eq!(profile, RenderProfile { near: 0.2, antialiased: true, ..Default::default() });
-        for bad in ["near", "near=x", "nearr=1", "alpha_cap=1", "blur=-1", "far=0.1", "near=NaN"] {
+        for bad in [
+            "near",
+            "near=x",
+            "nearr=1",
+            "alpha_cap=1",
+            "blur=-1",
+            "far=0.1",
+            "near=NaN",
+            "tau_px=-1",
+            "reach_m=far",
+        ] {
             assert!(profile.clone().set(bad).is_err(), "{bad}");
         }
     }

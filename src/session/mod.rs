@@ -37,6 +37,7 @@ pub use opening::{Opening, Outputs, RigChoice, Start};
 pub use record::{EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs};
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 
+pub(crate) use observation::eyes;
 use observation::{Assembly, Layout};
 use opening::{choose_cameras, resolve_start};
 use record::{Line, Recorder};

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use crate::config;
 use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
-use crate::residency::Resident;
+use crate::residency::{Eye, Resident};
 use crate::scene::rig::{Rig, RigCamera};
 
 use super::buffer::Buffer;
@@ -251,11 +251,9 @@ impl Assembly {
             let _ = slots[view].set(drawn);
         };
         let started = Instant::now();
-        let frame = RenderFrame {
-            scene: &resident.scene,
-            profile: &resident.version.manifest.profile,
-            views: &views,
-        };
+        let profile = &resident.version.manifest.profile;
+        let scene = resident.scene(&eyes(&views), profile);
+        let frame = RenderFrame { scene: &scene, profile, views: &views };
         let stats = backend.render(&frame, &mut targets, &finished)?;
         self.timings.render += started.elapsed();
         for (stage, ms) in stats.stages_ms {
@@ -357,6 +355,15 @@ pub(super) fn views(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
         world_from_camera: world_from_rig * camera.rig_from_camera,
     };
     cameras.iter().map(view).collect()
+}
+
+/// What decides how much detail the views need.
+pub(crate) fn eyes(views: &[View]) -> Vec<Eye> {
+    let eye = |view: &View| Eye {
+        position_m: view.world_from_camera.position_m,
+        focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
+    };
+    views.iter().map(eye).collect()
 }
 
 /// The hash of a frame: of its images' hashes, in order.

@@ -290,11 +290,9 @@ fn redraw(
     let views: Vec<View> = observation::views(cameras, world_from_rig);
     let mut targets: Vec<Target<'_>> =
         pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
-    let frame = RenderFrame {
-        scene: &resident.scene,
-        profile: &resident.version.manifest.profile,
-        views: &views,
-    };
+    let profile = &resident.version.manifest.profile;
+    let scene = &resident.scene(&observation::eyes(&views), profile);
+    let frame = RenderFrame { scene, profile, views: &views };
     backend.render(&frame, &mut targets, &|_, _| {})?;
     Ok(pixels.iter().map(|rgb8| blake3::hash(rgb8)).collect())
 }

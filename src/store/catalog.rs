@@ -1,17 +1,17 @@
 //! The twins of a directory and their versions.
 
+use std::io::Read as _;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use crate::config;
-use crate::scene::manifest::ChunkEntry;
+use crate::scene::manifest::{ChunkEntry, Section};
 use crate::scene::rig::is_name;
-use crate::scene::{Chunk, Manifest};
+use crate::scene::{Chunk, Manifest, sh};
 
-use super::chunk_file::{self, ReadError};
 use super::objects::{ObjectReader, Objects};
-use super::{StoreError, recover};
+use super::{StoreError, chunk_file, recover};
 
 /// A directory of twins.
 #[derive(Clone, Debug)]
@@ -46,7 +46,7 @@ pub struct Version {
 /// A record of the log, as JSON.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Record {
+pub(super) struct LogRecord {
     pub(super) manifest: String,
     pub(super) created_us: i64,
 }
@@ -94,36 +94,53 @@ impl Catalog {
         if !numbers.contains(&number) {
             return Err(StoreError::NoVersion { name: name.to_owned(), number, latest });
         }
-        let Record { manifest: hash, created_us } = self.record(name, number)?;
-        let manifest = self.manifest(name, &hash)?;
+        let LogRecord { manifest: hash, created_us } = self.record(name, number)?;
+        let mut manifest = self.manifest(name, &hash)?;
+        self.fill(&mut manifest)?;
         Ok(Version { number, hash, created_us, manifest })
     }
 
-    /// Reads one chunk of a version, activated, and checks it against its hash.
+    /// Reads one section of a chunk, activated, and checks it against its hash; nothing else of the
+    /// chunk is read.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if it is not what was committed.
-    pub fn chunk(&self, version: &Version, entry: &ChunkEntry) -> Result<Chunk, StoreError> {
-        let Manifest { twin, sh_degree, .. } = &version.manifest;
-        let mut reader = self.objects.open(twin, &entry.object)?;
+    pub fn section(
+        &self,
+        version: &Version,
+        chunk: &ChunkEntry,
+        section: &Section,
+    ) -> Result<Chunk, StoreError> {
+        let Manifest { twin, sh_degree, record, .. } = &version.manifest;
+        let end = section.offset_bytes.saturating_add(section.bytes.into());
+        let bytes = self.objects.read_range(twin, &chunk.object, section.offset_bytes..end)?;
+        let damaged = |reason: String| {
+            let path = self.objects.path(twin, &chunk.object);
+            let Section { block, level, .. } = section;
+            StoreError::Damaged { path, reason: format!("block {block}, level {level}: {reason}") }
+        };
+        let found = blake3::hash(&bytes);
+        if found != section.hash {
+            return Err(damaged(format!("its bytes hash to {}", found.to_hex())));
+        }
+        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record).map_err(damaged)
+    }
+
+    /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if not.
+    pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
+        let mut reader = self.objects.open(name, &chunk.object)?;
         let path = reader.path().to_owned();
-        let total_bytes = reader.size_bytes();
-        let chunk = chunk_file::read(&mut reader, total_bytes).map_err(|error| match error {
-            ReadError::Io(source) => StoreError::io("read", &path)(source),
-            ReadError::Format(found) => {
-                StoreError::Format { path: path.clone(), found, supported: chunk_file::FORMAT }
-            }
-            ReadError::Damaged(reason) => StoreError::Damaged { path: path.clone(), reason },
-        });
+        let mut start = Vec::new();
+        let most = config::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
+        let read = (&mut reader).take(most as u64).read_to_end(&mut start);
+        read.map_err(StoreError::io("read", &path))?;
         // The hash says more than what its first wrong byte led to.
         reader.finish()?;
-        let chunk = chunk?;
-        let found = (chunk.cell(), chunk.sh_degree(), chunk.len() as u64);
-        if found != (entry.cell, *sh_degree, entry.count) {
-            let reason = "the manifest says another cell, degree or count".to_owned();
-            return Err(StoreError::Damaged { path, reason });
-        }
-        Ok(chunk)
+        chunk_file::check_start(&start, chunk)
+            .map_err(|reason| StoreError::Damaged { path, reason })
     }
 
     /// Numbers of a twin's versions, rising; at least one.
@@ -139,23 +156,35 @@ impl Catalog {
         Ok(numbers)
     }
 
-    pub(super) fn record(&self, name: &str, number: u64) -> Result<Record, StoreError> {
+    pub(super) fn record(&self, name: &str, number: u64) -> Result<LogRecord, StoreError> {
         let bytes = self.objects.record(name, number)?;
         let damaged = |reason| {
             let path = self.objects.record_path(name, number);
             StoreError::Damaged { path, reason }
         };
-        let record: Record = serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
+        let record: LogRecord =
+            serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
         if !is_hash(&record.manifest) {
             return Err(damaged(format!("{:?} is not a hash", record.manifest)));
         }
         Ok(record)
     }
 
+    /// Reads the sections of a manifest's chunks from its table.
+    pub(super) fn fill(&self, manifest: &mut Manifest) -> Result<(), StoreError> {
+        let reader = self.objects.open(&manifest.twin, &manifest.table.object)?;
+        let path = reader.path().to_owned();
+        let table = read_whole(reader, "table", config::TABLE_BYTES)?;
+        let Manifest { chunks, sh_degree, record, .. } = manifest;
+        chunk_file::fill(chunks, *sh_degree, *record, &table)
+            .map_err(|reason| StoreError::Damaged { path, reason })
+    }
+
+    /// Reads a manifest without the sections of its chunks.
     pub(super) fn manifest(&self, name: &str, hash: &str) -> Result<Manifest, StoreError> {
         let reader = self.objects.open(name, hash)?;
         let path = reader.path().to_owned();
-        let bytes = read_whole(reader)?;
+        let bytes = read_whole(reader, "manifest", config::MANIFEST_BYTES)?;
         let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
         // The format first: of a later one, nothing else is known.
         let Format { format } =
@@ -168,10 +197,14 @@ impl Catalog {
         if manifest.twin != name {
             return Err(damaged(format!("it belongs to twin {:?}", manifest.twin)));
         }
-        match manifest.chunks.iter().find(|chunk| !is_hash(&chunk.object)) {
-            Some(chunk) => Err(damaged(format!("{:?} is not a hash", chunk.object))),
-            None => Ok(manifest),
+        if manifest.sh_degree > sh::MAX_DEGREE {
+            return Err(damaged(format!("SH degree is {}, not 0 to 3", manifest.sh_degree)));
         }
+        let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
+        if let Some(object) = objects.chain([&manifest.table.object]).find(|name| !is_hash(name)) {
+            return Err(damaged(format!("{object:?} is not a hash")));
+        }
+        Ok(manifest)
     }
 }
 
@@ -180,16 +213,19 @@ struct Format {
     format: u32,
 }
 
-fn read_whole(mut reader: ObjectReader) -> Result<Vec<u8>, StoreError> {
-    use std::io::Read as _;
+fn read_whole(
+    mut reader: ObjectReader,
+    what: &str,
+    limit_bytes: u64,
+) -> Result<Vec<u8>, StoreError> {
     let (path, bytes) = (reader.path().to_owned(), reader.size_bytes());
-    if bytes > config::MANIFEST_BYTES {
-        let reason = format!("a manifest of {bytes} bytes is above {}", config::MANIFEST_BYTES);
+    if bytes > limit_bytes {
+        let reason = format!("a {what} of {bytes} bytes is above {limit_bytes}");
         return Err(StoreError::Damaged { path, reason });
     }
     let mut whole = Vec::with_capacity(bytes as usize);
     (&mut reader)
-        .take(config::MANIFEST_BYTES)
+        .take(limit_bytes)
         .read_to_end(&mut whole)
         .map_err(StoreError::io("read", &path))?;
     reader.finish()?;

@@ -3,7 +3,9 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::config;
 use crate::ingest::IngestError;
+use crate::scene::Record;
 use crate::scene::profile::ProfileError;
 use crate::scene::rig::RigError;
 use crate::scene::trajectory::TrajectoryError;
@@ -57,7 +59,10 @@ pub enum StoreError {
         reason: String,
     },
     /// Written by another version of this program.
-    #[error("{} has format {found}; this build reads format {supported}", path.display())]
+    #[error(
+        "{} has format {found}; this build reads format {supported}: import the twin again",
+        path.display()
+    )]
     Format {
         /// The file.
         path: PathBuf,
@@ -90,6 +95,22 @@ pub enum StoreError {
     /// The Gaussians of a commit cannot be used.
     #[error(transparent)]
     Gaussians(#[from] IngestError),
+    /// The record is too narrow for the scene.
+    #[error(
+        "{count} of {gaussians} Gaussians have a value of {field} that record {record} cannot hold; \
+         at most {} % may: store it with --record h52 or f32",
+        100.0 * config::CLAMPED_SHARE
+    )]
+    Clamped {
+        /// The record.
+        record: Record,
+        /// The field with most of them.
+        field: &'static str,
+        /// How many values.
+        count: u64,
+        /// How many Gaussians there are.
+        gaussians: u64,
+    },
     /// The render profile of a commit cannot be used.
     #[error(transparent)]
     Profile(#[from] ProfileError),
@@ -105,11 +126,14 @@ pub enum StoreError {
         /// The name.
         name: String,
     },
-    /// Everything but the chunks is too much for one manifest.
+    /// What describes a twin is too large.
     #[error(
-        "the manifest would take {bytes} bytes; at most {limit} are read: shorten trajectories"
+        "the {what} would take {bytes} bytes; at most {limit} are read: shorten trajectories, or \
+         split the scene"
     )]
     ManifestSize {
+        /// `manifest`, or the `table` of its chunks' contents.
+        what: &'static str,
         /// Its size.
         bytes: u64,
         /// The largest that is read.

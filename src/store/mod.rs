@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! <twins>/<name>/log/0000000001         which manifest version 1 is, and since when
-//! <twins>/<name>/objects/3f/3f9c...     manifests and chunks, named by their BLAKE3
+//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables and chunks, named by their BLAKE3
 //! <twins>/.staging/<name>/              objects of a running import, invisible to everyone
 //! <twins>/.staging/<name>.lock          held while one runs
 //! ```
@@ -20,5 +20,5 @@ mod verify;
 
 pub use catalog::{Catalog, Listing, Version};
 pub use error::StoreError;
-pub use push::NewVersion;
+pub use push::{NewVersion, Storage};
 pub use verify::{Damage, Verified};

@@ -1,7 +1,8 @@
 //! The only file that opens files of a twin: objects by hash, log records by number, staging.
 
 use std::fs::{self, File, TryLockError};
-use std::io::{self, BufReader, BufWriter, ErrorKind, Read, Write};
+use std::io::{self, BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use crate::config;
@@ -81,6 +82,30 @@ impl Objects {
         })
     }
 
+    /// Reads a part of an object, without comparing anything with a hash.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if the object ends before the part does; nothing is allocated for it.
+    pub(super) fn read_range(
+        &self,
+        name: &str,
+        hash: &str,
+        bytes: Range<u64>,
+    ) -> Result<Vec<u8>, StoreError> {
+        let path = self.path(name, hash);
+        let mut file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let size = file.metadata().map_err(StoreError::io("read", &path))?.len();
+        if bytes.end > size {
+            let reason = format!("it has {size} bytes; {} are needed", bytes.end);
+            return Err(StoreError::Damaged { path, reason });
+        }
+        let mut part = vec![0; (bytes.end - bytes.start) as usize];
+        file.seek(SeekFrom::Start(bytes.start))
+            .and_then(|_| file.read_exact(&mut part))
+            .map_err(StoreError::io("read", &path))?;
+        Ok(part)
+    }
+
     /// Names of the twins whose import was begun and not ended: it runs, or it was killed.
     pub(super) fn begun(&self) -> Result<Vec<String>, StoreError> {
         let mut names = entries(&self.root.join(STAGING))?;
@@ -158,6 +183,11 @@ pub(super) struct Put {
 }
 
 impl Staging {
+    /// Where it lies.
+    pub(super) fn dir(&self) -> &Path {
+        &self.dir
+    }
+
     /// Writes one object, hashing on the way, and names it by its hash.
     pub(super) fn put(
         &mut self,

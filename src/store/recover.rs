@@ -38,6 +38,7 @@ fn named(catalog: &Catalog, name: &str) -> Result<BTreeSet<String>, StoreError> 
         let hash = catalog.record(name, number)?.manifest;
         let manifest = catalog.manifest(name, &hash)?;
         named.extend(manifest.chunks.into_iter().map(|chunk| chunk.object));
+        named.insert(manifest.table.object);
         named.insert(hash);
     }
     Ok(named)

@@ -42,7 +42,7 @@ fn a_damaged_demo_twin_is_built_again() {
     };
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
     assert!(drive().contains("building the demo twin in "));
-    assert_eq!(drive(), "", "built once");
+    assert!(!drive().contains("building"), "built once");
     let version = catalog.version("demo", None).unwrap();
     let object = |hash: &str| dir.path().join("twins/demo/objects").join(&hash[..2]).join(hash);
     for hash in [&version.manifest.chunks[3].object, &version.hash] {

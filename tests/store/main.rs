@@ -16,8 +16,8 @@ mod round_trip;
 use std::path::{Path, PathBuf};
 
 use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, RenderProfile};
-use wildcity::store::{Catalog, NewVersion, StoreError, Version};
+use wildcity::scene::{Gaussians, Record, RenderProfile};
+use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 fn street(gaussians: &Gaussians) -> NewVersion<'_> {
@@ -32,6 +32,7 @@ fn street(gaussians: &Gaussians) -> NewVersion<'_> {
             builder: "test".into(),
             options: Vec::new(),
         },
+        storage: Storage { record: Record::F32, levels: false },
     }
 }
 

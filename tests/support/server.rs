@@ -22,7 +22,7 @@ use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
 use wildcity::scene::{Gaussians, RenderProfile};
 use wildcity::server::{self, Config, Limits, Running};
-use wildcity::store::{Catalog, NewVersion};
+use wildcity::store::{Catalog, NewVersion, Storage};
 
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -128,6 +128,7 @@ pub(crate) fn commit_twin(dir: &Path) {
             builder: "test".to_owned(),
             options: vec![],
         },
+        storage: Storage::default(),
     };
     Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
 }

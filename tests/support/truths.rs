@@ -67,6 +67,8 @@ const GSPLAT_OF_THEN: RenderProfile = RenderProfile {
     alpha_cap: 0.999,
     alpha_cut: 1.0 / 255.0,
     stop: 1e-4,
+    tau_px: 1.0,
+    reach_m: None,
 };
 
 /// The values of a little-endian float32 `.npy` file.

@@ -84,7 +84,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
             .map(TrajectorySummary::of)
             .map(trajectory_info)
             .collect(),
-        resident_bytes: resident.scene.bytes() as u64,
+        resident_bytes: resident.bytes() as u64,
     })))
 }
 

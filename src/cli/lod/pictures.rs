@@ -1,0 +1,133 @@
+//! Full detail beside what is drawn with levels of detail.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use anyhow::Context;
+use image::RgbImage;
+use image::imageops;
+
+use crate::config;
+use crate::ingest::cameras;
+use crate::render::{Backend, Frame, Target, View};
+use crate::residency::{Cache, demand, gaussians};
+use crate::scene::{RenderProfile, Rig, Scene};
+use crate::session;
+use crate::store::{Catalog, Version};
+
+use super::super::{output, progress};
+use super::Lod;
+
+/// Pixels between two pictures.
+const GAP_PX: u32 = 8;
+
+/// Writes a PNG per camera, full detail first, and says what each tau draws.
+pub(super) fn draw(
+    lod: &Lod,
+    catalog: Catalog,
+    version: &Version,
+    out: &Path,
+) -> anyhow::Result<()> {
+    let shots = shots(lod, version)?;
+    let (names, views): (Vec<String>, Vec<View>) = shots.into_iter().unzip();
+    let mut profiles = vec![RenderProfile { tau_px: 0.0, ..version.manifest.profile }];
+    for &tau_px in &lod.tau {
+        let profile = RenderProfile { tau_px, ..version.manifest.profile };
+        profile.check()?;
+        profiles.push(profile);
+    }
+    let backend = lod.engine.backend()?;
+    let resident = Cache::new(catalog).open(&version.manifest.twin, Some(version.number))?;
+    output::make_dir(out)?;
+    let eyes = session::eyes(&views);
+    let bar = progress::count("rendering");
+    bar.set_length(profiles.len() as u64);
+    let mut drawn: Vec<Vec<RgbImage>> = Vec::new();
+    let mut lines = Vec::new();
+    for profile in &profiles {
+        let scene = resident.scene(&eyes, profile);
+        drawn.push(render(&*backend, &scene, profile, &views)?);
+        let needed = demand(&version.manifest, &eyes, profile);
+        let count = gaussians(&version.manifest.chunks, &needed);
+        let share = 100.0 * count as f64 / version.manifest.gaussians() as f64;
+        let (full, now) = (&drawn[0], &drawn[drawn.len() - 1]);
+        let decibels = match mean_square(full, now) {
+            0.0 => "the same image".to_owned(),
+            error => format!("{:.1} dB", -10.0 * error.log10()),
+        };
+        lines.push(format!("tau {:>4} px: {share:>5.1} % drawn, {decibels}", profile.tau_px));
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let mut said = io::stdout().lock();
+    for line in &lines[1..] {
+        writeln!(said, "{line}")?;
+    }
+    for (camera, name) in names.iter().enumerate() {
+        let path = out.join(format!("{name}.png"));
+        let row: Vec<&RgbImage> = drawn.iter().map(|images| &images[camera]).collect();
+        let picture = side_by_side(&row);
+        let file = session::png(&picture, picture.width(), picture.height());
+        output::write(&path, &file.map_err(anyhow::Error::msg)?)?;
+        writeln!(said, "{}", path.display())?;
+    }
+    Ok(())
+}
+
+/// The cameras of the list, or of the rig in the middle of the drive.
+fn shots(lod: &Lod, version: &Version) -> anyhow::Result<Vec<(String, View)>> {
+    if let Some(path) = &lod.cameras {
+        let listed = cameras::read(path).with_context(|| format!("{}", path.display()))?;
+        let view = |listed: cameras::ListedCamera| {
+            let cameras::ListedCamera { name, camera, world_from_camera, .. } = listed;
+            (name, View { camera, world_from_camera })
+        };
+        return Ok(listed.into_iter().map(view).collect());
+    }
+    let manifest = &version.manifest;
+    let log = manifest
+        .trajectories
+        .first()
+        .with_context(|| format!("twin {:?} has no trajectory: give --cameras", manifest.twin))?;
+    let world_from_rig = log.at_station(0.5 * log.length_m());
+    let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+    let rig = rig.context("no rig")?;
+    let view = |mounted: &crate::scene::rig::RigCamera| {
+        let world_from_camera = world_from_rig * mounted.rig_from_camera;
+        (mounted.name.clone(), View { camera: mounted.camera, world_from_camera })
+    };
+    Ok(rig.cameras.iter().map(view).collect())
+}
+
+fn render(
+    backend: &dyn Backend,
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+) -> anyhow::Result<Vec<RgbImage>> {
+    let empty = |view: &View| RgbImage::new(view.camera.width_px, view.camera.height_px);
+    let mut images: Vec<RgbImage> = views.iter().map(empty).collect();
+    let target = |image| Target { rgb8: Some(image), ..Target::default() };
+    let mut targets: Vec<Target<'_>> = images.iter_mut().map(|image| target(image)).collect();
+    backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;
+    Ok(images)
+}
+
+/// Mean squared difference of all cameras' values, for values whose peak is 1.
+fn mean_square(one: &[RgbImage], other: &[RgbImage]) -> f64 {
+    let pairs = one.iter().zip(other).flat_map(|(one, other)| one.iter().zip(other.iter()));
+    let (sum, count) = pairs.fold((0_u64, 0_u64), |(sum, count), (a, b)| {
+        (sum + u64::from(a.abs_diff(*b)).pow(2), count + 1)
+    });
+    sum as f64 / (255.0 * 255.0 * count as f64)
+}
+
+fn side_by_side(row: &[&RgbImage]) -> RgbImage {
+    let [width, height] = [row[0].width(), row[0].height()];
+    let count = row.len() as u32;
+    let mut picture = RgbImage::new(count * (width + GAP_PX) - GAP_PX, height);
+    for (place, image) in (0_u32..).zip(row) {
+        imageops::replace(&mut picture, *image, i64::from(place * (width + GAP_PX)), 0);
+    }
+    picture
+}

@@ -1,0 +1,196 @@
+//! Merging Gaussians by their moments, and what that costs.
+
+use glam::{DMat3, DQuat, DVec3};
+
+/// A Gaussian with the moments that merging needs.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Node {
+    /// Centre, in metres.
+    pub(super) mean_m: DVec3,
+    /// Covariance, in m².
+    pub(super) cov_m2: DMat3,
+    /// Standard deviations along the own axes, in metres.
+    pub(super) scale_m: DVec3,
+    /// The own axes, as columns.
+    pub(super) axes: DMat3,
+    /// Opacity times [`area_m2`].
+    pub(super) weight: f64,
+}
+
+/// The measure of how much a Gaussian covers: proportional to the mean of its three projections
+/// along its own axes. Two flat neighbours merge into a flat one of their areas' sum, if they touch.
+pub(super) fn area_m2(scale_m: DVec3) -> f64 {
+    let DVec3 { x, y, z } = scale_m;
+    x * y + y * z + z * x
+}
+
+impl Node {
+    /// From standard deviations and a unit quaternion (w, x, y, z).
+    pub(super) fn new(mean_m: DVec3, scale_m: DVec3, quat_wxyz: [f64; 4], opacity: f64) -> Self {
+        let [w, x, y, z] = quat_wxyz;
+        let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        let root = axes * DMat3::from_diagonal(scale_m);
+        let weight = opacity * area_m2(scale_m);
+        Self { mean_m, cov_m2: root * root.transpose(), scale_m, axes, weight }
+    }
+
+    /// Largest standard deviation, in metres.
+    pub(super) fn sigma_m(&self) -> f64 {
+        self.scale_m.max_element()
+    }
+
+    /// Opacity of the peak; above 1 where much lay on top of each other.
+    pub(super) fn opacity(&self) -> f64 {
+        self.weight / area_m2(self.scale_m)
+    }
+
+    /// The own axes as a unit quaternion (w, x, y, z).
+    pub(super) fn quat_wxyz(&self) -> [f64; 4] {
+        let q = DQuat::from_mat3(&self.axes).normalize();
+        [q.w, q.x, q.y, q.z]
+    }
+}
+
+/// The first two moments of two Gaussians by weight; `scale_m` and `axes` are still to be found by
+/// [`Node::diagonalise`].
+pub(super) fn joined(a: &Node, b: &Node) -> Node {
+    let weight = a.weight + b.weight;
+    // Two that cannot be seen are equally important.
+    let share = if weight > 0.0 { b.weight / weight } else { 0.5 };
+    let offset = b.mean_m - a.mean_m;
+    let mean_m = a.mean_m + share * offset;
+    // Both displacements together: share (1 - share) d dᵀ.
+    let spread = outer(offset) * (share * (1.0 - share));
+    let cov_m2 = a.cov_m2 * (1.0 - share) + b.cov_m2 * share + spread;
+    Node { mean_m, cov_m2, weight, ..*a }
+}
+
+impl Node {
+    /// Finds the own axes and the standard deviations along them.
+    pub(super) fn diagonalise(&mut self) {
+        let (squares, axes) = eigen(self.cov_m2);
+        self.scale_m = squares.max(DVec3::ZERO).map(f64::sqrt);
+        self.axes = axes;
+    }
+}
+
+/// How different two Gaussians look from their merger: the squared L2 norm of the difference of the
+/// fields, divided by that of what was there, 0 to about 1.
+///
+/// A field is `weight x normal density x (1, colour)`, seen through a blur of `blur_m2`, so that
+/// what a pixel cannot resolve does not count. `∫ N(a, A) N(b, B) = N(a - b; 0, A + B)`: six
+/// closed-form terms, of which four remain since the merger's weight is the sum.
+pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_m2: f64) -> f64 {
+    let share = if merged.weight > 0.0 { b.weight / merged.weight } else { 0.5 };
+    let colour = colours[0].lerp(colours[1], share);
+    let fields =
+        [(a, a.weight, colours[0]), (b, b.weight, colours[1]), (merged, -merged.weight, colour)];
+    let term = |i: usize, j: usize| {
+        let ((p, weight_p, colour_p), (q, weight_q, colour_q)) = (fields[i], fields[j]);
+        weight_p * weight_q * (1.0 + colour_p.dot(colour_q)) * overlap(p, q, blur_m2)
+    };
+    let there = term(0, 0) + term(1, 1) + 2.0 * term(0, 1);
+    let difference = there + term(2, 2) + 2.0 * (term(0, 2) + term(1, 2));
+    if there > 0.0 { difference / there } else { 0.0 }
+}
+
+/// `N(a - b; 0, A + B + 2 blur)` without the constant `(2 π)^(-3/2)`.
+fn overlap(a: &Node, b: &Node, blur_m2: f64) -> f64 {
+    let sum = a.cov_m2 + b.cov_m2 + DMat3::from_diagonal(DVec3::splat(2.0 * blur_m2));
+    let offset = b.mean_m - a.mean_m;
+    // Cofactors: the rows of the inverse times the determinant.
+    let [x, y, z] = [sum.x_axis, sum.y_axis, sum.z_axis];
+    let (yz, zx, xy) = (y.cross(z), z.cross(x), x.cross(y));
+    let determinant = x.dot(yz);
+    let solved = DVec3::new(yz.dot(offset), zx.dot(offset), xy.dot(offset));
+    (-0.5 * offset.dot(solved) / determinant).exp() / determinant.sqrt()
+}
+
+fn outer(v: DVec3) -> DMat3 {
+    DMat3::from_cols(v * v.x, v * v.y, v * v.z)
+}
+
+/// Eigenvalues and a right-handed set of eigenvectors of a symmetric matrix, by Jacobi's rotations:
+/// each makes one entry zero, and five rounds leave nothing of f64's.
+fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
+    let mut vectors = DMat3::IDENTITY;
+    for _ in 0..8 {
+        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
+            let (pp, qq, pq) = (matrix.col(p)[p], matrix.col(q)[q], matrix.col(q)[p]);
+            if pq.abs() <= 1e-18 * (pp.abs() + qq.abs()) {
+                continue;
+            }
+            // Golub & Van Loan, Matrix Computations, symmetric Schur decomposition.
+            let tau = (qq - pp) / (2.0 * pq);
+            let t = tau.signum() / (tau.abs() + (1.0 + tau * tau).sqrt());
+            let cos = 1.0 / (1.0 + t * t).sqrt();
+            let sin = t * cos;
+            let mut turn = DMat3::IDENTITY;
+            turn.col_mut(p)[p] = cos;
+            turn.col_mut(q)[q] = cos;
+            turn.col_mut(q)[p] = sin;
+            turn.col_mut(p)[q] = -sin;
+            matrix = turn.transpose() * matrix * turn;
+            vectors *= turn;
+        }
+    }
+    (DVec3::new(matrix.x_axis.x, matrix.y_axis.y, matrix.z_axis.z), vectors)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ball(x: f64, sigma_m: f64, opacity: f64) -> Node {
+        Node::new(DVec3::X * x, DVec3::splat(sigma_m), [1.0, 0.0, 0.0, 0.0], opacity)
+    }
+
+    #[test]
+    fn eigenvectors_make_the_matrix_again() {
+        let turn = DMat3::from_quat(DQuat::from_xyzw(0.3, -0.5, 0.7, 0.2).normalize());
+        for squares in [[4.0, 1.0, 1e-8], [1.0, 1.0, 1.0], [1e4, 1e-9, 2e-9], [0.0, 0.0, 0.0]] {
+            let squares = DVec3::from_array(squares);
+            let matrix = turn * DMat3::from_diagonal(squares) * turn.transpose();
+            let (values, axes) = eigen(matrix);
+            let again = axes * DMat3::from_diagonal(values) * axes.transpose();
+            let off = (again - matrix).to_cols_array().map(f64::abs);
+            assert!(off.iter().all(|&off| off <= 1e-14 * squares.max_element()), "{off:?}");
+            assert!((axes.determinant() - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn a_merger_has_the_moments_of_both() {
+        let mut merged = joined(&ball(-1.0, 0.5, 0.8), &ball(1.0, 0.5, 0.8));
+        merged.diagonalise();
+        assert!((merged.mean_m - DVec3::ZERO).length() < 1e-15);
+        // 0.25 m² of each, and a displacement of 1 m along x.
+        let wanted = DVec3::new(1.25_f64.sqrt(), 0.5, 0.5);
+        assert!((merged.scale_m - wanted).length() < 1e-12, "{}", merged.scale_m);
+        assert!((merged.weight - 2.0 * 0.8 * 0.75).abs() < 1e-12);
+    }
+
+    #[test]
+    fn twins_on_one_spot_cost_nothing_and_become_twice_as_opaque() {
+        let (a, b) = (ball(0.0, 0.5, 0.8), ball(0.0, 0.5, 0.8));
+        let mut merged = joined(&a, &b);
+        merged.diagonalise();
+        assert!((merged.opacity() - 1.6).abs() < 1e-12, "{}", merged.opacity());
+        assert!(cost(&a, &b, &merged, [DVec3::ONE; 2], 1e-4).abs() < 1e-12);
+    }
+
+    #[test]
+    fn distance_and_colour_cost() {
+        let price = |x: f64, colours: [DVec3; 2], blur_m2: f64| {
+            let (a, b) = (ball(0.0, 0.1, 0.8), ball(x, 0.1, 0.8));
+            let mut merged = joined(&a, &b);
+            merged.diagonalise();
+            cost(&a, &b, &merged, colours, blur_m2)
+        };
+        let grey = [DVec3::splat(0.5); 2];
+        let (near, far) = (price(0.1, grey, 1e-4), price(1.0, grey, 1e-4));
+        assert!(near < 0.01 && far > 0.3, "{near}, {far}");
+        assert!(price(1.0, grey, 1.0) < 0.01, "what a blur hides is free");
+        assert!(price(0.1, [DVec3::ZERO, DVec3::ONE], 1e-4) > near);
+    }
+}

@@ -1,0 +1,376 @@
+//! How the values of one field become bytes, and back.
+
+use std::f32::consts::SQRT_2;
+
+use half::f16;
+
+use crate::scene::chunk::LANES;
+
+/// A field's code.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Code {
+    /// f32, bit by bit.
+    Float,
+    /// f16.
+    Half,
+    /// So many bits of multiples of a step, from the smallest value of the part to the largest.
+    Steps(u32),
+    /// The same with a step that is a power of two, so that neighbours share their grid.
+    Binary(u32),
+    /// A unit quaternion as its three smallest components of so many bits, and which is largest.
+    Rotation(u32),
+}
+
+/// What is coded of a value.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Measure {
+    /// The value.
+    Plain,
+    /// The natural logarithm of it and [`THIN_M`]: scales, where the ratio counts, down to a size
+    /// that no camera sees.
+    Logarithm,
+    /// Two to its power: opacities, whose logarithm is in the chunk. Linear, since alpha is.
+    Opacity,
+    /// Its signed square root: coefficients, most of which are near zero.
+    Root,
+}
+
+/// 10 µm, added to scales before the logarithm: trainers flatten surfels to 1e-9 m and less, which
+/// would take the better part of a logarithm's range.
+const THIN_M: f32 = 1e-5;
+
+/// Steps of a part: value = (first + k) step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Grid {
+    first: i32,
+    step: f32,
+}
+
+/// Decoded values of sixteen Gaussians: their number / 16, the column of the field, the values.
+pub(super) type Put<'a> = &'a mut dyn FnMut(usize, usize, &[f32; LANES]);
+
+impl Measure {
+    /// The measures that a grid can span; f32's own where it does not matter. Scales: up to
+    /// 2.9 km. Opacity: merged Gaussians reach about 10. Root: a
+    /// coefficient of 16, when colours are about 1. Plain: centres within 1e8 m, the import's bound;
+    /// a colour cannot be there.
+    fn range(self) -> [f32; 2] {
+        match self {
+            Self::Plain => [-1e9, 1e9],
+            Self::Logarithm => [-11.6, 8.0],
+            Self::Opacity => [0.0, 64.0],
+            Self::Root => [-4.0, 4.0],
+        }
+    }
+
+    fn of(self, value: f32) -> f32 {
+        match self {
+            Self::Plain => value,
+            Self::Logarithm => (value + THIN_M).ln(),
+            Self::Opacity => value.exp2(),
+            Self::Root => value.abs().sqrt().copysign(value),
+        }
+    }
+
+    #[inline(always)]
+    fn value(self, measure: f32) -> f32 {
+        match self {
+            Self::Plain => measure,
+            Self::Logarithm => (measure.exp() - THIN_M).max(0.0),
+            Self::Opacity => measure.log2(),
+            Self::Root => measure * measure.abs(),
+        }
+    }
+}
+
+impl Code {
+    /// Bits of one Gaussian.
+    pub(super) fn bits(self, columns: usize) -> usize {
+        match self {
+            Self::Float => 32 * columns,
+            Self::Half => 16 * columns,
+            Self::Steps(bits) | Self::Binary(bits) => bits as usize * columns,
+            Self::Rotation(bits) => 2 + 3 * bits as usize,
+        }
+    }
+
+    /// Bytes of each stored column.
+    pub(super) fn planes(self, columns: usize) -> Vec<usize> {
+        let bytes = |bits: u32| bits.div_ceil(8) as usize;
+        match self {
+            Self::Float => vec![4; columns],
+            Self::Half => vec![2; columns],
+            Self::Steps(bits) | Self::Binary(bits) => vec![bytes(bits); columns],
+            Self::Rotation(bits) => vec![bytes(bits + 2), bytes(bits), bytes(bits)],
+        }
+    }
+
+    /// Bytes of the part's grid.
+    pub(super) fn grid_bytes(self) -> usize {
+        match self {
+            Self::Steps(_) | Self::Binary(_) => 8,
+            Self::Float | Self::Half | Self::Rotation(_) => 0,
+        }
+    }
+
+    /// Appends the part's grid and planes. Returns how many values were clamped.
+    pub(super) fn encode<V: Iterator<Item = f32>>(
+        self,
+        measure: Measure,
+        columns: usize,
+        values: &dyn Fn(usize) -> V,
+        grids: &mut Vec<u8>,
+        planes: &mut Vec<u8>,
+    ) -> u64 {
+        let (bits, binary) = match self {
+            Self::Float => {
+                for column in 0..columns {
+                    let codes: Vec<u32> = values(column).map(f32::to_bits).collect();
+                    write_planes(planes, &codes, 4);
+                }
+                return 0;
+            }
+            Self::Half => {
+                for column in 0..columns {
+                    let half = |value| u32::from(f16::from_f32(measure.of(value)).to_bits());
+                    let codes: Vec<u32> = values(column).map(half).collect();
+                    write_planes(planes, &codes, 2);
+                }
+                return 0;
+            }
+            Self::Rotation(bits) => {
+                let [w, x, y, z] = [0, 1, 2, 3].map(values);
+                let quats = w.zip(x).zip(y.zip(z)).map(|((w, x), (y, z))| [w, x, y, z]);
+                let codes: Vec<[u32; 3]> = quats.map(|q| smallest_three(q, bits)).collect();
+                for (k, bytes) in self.planes(columns).into_iter().enumerate() {
+                    let column: Vec<u32> = codes.iter().map(|code| code[k]).collect();
+                    write_planes(planes, &column, bytes);
+                }
+                return 0;
+            }
+            Self::Steps(bits) => (bits, false),
+            Self::Binary(bits) => (bits, true),
+        };
+        let [low, high] = measure.range();
+        let mut clamped = 0;
+        let measured: Vec<f32> = (0..columns)
+            .flat_map(values)
+            .map(|value| {
+                let measured = measure.of(value);
+                let within = measured.clamp(low, high);
+                clamped += u64::from(within != measured);
+                within
+            })
+            .collect();
+        let grid = Grid::over(&measured, bits, binary);
+        grids.extend(grid.first.to_le_bytes());
+        grids.extend(grid.step.to_le_bytes());
+        let codes: Vec<u32> = measured.iter().map(|&value| grid.code(value, bits)).collect();
+        for column in codes.chunks(codes.len().div_ceil(columns).max(1)) {
+            write_planes(planes, column, bits.div_ceil(8) as usize);
+        }
+        clamped
+    }
+
+    /// Hands the values of `count` Gaussians to `put`, column by column, 16 at a time; the last ones
+    /// with garbage behind them.
+    pub(super) fn decode(
+        self,
+        measure: Measure,
+        columns: usize,
+        grid: &[u8],
+        planes: &[u8],
+        count: usize,
+        put: Put<'_>,
+    ) {
+        let mut planes = planes;
+        let mut take = |bytes: usize| {
+            let (own, rest) = planes.split_at(bytes * count);
+            planes = rest;
+            own
+        };
+        match self {
+            Self::Float => {
+                for column in 0..columns {
+                    let own = take(4);
+                    blocks::<4>(own, count, |block, codes| {
+                        put(block, column, &codes.map(f32::from_bits));
+                    });
+                }
+            }
+            Self::Half => {
+                for column in 0..columns {
+                    let own = take(2);
+                    blocks::<2>(own, count, |block, codes| {
+                        let half = |code| measure.value(f16::from_bits(code as u16).to_f32());
+                        put(block, column, &codes.map(half));
+                    });
+                }
+            }
+            Self::Rotation(bits) => {
+                let bytes = self.planes(columns);
+                let [a, b, c] = [0, 1, 2].map(|k: usize| widen(take(bytes[k]), bytes[k], count));
+                for (block, codes) in a.iter().zip(b.iter().zip(&c)).enumerate() {
+                    let (a, (b, c)) = codes;
+                    let mut quats = [[0.0; LANES]; 4];
+                    for lane in 0..LANES {
+                        let quat = from_smallest_three([a[lane], b[lane], c[lane]], bits);
+                        for (column, q) in quats.iter_mut().zip(quat) {
+                            column[lane] = q;
+                        }
+                    }
+                    for (column, values) in quats.iter().enumerate() {
+                        put(block, column, values);
+                    }
+                }
+            }
+            Self::Steps(bits) | Self::Binary(bits) => {
+                let grid = Grid::read(grid);
+                let value = |code: u32| measure.value(grid.at(code));
+                let curved = matches!(measure, Measure::Logarithm | Measure::Opacity);
+                // Where there are more values than codes, each code's is computed once.
+                let table: Vec<f32> = if curved && columns * count > 1 << bits {
+                    (0..1 << bits).map(value).collect()
+                } else {
+                    Vec::new()
+                };
+                let all = (1_u32 << bits) - 1;
+                for column in 0..columns {
+                    let bytes = bits.div_ceil(8) as usize;
+                    let own = take(bytes);
+                    let mut each = |block, codes: [u32; LANES]| {
+                        let values = if table.is_empty() {
+                            codes.map(value)
+                        } else {
+                            codes.map(|code| table[(code & all) as usize])
+                        };
+                        put(block, column, &values);
+                    };
+                    match bytes {
+                        1 => blocks::<1>(own, count, &mut each),
+                        2 => blocks::<2>(own, count, &mut each),
+                        _ => blocks::<3>(own, count, &mut each),
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Grid {
+    /// The finest one that spans all values with the numbers 0 to 2^bits - 1.
+    ///
+    /// Multiples of the step, so that zero is on it: where it begins is rounded down to one, which
+    /// costs one of the steps. A step of 2^-30 of the largest value is below f32's own.
+    fn over(values: &[f32], bits: u32, binary: bool) -> Self {
+        let fold = |from: f64, pick: fn(f64, f64) -> f64| {
+            values.iter().fold(from, |all, &value| pick(all, f64::from(value)))
+        };
+        let (low, high) = (fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max));
+        let steps = f64::from((1_u32 << bits) - 2);
+        let finest = low.abs().max(high.abs()) / f64::from(1 << 30);
+        let step = ((high - low) / steps).max(finest);
+        let spans = step > 1e-30;
+        if !spans {
+            // All zero, or none.
+            return Self { first: 0, step: 1.0 };
+        }
+        // Rounded up, so that the last number still reaches the largest value.
+        let step =
+            if binary { step.log2().ceil().exp2() as f32 } else { (step * (1.0 + 1e-6)) as f32 };
+        Self { first: (low / f64::from(step)).floor() as i32, step }
+    }
+
+    fn code(self, value: f32, bits: u32) -> u32 {
+        let number = (f64::from(value) / f64::from(self.step)).round() - f64::from(self.first);
+        number.clamp(0.0, f64::from((1_u32 << bits) - 1)) as u32
+    }
+
+    #[inline(always)]
+    fn at(self, code: u32) -> f32 {
+        self.first.wrapping_add(code as i32) as f32 * self.step
+    }
+
+    fn read(bytes: &[u8]) -> Self {
+        let word = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
+        Self { first: i32::from_le_bytes(word(0)), step: f32::from_le_bytes(word(4)) }
+    }
+}
+
+/// The codes of three components, each at most 1/√2, zero in the middle; the number of the largest
+/// one is above the first. A quaternion and its negative are one rotation: the largest is positive.
+fn smallest_three(quat: [f32; 4], bits: u32) -> [u32; 3] {
+    let largest = (0..4).max_by(|&a, &b| quat[a].abs().total_cmp(&quat[b].abs())).unwrap_or(0);
+    let half = f64::from((1_u32 << (bits - 1)) - 1);
+    let sign = if quat[largest] < 0.0 { -1.0 } else { 1.0 };
+    let mut codes = [0; 3];
+    let others = (0..4).filter(|&k| k != largest);
+    for (code, k) in codes.iter_mut().zip(others) {
+        let share = sign * f64::from(quat[k]) * std::f64::consts::SQRT_2;
+        *code = ((share * half).round().clamp(-half, half) + half) as u32;
+    }
+    codes[0] |= (largest as u32) << bits;
+    codes
+}
+
+#[inline(always)]
+fn from_smallest_three(codes: [u32; 3], bits: u32) -> [f32; 4] {
+    let half = ((1_u32 << (bits - 1)) - 1) as f32;
+    let step = 1.0 / (SQRT_2 * half);
+    let largest = codes[0] >> bits & 3;
+    let [a, b, c] =
+        [codes[0] & ((1 << bits) - 1), codes[1], codes[2]].map(|code| (code as f32 - half) * step);
+    let d = (1.0 - a * a - b * b - c * c).max(0.0).sqrt();
+    match largest {
+        0 => [d, a, b, c],
+        1 => [a, d, b, c],
+        2 => [a, b, d, c],
+        _ => [a, b, c, d],
+    }
+}
+
+fn write_planes(planes: &mut Vec<u8>, codes: &[u32], bytes: usize) {
+    for byte in 0..bytes {
+        planes.extend(codes.iter().map(|code| (code >> (8 * byte)) as u8));
+    }
+}
+
+/// Joins the `BYTES` planes of one column, 16 values at a time; what is behind the last is zero.
+#[inline(always)]
+fn blocks<const BYTES: usize>(
+    planes: &[u8],
+    count: usize,
+    mut each: impl FnMut(usize, [u32; LANES]),
+) {
+    let plane = |byte: usize| &planes[byte * count..(byte + 1) * count];
+    for block in 0..count.div_ceil(LANES) {
+        let run = block * LANES..count.min((block + 1) * LANES);
+        let mut codes = [0; LANES];
+        for byte in 0..BYTES {
+            let own = &plane(byte)[run.clone()];
+            match <&[u8; LANES]>::try_from(own) {
+                Ok(own) => {
+                    for (code, &own) in codes.iter_mut().zip(own) {
+                        *code |= u32::from(own) << (8 * byte);
+                    }
+                }
+                Err(_) => {
+                    for (code, &own) in codes.iter_mut().zip(own) {
+                        *code |= u32::from(own) << (8 * byte);
+                    }
+                }
+            }
+        }
+        each(block, codes);
+    }
+}
+
+fn widen(planes: &[u8], bytes: usize, count: usize) -> Vec<[u32; LANES]> {
+    let mut codes = vec![[0; LANES]; count.div_ceil(LANES)];
+    let mut each = |block: usize, own| codes[block] = own;
+    match bytes {
+        1 => blocks::<1>(planes, count, &mut each),
+        _ => blocks::<2>(planes, count, &mut each),
+    }
+    codes
+}

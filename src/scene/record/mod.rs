@@ -1,0 +1,239 @@
+//! Records: in how many bits a Gaussian is stored, field by field.
+//!
+//! A part of a section, up to [`PART`] Gaussians, is first the grids of its quantised fields (the
+//! smallest step number as i32 and the step as f32, little-endian, in the order of the table), and
+//! then byte planes: column after column, first the lowest byte of all values, then the next. What
+//! changes slowly ends up side by side, where a byte-wise compressor finds it, and no bit straddles
+//! another value.
+//!
+//! Ranges are those of the part's own values, and every grid has zero on it: what is grey, flat on
+//! the ground or independent of the direction stays exactly so.
+
+mod code;
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
+use super::chunk::{Chunk, LANES, Lanes, column, columns};
+use super::sh;
+
+use code::{Code, Measure};
+
+/// Gaussians that share ranges, at most: raw, 65,536 of Q32 at degree 3 are 7.9 MB, of F32 15 MB.
+/// A multiple of a cluster.
+pub const PART: usize = 1 << 16;
+
+/// How a twin's Gaussians are stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Record {
+    /// What the renderer reads, bit by bit: activated f32, 92 bytes at degree 1.
+    F32,
+    /// Centres in f32, everything else in f16: 52 bytes at degree 1.
+    H52,
+    /// 32 bytes at degree 1.
+    #[default]
+    Q32,
+    /// 24 bytes at degree 1.
+    Q24,
+}
+
+/// One field of a record: consecutive columns of a chunk that are coded alike.
+#[derive(Clone, Copy, Debug)]
+struct Field {
+    name: &'static str,
+    column: usize,
+    columns: usize,
+    measure: Measure,
+    code: Code,
+}
+
+/// Values that a record could not hold, per field.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Clamped(Vec<(&'static str, u64)>);
+
+impl Record {
+    /// Every record, the most exact first.
+    pub const ALL: [Self; 4] = [Self::F32, Self::H52, Self::Q32, Self::Q24];
+
+    /// Its name, as options and manifests spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::H52 => "h52",
+            Self::Q32 => "q32",
+            Self::Q24 => "q24",
+        }
+    }
+
+    /// The table. Bits at degree 0, 1, 2, 3:
+    ///
+    /// | | centre | rotation | scale | opacity | DC | SH1 | SH2 | SH3 | 0 | 1 | 2 | 3 |
+    /// |---|---|---|---|---|---|---|---|---|---|---|---|---|
+    /// | F32 | 3x32 | 4x32 | 3x32 | 32 | 3x32 | 9x32 | 15x32 | 21x32 | 448 | 736 | 1216 | 1888 |
+    /// | H52 | 3x32 | 4x16 | 3x16 | 16 | 3x16 | 9x16 | 15x16 | 21x16 | 272 | 416 | 656 | 992 |
+    /// | Q32 | 3x23 | 2+3x10 | 3x10 | 10 | 3x11 | 9x9 | 15x8 | 21x8 | 174 | 255 | 375 | 543 |
+    /// | Q24 | 3x20 | 2+3x8 | 3x8 | 7 | 3x7 | 9x6 | 15x5 | 21x5 | 138 | 192 | 267 | 372 |
+    ///
+    /// Spent where an image sees it, each field alone at 60 dB or more: centres get the most, since
+    /// surfels of one plane that change places in depth are the first thing that is seen.
+    fn fields(self, sh_degree: u8) -> Vec<Field> {
+        let ([x, y, z], scale, quat, opacity, dc, bands) = match self {
+            Self::F32 => (
+                [Code::Float; 3],
+                Code::Float,
+                Code::Float,
+                Code::Float,
+                Code::Float,
+                [Code::Float; 3],
+            ),
+            Self::H52 => {
+                ([Code::Float; 3], Code::Half, Code::Half, Code::Half, Code::Half, [Code::Half; 3])
+            }
+            Self::Q32 => (
+                [Code::Binary(23); 3],
+                Code::Steps(10),
+                Code::Rotation(10),
+                Code::Steps(10),
+                Code::Steps(11),
+                [Code::Steps(9), Code::Steps(8), Code::Steps(8)],
+            ),
+            Self::Q24 => (
+                [Code::Binary(20); 3],
+                Code::Steps(8),
+                Code::Rotation(8),
+                Code::Steps(7),
+                Code::Steps(7),
+                [Code::Steps(6), Code::Steps(5), Code::Steps(5)],
+            ),
+        };
+        // F32 keeps what the renderer reads; the others keep what is even to the eye.
+        let exact = self == Self::F32;
+        let measure = |measure| if exact { Measure::Plain } else { measure };
+        let field =
+            |name, column, columns, measure, code| Field { name, column, columns, measure, code };
+        let mut fields = vec![
+            field("x", column::MEAN, 1, Measure::Plain, x),
+            field("y", column::MEAN + 1, 1, Measure::Plain, y),
+            field("z", column::MEAN + 2, 1, Measure::Plain, z),
+            field("scale", column::SCALE, 3, measure(Measure::Logarithm), scale),
+            field("rotation", column::QUAT, 4, Measure::Plain, quat),
+            field("opacity", column::LOG2_OPACITY, 1, measure(Measure::Opacity), opacity),
+            field("colour", column::SH, 3, Measure::Plain, dc),
+        ];
+        let names = ["SH degree 1", "SH degree 2", "SH degree 3"];
+        for degree in 1..=usize::from(sh_degree) {
+            let column = column::SH + 3 * sh::coefficients(degree as u8 - 1);
+            let columns = 3 * (2 * degree + 1);
+            let band = measure(Measure::Root);
+            fields.push(field(names[degree - 1], column, columns, band, bands[degree - 1]));
+        }
+        fields
+    }
+
+    /// Bits of information per Gaussian, before compression.
+    pub fn bits(self, sh_degree: u8) -> usize {
+        self.fields(sh_degree).iter().map(|field| field.code.bits(field.columns)).sum()
+    }
+
+    /// Bytes of a part of `count` Gaussians, before compression.
+    pub fn part_bytes(self, sh_degree: u8, count: usize) -> usize {
+        let bytes = |field: &Field| {
+            field.code.grid_bytes() + count * field.code.planes(field.columns).iter().sum::<usize>()
+        };
+        self.fields(sh_degree).iter().map(bytes).sum()
+    }
+
+    /// Codes a run of a chunk's Gaussians, and counts what does not fit.
+    ///
+    /// # Panics
+    /// If the run does not begin at a cluster or reaches past the chunk.
+    pub fn encode(self, chunk: &Chunk, run: Range<usize>, clamped: &mut Clamped) -> Vec<u8> {
+        assert!(run.start.is_multiple_of(LANES) && run.end <= chunk.len(), "{run:?}");
+        let fields = self.fields(chunk.sh_degree());
+        let (mut grids, mut planes) = (Vec::new(), Vec::new());
+        for field in &fields {
+            let values = |column: usize| {
+                let column = field.column + column;
+                run.clone().map(move |index| chunk.value(index, column))
+            };
+            let count =
+                field.code.encode(field.measure, field.columns, &values, &mut grids, &mut planes);
+            clamped.add(field.name, count);
+        }
+        grids.append(&mut planes);
+        grids
+    }
+
+    /// Decodes a part into the lanes of its Gaussians, 16 at a time.
+    ///
+    /// # Errors
+    /// Says what is wrong with the part's size.
+    ///
+    /// # Panics
+    /// If there are not as many lanes as `count` Gaussians of the degree take.
+    pub fn decode(
+        self,
+        part: &[u8],
+        sh_degree: u8,
+        count: usize,
+        lanes: &mut [Lanes],
+    ) -> Result<(), String> {
+        let width = columns(sh_degree);
+        assert_eq!(lanes.len(), count.div_ceil(LANES) * width, "lanes of another count");
+        let wanted = self.part_bytes(sh_degree, count);
+        if part.len() != wanted {
+            return Err(format!("{count} Gaussians take {wanted} bytes, not {}", part.len()));
+        }
+        let fields = self.fields(sh_degree);
+        let (mut grids, mut planes) =
+            part.split_at(fields.iter().map(|field| field.code.grid_bytes()).sum());
+        for field in &fields {
+            let Field { column, columns, measure, code, .. } = *field;
+            let (grid, rest) = grids.split_at(code.grid_bytes());
+            let bytes = count * code.planes(columns).iter().sum::<usize>();
+            let (own, others) = planes.split_at(bytes);
+            code.decode(measure, columns, grid, own, count, &mut |block, k, values| {
+                lanes[block * width + column + k].0 = *values;
+            });
+            (grids, planes) = (rest, others);
+        }
+        Ok(())
+    }
+}
+
+impl std::str::FromStr for Record {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let known = || Self::ALL.map(Self::name).join(", ");
+        let found = Self::ALL.into_iter().find(|record| record.name() == text);
+        found.ok_or_else(|| format!("there is no record {text:?}; the records are {}", known()))
+    }
+}
+
+impl std::fmt::Display for Record {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Clamped {
+    fn add(&mut self, field: &'static str, count: u64) {
+        match self.0.iter_mut().find(|(name, _)| *name == field) {
+            Some((_, sum)) => *sum += count,
+            None => self.0.push((field, count)),
+        }
+    }
+
+    /// Adds what another part could not hold.
+    pub fn merge(&mut self, other: &Self) {
+        other.0.iter().for_each(|&(field, count)| self.add(field, count));
+    }
+
+    /// The field with the most clamped values, and how many Gaussians have one.
+    pub fn worst(&self) -> Option<(&'static str, u64)> {
+        self.0.iter().copied().max_by_key(|&(_, count)| count)
+    }
+}

@@ -1,0 +1,83 @@
+use glam::DVec3;
+use wildcity::residency::{Eye, Needed, demand, gaussians};
+use wildcity::scene::{Manifest, RenderProfile};
+use wildcity::store::Storage;
+
+use crate::{commit, streets, tau};
+
+fn manifest() -> Manifest {
+    let dir = tempfile::tempdir().unwrap();
+    let (scene, _) = streets::demo_street();
+    commit(dir.path(), &scene, Storage::default()).unwrap().manifest
+}
+
+fn eye(x: f64, focal_px: f64) -> Eye {
+    Eye { position_m: DVec3::new(x, 0.0, 1.6), focal_px }
+}
+
+fn levels(manifest: &Manifest, needed: &[Needed]) -> Vec<u8> {
+    needed.iter().map(|n| manifest.chunks[n.chunk].sections[n.section].level).collect()
+}
+
+#[test]
+fn the_set_is_one_level_of_every_block_and_follows_from_the_table() {
+    let manifest = manifest();
+    let blocks: usize = manifest
+        .chunks
+        .iter()
+        .map(|chunk| chunk.sections.iter().filter(|section| section.level == 0).count())
+        .sum();
+    let all = demand(&manifest, &[eye(60.0, 1800.0)], &tau(0.0));
+    assert_eq!(all.len(), blocks);
+    assert!(all.is_sorted());
+    assert!(levels(&manifest, &all).iter().all(|&level| level == 0));
+    assert_eq!(gaussians(&manifest.chunks, &all), manifest.gaussians());
+
+    for tau_px in [0.5, 1.0, 4.0, 16.0] {
+        let eyes = [eye(60.0, 1800.0), eye(70.0, 900.0)];
+        let needed = demand(&manifest, &eyes, &tau(tau_px));
+        assert_eq!(needed, demand(&manifest, &[eyes[1], eyes[0]], &tau(tau_px)));
+        assert_eq!(needed.len(), blocks);
+        // The rule once more, section by section.
+        for n in &needed {
+            let chunk = &manifest.chunks[n.chunk];
+            let section = &chunk.sections[n.section];
+            let mine = chunk.sections.iter().filter(|other| other.block == section.block);
+            let full = mine.clone().find(|other| other.level == 0).unwrap();
+            let bounds = chunk.section_bounds(full);
+            let distance =
+                eyes.map(|e| bounds.distance_m(e.position_m)).into_iter().fold(f64::MAX, f64::min);
+            let size_px = |error_m: f32| 1800.0 * f64::from(error_m) / distance;
+            assert!(section.level == 0 || size_px(section.error_m) <= tau_px);
+            let coarser = mine.clone().find(|other| other.level == section.level + 1);
+            assert!(coarser.is_none_or(|coarser| size_px(coarser.error_m) > tau_px));
+        }
+    }
+}
+
+#[test]
+fn nearer_eyes_longer_lenses_and_smaller_errors_need_more() {
+    let manifest = manifest();
+    let count =
+        |eyes: &[Eye], tau_px| gaussians(&manifest.chunks, &demand(&manifest, eyes, &tau(tau_px)));
+    let here = count(&[eye(60.0, 1800.0)], 4.0);
+    assert!(count(&[eye(-5_000.0, 1800.0)], 4.0) < here / 4, "far away");
+    assert!(count(&[eye(60.0, 18_000.0)], 4.0) > here, "a longer lens");
+    assert!(count(&[eye(60.0, 1800.0)], 2.0) > here, "a smaller error");
+    assert!(count(&[eye(60.0, 1800.0), eye(250.0, 1800.0)], 4.0) > here, "eyes at both ends");
+}
+
+#[test]
+fn what_is_out_of_reach_is_not_drawn() {
+    let manifest = manifest();
+    let eyes = [eye(60.0, 1800.0)];
+    let near = RenderProfile { reach_m: Some(50.0), ..tau(0.0) };
+    let needed = demand(&manifest, &eyes, &near);
+    assert!(needed.len() > 5 && needed.len() < demand(&manifest, &eyes, &tau(0.0)).len() / 2);
+    for n in &needed {
+        let chunk = &manifest.chunks[n.chunk];
+        let bounds = chunk.section_bounds(&chunk.sections[n.section]);
+        assert!(bounds.distance_m(eyes[0].position_m) <= 50.0);
+    }
+    assert_eq!(demand(&manifest, &[], &near), [], "nobody sees nothing");
+}

@@ -1,0 +1,165 @@
+use std::fs;
+
+use glam::DVec3;
+use wildcity::generate::{self, StreetSettings};
+use wildcity::geometry::Camera;
+use wildcity::geometry::camera::Pinhole;
+use wildcity::render::View;
+use wildcity::scene::chunk::{Partition, column};
+use wildcity::scene::rig::{Rig, RigCamera};
+use wildcity::scene::{Chunk, Gaussians, Record, Scene, lod};
+use wildcity::store::{Catalog, Storage};
+
+use crate::{commit, decibels, eyes, stored, streets, tau};
+
+/// Blocks of a scene at full detail.
+fn blocks(scene: &Gaussians) -> Vec<Chunk> {
+    let Partition { cells, order } = Partition::new(&scene.means_m);
+    let block = |(cell, run): (&wildcity::scene::chunk::CellRun, std::ops::Range<usize>)| {
+        let mut chunk = Chunk::new(cell.cell, cell.origin_m, scene.sh_degree, run.len());
+        for &index in &order[run] {
+            chunk.push(&cell.record(scene, index as usize));
+        }
+        chunk
+    };
+    let runs = cells.iter().flat_map(|cell| cell.blocks.iter().map(move |b| (cell, b.1.clone())));
+    runs.map(block).collect()
+}
+
+/// Centre, largest standard deviation, and opacity x area.
+fn moments(chunk: &Chunk) -> Vec<(DVec3, f64, f64)> {
+    let moment = |index: usize| {
+        let value = |column| f64::from(chunk.value(index, column));
+        let mean = DVec3::new(value(0), value(1), value(2));
+        let [a, b, c] = [0, 1, 2].map(|axis| value(column::SCALE + axis));
+        let weight = value(column::LOG2_OPACITY).exp2() * (a * b + b * c + c * a);
+        (mean, a.max(b).max(c), weight)
+    };
+    (0..chunk.len()).map(moment).collect()
+}
+
+#[test]
+fn tau_zero_is_level_zero_everywhere() {
+    let (scene, views) = streets::demo_street();
+    let resident = stored(&scene, Record::F32, true);
+    let drawn = resident.scene(&eyes(&views), &tau(0.0));
+    assert_eq!(drawn.gaussians(), scene.len());
+    let db = decibels(&drawn, &Scene::from_gaussians(&scene), &views);
+    assert_eq!(db, f64::INFINITY, "the same bits as the scene in memory");
+}
+
+#[test]
+fn a_pixel_of_error_is_hardly_seen_on_the_street() {
+    // All six cameras at a quarter of their size: at their full size, a pixel is so small that hardly
+    // anything of a street of 300 m is merged.
+    let (scene, _) = streets::demo_street();
+    let views = quarter_rig();
+    let truth = Scene::from_gaussians(&scene);
+    let resident = stored(&scene, Record::F32, true);
+    let mut before = scene.len();
+    for (tau_px, wanted_db) in [(1.0, 45.0), (2.0, 41.0), (4.0, 37.0), (8.0, 33.0)] {
+        let drawn = resident.scene(&eyes(&views), &tau(tau_px));
+        let db = decibels(&drawn, &truth, &views);
+        assert!(db >= wanted_db, "tau {tau_px}: {db:.1} dB");
+        assert!(drawn.gaussians() < before, "tau {tau_px}: {} drawn", drawn.gaussians());
+        before = drawn.gaussians();
+    }
+    assert!(before < scene.len() / 2, "{before} of {}", scene.len());
+}
+
+/// The demo's six cameras, 60 m along its street, at a quarter of their size.
+fn quarter_rig() -> Vec<View> {
+    let street = generate::street(&StreetSettings::default()).unwrap();
+    let world_from_rig = street.trajectory.at_station(60.0);
+    let view = |mounted: &RigCamera| {
+        let Camera { width_px, height_px, pinhole: p } = mounted.camera;
+        let pinhole = Pinhole { fx: p.fx / 4.0, fy: p.fy / 4.0, cx: p.cx / 4.0, cy: p.cy / 4.0 };
+        View {
+            camera: Camera { width_px: width_px / 4, height_px: height_px / 4, pinhole },
+            world_from_camera: world_from_rig * mounted.rig_from_camera,
+        }
+    };
+    Rig::preset("vehicle6").unwrap().cameras.iter().map(view).collect()
+}
+
+#[test]
+fn every_level_keeps_its_word() {
+    let (scene, _) = streets::demo_street();
+    let mut checked = 0;
+    for block in blocks(&scene).iter().filter(|block| block.len() > 500).step_by(9) {
+        let leaves = moments(block);
+        let whole: f64 = leaves.iter().map(|leaf| leaf.2).sum();
+        let (mut error_m, mut count) = (0.0, block.len());
+        for level in lod::levels(block) {
+            assert!(level.error_m >= error_m && level.chunk.len() < count);
+            (error_m, count) = (level.error_m, level.chunk.len());
+            let nodes = moments(&level.chunk);
+            // Nothing of what covers the picture is lost.
+            let now: f64 = nodes.iter().map(|node| node.2).sum();
+            assert!((now / whole - 1.0).abs() < 1e-4, "{now} of {whole}");
+            // Everything has somebody near and wide enough that may stand for it.
+            for (mean, sigma, _) in &leaves {
+                let nearest = nodes.iter().map(|(node, node_sigma, _)| {
+                    node.distance(*mean) + 3.0 * (sigma - node_sigma).max(0.0)
+                });
+                let nearest = nearest.fold(f64::INFINITY, f64::min);
+                assert!(nearest <= f64::from(error_m) + 1e-5, "{nearest} m, not {error_m} m");
+            }
+            checked += 1;
+        }
+    }
+    assert!(checked > 20, "{checked} levels");
+}
+
+#[test]
+fn levels_are_the_same_bytes_at_any_thread_count() {
+    let scene = streets::street(60_000, 1, 3);
+    let hash = |threads: usize| {
+        let dir = tempfile::tempdir().unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let version = pool.install(|| commit(dir.path(), &scene, Storage::default())).unwrap();
+        assert!(version.manifest.chunks.iter().any(|c| c.sections.iter().any(|s| s.level > 2)));
+        version.hash
+    };
+    let wanted = hash(1);
+    for threads in [2, 3, 16] {
+        assert_eq!(hash(threads), wanted, "{threads} threads");
+    }
+}
+
+#[test]
+fn a_section_is_read_by_itself() {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = streets::street(30_000, 1, 1);
+    let version = commit(dir.path(), &scene, Storage::default()).unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let chunk = version.manifest.chunks.iter().max_by_key(|chunk| chunk.sections.len()).unwrap();
+    let path = dir.path().join("street/objects").join(&chunk.object[..2]).join(&chunk.object);
+    let mut bytes = fs::read(&path).unwrap();
+
+    // Coarse levels come first, and no section touches a page without need.
+    let mut by_place = chunk.sections.clone();
+    by_place.sort_by_key(|section| section.offset_bytes);
+    assert!(by_place.is_sorted_by_key(|section| std::cmp::Reverse(section.level)));
+    for section in &by_place {
+        let first = section.offset_bytes / 4096;
+        let last = (section.offset_bytes + u64::from(section.bytes) - 1) / 4096;
+        assert!(last - first <= u64::from(section.bytes) / 4096, "{section:?}");
+        assert!(section.bytes < 4096 || section.offset_bytes % 4096 == 0, "{section:?}");
+    }
+
+    // One damaged section fails alone.
+    let damaged = by_place[by_place.len() / 2];
+    bytes[damaged.offset_bytes as usize + 9] ^= 1;
+    fs::write(&path, bytes).unwrap();
+    for section in &chunk.sections {
+        let read = catalog.section(&version, chunk, section);
+        if *section == damaged {
+            let said = read.unwrap_err().to_string();
+            let place = format!("block {}, level {}: its bytes", section.block, section.level);
+            assert!(said.contains(&place), "{said}");
+        } else {
+            assert_eq!(read.unwrap().len(), section.count as usize);
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! Records and levels of detail: how much is lost, that nothing else is, and that it is always the
+//! same.
+
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/images.rs"]
+mod images;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+#[path = "../support/streets.rs"]
+#[allow(dead_code, reason = "tests/render uses the rest of it")]
+mod streets;
+
+mod demand;
+mod levels;
+mod records;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use wildcity::render::View;
+use wildcity::residency::{Cache, Eye, Resident};
+use wildcity::scene::manifest::Provenance;
+use wildcity::scene::{Gaussians, Record, RenderProfile, Scene};
+use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
+
+use images::{cpu, psnr, render};
+
+/// Stores a scene as the next version of twin "street".
+fn commit(dir: &Path, gaussians: &Gaussians, storage: Storage) -> Result<Version, StoreError> {
+    let new = NewVersion {
+        name: "street",
+        gaussians,
+        profile: RenderProfile::default(),
+        rig: None,
+        trajectories: Vec::new(),
+        provenance: Provenance {
+            source: "test".into(),
+            builder: "test".into(),
+            options: Vec::new(),
+        },
+        storage,
+    };
+    Catalog::open(dir)?.commit(new, &mut |_, _| {})
+}
+
+/// A scene that was stored and read again.
+fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Arc<Resident> {
+    let dir = tempfile::tempdir().unwrap();
+    commit(dir.path(), gaussians, Storage { record, levels }).unwrap();
+    Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap()
+}
+
+fn eyes(views: &[View]) -> Vec<Eye> {
+    let eye = |view: &View| Eye {
+        position_m: view.world_from_camera.position_m,
+        focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
+    };
+    views.iter().map(eye).collect()
+}
+
+/// The default profile with another tau.
+fn tau(tau_px: f64) -> RenderProfile {
+    RenderProfile { tau_px, ..RenderProfile::default() }
+}
+
+/// Signal-to-noise ratio of all views of a scene, in dB; infinite if they are the same.
+fn decibels(scene: &Scene, truth: &Scene, views: &[View]) -> f64 {
+    let rgb = |scene: &Scene| -> Vec<f32> {
+        let images = render(&cpu(), scene, &RenderProfile::default(), views);
+        images.into_iter().flat_map(|image| image.rgba).collect()
+    };
+    psnr(&rgb(scene), &rgb(truth))
+}
