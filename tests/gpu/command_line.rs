@@ -6,6 +6,7 @@ use std::process::{Command, Output};
 
 use tempfile::TempDir;
 
+use crate::gpu::assert_quiet;
 use crate::scene_files::{inria_columns, ply};
 use crate::streets::street;
 
@@ -32,7 +33,7 @@ fn run(dir: &Path, arguments: &[&str]) -> Output {
 }
 
 fn said(output: &Output) -> String {
-    assert!(output.status.success(), "{output:?}");
+    assert_quiet(output);
     String::from_utf8(output.stdout.clone()).unwrap()
 }
 

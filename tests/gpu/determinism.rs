@@ -1,9 +1,13 @@
 //! The same input, the same bytes.
 
+use std::io::Write;
+
+use wildcity::render::gpu::devices;
 use wildcity::scene::{RenderProfile, Scene};
 
 use crate::gpu::gpu;
 use crate::images::{render, render_one};
+use crate::parity::streets_of_every_sh_degree;
 use crate::scene_files::gaussians;
 use crate::streets::{street, turning_views as views};
 
@@ -51,18 +55,31 @@ fn a_frame_leaves_nothing_for_the_next() {
 }
 
 /// Lavapipe takes the width of its subgroups from the environment: 4, 8 and 16 threads. On other
-/// devices the variable does nothing. A process of its own, since a driver reads it once.
+/// devices the variable does nothing. A process of its own, since a driver reads it once, and says
+/// what it found.
 #[test]
 fn subgroups_of_any_size() {
-    for width in ["128", "256", "512"] {
+    let is_lavapipe = devices()[0].name.contains("llvmpipe");
+    for (width, threads) in [("128", 4), ("256", 8), ("512", 16)] {
         let output = std::process::Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "parity::streets_of_every_sh_degree"])
+            .args(["--exact", "determinism::one_size_of_subgroups", "--ignored", "--nocapture"])
             .env("LP_NATIVE_VECTOR_WIDTH", width)
             .output()
             .unwrap();
         let said = String::from_utf8_lossy(&output.stdout);
         assert!(output.status.success() && said.contains("1 passed"), "{width}: {said}");
+        let sizes = format!("subgroups of {threads} to {threads} threads");
+        assert!(!is_lavapipe || said.contains(&sizes), "{width}: {said}");
     }
+}
+
+#[test]
+#[ignore = "a process of its own, started by subgroups_of_any_size"]
+fn one_size_of_subgroups() {
+    streets_of_every_sh_degree();
+    let threads = devices()[0].subgroup_threads.clone();
+    let line = format!("\nsubgroups of {} to {} threads\n", threads.start(), threads.end());
+    std::io::stdout().write_all(line.as_bytes()).unwrap();
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError, devices};
 
-use crate::gpu::gpu;
+use crate::gpu::{gpu, gpu_on};
 
 #[test]
 fn a_device_goes_by_number_and_by_a_part_of_its_name() {
@@ -10,7 +10,7 @@ fn a_device_goes_by_number_and_by_a_part_of_its_name() {
     assert!(!found.is_empty(), "no Vulkan driver: apt-get install mesa-vulkan-drivers");
     let name = found[0].name.clone();
     for choice in ["0".to_owned(), name.to_uppercase(), name[..4].to_owned()] {
-        let gpu = Gpu::new(&AdapterChoice::Named(choice.clone()), 1).unwrap();
+        let gpu = gpu_on(&AdapterChoice::Named(choice.clone()), 1);
         assert_eq!(gpu.usage().unwrap().name, name, "{choice:?}");
     }
 }

@@ -9,6 +9,7 @@ use wildcity::scene::{RenderProfile, Scene};
 use crate::blobs::{Blob, ahead, raw, scene};
 use crate::gpu::gpu;
 use crate::images::{Image, agree, cpu, crop, crop_difference, look, max_difference, render_one};
+use crate::poisons::{poisoned, with_one_more};
 use crate::streets::street;
 
 /// The image, after it was made sure that the definition gives it too.
@@ -163,6 +164,24 @@ fn t11_t13_every_opacity_and_every_thinness() {
     for sigma_m in [DVec3::splat(1e-8), DVec3::new(1.0, 1e-6, 1e-6), DVec3::new(1e-8, 1e-2, 1e-8)] {
         let thin = scene(&[Blob { sigma_m, ..Blob::default() }]);
         agreed(&gpu, &thin, &profile, ahead([96, 96], 120.0), &format!("{sigma_m}"));
+    }
+}
+
+#[test]
+fn t12_what_slips_past_the_gate_is_not_drawn() {
+    let (gpu, profile) = (gpu(), RenderProfile::default());
+    let good = street(2_000, 1, 24);
+    let view = look([160, 100], 120.0, DVec3::new(0.3, 0.1, 20.0), DVec3::Z, DVec3::Y);
+    let right = render_one(&gpu, &Scene::from_gaussians(&good), &profile, view);
+    let more = with_one_more(&good, [0.3, 0.1, 22.0]);
+    let seen = render_one(&gpu, &Scene::from_gaussians(&more), &profile, view);
+    assert!(max_difference(&seen.rgba, &right.rgba) > 0.1, "unpoisoned, it would be seen");
+    for (poison, poisoned) in poisoned(&more) {
+        let image = agreed(&gpu, &Scene::from_gaussians(&poisoned), &profile, view, &poison);
+        // One place further, a Gaussian may be in the next cluster, whose colours have other steps:
+        // 1.5 / 32,767 of each coefficient.
+        let off = max_difference(&image.rgba, &right.rgba);
+        assert!(off < 1e-4, "{poison}: neighbours are off by {off}");
     }
 }
 

@@ -8,6 +8,8 @@ mod data;
 mod gpu;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/poisons.rs"]
+mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]
@@ -20,6 +22,7 @@ mod command_line;
 mod definition;
 mod determinism;
 mod devices;
+mod encoding;
 mod extremes;
 mod flat;
 mod overlap;

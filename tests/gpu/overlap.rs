@@ -8,6 +8,7 @@ use wildcity::render::gpu::{AdapterChoice, Gpu};
 use wildcity::render::{Backend, Finished, Frame, Target};
 use wildcity::scene::{RenderProfile, Scene};
 
+use crate::gpu::gpu_on;
 use crate::images::render_one;
 use crate::streets::{street, turning_views};
 
@@ -25,10 +26,10 @@ fn draw(gpu: &Gpu, scene: &Scene, finished: Finished<'_>) -> Vec<u8> {
 #[test]
 fn a_frame_is_drawn_while_another_is_encoded() {
     // The encoder of the first frame waits until all that the backend takes beside it are drawn.
-    let gpu = Gpu::new(&AdapterChoice::Best, 1).unwrap();
+    let gpu = gpu_on(&AdapterChoice::Best, 1);
     let beside = gpu.frames_at_once() - 1;
     assert!(beside > 0);
-    let gpu = Gpu::new(&AdapterChoice::Best, gpu.frames_at_once()).unwrap();
+    let gpu = gpu_on(&AdapterChoice::Best, gpu.frames_at_once());
     let scene = Scene::from_gaussians(&street(5_000, 1, 51));
     let alone = render_one(&gpu, &scene, &RenderProfile::default(), turning_views()[0]).rgb8;
     let ((encoding, is_encoding), (drawn, all_drawn)) = (mpsc::channel(), mpsc::channel());
@@ -59,7 +60,7 @@ fn a_frame_is_drawn_while_another_is_encoded() {
 /// themselves.
 #[test]
 fn many_callers_of_few_threads_get_on() {
-    let gpu = Gpu::new(&AdapterChoice::Best, 1).unwrap();
+    let gpu = gpu_on(&AdapterChoice::Best, 1);
     let scene = Scene::from_gaussians(&street(5_000, 1, 52));
     let alone = draw(&gpu, &scene, &|_, _| {});
     let (done, all_done) = mpsc::channel();

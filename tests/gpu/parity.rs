@@ -37,7 +37,7 @@ fn compare_colors(scene: &Scene, profile: &RenderProfile, views: &[View], what: 
 }
 
 #[test]
-fn streets_of_every_sh_degree() {
+pub(crate) fn streets_of_every_sh_degree() {
     for degree in 0..=3 {
         let scene = Scene::from_gaussians(&street(30_000, degree, 5));
         compare(&scene, &RenderProfile::default(), &street_views(), &format!("degree {degree}"));
@@ -120,6 +120,8 @@ fn real_captures() {
             DVec3::NEG_Z,
             DVec3::NEG_Y,
         ),
+        ("scenes/playbot/lod-meta.json", DVec3::new(0.0, -0.5, -2.5), DVec3::Z, DVec3::Y),
+        ("scenes/playcanvas-logo/meta.json", DVec3::new(0.0, -1.2, -4.0), DVec3::Z, DVec3::Y),
     ] {
         let Some(path) = real(file) else { return };
         let view = look([640, 480], 600.0, at, forward, down);

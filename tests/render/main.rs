@@ -6,6 +6,8 @@ mod blobs;
 mod data;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/poisons.rs"]
+mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]

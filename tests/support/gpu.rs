@@ -1,6 +1,7 @@
 //! A GPU for tests. Lavapipe counts as one, so every machine can have one and no test skips.
 
 use std::ops::Deref;
+use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity::render::gpu::shaders::Shaders;
@@ -10,6 +11,11 @@ use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target
 /// The best device of this machine.
 pub(crate) fn gpu() -> Watched {
     gpu_with(Shaders::default())
+}
+
+/// The same with so many threads, on a device that was chosen.
+pub(crate) fn gpu_on(choice: &AdapterChoice, threads: usize) -> Watched {
+    watched(|| Gpu::new(choice, threads))
 }
 
 /// The same with other shaders.
@@ -28,29 +34,42 @@ fn watched(open: impl FnOnce() -> Result<Gpu, GpuError>) -> Watched {
         log::set_logger(&Listener).unwrap();
         log::set_max_level(log::LevelFilter::Warn);
     });
-    Watched(open().unwrap_or_else(|error| {
+    Watched(Some(open().unwrap_or_else(|error| {
         panic!(
             "{error}\n(the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers)"
         )
-    }))
+    })))
 }
 
 /// A backend whose test fails if wgpu, its validation or Vulkan's has had anything to say: with
-/// `WGPU_VALIDATION=1` Vulkan's validation layer speaks too, where it is installed.
+/// `WGPU_VALIDATION=1` Vulkan's validation layer speaks too, where it is installed. It holds a GPU
+/// until it is dropped: what is said of objects that outlive their device is heard too.
 #[derive(Debug)]
-pub(crate) struct Watched(Gpu);
+pub(crate) struct Watched(Option<Gpu>);
 
 impl Deref for Watched {
     type Target = Gpu;
 
     fn deref(&self) -> &Gpu {
-        &self.0
+        self.0.as_ref().expect("dropped with its watch")
     }
 }
 
 impl Backend for Watched {
     fn name(&self) -> &'static str {
-        self.0.name()
+        self.deref().name()
+    }
+
+    fn detail(&self) -> String {
+        self.deref().detail()
+    }
+
+    fn threads(&self) -> usize {
+        self.deref().threads()
+    }
+
+    fn frames_at_once(&self) -> usize {
+        self.deref().frames_at_once()
     }
 
     fn render(
@@ -59,17 +78,29 @@ impl Backend for Watched {
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.0.render(frame, targets, finished)
+        self.deref().render(frame, targets, finished)
     }
 }
 
 impl Drop for Watched {
     fn drop(&mut self) {
+        drop(self.0.take());
         let said = SAID.lock().unwrap_or_else(PoisonError::into_inner);
         if !std::thread::panicking() {
             assert!(said.is_empty(), "in this test or one beside it:\n{}", said.join("\n"));
         }
     }
+}
+
+/// Makes sure that another process succeeded, and had neither a warning nor an error to tell.
+pub(crate) fn assert_quiet(output: &Output) {
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let is_bad = |line: &&str| {
+        let line = line.to_lowercase();
+        ["warn", "error", "validation", "vuid"].iter().any(|word| line.contains(word))
+    };
+    assert_eq!(said.lines().find(is_bad), None, "{said}");
 }
 
 /// Warnings and errors of this process' tests.

@@ -126,3 +126,41 @@ fn job(length: u32, per_group: u32) -> Job {
     let rows = groups.div_ceil(MAX_GROUPS).max(1);
     Job { length, groups: [groups.div_ceil(rows), rows, 1] }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use naga::{Expression, Literal};
+
+    use super::job;
+
+    #[test]
+    fn slots_are_the_shaders() {
+        let rust = BTreeMap::from([
+            ("ITEMS", job::ITEMS),
+            ("SPLATS", job::SPLATS),
+            ("SPLATS_SCAN", job::SPLATS_SCAN),
+            ("SPLATS_SORT", job::SPLATS_SORT),
+            ("SPLATS_DIGITS", job::SPLATS_DIGITS),
+            ("TOUCHES", job::TOUCHES),
+            ("TOUCHES_SORT", job::TOUCHES_SORT),
+            ("TOUCHES_DIGITS", job::TOUCHES_DIGITS),
+            ("TILES", job::TILES),
+            ("INSTANCES", job::INSTANCES),
+            ("JOB_COUNT", job::COUNT as u64),
+        ]);
+        // The shader's own, without those that it imports.
+        let shader = include_str!("../../../shaders/plan.wgsl");
+        let own = shader.lines().filter(|line| line.starts_with("const "));
+        let module = naga::front::wgsl::parse_str(&own.collect::<String>()).unwrap();
+        let wgsl = module.constants.iter().map(|(_, constant)| {
+            let name = constant.name.as_deref().unwrap();
+            match module.global_expressions[constant.init] {
+                Expression::Literal(Literal::U32(value)) => (name, u64::from(value)),
+                ref other => panic!("{name} is {other:?}"),
+            }
+        });
+        assert_eq!(wgsl.collect::<BTreeMap<_, _>>(), rust);
+    }
+}
