@@ -18,6 +18,7 @@ const BATCH_WORDS: u32 = EXPAND_BATCH / 32;
 @group(0) @binding(5) var<storage, read> instances_job: Job;
 @group(0) @binding(6) var<storage, read_write> ranges: array<vec2u>;
 @group(0) @binding(7) var<storage, read_write> instance_places: array<u32>;
+@group(0) @binding(8) var<storage, read_write> counters: Counters;
 
 var<workgroup> counts: array<atomic<u32>, TILES>;
 
@@ -45,6 +46,9 @@ fn count(
     let tile = tile_at(index, thread);
     if tile < frame.tiles {
         offsets[tile] = atomicLoad(&counts[thread]);
+    }
+    if thread == 0u {
+        atomicMax(&counters.most_touches, range.y - range.x);
     }
 }
 

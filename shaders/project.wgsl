@@ -44,7 +44,7 @@ fn cull(
         atomicStore(&mask[thread], 0u);
     }
     workgroupBarrier();
-    if project_shape(geometry(item.cluster, thread), chunk_views[item.chunk_view]).visible {
+    if project_shape(geometry(item.cluster, thread), chunk_views[item.chunk_view], false).visible {
         atomicOr(&mask[thread / 32u], 1u << (thread % 32u));
     }
     workgroupBarrier();
@@ -87,11 +87,11 @@ fn project(
     }
     let chunk_view = chunk_views[item.chunk_view];
     let own = geometry(item.cluster, thread);
-    let projected = project_shape(own, chunk_view);
+    let projected = project_shape(own, chunk_view, true);
     shapes[place] = projected.shape;
     let rgb = color(item.cluster, thread, own.mean_m - chunk_view.camera_m);
     colors[place] = SplatColor(rgb, projected.depth_m);
-    let depth = bitcast<u32>(projected.depth_m) - bitcast<u32>(frame.near_m);
+    let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
     keys[place] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
     places[place] = place;
 }
@@ -134,7 +134,8 @@ fn halves(x: f32) -> vec2f {
     return vec2f(high, x - high);
 }
 
-fn project_shape(own: Geometry, view: ChunkView) -> Projected {
+// What is not in range has no shape, unless it was `decided` that it is.
+fn project_shape(own: Geometry, view: ChunkView, decided: bool) -> Projected {
     // Camera space: in range?
     let mean = vec4f(own.mean_m, 1.0);
     let x = dot(view.camera_from_chunk[0], mean);
@@ -142,7 +143,7 @@ fn project_shape(own: Geometry, view: ChunkView) -> Projected {
     let z = depth(own.mean_m, view);
     let in_range = z >= frame.near_m && z <= frame.far_m
         && own.log2_opacity >= frame.log2_alpha_cut;
-    if !in_range {
+    if !in_range && !decided {
         return Projected();
     }
 

@@ -53,5 +53,7 @@ fn multiply_add(
         c = fma(c, factor, addend);
         d = fma(d, factor, addend);
     }
-    copied[i] = a + b + c + d;
+    if i < arrayLength(&copied) {
+        copied[i] = a + b + c + d;
+    }
 }

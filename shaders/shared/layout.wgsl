@@ -67,6 +67,7 @@ struct Counters {
     instances: u32,
     batches: atomic<u32>,
     most_batches: atomic<u32>,
+    most_touches: atomic<u32>,
 }
 
 struct SplatShape {

@@ -12,9 +12,10 @@ use super::scene_source::{Machine, SceneSource};
 ///
 /// Draws every camera of the list on the cpu backend, on the gpu backend, and with the stages up to
 /// project, sort and bin on the cpu and the rest on the GPU. Prints how close each comes to the cpu's
-/// colours, as PSNR in dB (inf where no value differs). A stage is wrong if the image is wrong, below
-/// 60 dB, for as long as the GPU runs it, and right as soon as the cpu does. Exit code 1 if a camera
-/// has one. `wildcity render --cpu-through STAGE` shows the images.
+/// colours, as PSNR in dB (inf where no value differs, NaN where the GPU counted more than a frame may
+/// hold). A stage is wrong if the image is wrong, below 60 dB, for as long as the GPU runs it, and
+/// right as soon as the cpu does. Exit code 1 if a camera has one. `wildcity render --cpu-through STAGE`
+/// shows the images.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Bisect {

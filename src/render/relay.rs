@@ -65,8 +65,9 @@ pub const RIGHT_DB: f64 = 60.0;
 /// How close the gpu backend comes to the cpu backend, by the stages that the latter runs for it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
-    /// The last stage on the cpu, if any, and PSNR of the colour and opacity of all views, in dB;
-    /// infinite where no value differs.
+    /// The last stage on the cpu, if any, and the PSNR of all views in dB: that of colour and opacity
+    /// or that of the 8-bit colour, whichever is less. Infinite where no value differs, NaN where the
+    /// gpu asked for more than a frame may hold.
     pub psnr_db: Vec<(Option<Stage>, f64)>,
 }
 

@@ -95,7 +95,7 @@ pub(crate) const SLIPS: &[Slip] = &[
     slip("expand", "word_starts[word] = next", "word_starts[word] = first", BIN),
     slip("expand", "& (own_bit - 1u)", "& ~(own_bit | (own_bit - 1u))", BIN),
     slip("expand", "k / MACRO_COLUMNS", "k / 4u", BIN),
-    slip("rasterize", "after > vec4f(frame.stop)", "after > vec4f(50.0 * frame.stop)", RASTERIZE),
+    slip("rasterize", "after > vec4f(frame.stop)", "after > vec4f(100.0 * frame.stop)", RASTERIZE),
     slip("rasterize", "instance_places[first + k]", "instance_places[first + (k ^ 1u)]", RASTERIZE),
     slip("rasterize", "sums.green += weight", "sums.green += alpha", RASTERIZE),
     slip("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)", RASTERIZE),

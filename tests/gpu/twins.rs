@@ -84,7 +84,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, touches, instances, batches, most_batches }
+        Counters { splats, touches, instances, batches, most_batches, most_touches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

@@ -153,7 +153,13 @@ impl Bin {
             (2, self.masks[sorted].bind()),
             (4, self.tile_offsets.bind()),
         ];
-        self.count_instances.run(device, pass, groups, &counted);
+        let crowd = (8, plan.counters().as_entire_binding());
+        self.count_instances.run(
+            device,
+            pass,
+            groups,
+            &counted.iter().cloned().chain([crowd]).collect::<Vec<_>>(),
+        );
         scan.run(device, pass, (jobs, job::TILES), self.tile_offsets.buffer());
         plan.instances(device, pass, scan.block_sums());
         let listed = [

@@ -141,7 +141,9 @@ impl Chain {
                 BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
             ),
             ring: Ring::default(),
+            // Nothing is made for a crowd: it is bounded alone.
             high_water: Needs {
+                crowd: 0,
                 splats: FIRST_SPLATS.min(Splats::limit(&device)),
                 touches: FIRST_TOUCHES.min(Bin::limit(&device)),
                 instances: FIRST_INSTANCES.min(Bin::limit(&device)),
@@ -167,7 +169,7 @@ impl Chain {
         cull: &ThreadPool,
     ) -> Result<Drawn, RenderError> {
         let start = Instant::now();
-        self.mirror.hold(&self.device, frame.scene);
+        cull.install(|| self.mirror.hold(&self.device, frame.scene));
         let (mut gpu_frame, read_back) = self.begin(frame, planes);
         let mut stats = FrameStats::default();
         add(&mut stats, "prepare", start.elapsed());
@@ -189,7 +191,17 @@ impl Chain {
                 continue;
             }
             let start = Instant::now();
-            let work = cull.install(|| Work::new(frame, views, &self.mirror));
+            let work = cull.install(|| Work::new(frame, views.clone(), &self.mirror));
+            let limit = Project::limit(&self.device);
+            let pieces = u64::from(work.items()).div_ceil(limit);
+            if pieces > 1 {
+                // Clusters are culled against whole views: bands of one would have as many.
+                let cut = if views.len() > 1 { rows.cut(&part, pieces) } else { None };
+                let what = "clusters of 256 Gaussians before one camera";
+                let cut = cut.ok_or(RenderError::TooMany { what, limit })?;
+                rest.extend(cut.into_iter().rev());
+                continue;
+            }
             self.project.upload(&self.device, &work);
             add(&mut stats, "prepare", start.elapsed());
             let tiles = gpu_frame.restrict(&rows, &part);
@@ -229,7 +241,7 @@ impl Chain {
         frame: &GpuFrame,
         stats: FrameStats,
     ) -> Result<Drawn, RenderError> {
-        let pages = read_back.pages()?;
+        let pages = read_back.pages(&self.device)?;
         let views = frame.view[..frame.views as usize].to_vec();
         Ok(Drawn { read_back, ring: self.ring.clone(), pages, views, stats })
     }
@@ -250,10 +262,11 @@ impl Chain {
             self.reserve(frame, source.items());
             let (stages, submission) = self.submit(source, frame, output, read_back);
             add(stats, "record", start.elapsed());
+            let submitted = Instant::now();
             read_back.map(&self.device, submission)?;
             self.device.check()?;
-            let (counters, ticks) = read_back.head()?;
-            self.time(stats, &stages, &ticks, start.elapsed());
+            let (counters, ticks) = read_back.head(&self.device)?;
+            self.time(stats, &stages, &ticks, submitted.elapsed());
             let (needs, fits) = self.learn(&counters, frame);
             if fits {
                 let limit = self.device.tile_splats();
@@ -279,6 +292,7 @@ impl Chain {
             splats: counters.splats.into(),
             touches: counters.touches.into(),
             instances: counters.instances.into(),
+            crowd: counters.most_touches.into(),
         };
         let fits = counters.splats <= frame.splat_capacity
             && counters.touches <= frame.touch_capacity
@@ -294,7 +308,7 @@ impl Chain {
     }
 
     fn reserve(&mut self, frame: &mut GpuFrame, items: u32) {
-        let Needs { splats, touches, instances } = self.high_water;
+        let Needs { splats, touches, instances, .. } = self.high_water;
         let (device, scan) = (&self.device, &mut self.scan);
         frame.splat_capacity = self.splats.reserve(device, splats);
         let (splats, tiles) = (u64::from(frame.splat_capacity), (frame.macros, frame.tiles));
@@ -308,13 +322,20 @@ impl Chain {
     /// The most that the device holds at once.
     fn limit(&self) -> Needs {
         let listed = Bin::limit(&self.device);
-        Needs { splats: Splats::limit(&self.device), touches: listed, instances: listed }
+        Needs {
+            splats: Splats::limit(&self.device),
+            touches: listed,
+            instances: listed,
+            crowd: self.device.macro_touches(),
+        }
     }
 
     fn too_many(&self, needs: Needs) -> RenderError {
         let limit = self.limit();
         let (what, limit) = if needs.splats > limit.splats {
             ("visible splats in one row of tiles", limit.splats)
+        } else if needs.crowd > limit.crowd {
+            ("visible splats in eight tiles (of a device in software)", limit.crowd)
         } else {
             ("(Gaussian, tile) pairs in one row of tiles", limit.instances)
         };
@@ -508,15 +529,15 @@ impl ReadBack {
         }
     }
 
-    fn head(&self) -> Result<(Counters, Vec<u64>), RenderError> {
-        let view = view(&self.head)?;
+    fn head(&self, device: &Device) -> Result<(Counters, Vec<u64>), RenderError> {
+        let view = view(device, &self.head)?;
         let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
         let ticks = &view[TICKS_OFFSET as usize..(TICKS_OFFSET + TICKS_BYTES) as usize];
         Ok((counters, ticks.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect()))
     }
 
-    fn pages(&self) -> Result<Vec<BufferView>, RenderError> {
-        self.pages.iter().map(view).collect()
+    fn pages(&self, device: &Device) -> Result<Vec<BufferView>, RenderError> {
+        self.pages.iter().map(|page| view(device, page)).collect()
     }
 
     fn unmap(&self) {
@@ -528,12 +549,9 @@ impl ReadBack {
     }
 }
 
-fn view(growing: &Growing) -> Result<BufferView, RenderError> {
-    growing
-        .buffer()
-        .slice(..)
-        .get_mapped_range()
-        .map_err(|error| RenderError::Device { device: String::new(), reason: error.to_string() })
+fn view(device: &Device, growing: &Growing) -> Result<BufferView, RenderError> {
+    let mapped = growing.buffer().slice(..).get_mapped_range();
+    mapped.map_err(|error| device.failed(error.to_string()))
 }
 
 /// Bits of a number.

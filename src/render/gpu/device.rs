@@ -8,10 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use futures_util::FutureExt;
 use wgpu::{
     Adapter, AdapterInfo, Backends, Buffer, BufferDescriptor, BufferUsages, DeviceDescriptor,
-    DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, Queue,
+    DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, PollType, Queue,
 };
 
-use super::layout::{MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
+use super::layout::{EXPAND_BATCH, MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
 use crate::render::RenderError;
 
 /// Why there is no GPU to render on.
@@ -58,7 +58,7 @@ pub enum AdapterChoice {
     Best,
     /// The fastest kind that is not software.
     Hardware,
-    /// Its number in [`devices`], or a part of its name in any case.
+    /// Its number in [`devices`], or else a part of its name in any case; of several the first.
     Named(String),
 }
 
@@ -151,8 +151,10 @@ impl AdapterChoice {
             Self::Named(choice) => {
                 let name = choice.to_lowercase();
                 let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
-                let numbered = choice.parse().ok().filter(|&index: &usize| index < found.len());
-                numbered.or_else(|| infos.iter().position(has_name))
+                match choice.parse::<usize>() {
+                    Ok(number) => (number < found.len()).then_some(number),
+                    Err(_) => infos.iter().position(has_name),
+                }
             }
         };
         match (index.and_then(|index| found.into_iter().nth(index)), self) {
@@ -255,6 +257,13 @@ impl Device {
         self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
     }
 
+    /// Most touches of a macro tile that `expand` hands on: 300 iterations for each batch of 1,024, if
+    /// they touch all of its tiles.
+    pub(super) fn macro_touches(&self) -> u64 {
+        let batch = u64::from(EXPAND_BATCH);
+        self.loop_iterations().map_or(u32::MAX.into(), |most| most / 300 * batch)
+    }
+
     /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
     /// cover all of them: each takes 20 iterations, and 13 for every 256 macro tiles. Those at the
     /// edges of an image may be of a few tiles: half of a macro tile is counted on.
@@ -287,9 +296,11 @@ impl Device {
         })
     }
 
-    /// Copies bytes to a buffer, and submits the copy so that its staging memory does not pile up.
+    /// Copies bytes to a buffer, and lets go of the staging memory of copies that are done, so that it
+    /// does not pile up. What goes wrong is told by [`Device::check`].
     pub(super) fn write_now(&self, buffer: &Buffer, offset: u64, bytes: &[u8]) {
         self.queue.write_buffer(buffer, offset, bytes);
         self.queue.submit([]);
+        let _ = self.device.poll(PollType::Poll);
     }
 }

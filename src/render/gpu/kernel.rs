@@ -1,8 +1,8 @@
 //! A compiled entry point of a shader, and the passes that run it.
 
 use wgpu::{
-    BindGroupDescriptor, BindGroupEntry, BindingResource, Buffer, BufferBinding, BufferSize,
-    CommandEncoder, CommandEncoderDescriptor, ComputePass, ComputePassDescriptor,
+    BindGroupDescriptor, BindGroupEntry, BindGroupLayout, BindingResource, Buffer, BufferBinding,
+    BufferSize, CommandEncoder, CommandEncoderDescriptor, ComputePass, ComputePassDescriptor,
     ComputePassTimestampWrites, ComputePipeline, ComputePipelineDescriptor,
     PipelineCompilationOptions, QuerySet, QuerySetDescriptor, QueryType, ShaderModule,
     ShaderModuleDescriptor, ShaderSource,
@@ -17,6 +17,7 @@ use super::shaders::Shaders;
 pub(super) struct Kernel {
     label: &'static str,
     pipeline: ComputePipeline,
+    layout: BindGroupLayout,
 }
 
 /// How many groups of a kernel run.
@@ -48,7 +49,8 @@ impl Kernel {
             },
             cache: None,
         });
-        Self { label: entry, pipeline }
+        let layout = pipeline.get_bind_group_layout(0);
+        Self { label: entry, pipeline, layout }
     }
 
     /// Runs the kernel in a pass, with these resources by binding number.
@@ -68,7 +70,7 @@ impl Kernel {
             .collect();
         let bind_group = device.device.create_bind_group(&BindGroupDescriptor {
             label: Some(self.label),
-            layout: &self.pipeline.get_bind_group_layout(0),
+            layout: &self.layout,
             entries: &entries,
         });
         pass.set_pipeline(&self.pipeline);

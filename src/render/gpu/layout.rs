@@ -237,6 +237,8 @@ pub struct Counters {
     pub batches: u32,
     /// Those of the tile that blended the most.
     pub most_batches: u32,
+    /// Splats that touch the macro tile that most do.
+    pub most_touches: u32,
 }
 
 /// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::{Arc, Weak};
 
+use rayon::prelude::*;
 use wgpu::{Buffer, BufferUsages};
 
 use super::device::Device;
@@ -61,10 +62,10 @@ impl Mirror {
             let is_missing = |chunk: &&Arc<Chunk>| !self.resident.contains_key(&address(chunk));
             scene.chunks.iter().filter(is_missing).collect()
         };
+        self.drop_dead();
         if missing.is_empty() {
             return;
         }
-        self.drop_dead();
         // A dead chunk's address may have been taken by another chunk only after it was dropped
         // here, since the weak pointer keeps the allocation: what was not missing still is not.
         let mut needed: u32 = missing.iter().map(|chunk| chunk.clusters().len() as u32).sum();
@@ -168,9 +169,9 @@ impl Mirror {
             for first in clusters.clone().step_by(UPLOAD_CLUSTERS as usize) {
                 let count = UPLOAD_CLUSTERS.min(clusters.end - first) as usize;
                 let mut block = vec![0; count * words];
-                for (k, cluster) in block.chunks_exact_mut(words).enumerate() {
+                block.par_chunks_exact_mut(words).enumerate().for_each(|(k, cluster)| {
                     encode(chunk, next + k, cluster);
-                }
+                });
                 next += count;
                 let offset = u64::from(first) * words as u64 * 4;
                 device.write_now(buffer, offset, bytemuck::cast_slice(&block));

@@ -47,8 +47,8 @@ use crate::config;
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
-    /// The device and its driver.
-    detail: String,
+    /// The device and its driver, the same for as long as the backend lives.
+    info: AdapterInfo,
     shaders: Shaders,
     binding_limit: u64,
     /// Delivers images, and runs what `finished` does with them.
@@ -131,11 +131,9 @@ impl Gpu {
             pool.map_err(|error| GpuError::Threads { reason: error.to_string() })
         };
         let (deliver, cull) = (pool("deliver")?, pool("cull")?);
-        let AdapterInfo { name, driver, driver_info, .. } = &device.info;
-        let detail = format!("{name}, {driver} {driver_info}");
         Ok(Self {
             choice: choice.clone(),
-            detail,
+            info: device.info.clone(),
             binding_limit,
             deliver,
             cull,
@@ -209,15 +207,25 @@ impl Gpu {
         work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
     ) -> Result<T, RenderError> {
         let _turn = self.turns.wait();
-        let mut slot = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut slot = self.chain.lock().unwrap_or_else(|poisoned| {
+            // Someone panicked in mid-frame: memory may be half-written, so begin anew.
+            self.chain.clear_poison();
+            let mut slot = poisoned.into_inner();
+            discard(slot.take());
+            slot
+        });
         let chain = match &mut *slot {
             Some(chain) => chain,
             None => {
+                let failed =
+                    |reason| RenderError::Device { device: self.info.name.clone(), reason };
                 let device = Device::open(&self.choice, self.binding_limit);
-                let device = device.map_err(|error| RenderError::Device {
-                    device: "the GPU".to_owned(),
-                    reason: error.to_string(),
-                })?;
+                let device = device.map_err(|error| failed(error.to_string()))?;
+                // Another one would draw other bytes, and nobody has asked for it.
+                if device.info != self.info {
+                    let reason = format!("it was lost, and in its place is {}", device.info.name);
+                    return Err(failed(reason));
+                }
                 tracing::info!(device = device.info.name, "the GPU is opened again");
                 slot.insert(Chain::new(device, &self.shaders)?)
             }
@@ -225,7 +233,7 @@ impl Gpu {
         let done = work(chain);
         // Whatever else it was, memory may be half-written: begin anew.
         if let Err(RenderError::Device { .. }) = done {
-            *slot = None;
+            discard(slot.take());
         }
         done
     }
@@ -270,13 +278,21 @@ impl Gpu {
     }
 }
 
+/// Lets go of a device that failed, without waiting for it: a driver that hangs would hold up everyone.
+fn discard(chain: Option<Chain>) {
+    if chain.is_some() {
+        std::thread::spawn(move || drop(chain));
+    }
+}
+
 impl Backend for Gpu {
     fn name(&self) -> &'static str {
         "gpu"
     }
 
     fn detail(&self) -> String {
-        self.detail.clone()
+        let AdapterInfo { name, driver, driver_info, .. } = &self.info;
+        format!("{name}, {driver} {driver_info}")
     }
 
     fn threads(&self) -> usize {
@@ -309,23 +325,32 @@ mod tests {
 
     #[test]
     fn a_lost_device_fails_its_frame_and_not_the_next() {
-        let gpu = Gpu::new(&AdapterChoice::Best, 1)
+        let mut gpu = Gpu::new(&AdapterChoice::Best, 1)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
         let camera = Camera { width_px: 16, height_px: 16, pinhole };
         let views = [View { camera, world_from_camera: Pose::IDENTITY }];
         let (scene, profile) = (Scene::default(), RenderProfile::default());
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        let mut image = vec![77; 3 * 256];
-        let mut render = || {
+        let render = |gpu: &Gpu| {
+            let mut image = vec![77; 3 * 256];
             let target = Target { rgb8: Some(&mut image), ..Target::default() };
             gpu.render(&frame, &mut [target], &|_, _| {}).map(|_| image[0])
         };
-        assert_eq!(render(), Ok(0));
-        gpu.chain.lock().unwrap().as_ref().unwrap().device.device.destroy();
-        let lost = render();
+        let lose = |gpu: &Gpu| {
+            gpu.chain.lock().unwrap().as_ref().unwrap().device.device.destroy();
+        };
+        assert_eq!(render(&gpu), Ok(0));
+        lose(&gpu);
+        let lost = render(&gpu);
         assert!(matches!(lost, Err(RenderError::Device { .. })), "{lost:?}");
         assert_eq!(gpu.usage(), None);
-        assert_eq!(render(), Ok(0));
+        assert_eq!(render(&gpu), Ok(0));
+        // Lost again, and now another device is in its place.
+        gpu.info.name = "the card that was there before".to_owned();
+        lose(&gpu);
+        assert!(render(&gpu).is_err());
+        let error = render(&gpu).unwrap_err().to_string();
+        assert!(error.contains("in its place is"), "{error}");
     }
 }

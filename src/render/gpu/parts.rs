@@ -19,13 +19,15 @@ pub(super) struct Needs {
     pub(super) splats: u64,
     pub(super) touches: u64,
     pub(super) instances: u64,
+    /// Touches of the macro tile that has most.
+    pub(super) crowd: u64,
 }
 
 impl Needs {
     /// In how many parts, at least, what takes this much must be drawn.
     pub(super) fn pieces(self, limit: Self) -> u64 {
-        let Self { splats, touches, instances } = self.with(limit, u64::div_ceil);
-        splats.max(touches).max(instances)
+        let Self { splats, touches, instances, crowd } = self.with(limit, u64::div_ceil);
+        splats.max(touches).max(instances).max(crowd)
     }
 
     /// Enough for either.
@@ -46,6 +48,7 @@ impl Needs {
             splats: combine(self.splats, other.splats),
             touches: combine(self.touches, other.touches),
             instances: combine(self.instances, other.instances),
+            crowd: combine(self.crowd, other.crowd),
         }
     }
 }
@@ -191,8 +194,9 @@ mod tests {
     fn parts_that_fit_together_are_drawn_together_again() {
         let (mut cuts, rows) = (Cuts::default(), rows());
         let subject = Subject { gaussians: 1, sizes_px: vec![[16, 64]] };
-        let limit = Needs { splats: 800, touches: 4000, instances: 8000 };
-        let needs = |splats, instances| Needs { splats, touches: instances / 2, instances };
+        let limit = Needs { splats: 800, touches: 4000, instances: 8000, crowd: 100 };
+        let needs =
+            |splats, instances| Needs { splats, touches: instances / 2, instances, crowd: 1 };
         assert_eq!(cuts.recall(&subject, &rows), [rows.all()]);
         let drawn = vec![(0..4, needs(500, 1)), (4..6, needs(200, 1)), (6..12, needs(1, 6999))];
         cuts.remember(subject.clone(), drawn, limit);

@@ -154,6 +154,12 @@ impl Project {
         }
     }
 
+    /// Most items, clusters in views, that a device can hold: 32 bytes of bits each, and if every
+    /// one is of a chunk of its own, that chunk's 128 bytes.
+    pub(super) fn limit(device: &Device) -> u64 {
+        device.binding_bytes() / size_of::<ChunkView>() as u64
+    }
+
     /// Sends a frame's work to the device.
     pub(super) fn upload(&mut self, device: &Device, work: &Work) {
         let spans: Vec<[u32; SLOT_BYTES as usize / 4]> = (work.spans.iter())

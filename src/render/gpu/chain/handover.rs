@@ -55,7 +55,7 @@ impl Chain {
                 Source::Between(between)
             }
             None => {
-                self.mirror.hold(&self.device, frame.scene);
+                cull.install(|| self.mirror.hold(&self.device, frame.scene));
                 work = cull.install(|| Work::new(frame, 0..frame.views.len(), &self.mirror));
                 self.project.upload(&self.device, &work);
                 Source::Gaussians(&work)
@@ -74,7 +74,7 @@ impl Chain {
             let submission = self.device.queue.submit([recorder.encoder.finish()]);
             read_back.map(&self.device, submission)?;
             self.device.check()?;
-            let (counters, _) = read_back.head()?;
+            let (counters, _) = read_back.head(&self.device)?;
             read_back.unmap();
             let (needs, fits) = self.learn(&counters, &gpu_frame);
             self.check_room(needs)?;
@@ -87,7 +87,8 @@ impl Chain {
     /// Makes sure that there will be room for what another backend did.
     fn expect(&mut self, between: &Between) -> Result<(), RenderError> {
         let Counts { splats, instances, .. } = counts(between);
-        let needs = Needs { splats: splats.into(), touches: 0, instances: instances.into() };
+        let needs =
+            Needs { splats: splats.into(), touches: 0, instances: instances.into(), crowd: 0 };
         self.check_room(needs)?;
         self.high_water = self.high_water.max(needs);
         Ok(())
@@ -100,6 +101,7 @@ impl Chain {
             ("visible splats at once", needs.splats, limit.splats),
             ("(Gaussian, macro tile) pairs at once", needs.touches, limit.touches),
             ("(Gaussian, tile) pairs at once", needs.instances, limit.instances),
+            ("visible splats in 32 tiles (of a device in software)", needs.crowd, limit.crowd),
         ] {
             if needed > limit {
                 return Err(RenderError::TooMany { what, limit });
@@ -162,7 +164,7 @@ impl Chain {
         }
         read_back.map(device, device.queue.submit([encoder.finish()]))?;
         device.check()?;
-        let pages = read_back.pages()?;
+        let pages = read_back.pages(device)?;
         let page = |k: usize| &pages[k][..from[k].1 as usize];
 
         let (shapes, colors) = (values::<SplatShape>(page(0)), values::<SplatColor>(page(1)));
