@@ -14,7 +14,8 @@ const HEIGHT_M: f64 = 6.0;
 const ROUGH_M: f64 = 0.05;
 
 /// Makes `count` Gaussians of SH degree 1 around the origin, the road along x at z = 0; tells
-/// `progress` how many are done of how many. The same count gives the same Gaussians.
+/// `progress` how many are done of how many. The same count gives the same
+/// Gaussians, on another machine up to rounding: the logarithm is the system's.
 pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
     let [half_length, half_width] = HALF_M;
     let areas_m2 =

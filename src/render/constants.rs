@@ -7,8 +7,9 @@ pub const TILE_PX: u32 = 16;
 /// small splat more tightly than a row of 16 pixels does (a third fewer evaluations on a street).
 pub const BLOCK_PX: u32 = 4;
 
-/// Most (Gaussian, tile) pairs of a frame: 2^27 of 4 B are 512 MiB, five times what 5 million visible
-/// Gaussians of a street take.
+/// Most (Gaussian, tile) pairs of a frame; on the gpu backend of each part of a frame, and as many
+/// (splat, macro tile) pairs. 2^27 of 4 B are 512 MiB, five times what 5 million visible Gaussians of a
+/// street take.
 pub const MAX_INSTANCES: u64 = 1 << 27;
 
 /// How much wider than computed a splat's extent is taken when tiles and blocks are chosen, in

@@ -41,6 +41,12 @@ fn a_report_has_every_stage_beside_its_rooflines() {
             assert_eq!(number(&stage["arithmetic_ms"]) > 0.0, rasterizes, "{stage}");
             assert!(number(&stage["device_ms"]) > 0.0, "{stage}");
         }
+        assert_eq!([&scene["frames"], &scene["parts"], &scene["retries"]], [1, 1, 0]);
+        let host = scene["host_ms"].as_array().unwrap();
+        assert_eq!(host.last().unwrap()[0], "unaccounted");
+        let host_ms: f64 = host.iter().map(|row| number(&row[1])).sum();
+        let device_ms: f64 = stages.iter().map(|stage| number(&stage["device_ms"])).sum();
+        assert!((host_ms + device_ms - number(&scene["step_ms"])).abs() < 1e-6, "{scene}");
         // Four passes over 31 bits: 4 + 16 B per key, and 256 counters of 20 B per 4,096 keys.
         let sorted = 4 * (20 * pairs + 20 * 256 * pairs.div_ceil(4096));
         assert_eq!(stages[1]["bytes"], sorted);
@@ -61,7 +67,10 @@ fn tables_are_markdown() {
         assert_eq!(rows(&format!("| {stage} |")), 2, "{stage}: {said}");
     }
     assert_eq!((rows("| **device** |"), rows("| **step** |"), rows("Goal 4.7 ms")), (2, 2, 2));
-    assert!(!said.contains("cpu backend"), "{said}");
+    for row in ["- device time / goal: ", "- step / goal: ", "| unaccounted (host) |"] {
+        assert_eq!(rows(row), 2, "{row}: {said}");
+    }
+    assert!(!said.contains("cpu backend") && !said.contains("Warning"), "{said}");
     for row in said.lines().filter(|line| line.starts_with('|')) {
         assert_eq!(row.matches('|').count(), 7, "{row}");
     }

@@ -62,7 +62,7 @@ fn a_step_can_begin_on_the_cpu() {
     };
     let (cpu, half) = (step(&["--backend", "cpu"]), step(&["--cpu-through", "sort"]));
     assert_eq!(half["backend"], "cpu+gpu");
-    assert!(half["simd"].as_str().unwrap().contains("through sort"), "{half}");
+    assert!(half["detail"].as_str().unwrap().contains("through sort"), "{half}");
     let stages = half["stages_ms"].as_object().unwrap();
     assert!(["project", "sort"].iter().all(|stage| stages.contains_key(*stage)), "{half}");
     for count in ["visible_pairs", "instances"] {

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use anyhow::{Context, ensure};
 
-use self::report::{Report, SceneReport, StageReport};
+use self::report::{Images, Report, SceneReport, StageReport};
 use super::median;
 use crate::cli::progress;
 use crate::config;
@@ -21,9 +21,12 @@ use crate::scene::{RenderProfile, Rig, Scene};
 /// Measure a device: steps of six full cameras in streets of several sizes, stage by stage, beside
 /// what its memory and arithmetic allow.
 ///
-/// Prints tables in Markdown. The streets are made in memory, the same on every machine. What the
-/// device can do at most is measured in the same run, by a copy and by a loop of multiply-adds; what
-/// a stage must move is computed from what the frame counted (`src/render/gpu/traffic.rs` has the
+/// Prints tables in Markdown. The streets are made in memory, on every machine the same up to rounding.
+/// Stages are device time, by the device's own clock; rows marked "host" are host time, and the last of
+/// them, "unaccounted", is what no other row has: copying pixels to where the host reads them, mapping
+/// them, and waiting between submissions. So the rows add up to the step, as its caller sees it. What
+/// the device can do at most is measured in the same run, by a copy and by a loop of multiply-adds;
+/// what a stage must move is computed from what the frame counted (`src/render/gpu/traffic.rs` has the
 /// sums). The cpu backend draws the same step for comparison, and the first image of both is compared,
 /// so that a device that is fast and wrong is noticed.
 #[derive(Debug, clap::Args)]
@@ -73,8 +76,7 @@ impl Gpu {
         let device = gpu::Gpu::new(&choice, 0)?;
         let cpu = (!self.no_cpu).then(|| Cpu::new(0, Simd::Best)).transpose()?;
         let roofline = device.roofline()?;
-        let usage = device.usage().context("the device was lost")?;
-        let mut report = Report { device: usage.name, roofline, scenes: Vec::new() };
+        let mut report = Report { device: device.detail(), roofline, scenes: Vec::new() };
         for &gaussians in &self.gaussians {
             let scene = self.scene(gaussians, &device, cpu.as_ref(), &roofline);
             report.scenes.push(scene.with_context(|| format!("{gaussians} Gaussians"))?);
@@ -99,9 +101,17 @@ impl Gpu {
             Scene::from_gaussians(&generate::canyon(gaussians as usize, &mut progress::show(&bar)));
         bar.finish_and_clear();
         let views = views()?;
-        let own = self.time(device, &scene, &views)?;
-        let usage = device.usage().context("the device was lost")?;
-        let cpu = cpu.map(|cpu| self.time(cpu, &scene, &views)).transpose()?;
+        let usage = || device.usage().context("the device was lost");
+        time(device, &scene, &views, WARM_UP)?;
+        let before = usage()?;
+        let own = time(device, &scene, &views, self.repeat)?;
+        let usage = usage()?;
+        let cpu = cpu.map(|cpu| {
+            time(cpu, &scene, &views, WARM_UP)?;
+            time(cpu, &scene, &views, self.repeat)
+        });
+        let cpu = cpu.transpose()?;
+        let stages = stages(&own, &usage.last, roofline);
         Ok(SceneReport {
             gaussians,
             mirror_bytes: usage.mirror_bytes,
@@ -109,44 +119,53 @@ impl Gpu {
             touches: usage.last.touches,
             instances: usage.last.instances,
             evaluations: own.stats.evaluations,
-            stages: stages(&own, &usage.last, roofline),
-            host_ms: host(&own, &usage.last),
+            frames: self.repeat,
+            parts: usage.parts.saturating_sub(before.parts),
+            retries: usage.retries.saturating_sub(before.retries),
+            host_ms: host(&own, &usage.last, &stages),
+            stages,
             step_ms: own.step_ms,
             cpu_step_ms: cpu.as_ref().map(|cpu| cpu.step_ms),
-            psnr_db: cpu.map(|cpu| psnr_db(&own.first_image, &cpu.first_image)),
+            images: cpu
+                .map(|cpu| Images::compare(&own.first_image, &cpu.first_image))
+                .transpose()?,
         })
     }
+}
 
-    /// The median step of a backend, and the medians of its stages.
-    fn time(&self, backend: &dyn Backend, scene: &Scene, views: &[View]) -> anyhow::Result<Timed> {
-        let profile = RenderProfile::default();
-        let frame = Frame { scene, profile: &profile, views };
-        let mut images: Vec<Vec<u8>> =
-            views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-        let bar = progress::count(backend.name());
-        bar.set_length(u64::from(WARM_UP + self.repeat));
-        let mut runs: Vec<(f64, FrameStats)> = Vec::new();
-        for _ in 0..WARM_UP + self.repeat {
-            let targets = images.iter_mut();
-            let mut targets: Vec<Target<'_>> =
-                targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
-            let start = Instant::now();
-            let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
-            runs.push((start.elapsed().as_secs_f64() * 1e3, stats));
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        let runs = &runs[WARM_UP as usize..];
-        let mut stats = runs[0].1.clone();
-        for (name, ms) in &mut stats.stages_ms {
-            let of = |(_, stats): &(f64, FrameStats)| {
-                stats.stages_ms.iter().filter(|(other, _)| other == name).map(|(_, ms)| ms).sum()
-            };
-            *ms = median(runs.iter().map(of));
-        }
-        let step_ms = median(runs.iter().map(|(step_ms, _)| *step_ms));
-        Ok(Timed { step_ms, stats, first_image: images.swap_remove(0) })
+/// Draws so many frames: the median step of a backend, and the medians of its stages.
+fn time(
+    backend: &dyn Backend,
+    scene: &Scene,
+    views: &[View],
+    frames: u32,
+) -> anyhow::Result<Timed> {
+    let profile = RenderProfile::default();
+    let frame = Frame { scene, profile: &profile, views };
+    let mut images: Vec<Vec<u8>> =
+        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
+    let bar = progress::count(backend.name());
+    bar.set_length(frames.into());
+    let mut runs: Vec<(f64, FrameStats)> = Vec::new();
+    for _ in 0..frames {
+        let targets = images.iter_mut();
+        let mut targets: Vec<Target<'_>> =
+            targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
+        let start = Instant::now();
+        let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
+        runs.push((start.elapsed().as_secs_f64() * 1e3, stats));
+        bar.inc(1);
     }
+    bar.finish_and_clear();
+    let mut stats = runs[0].1.clone();
+    for (name, ms) in &mut stats.stages_ms {
+        let of = |(_, stats): &(f64, FrameStats)| {
+            stats.stages_ms.iter().filter(|(other, _)| other == name).map(|(_, ms)| ms).sum()
+        };
+        *ms = median(runs.iter().map(of));
+    }
+    let step_ms = median(runs.iter().map(|(step_ms, _)| *step_ms));
+    Ok(Timed { step_ms, stats, first_image: images.swap_remove(0) })
 }
 
 struct Timed {
@@ -177,16 +196,14 @@ fn stages(own: &Timed, work: &FrameWork, roofline: &Roofline) -> Vec<StageReport
     stages.collect()
 }
 
-/// What is not the device's own time.
-fn host(own: &Timed, work: &FrameWork) -> Vec<(&'static str, f64)> {
+/// What is not the device's own time: what the host timed, and what is left of the step.
+fn host(own: &Timed, work: &FrameWork, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
     let bytes = work.bytes();
     let is_host = |name: &str| bytes.iter().all(|(stage, _)| *stage != name);
-    own.stats.stages_ms.iter().filter(|(name, _)| is_host(name)).copied().collect()
-}
-
-/// Infinite for equal images.
-fn psnr_db(a: &[u8], b: &[u8]) -> f64 {
-    let square = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b)).powi(2);
-    let mean = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
-    10.0 * (255.0 * 255.0 / mean).log10()
+    let timed = own.stats.stages_ms.iter().filter(|(name, _)| is_host(name));
+    let mut host_ms: Vec<(&'static str, f64)> = timed.copied().collect();
+    let host_sum_ms: f64 = host_ms.iter().map(|(_, ms)| ms).sum();
+    let device_sum_ms: f64 = stages.iter().map(StageReport::device_ms).sum();
+    host_ms.push(("unaccounted", own.step_ms - device_sum_ms - host_sum_ms));
+    host_ms
 }

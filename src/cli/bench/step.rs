@@ -13,9 +13,9 @@ use crate::cli::scene_source::{Renderer, SceneSource};
 
 /// Time one step: all cameras of the list in one frame, to 8-bit colour.
 ///
-/// Reports the median and the extremes of the repeats, after one that is not counted, and medians
-/// per stage; (Gaussian, view)
-/// pairs that are visible, (Gaussian, tile) pairs after binning, and Gaussian-pixel evaluations.
+/// Reports the median and the extremes of the repeats, after one that is not counted; medians per
+/// stage; (Gaussian, view) pairs that are visible, (Gaussian, tile) pairs after binning, and
+/// Gaussian-pixel evaluations.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Step {
@@ -86,7 +86,7 @@ impl Step {
         let step_ms = median(steps_ms());
         let (min_ms, max_ms) =
             (steps_ms().fold(step_ms, f64::min), steps_ms().fold(step_ms, f64::max));
-        let (name, simd, threads) = (backend.name(), backend.detail(), backend.threads());
+        let (name, detail, threads) = (backend.name(), backend.detail(), backend.threads());
         let (_, stats) = &runs[0];
         let stages: Vec<(&str, f64)> = (0..stats.stages_ms.len())
             .map(|k| (stats.stages_ms[k].0, median(runs.iter().map(|(_, s)| s.stages_ms[k].1))))
@@ -98,7 +98,7 @@ impl Step {
                 stages.iter().map(|(name, ms)| (name.to_string(), json!(ms))).collect();
             let report = json!({
                 "backend": name,
-                "simd": simd,
+                "detail": detail,
                 "threads": threads,
                 "gaussians": scene.gaussians(),
                 "sh_degree": scene.sh_degree(),
@@ -119,7 +119,7 @@ impl Step {
         }
         writeln!(
             out,
-            "{} Gaussians, {} cameras, {pixels} px, {name} {simd}, {threads} threads",
+            "{} Gaussians, {} cameras, {pixels} px, {name} {detail}, {threads} threads",
             scene.gaussians(),
             views.len()
         )?;

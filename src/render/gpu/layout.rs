@@ -9,11 +9,12 @@ use super::parts::{Part, Rows};
 use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
 use crate::render::{MAX_VIEWS, View, constants};
 
-/// Threads of a workgroup; any device has them.
+/// Threads of a workgroup: what wgpu by default asks of every device. Vulkan alone promises 128.
 pub const WORKGROUP: u32 = 256;
 /// Elements that one workgroup of the prefix sum adds up.
 pub const SCAN_BLOCK: u32 = 2048;
-/// Keys that one workgroup of the radix sort places: its 256 counters are 1 KiB beside 32 KiB.
+/// Keys that one workgroup of the radix sort places: its 256 counters are 1 KiB beside 32 KiB
+/// of keys and values, or 48 KiB with masks.
 pub const SORT_BLOCK: u32 = 4096;
 /// Values of a digit of the radix sort.
 pub const DIGITS: u32 = 256;
@@ -23,7 +24,8 @@ pub const MAX_GROUPS: u32 = 65_535;
 pub const MACRO_COLUMNS: u32 = 8;
 /// ... and one above the other: a word has a bit for each.
 pub const MACRO_ROWS: u32 = 4;
-/// Splats over more macro tiles are emitted by a whole workgroup.
+/// Splats over more macro tiles are emitted by a whole workgroup: a thread alone writes at most 16 macro
+/// tiles of 4 rows of tiles each, 64 masks of a row, while 255 others wait; beyond, all 256 share.
 pub const BIG_SPLAT_MACROS: u32 = 16;
 /// Splats of a macro tile that are handed to its tiles at a time: 8 KiB of workgroup memory.
 pub const EXPAND_BATCH: u32 = 1024;
@@ -223,7 +225,7 @@ pub struct JobSlot {
     pub pad: [[u32; 4]; 15],
 }
 
-/// What the host reads after a frame (16 bytes).
+/// What the host reads after a frame (24 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Counters {

@@ -75,6 +75,7 @@ impl FrameWork {
     /// | expand | touch | macro tile 4, mask 8, place 4 |
     /// | | instance | place 4 |
     /// | | tile | offset and its prefix sum 20, range 8 |
+    /// | | macro tile | range 8, written once and read twice |
     /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
     /// | | instance, tile, pixel | place 4; range 8; 4 for each value that is asked for |
     pub fn bytes(&self) -> [(&'static str, u64); 6] {

@@ -2,17 +2,19 @@
 
 use std::fmt;
 
+use anyhow::ensure;
 use serde::Serialize;
 
 use crate::render::gpu::Roofline;
 
-/// The goal: a step of six full cameras at as many visible pairs.
+/// The goal: a step of six full cameras, from asking to images on the host, at as many visible pairs.
 const GOAL_MS: f64 = 4.7;
 const GOAL_PAIRS: f64 = 5e6;
 
 /// One device.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
+    /// Its name and its driver.
     pub(super) device: String,
     #[serde(serialize_with = "measured")]
     pub(super) roofline: Roofline,
@@ -28,13 +30,46 @@ pub(super) struct SceneReport {
     pub(super) touches: u64,
     pub(super) instances: u64,
     pub(super) evaluations: u64,
+    /// Frames that were timed, ...
+    pub(super) frames: u32,
+    /// ... the parts that all of them were drawn in, ...
+    pub(super) parts: u64,
+    /// ... and attempts among them that drew nothing, since buffers were too small.
+    pub(super) retries: u64,
     /// Empty for a device without a clock.
     pub(super) stages: Vec<StageReport>,
+    /// What is left unaccounted comes last: these and the stages add up to the step.
     pub(super) host_ms: Vec<(&'static str, f64)>,
     pub(super) step_ms: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) cpu_step_ms: Option<f64>,
-    /// Of the first image against the cpu backend's; JSON's null for equal ones.
-    pub(super) psnr_db: Option<f64>,
+    #[serde(flatten)]
+    pub(super) images: Option<Images>,
+}
+
+/// The first image against the cpu backend's.
+#[derive(Debug, Serialize)]
+pub(super) struct Images {
+    images_equal: bool,
+    /// Of images that are not equal.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    psnr_db: Option<f64>,
+}
+
+impl Images {
+    /// Compares 8-bit images of one size.
+    ///
+    /// # Errors
+    /// They have no pixels, or are not of one size.
+    pub(super) fn compare(a: &[u8], b: &[u8]) -> anyhow::Result<Self> {
+        let (own, other) = (a.len(), b.len());
+        ensure!(own == other && own > 0, "images of {own} and {other} bytes cannot be compared");
+        let square = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b)).powi(2);
+        let mean = a.iter().zip(b).map(square).sum::<f64>() / own as f64;
+        let images_equal = a == b;
+        let psnr_db = (!images_equal).then(|| 10.0 * (255.0 * 255.0 / mean).log10());
+        Ok(Self { images_equal, psnr_db })
+    }
 }
 
 /// One stage.
@@ -50,6 +85,10 @@ pub(super) struct StageReport {
 }
 
 impl StageReport {
+    pub(super) fn device_ms(&self) -> f64 {
+        self.device_ms
+    }
+
     pub(super) fn new(
         stage: &'static str,
         device_ms: f64,
@@ -101,9 +140,26 @@ impl fmt::Display for SceneReport {
             grouped(self.instances),
             grouped(self.evaluations)
         )?;
+        if self.parts > u64::from(self.frames) {
+            writeln!(
+                f,
+                "**Warning: {} frames were drawn in {} parts: a pair that reaches into two bands of an \
+                 image counts twice.**\n",
+                self.frames, self.parts
+            )?;
+        }
+        if self.retries > 0 {
+            writeln!(
+                f,
+                "**Warning: {} attempts within {} frames drew nothing, since buffers were too small; \
+                 their time is in the tables.**\n",
+                self.retries, self.frames
+            )?;
+        }
         writeln!(
             f,
-            "| stage | device ms | MB | memory roofline ms | arithmetic roofline ms | share |"
+            "| stage (device time, unless host is said) | ms | MB | memory roofline ms | arithmetic \
+             roofline ms | share |"
         )?;
         writeln!(f, "|---|---|---|---|---|---|")?;
         let row = |f: &mut fmt::Formatter<'_>, name: &str, stage: &StageReport| {
@@ -119,7 +175,9 @@ impl fmt::Display for SceneReport {
             row(f, stage.stage, stage)?;
         }
         let all = self.all();
-        row(f, "**device**", &all)?;
+        if !self.stages.is_empty() {
+            row(f, "**device**", &all)?;
+        }
         for (name, ms) in &self.host_ms {
             writeln!(f, "| {name} (host) | {ms:.3} | | | | |")?;
         }
@@ -134,15 +192,17 @@ impl fmt::Display for SceneReport {
         let goal_ms = GOAL_MS * self.visible_pairs as f64 / GOAL_PAIRS;
         writeln!(
             f,
-            "\nGoal {GOAL_MS} ms at 5 million visible pairs, so {goal_ms:.3} ms here: the device takes \
-             {:.2} times that.",
-            all.device_ms / goal_ms
+            "\nGoal {GOAL_MS} ms a step at 5 million visible pairs, so {goal_ms:.3} ms here:\n"
         )?;
-        match self.psnr_db {
-            Some(db) if db.is_infinite() => {
-                writeln!(f, "The first image equals the cpu backend's.")
+        if !self.stages.is_empty() {
+            writeln!(f, "- device time / goal: {:.2}", all.device_ms / goal_ms)?;
+        }
+        writeln!(f, "- step / goal: {:.2}", self.step_ms / goal_ms)?;
+        match &self.images {
+            Some(Images { psnr_db: Some(db), .. }) => {
+                writeln!(f, "\nThe first image is {db:.1} dB from the cpu backend's.")
             }
-            Some(db) => writeln!(f, "The first image is {db:.1} dB from the cpu backend's."),
+            Some(_) => writeln!(f, "\nThe first image equals the cpu backend's."),
             None => Ok(()),
         }
     }
