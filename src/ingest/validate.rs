@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use crate::geometry::Pose;
-use crate::scene::Gaussians;
+use crate::scene::{Gaussians, sh};
 
 use super::IngestError;
 
@@ -17,7 +17,7 @@ pub const LN_SCALE: [f32; 2] = [-30.0, 10.0];
 /// Largest opacity before the sigmoid, either way; f32's sigmoid is 1 from 17 on.
 pub const MAX_LOGIT: f32 = 1e4;
 /// Largest colour coefficient, either way: colours are about 1.
-pub const MAX_SH: f32 = 1e3;
+pub const MAX_SH: f32 = sh::MAX_COEFFICIENT;
 
 /// One number of a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -183,7 +183,8 @@ impl Chunk {
         });
     }
 
-    /// Appends one Gaussian that is activated already; one that is not finite, as an empty lane.
+    /// Appends one Gaussian that is activated already; one that is not finite, or whose colour is beyond
+    /// all bounds, as an empty lane.
     ///
     /// # Panics
     /// If the record's colour is not of the chunk's degree.
@@ -203,6 +204,12 @@ impl Chunk {
         let ActiveRecord { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
         let mut values = mean_m.iter().chain(scale_m).chain(quat_wxyz).chain(*sh);
         if !values.all(|value| value.is_finite()) || log2_opacity.is_nan() {
+            return;
+        }
+        // Twice the gate's bound, which a record may round over. The gpu shares one scale of colours
+        // among 256 neighbours, who would notice a larger one.
+        let is_colour = |value: &f32| value.abs() <= 2.0 * sh::MAX_COEFFICIENT;
+        if !sh.iter().all(is_colour) {
             return;
         }
         let block = &mut self.lanes[slot..slot + width];

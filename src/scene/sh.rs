@@ -10,6 +10,8 @@ use glam::{DMat3, DVec3};
 
 /// Largest supported degree.
 pub const MAX_DEGREE: u8 = 3;
+/// Largest magnitude of a coefficient that a scene may have: a colour of 282, where 1 is white.
+pub const MAX_COEFFICIENT: f32 = 1e3;
 
 /// `½ √(1/π)`.
 pub const C0: f64 = 0.282_094_791_773_878_14;

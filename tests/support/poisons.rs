@@ -38,6 +38,7 @@ pub(crate) fn poisoned(more: &Gaussians) -> Vec<(String, Gaussians)> {
         }
     }
     add("opacity NaN".to_owned(), &|g| g.logit_opacities[0] = f32::NAN);
+    add("colour of a million".to_owned(), &|g| g.sh[0] = 1e6);
     add("no rotation".to_owned(), &|g| g.quats_wxyz[0] = [0.0; 4]);
     all
 }
