@@ -184,7 +184,13 @@ mod tests {
             ("rasterize", "sums.green += weight", "sums.green += 1.02 * weight"),
         ] {
             let doubt = trial(&broken(stage, part, slip), &cpu);
-            let noticed = matches!(doubt, Err(Doubt::Wrong { .. } | Doubt::Unstable));
+            // Counts that are wrong may be too many.
+            let noticed = matches!(
+                doubt,
+                Err(Doubt::Wrong { .. }
+                    | Doubt::Unstable
+                    | Doubt::Render(RenderError::TooMany { .. }))
+            );
             assert!(noticed, "{stage}: {doubt:?}");
         }
     }

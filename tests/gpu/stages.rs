@@ -9,7 +9,7 @@ use wildcity::render::gpu::{AdapterChoice, Gpu};
 use wildcity::render::layout::Cutoffs;
 use wildcity::render::relay::{RIGHT_DB, Relay, bisect};
 use wildcity::render::stage::{Between, Stage};
-use wildcity::render::{Backend, Frame, View};
+use wildcity::render::{Backend, Frame, RenderError, View};
 use wildcity::scene::{RenderProfile, Scene};
 
 use crate::definition::{self, Splat};
@@ -65,11 +65,20 @@ impl Truth {
     /// The stages of a gpu that are wrong, by name, and what its twins on the cpu and in f64 object to.
     fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Objections)> {
         let [project, sort, bin] = &self.cpu;
-        let through = |done, last| gpu.through(&self.frame(), done, last).unwrap();
+        let object = |done, last, objections: &dyn Fn(&Between) -> Objections| {
+            match gpu.through(&self.frame(), done, last) {
+                Ok(found) => objections(&found),
+                // A stage that counts wrong may ask for more than there is.
+                Err(error @ RenderError::TooMany { .. }) => {
+                    [(); 2].map(|()| Some(error.to_string()))
+                }
+                Err(error) => panic!("{error}"),
+            }
+        };
         let all = [
-            ("project", self.object_to_project(&through(None, Stage::Project))),
-            ("sort", self.object_to_sort(&through(Some(project), Stage::Sort))),
-            ("bin", self.object_to_bin(&through(Some(sort), Stage::Bin))),
+            ("project", object(None, Stage::Project, &|found| self.object_to_project(found))),
+            ("sort", object(Some(project), Stage::Sort, &|found| self.object_to_sort(found))),
+            ("bin", object(Some(sort), Stage::Bin, &|found| self.object_to_bin(found))),
             ("rasterize", self.object_to_rasterize(&self.drawn(gpu, bin))),
         ];
         all.into_iter().filter(|(_, twins)| twins.iter().any(Option::is_some)).collect()

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::render::{Backend, Frame, Target, View};
+use wildcity::render::{Backend, Frame, RenderError, Target, View};
 use wildcity::scene::{RenderProfile, Scene};
 
 /// What a backend says of one view.
@@ -30,6 +30,16 @@ pub(crate) fn render(
     profile: &RenderProfile,
     views: &[View],
 ) -> Vec<Image> {
+    try_render(backend, scene, profile, views).unwrap()
+}
+
+/// The same of a backend that may refuse.
+pub(crate) fn try_render(
+    backend: &dyn Backend,
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+) -> Result<Vec<Image>, RenderError> {
     // Garbage, so that a pixel that nobody wrote is seen.
     let empty = |view: &View| {
         let pixels = view.camera.pixels();
@@ -48,8 +58,8 @@ pub(crate) fn render(
         opacity: Some(opacity),
     });
     let mut targets: Vec<Target<'_>> = targets.collect();
-    backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {}).unwrap();
-    images
+    backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;
+    Ok(images)
 }
 
 /// The image of one view.
