@@ -3,36 +3,31 @@
 mod handover;
 
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use rayon::ThreadPool;
-use wgpu::{BufferUsages, BufferView, MapMode, PollType, QuerySet, SubmissionIndex};
+use wgpu::{BufferUsages, QuerySet, SubmissionIndex};
 
 use super::bin::Bin;
 use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Recorder, TICKS_BYTES, clock};
-use super::layout::{Counters, Frame as GpuFrame, FrameView, RASTER_BATCH};
+use super::layout::{Counters, Frame as GpuFrame, RASTER_BATCH};
 use super::mirror::Mirror;
 use super::parts::{Cuts, Needs, Rows, Subject};
 use super::plan::{Counts, Plan, job};
 use super::project::{Project, Splats, Work};
-use super::rasterize::{Rasterize, pages};
+use super::rasterize::Rasterize;
+use super::read_back::{Drawn, ReadBack, Ring, TICKS_OFFSET};
 use super::resolve::Planes;
 use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::{Columns, Sort};
 use super::traffic::FrameWork;
-use crate::config;
 use crate::render::constants::{DEPTH_BITS, TILE_PX};
 use crate::render::layout::Cutoffs;
 use crate::render::stage::{Between, Stage};
 use crate::render::{Frame, FrameStats, RenderError};
-
-/// How long a frame may take on the device before it counts as lost.
-const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
 const FIRST_SPLATS: u64 = 1 << 15;
@@ -92,31 +87,6 @@ impl Source<'_> {
             Self::Between(_) => 0,
         }
     }
-}
-
-/// Where a frame reaches the host. A step's images are copied out of one while the next step fills
-/// another.
-#[derive(Debug)]
-pub(super) struct ReadBack {
-    /// Counters, then ticks.
-    head: Growing,
-    pages: Vec<Growing>,
-    tiles_per_page: u32,
-}
-
-/// Read-back buffers of one device that nobody reads.
-#[derive(Clone, Debug, Default)]
-struct Ring(Arc<Mutex<Vec<ReadBack>>>);
-
-/// A frame that is done, in mapped memory.
-#[derive(Debug)]
-pub(super) struct Drawn {
-    read_back: ReadBack,
-    ring: Ring,
-    /// Pixels, page by page.
-    pub(super) pages: Vec<BufferView>,
-    pub(super) views: Vec<FrameView>,
-    pub(super) stats: FrameStats,
 }
 
 impl Chain {
@@ -455,103 +425,6 @@ fn count(stats: &mut FrameStats, counters: &Counters) {
     stats.visible_pairs += u64::from(counters.splats);
     stats.instances += u64::from(counters.instances);
     stats.evaluations += u64::from(counters.batches) * evaluations_per_batch;
-}
-
-impl Drawn {
-    /// Tiles of a page, of the last one perhaps fewer.
-    pub(super) fn tiles_per_page(&self) -> u32 {
-        self.read_back.tiles_per_page
-    }
-
-    /// Gives the memory back for another frame, which may be drawn by now.
-    pub(super) fn recycle(self) {
-        let Self { read_back, ring, pages, .. } = self;
-        // A buffer stays mapped for as long as a view of it lives.
-        drop(pages);
-        read_back.unmap();
-        let mut unused = ring.lock();
-        if unused.len() < config::GPU_FRAMES {
-            unused.push(read_back);
-        }
-    }
-}
-
-impl Ring {
-    fn take(&self) -> Option<ReadBack> {
-        self.lock().pop()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Vec<ReadBack>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// Where the ticks lie behind the counters.
-const TICKS_OFFSET: u64 = 256;
-
-impl ReadBack {
-    fn new(device: &Device) -> Self {
-        let head = Self::buffer(device, "counters read back");
-        Self { head, pages: Vec::new(), tiles_per_page: 1 }
-    }
-
-    fn buffer(device: &Device, label: &'static str) -> Growing {
-        Growing::new(device, label, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
-    }
-
-    fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32, per_page: u32) {
-        self.tiles_per_page = per_page;
-        self.head.reserve(device, TICKS_OFFSET + TICKS_BYTES);
-        let count = tiles.div_ceil(per_page) as usize;
-        self.pages.resize_with(count, || Self::buffer(device, "pixels read back"));
-        for (page, tiles) in pages(&(0..tiles), per_page) {
-            self.pages[page].reserve(device, planes.tile_bytes() * tiles.len() as u64);
-        }
-    }
-
-    /// Waits for a submission, and maps everything.
-    fn map(&self, device: &Device, submission: SubmissionIndex) -> Result<(), RenderError> {
-        let failed = Arc::new(AtomicBool::new(false));
-        for growing in self.all() {
-            let failed = Arc::clone(&failed);
-            growing.buffer().slice(..).map_async(MapMode::Read, move |result| {
-                failed.fetch_or(result.is_err(), Relaxed);
-            });
-        }
-        let wait =
-            PollType::Wait { submission_index: Some(submission), timeout: Some(FRAME_TIMEOUT) };
-        let polled = device.device.poll(wait);
-        device.check()?;
-        polled.map_err(|error| device.failed(error.to_string()))?;
-        match failed.load(Relaxed) {
-            true => Err(device.failed("its memory could not be read".to_owned())),
-            false => Ok(()),
-        }
-    }
-
-    fn head(&self, device: &Device) -> Result<(Counters, Vec<u64>), RenderError> {
-        let view = view(device, &self.head)?;
-        let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
-        let ticks = &view[TICKS_OFFSET as usize..(TICKS_OFFSET + TICKS_BYTES) as usize];
-        Ok((counters, ticks.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect()))
-    }
-
-    fn pages(&self, device: &Device) -> Result<Vec<BufferView>, RenderError> {
-        self.pages.iter().map(|page| view(device, page)).collect()
-    }
-
-    fn unmap(&self) {
-        self.all().for_each(|growing| growing.buffer().unmap());
-    }
-
-    fn all(&self) -> impl Iterator<Item = &Growing> {
-        std::iter::once(&self.head).chain(&self.pages)
-    }
-}
-
-fn view(device: &Device, growing: &Growing) -> Result<BufferView, RenderError> {
-    let mapped = growing.buffer().slice(..).get_mapped_range();
-    mapped.map_err(|error| device.failed(error.to_string()))
 }
 
 /// Bits of a number.

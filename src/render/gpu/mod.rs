@@ -15,6 +15,7 @@ mod parts;
 mod plan;
 mod project;
 mod rasterize;
+mod read_back;
 mod resolve;
 mod roofline;
 mod scan;
@@ -34,8 +35,9 @@ pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
 pub use roofline::Roofline;
 pub use traffic::FrameWork;
 
-use self::chain::{Chain, Drawn};
+use self::chain::Chain;
 use self::device::Device;
+use self::read_back::Drawn;
 use self::resolve::{Pixels, Planes};
 use self::shaders::Shaders;
 use self::turns::Turns;

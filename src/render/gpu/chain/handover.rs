@@ -4,12 +4,13 @@ use bytemuck::AnyBitPattern;
 use rayon::ThreadPool;
 use wgpu::{Buffer, CommandEncoderDescriptor};
 
-use super::{Chain, Drawn, ReadBack, Source, TICKS_BYTES, TICKS_OFFSET};
-use crate::render::gpu::kernel::Recorder;
+use super::{Chain, Source};
+use crate::render::gpu::kernel::{Recorder, TICKS_BYTES};
 use crate::render::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
 use crate::render::gpu::parts::Needs;
 use crate::render::gpu::plan::Counts;
 use crate::render::gpu::project::Work;
+use crate::render::gpu::read_back::{Drawn, ReadBack, TICKS_OFFSET};
 use crate::render::gpu::resolve::Planes;
 use crate::render::layout::{Cutoffs, Splat};
 use crate::render::stage::{Between, Stage, Tiles};
