@@ -128,7 +128,7 @@ impl Chunk {
 
     /// A chunk whose columns are already laid out, as `lanes[block * columns(sh_degree) + column]`.
     ///
-    /// Lanes past `count` are made empty, and so is what holds a number that is not finite.
+    /// Lanes past `count` are made empty, and so is what cannot be drawn, as by [`Chunk::push_active`].
     ///
     /// # Panics
     /// If there are not as many lanes as `count` Gaussians of the degree take.
@@ -145,13 +145,8 @@ impl Chunk {
         for (index, block) in lanes.chunks_exact_mut(width).enumerate() {
             let cluster = &mut clusters[index * LANES / CLUSTER];
             for lane in 0..LANES {
-                let sound = |(column, lanes): (usize, &Lanes)| {
-                    let value = lanes.0[lane];
-                    // Minus infinity is an opacity: it is never drawn.
-                    value.is_finite()
-                        || column == column::LOG2_OPACITY && value == f32::NEG_INFINITY
-                };
-                if index * LANES + lane < count && block.iter().enumerate().all(sound) {
+                let values = block.iter().map(|lanes| lanes.0[lane]);
+                if index * LANES + lane < count && is_drawable(values) {
                     cluster.add(
                         [0, 1, 2].map(|axis| block[column::MEAN + axis].0[lane]),
                         [0, 1, 2].map(|axis| block[column::SCALE + axis].0[lane]),
@@ -202,14 +197,8 @@ impl Chunk {
         self.count += 1;
 
         let ActiveRecord { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
-        let mut values = mean_m.iter().chain(scale_m).chain(quat_wxyz).chain(*sh);
-        if !values.all(|value| value.is_finite()) || log2_opacity.is_nan() {
-            return;
-        }
-        // Twice the gate's bound, which a record may round over. The gpu shares one scale of colours
-        // among 256 neighbours, who would notice a larger one.
-        let is_colour = |value: &f32| value.abs() <= 2.0 * sh::MAX_COEFFICIENT;
-        if !sh.iter().all(is_colour) {
+        let geometry = mean_m.iter().chain(scale_m).chain(quat_wxyz);
+        if !is_drawable(geometry.chain([log2_opacity]).chain(*sh).copied()) {
             return;
         }
         let block = &mut self.lanes[slot..slot + width];
@@ -292,6 +281,18 @@ impl Chunk {
     pub fn bytes(&self) -> usize {
         self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()
     }
+}
+
+/// Whether a Gaussian's columns, in order, are what the renderer can draw.
+fn is_drawable(columns: impl Iterator<Item = f32>) -> bool {
+    columns.enumerate().all(|(column, value)| match column {
+        // Minus infinity is an opacity: it is never drawn.
+        column::LOG2_OPACITY => value.is_finite() || value == f32::NEG_INFINITY,
+        // Twice the gate's bound, which a record may round over. The gpu shares one scale of colours
+        // among 256 neighbours, who would notice a larger one.
+        column::SH.. => value.abs() <= 2.0 * sh::MAX_COEFFICIENT,
+        _ => value.is_finite(),
+    })
 }
 
 /// `log2(1 / (1 + exp(-x)))`, for any x but NaN without overflow or cancellation.
@@ -481,6 +482,48 @@ mod tests {
         assert!((value(2, column::LOG2_OPACITY) + 100.0 * std::f32::consts::LOG2_E).abs() < 1e-5);
         let unused = &scene.chunks[0].block(0)[column::LOG2_OPACITY].0[1..];
         assert_eq!(unused, [f32::NEG_INFINITY; LANES - 1]);
+    }
+
+    /// Appended or laid out, what cannot be drawn is an empty lane, and its neighbour stays.
+    #[test]
+    fn both_ways_into_a_chunk_keep_the_same_out() {
+        let mut cell = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
+        for _ in 0..2 {
+            cell.push(&RawRecord {
+                mean_m: [1.0; 3],
+                quat_wxyz: [1.0, 0.0, 0.0, 0.0],
+                ln_scale: [0.0; 3],
+                logit_opacity: 0.0,
+                sh: &[0.5; 3],
+            });
+        }
+        let opacities = |chunk: &Chunk| [0, 1].map(|i| chunk.value(i, column::LOG2_OPACITY));
+        assert_eq!(opacities(&cell), [-1.0; 2]);
+        for (column, value) in [
+            (column::MEAN, f32::NAN),
+            (column::SCALE, f32::INFINITY),
+            (column::LOG2_OPACITY, f32::INFINITY),
+            (column::SH, 1e6),
+            (column::SH + 2, f32::NEG_INFINITY),
+        ] {
+            let mut lanes = cell.block(0).to_vec();
+            lanes[column].0[0] = value;
+            let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, 2, lanes.clone());
+            let one = |i: usize, column: usize| lanes[column].0[i];
+            let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
+            for i in 0..2 {
+                pushed.push_active(&ActiveRecord {
+                    mean_m: [0, 1, 2].map(|k| one(i, column::MEAN + k)),
+                    scale_m: [0, 1, 2].map(|k| one(i, column::SCALE + k)),
+                    quat_wxyz: [0, 1, 2, 3].map(|k| one(i, column::QUAT + k)),
+                    log2_opacity: one(i, column::LOG2_OPACITY),
+                    sh: &[0, 1, 2].map(|k| one(i, column::SH + k)),
+                });
+            }
+            for chunk in [laid, pushed] {
+                assert_eq!(opacities(&chunk), [f32::NEG_INFINITY, -1.0], "{column} is {value}");
+            }
+        }
     }
 
     #[test]
