@@ -218,7 +218,7 @@ impl Chain {
 
     /// Draws one part, again in larger buffers where they were too small: the device never drops
     /// what does not fit, it draws nothing then. Returns what the part needs: where that is above
-    /// the limit, nothing was drawn.
+    /// the limit, nothing was drawn that counts.
     fn draw_part(
         &mut self,
         source: Source<'_>,
@@ -266,7 +266,8 @@ impl Chain {
         };
         let fits = counters.splats <= frame.splat_capacity
             && counters.touches <= frame.touch_capacity
-            && counters.instances <= frame.instance_capacity;
+            && counters.instances <= frame.instance_capacity
+            && needs.crowd <= self.limit().crowd;
         if !fits {
             self.retries += 1;
             tracing::debug!(?needs, "not enough room on the device");
