@@ -60,17 +60,7 @@ fn scatter(
 ) {
     let block = start_block(group_index(group, groups), thread);
     for (var at = block.x; at < block.y; at += WORKGROUP) {
-        let i = at + thread;
-        let held = i < block.y;
-        var key = 0u;
-        if held {
-            key = keys[i];
-        }
-        let to = place_of(key, held, thread);
-        if held {
-            sorted_keys[to] = key;
-            sorted_values[to] = values[i];
-        }
+        scatter_round(at, block.y, thread);
     }
 }
 
@@ -84,18 +74,27 @@ fn scatter_masked(
     let block = start_block(group_index(group, groups), thread);
     for (var at = block.x; at < block.y; at += WORKGROUP) {
         let i = at + thread;
-        let held = i < block.y;
-        var key = 0u;
-        if held {
-            key = keys[i];
-        }
-        let to = place_of(key, held, thread);
-        if held {
-            sorted_keys[to] = key;
-            sorted_values[to] = values[i];
+        let to = scatter_round(at, block.y, thread);
+        if i < block.y {
             sorted_masks[to] = masks[i];
         }
     }
+}
+
+// A key and its value per thread; where they went.
+fn scatter_round(at: u32, end: u32, thread: u32) -> u32 {
+    let i = at + thread;
+    let held = i < end;
+    var key = 0u;
+    if held {
+        key = keys[i];
+    }
+    let to = place_of(key, held, thread);
+    if held {
+        sorted_keys[to] = key;
+        sorted_values[to] = values[i];
+    }
+    return to;
 }
 
 // First key and end of a block; none for a group too many.
