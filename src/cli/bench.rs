@@ -2,6 +2,7 @@
 
 mod gpu;
 mod step;
+mod timed;
 
 /// Time the renderer.
 #[derive(Debug, clap::Args)]
@@ -23,12 +24,4 @@ impl Bench {
             What::Gpu(gpu) => gpu.run(),
         }
     }
-}
-
-/// The one in the middle, or the mean of the two in the middle.
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
-    0.5 * (values.get(low).unwrap_or(&f64::NAN) + values.get(high).unwrap_or(&f64::NAN))
 }

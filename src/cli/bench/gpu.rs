@@ -3,19 +3,18 @@
 mod report;
 
 use std::io::{self, Write};
-use std::time::Instant;
 
 use anyhow::{Context, ensure};
 
 use self::report::{Images, Report, SceneReport, StageReport};
-use super::median;
+use super::timed::{Timed, time};
 use crate::cli::progress;
 use crate::config;
 use crate::generate;
 use crate::geometry::Pose;
 use crate::render::cpu::{Cpu, Simd};
 use crate::render::gpu::{self, AdapterChoice, FrameWork, Roofline};
-use crate::render::{Backend, Frame, FrameStats, Target, View};
+use crate::render::{Backend, Frame, View};
 use crate::scene::{RenderProfile, Rig, Scene};
 
 /// Measure a device: steps of six full cameras in streets of several sizes, stage by stage, beside
@@ -102,13 +101,15 @@ impl Gpu {
         bar.finish_and_clear();
         let views = views()?;
         let usage = || device.usage().context("the device was lost");
-        time(device, &scene, &views, WARM_UP)?;
+        let profile = RenderProfile::default();
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        time(device, &frame, WARM_UP, "gpu")?;
         let before = usage()?;
-        let own = time(device, &scene, &views, self.repeat)?;
+        let own = time(device, &frame, self.repeat, "gpu")?;
         let usage = usage()?;
         let cpu = cpu.map(|cpu| {
-            time(cpu, &scene, &views, WARM_UP)?;
-            time(cpu, &scene, &views, self.repeat)
+            time(cpu, &frame, WARM_UP, "cpu")?;
+            time(cpu, &frame, self.repeat, "cpu")
         });
         let cpu = cpu.transpose()?;
         let stages = stages(&own, &usage.last, roofline);
@@ -124,66 +125,18 @@ impl Gpu {
             retries: usage.retries.saturating_sub(before.retries),
             host_ms: host(&own, &usage.last, &stages),
             stages,
-            step_ms: own.step_ms,
-            cpu_step_ms: cpu.as_ref().map(|cpu| cpu.step_ms),
-            images: cpu
-                .map(|cpu| Images::compare(&own.first_image, &cpu.first_image))
-                .transpose()?,
+            step_ms: own.step_ms(),
+            cpu_step_ms: cpu.as_ref().map(Timed::step_ms),
+            images: cpu.map(|cpu| Images::compare(&own.images[0], &cpu.images[0])).transpose()?,
         })
     }
-}
-
-/// Draws so many frames: the median step of a backend, and the medians of its stages.
-fn time(
-    backend: &dyn Backend,
-    scene: &Scene,
-    views: &[View],
-    frames: u32,
-) -> anyhow::Result<Timed> {
-    let profile = RenderProfile::default();
-    let frame = Frame { scene, profile: &profile, views };
-    let mut images: Vec<Vec<u8>> =
-        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-    let bar = progress::count(backend.name());
-    bar.set_length(frames.into());
-    let mut runs: Vec<(f64, FrameStats)> = Vec::new();
-    for _ in 0..frames {
-        let targets = images.iter_mut();
-        let mut targets: Vec<Target<'_>> =
-            targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
-        let start = Instant::now();
-        let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
-        runs.push((start.elapsed().as_secs_f64() * 1e3, stats));
-        bar.inc(1);
-    }
-    bar.finish_and_clear();
-    let mut stats = runs[0].1.clone();
-    for (name, ms) in &mut stats.stages_ms {
-        let of = |(_, stats): &(f64, FrameStats)| {
-            stats.stages_ms.iter().filter(|(other, _)| other == name).map(|(_, ms)| ms).sum()
-        };
-        *ms = median(runs.iter().map(of));
-    }
-    let step_ms = median(runs.iter().map(|(step_ms, _)| *step_ms));
-    Ok(Timed { step_ms, stats, first_image: images.swap_remove(0) })
-}
-
-struct Timed {
-    step_ms: f64,
-    stats: FrameStats,
-    first_image: Vec<u8>,
 }
 
 /// What a vehicle sees from the middle of the street: 3 x 1440x928 and 3 x 1240x728.
 fn views() -> anyhow::Result<Vec<View>> {
     let rig = Rig::preset("vehicle6").context("the rig vehicle6 comes with the program")?;
     ensure!(!rig.cameras.is_empty(), "the rig vehicle6 has no cameras");
-    let world_from_rig = Pose::IDENTITY;
-    let view = |mounted: &crate::scene::rig::RigCamera| View {
-        camera: mounted.camera,
-        world_from_camera: world_from_rig * mounted.rig_from_camera,
-    };
-    Ok(rig.cameras.iter().map(view).collect())
+    Ok(View::of_rig(&rig.cameras, Pose::IDENTITY))
 }
 
 fn stages(own: &Timed, work: &FrameWork, roofline: &Roofline) -> Vec<StageReport> {
@@ -204,6 +157,6 @@ fn host(own: &Timed, work: &FrameWork, stages: &[StageReport]) -> Vec<(&'static 
     let mut host_ms: Vec<(&'static str, f64)> = timed.copied().collect();
     let host_sum_ms: f64 = host_ms.iter().map(|(_, ms)| ms).sum();
     let device_sum_ms: f64 = stages.iter().map(StageReport::device_ms).sum();
-    host_ms.push(("unaccounted", own.step_ms - device_sum_ms - host_sum_ms));
+    host_ms.push(("unaccounted", own.step_ms() - device_sum_ms - host_sum_ms));
     host_ms
 }

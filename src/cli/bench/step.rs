@@ -1,14 +1,12 @@
 //! `wildcity bench step`.
 
 use std::io::{self, Write};
-use std::time::Instant;
 
 use serde_json::json;
 
-use crate::render::{Backend, Frame, FrameStats, Target, View};
+use crate::render::{Backend, Frame, View};
 
-use super::median;
-use crate::cli::progress;
+use super::timed::{Timed, time};
 use crate::cli::scene_source::{Renderer, SceneSource};
 
 /// Time one step: all cameras of the list in one frame, to 8-bit colour.
@@ -54,25 +52,10 @@ impl Step {
             );
         }
         let frame = Frame { scene: &ready.scene, profile: &profile, views: &views };
-        let mut images: Vec<Vec<u8>> =
-            views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-        let bar = progress::count("rendering");
-        bar.set_length(u64::from(self.repeat) + 1);
-        let mut runs = Vec::with_capacity(self.repeat as usize);
-        for repeat in 0..=self.repeat {
-            let targets = images.iter_mut();
-            let mut targets: Vec<Target<'_>> =
-                targets.map(|image| Target { rgb8: Some(image), ..Target::default() }).collect();
-            let start = Instant::now();
-            let stats = backend.render(&frame, &mut targets, &|_, _| {})?;
-            let step_ms = start.elapsed().as_secs_f64() * 1e3;
-            if repeat > 0 {
-                runs.push((step_ms, stats));
-            }
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        self.report(&ready.scene, &views, &*backend, &runs)
+        // The first frame makes room, and is not counted.
+        time(&*backend, &frame, 1, "rendering")?;
+        let timed = time(&*backend, &frame, self.repeat, "rendering")?;
+        self.report(&ready.scene, &views, &*backend, &timed)
     }
 
     fn report(
@@ -80,22 +63,18 @@ impl Step {
         scene: &crate::scene::Scene,
         views: &[View],
         backend: &dyn Backend,
-        runs: &[(f64, FrameStats)],
+        timed: &Timed,
     ) -> anyhow::Result<()> {
-        let steps_ms = || runs.iter().map(|(step_ms, _)| *step_ms);
-        let step_ms = median(steps_ms());
-        let (min_ms, max_ms) =
-            (steps_ms().fold(step_ms, f64::min), steps_ms().fold(step_ms, f64::max));
+        let Timed { steps_ms, stats, .. } = timed;
+        let step_ms = timed.step_ms();
+        let min_ms = steps_ms.iter().copied().fold(step_ms, f64::min);
+        let max_ms = steps_ms.iter().copied().fold(step_ms, f64::max);
         let (name, detail, threads) = (backend.name(), backend.detail(), backend.threads());
-        let (_, stats) = &runs[0];
-        let stages: Vec<(&str, f64)> = (0..stats.stages_ms.len())
-            .map(|k| (stats.stages_ms[k].0, median(runs.iter().map(|(_, s)| s.stages_ms[k].1))))
-            .collect();
         let pixels: usize = views.iter().map(|view| view.camera.pixels()).sum();
         let mut out = io::stdout().lock();
         if self.json {
             let stages: serde_json::Map<_, _> =
-                stages.iter().map(|(name, ms)| (name.to_string(), json!(ms))).collect();
+                stats.stages_ms.iter().map(|(name, ms)| (name.to_string(), json!(ms))).collect();
             let report = json!({
                 "backend": name,
                 "detail": detail,
@@ -126,7 +105,7 @@ impl Step {
         writeln!(out, "visible pairs  {:>14}", stats.visible_pairs)?;
         writeln!(out, "instances      {:>14}", stats.instances)?;
         writeln!(out, "evaluations    {:>14}", stats.evaluations)?;
-        for (name, ms) in stages {
+        for (name, ms) in &stats.stages_ms {
             writeln!(out, "{name:<14} {ms:>11.1} ms")?;
         }
         writeln!(
