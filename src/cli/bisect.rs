@@ -2,7 +2,8 @@
 
 use std::io::{self, Write};
 
-use crate::render::relay::{RIGHT_DB, bisect};
+use crate::render::psnr::RIGHT_DB;
+use crate::render::relay::bisect;
 use crate::render::{Backend, Frame};
 
 use super::progress;

@@ -9,10 +9,8 @@ use crate::scene::{Gaussians, RenderProfile, Scene, sh};
 
 use super::cpu::{Cpu, CpuError, Simd};
 use super::gpu::{AdapterChoice, Gpu, GpuError};
+use super::psnr::{RIGHT_DB, psnr_db};
 use super::{Backend, Frame, RenderError, Target, View};
-
-/// Least PSNR of the card against the cpu backend's: the bound of the whole gpu backend.
-const LEAST_DB: f64 = 60.0;
 
 /// A backend, and why it and no other.
 pub struct Automatic {
@@ -51,7 +49,7 @@ pub enum Doubt {
     Render(#[from] RenderError),
     /// It draws something else.
     #[error(
-        "its drawing of the trial card is {db:.1} dB from the cpu backend's, not {LEAST_DB} dB"
+        "its drawing of the trial card is {db:.1} dB from the cpu backend's, not {RIGHT_DB} dB"
     )]
     Wrong {
         /// PSNR of linear colour and opacity, in dB.
@@ -76,10 +74,9 @@ pub fn trial(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, Doubt> {
         return Err(Doubt::Unstable);
     }
     let truth = draw(truth, &scene, &views)?;
-    let squares = drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b).powi(2));
-    let db = -10.0 * (squares.sum::<f64>() / truth.len() as f64).log10();
+    let db = psnr_db(drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b)));
     // False for NaN too.
-    if db >= LEAST_DB { Ok(db) } else { Err(Doubt::Wrong { db }) }
+    if db >= RIGHT_DB { Ok(db) } else { Err(Doubt::Wrong { db }) }
 }
 
 /// Gaussians of the card. With two views some 46,000 splats: twelve blocks of the sort, and their 3,072

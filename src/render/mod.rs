@@ -8,11 +8,13 @@ pub mod constants;
 pub mod cpu;
 pub mod gpu;
 pub mod layout;
+pub mod psnr;
 pub mod reference;
 pub mod relay;
 pub mod stage;
 
 use crate::geometry::{Camera, Pose};
+use crate::scene::rig::RigCamera;
 use crate::scene::{RenderProfile, Rig, Scene};
 
 /// A camera somewhere in the world.
@@ -22,6 +24,17 @@ pub struct View {
     pub camera: Camera,
     /// Where the camera stands.
     pub world_from_camera: Pose,
+}
+
+impl View {
+    /// The cameras of a rig that stands somewhere.
+    pub fn of_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
+        let view = |camera: &RigCamera| Self {
+            camera: camera.camera,
+            world_from_camera: world_from_rig * camera.rig_from_camera,
+        };
+        cameras.iter().map(view).collect()
+    }
 }
 
 /// One chain of stages: all views of one step.

@@ -2,6 +2,7 @@
 
 use super::cpu::Cpu;
 use super::gpu::Gpu;
+use super::psnr::{RIGHT_DB, psnr_db, psnr_db_of_bytes};
 use super::stage::Stage;
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
 
@@ -58,9 +59,6 @@ fn render_through(
     stats.stages_ms.splice(0..0, before.stages_ms);
     Ok(stats)
 }
-
-/// Least PSNR at which an image counts as right, in dB: what backends promise each other.
-pub const RIGHT_DB: f64 = 60.0;
 
 /// How close the gpu backend comes to the cpu backend, by the stages that the latter runs for it.
 #[derive(Clone, Debug, PartialEq)]
@@ -136,15 +134,8 @@ impl Images {
         let rgba = self.rgba.iter().flatten().zip(truth.rgba.iter().flatten());
         let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
         let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
-        let written = psnr_db(rgb8.map(|(&a, &b)| f64::from(a.abs_diff(b)) / 255.0));
+        let written = psnr_db_of_bytes(rgb8);
         // A NaN is not right, whatever the other is.
         if linear < written || linear.is_nan() { linear } else { written }
     }
-}
-
-/// Of differences of values whose peak is 1.
-fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
-    let (sum, count) =
-        differences.fold((0.0, 0_u64), |(sum, count), off| (sum + off * off, count + 1));
-    -10.0 * (sum / count as f64).log10()
 }

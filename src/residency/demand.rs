@@ -2,7 +2,6 @@
 
 use glam::DVec3;
 
-use crate::scene::manifest::ChunkEntry;
 use crate::scene::{Manifest, RenderProfile};
 
 /// A camera, as far as it matters here.
@@ -15,7 +14,7 @@ pub struct Eye {
 }
 
 /// One level of one block that a frame draws: places in [`Manifest::chunks`] and in
-/// [`ChunkEntry::sections`].
+/// [`ChunkEntry::sections`](crate::scene::manifest::ChunkEntry::sections).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Needed {
     /// The chunk.
@@ -52,9 +51,4 @@ pub fn demand(manifest: &Manifest, eyes: &[Eye], profile: &RenderProfile) -> Vec
         }
     }
     needed
-}
-
-/// Gaussians of what a frame draws.
-pub fn gaussians(chunks: &[ChunkEntry], needed: &[Needed]) -> u64 {
-    needed.iter().map(|n| u64::from(chunks[n.chunk].sections[n.section].count)).sum()
 }

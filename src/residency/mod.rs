@@ -6,5 +6,5 @@ mod demand;
 mod error;
 
 pub use cache::{Cache, Resident};
-pub use demand::{Eye, Needed, demand, gaussians};
+pub use demand::{Eye, Needed, demand};
 pub use error::ResidencyError;

@@ -237,7 +237,7 @@ impl Assembly {
         scratch: &mut Scratch,
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
-        let views = views(&layout.cameras, world_from_rig);
+        let views = View::of_rig(&layout.cameras, world_from_rig);
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
         let mut targets = self.targets(scratch);
@@ -346,15 +346,6 @@ impl Assembly {
             timings: self.timings,
         })
     }
-}
-
-/// The cameras of a rig that stands somewhere.
-pub(super) fn views(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
-    let view = |camera: &RigCamera| View {
-        camera: camera.camera,
-        world_from_camera: world_from_rig * camera.rig_from_camera,
-    };
-    cameras.iter().map(view).collect()
 }
 
 /// What decides how much detail the views need.

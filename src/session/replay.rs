@@ -287,7 +287,7 @@ fn redraw(
     world_from_rig: Pose,
     pixels: &mut [Vec<u8>],
 ) -> Result<Vec<blake3::Hash>, RenderError> {
-    let views: Vec<View> = observation::views(cameras, world_from_rig);
+    let views = View::of_rig(cameras, world_from_rig);
     let mut targets: Vec<Target<'_>> =
         pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
     let profile = &resident.version.manifest.profile;

@@ -1,3 +1,4 @@
+use wildcity::render::View;
 use wildcity::scene::chunk::{CellRun, Partition, column, columns};
 use wildcity::scene::record::Clamped;
 use wildcity::scene::{Chunk, Gaussians, Record, Scene};
@@ -9,29 +10,29 @@ use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
 const WANTED_DB: [(Record, f64); 4] =
     [(Record::F32, f64::INFINITY), (Record::H52, 75.0), (Record::Q32, 60.0), (Record::Q24, 45.0)];
 
+/// Stores a scene in every record, and compares what these views see of it.
+fn every_record_keeps(scene: &Gaussians, views: &[View], what: &str) {
+    let truth = Scene::from_gaussians(scene);
+    for (record, wanted) in WANTED_DB {
+        let resident = stored(scene, record, false);
+        let db = decibels(&resident.scene(&eyes(views), &tau(0.0)), &truth, views);
+        assert!(db >= wanted, "{record}, {what}: {db:.1} dB");
+    }
+}
+
 #[test]
 fn every_record_keeps_the_image_at_every_degree() {
     let views = streets::street_views();
     for sh_degree in 0..=3 {
         let scene = streets::street(20_000, sh_degree, 1);
-        let truth = Scene::from_gaussians(&scene);
-        for (record, wanted) in WANTED_DB {
-            let resident = stored(&scene, record, false);
-            let db = decibels(&resident.scene(&eyes(&views), &tau(0.0)), &truth, &views);
-            assert!(db >= wanted, "{record} at degree {sh_degree}: {db:.1} dB");
-        }
+        every_record_keeps(&scene, &views, &format!("degree {sh_degree}"));
     }
 }
 
 #[test]
 fn every_record_keeps_the_demo_street() {
     let (scene, views) = streets::demo_street();
-    let truth = Scene::from_gaussians(&scene);
-    for (record, wanted) in WANTED_DB {
-        let resident = stored(&scene, record, false);
-        let db = decibels(&resident.scene(&eyes(&views), &tau(0.0)), &truth, &views);
-        assert!(db >= wanted, "{record}: {db:.1} dB");
-    }
+    every_record_keeps(&scene, &views, "the demo street");
 }
 
 #[test]
@@ -39,17 +40,9 @@ fn every_record_keeps_a_capture() {
     let Some(path) = data::real("scenes/skull/skull.ply") else { return };
     let camera = data::real("reference/skull_front.camera.json").unwrap();
     let camera = wildcity::ingest::cameras::read(&camera).unwrap().remove(0);
-    let views = [wildcity::render::View {
-        camera: camera.camera,
-        world_from_camera: camera.world_from_camera,
-    }];
+    let views = [View { camera: camera.camera, world_from_camera: camera.world_from_camera }];
     let scene = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
-    let truth = Scene::from_gaussians(&scene);
-    for (record, wanted) in WANTED_DB {
-        let resident = stored(&scene, record, false);
-        let db = decibels(&resident.scene(&eyes(&views), &tau(0.0)), &truth, &views);
-        assert!(db >= wanted, "{record}: {db:.1} dB");
-    }
+    every_record_keeps(&scene, &views, "skull");
 }
 
 #[test]

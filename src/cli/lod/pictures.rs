@@ -9,8 +9,9 @@ use image::imageops;
 
 use crate::config;
 use crate::ingest::cameras;
+use crate::render::psnr::psnr_db_of_bytes;
 use crate::render::{Backend, Frame, Target, View};
-use crate::residency::{Cache, demand, gaussians};
+use crate::residency::Cache;
 use crate::scene::{RenderProfile, Rig, Scene};
 use crate::session;
 use crate::store::{Catalog, Version};
@@ -47,13 +48,12 @@ pub(super) fn draw(
     for profile in &profiles {
         let scene = resident.scene(&eyes, profile);
         drawn.push(render(&*backend, &scene, profile, &views)?);
-        let needed = demand(&version.manifest, &eyes, profile);
-        let count = gaussians(&version.manifest.chunks, &needed);
-        let share = 100.0 * count as f64 / version.manifest.gaussians() as f64;
+        let share = 100.0 * scene.gaussians() as f64 / version.manifest.gaussians() as f64;
         let (full, now) = (&drawn[0], &drawn[drawn.len() - 1]);
-        let decibels = match mean_square(full, now) {
-            0.0 => "the same image".to_owned(),
-            error => format!("{:.1} dB", -10.0 * error.log10()),
+        let pairs = full.iter().zip(now).flat_map(|(full, now)| full.iter().zip(now.iter()));
+        let decibels = match psnr_db_of_bytes(pairs) {
+            f64::INFINITY => "the same image".to_owned(),
+            db => format!("{db:.1} dB"),
         };
         lines.push(format!("tau {:>4} px: {share:>5.1} % drawn, {decibels}", profile.tau_px));
         bar.inc(1);
@@ -92,11 +92,8 @@ fn shots(lod: &Lod, version: &Version) -> anyhow::Result<Vec<(String, View)>> {
     let world_from_rig = log.at_station(0.5 * log.length_m());
     let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
     let rig = rig.context("no rig")?;
-    let view = |mounted: &crate::scene::rig::RigCamera| {
-        let world_from_camera = world_from_rig * mounted.rig_from_camera;
-        (mounted.name.clone(), View { camera: mounted.camera, world_from_camera })
-    };
-    Ok(rig.cameras.iter().map(view).collect())
+    let names = rig.cameras.iter().map(|camera| camera.name.clone());
+    Ok(names.zip(View::of_rig(&rig.cameras, world_from_rig)).collect())
 }
 
 fn render(
@@ -111,15 +108,6 @@ fn render(
     let mut targets: Vec<Target<'_>> = images.iter_mut().map(|image| target(image)).collect();
     backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;
     Ok(images)
-}
-
-/// Mean squared difference of all cameras' values, for values whose peak is 1.
-fn mean_square(one: &[RgbImage], other: &[RgbImage]) -> f64 {
-    let pairs = one.iter().zip(other).flat_map(|(one, other)| one.iter().zip(other.iter()));
-    let (sum, count) = pairs.fold((0_u64, 0_u64), |(sum, count), (a, b)| {
-        (sum + u64::from(a.abs_diff(*b)).pow(2), count + 1)
-    });
-    sum as f64 / (255.0 * 255.0 * count as f64)
 }
 
 fn side_by_side(row: &[&RgbImage]) -> RgbImage {

@@ -6,6 +6,7 @@ use anyhow::ensure;
 use serde::Serialize;
 
 use crate::render::gpu::Roofline;
+use crate::render::psnr::psnr_db_of_bytes;
 
 /// The goal: a step of six full cameras, from asking to images on the host, at as many visible pairs.
 const GOAL_MS: f64 = 4.7;
@@ -64,10 +65,8 @@ impl Images {
     pub(super) fn compare(a: &[u8], b: &[u8]) -> anyhow::Result<Self> {
         let (own, other) = (a.len(), b.len());
         ensure!(own == other && own > 0, "images of {own} and {other} bytes cannot be compared");
-        let square = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b)).powi(2);
-        let mean = a.iter().zip(b).map(square).sum::<f64>() / own as f64;
         let images_equal = a == b;
-        let psnr_db = (!images_equal).then(|| 10.0 * (255.0 * 255.0 / mean).log10());
+        let psnr_db = (!images_equal).then(|| psnr_db_of_bytes(a.iter().zip(b)));
         Ok(Self { images_equal, psnr_db })
     }
 }
