@@ -1,9 +1,10 @@
 //! What all sessions share: the twins in memory, the backend, and one queue for the renderer.
 
+use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
@@ -39,6 +40,7 @@ pub struct EngineSettings {
 /// before is encoded. Frames are begun in the order in which they were asked for, and a session asks
 /// for one at a time, so that sessions take turns.
 pub struct Engine {
+    catalog: Catalog,
     listings: Arc<Listings>,
     cache: Cache,
     episodes: PathBuf,
@@ -46,6 +48,14 @@ pub struct Engine {
     step_timeout: Duration,
     jobs: mpsc::Sender<Job>,
     answers: Answers,
+    /// By twin: the version that counts as its latest, while a newer one is made ready.
+    held: Mutex<BTreeMap<String, u64>>,
+}
+
+/// Keeps what is the latest version of a twin, until dropped.
+pub struct HeldLatest {
+    engine: Arc<Engine>,
+    twin: String,
 }
 
 /// RGB images that are encoded and forgotten: kept between frames, so that no step allocates them.
@@ -82,8 +92,20 @@ impl Engine {
                 .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         }
         let listings = Arc::new(Listings::new(catalog.clone()));
-        let (cache, answers) = (Cache::limited(catalog, resident_bytes), Answers::default());
-        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
+        let cache = Cache::limited(catalog.clone(), resident_bytes);
+        let answers = Answers::default();
+        let held = Mutex::default();
+        Ok(Arc::new(Self {
+            catalog,
+            listings,
+            cache,
+            episodes,
+            backend,
+            step_timeout,
+            jobs,
+            answers,
+            held,
+        }))
     }
 
     /// The latest version of every twin, in order of name. A damaged one is logged and left out,
@@ -107,6 +129,30 @@ impl Engine {
         Ok(checked.await.map_err(|_| SessionError::Crashed)??)
     }
 
+    /// The twins that can be opened.
+    pub fn catalog(&self) -> &Catalog {
+        &self.catalog
+    }
+
+    /// Frames that wait for the renderer.
+    pub fn queued(&self) -> usize {
+        self.jobs.max_capacity() - self.jobs.capacity()
+    }
+
+    /// Lets a version be the latest of its twin for whoever opens it, whatever is committed meanwhile.
+    pub fn hold_latest(self: &Arc<Self>, twin: &str, number: u64) -> HeldLatest {
+        lock(&self.held).insert(twin.to_owned(), number);
+        HeldLatest { engine: self.clone(), twin: twin.to_owned() }
+    }
+
+    /// Loads a version, so that whoever opens it or switches to it need not wait.
+    ///
+    /// # Errors
+    /// It cannot be loaded.
+    pub async fn prepare(self: &Arc<Self>, twin: &str, number: u64) -> Result<(), SessionError> {
+        self.resident(twin.to_owned(), Some(number)).await.map(|_| ())
+    }
+
     /// Name of the backend.
     pub fn backend(&self) -> &'static str {
         self.backend.name()
@@ -124,6 +170,7 @@ impl Engine {
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
+        let version = version.or_else(|| lock(&self.held).get(&twin).copied());
         let loaded = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
         Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
@@ -174,6 +221,17 @@ impl Engine {
     pub(super) fn step_timeout(&self) -> Duration {
         self.step_timeout
     }
+}
+
+impl Drop for HeldLatest {
+    fn drop(&mut self) {
+        lock(&self.engine.held).remove(&self.twin);
+    }
+}
+
+/// A panic elsewhere leaves nothing half-done behind these locks.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl std::fmt::Debug for Engine {

@@ -175,6 +175,8 @@ impl TestServer {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
             twins: twins.path().to_owned(),
             episodes: episodes.path().to_owned(),
+            uploads: episodes.path().join("uploads"),
+            tokens: None,
             backend: painter.clone(),
             limits,
         };
