@@ -5,7 +5,9 @@
 
 mod connection;
 mod error;
+mod http;
 mod observation;
+mod upload;
 
 use std::mem;
 use std::time::Duration;
@@ -19,8 +21,12 @@ use crate::protocol::message::{
 
 use connection::{Connection, Incoming};
 
+pub use crate::protocol::http::{
+    All, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
+};
 pub use crate::protocol::message::{Open, Pose};
 pub use error::{ClientError, FrameError};
+pub use http::{HttpClient, HttpError};
 pub use observation::{ImageView, Observation};
 
 /// A connection to a server, and the session on it.
@@ -64,6 +70,17 @@ pub struct Resumed {
     pub step: u64,
     /// Simulated time, in microseconds.
     pub time_us: i64,
+}
+
+/// The server's answer to `switch_version`: what is seen from now on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Switched {
+    /// The version.
+    pub version: u64,
+    /// BLAKE3 of its manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of its render profile's JSON, in hex.
+    pub profile_hash: String,
 }
 
 impl Client {
@@ -187,6 +204,19 @@ impl Client {
         start: Option<Start>,
     ) -> Result<Observation, ClientError> {
         self.observation(&Request::Reset { seq: self.next_seq, seed, start }).await
+    }
+
+    /// Sees another version of the twin from the next step on, or the latest; the episode goes on.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn switch_version(&mut self, version: Option<u64>) -> Result<Switched, ClientError> {
+        match self.exchange(&Request::SwitchVersion { seq: self.next_seq, version }).await? {
+            Incoming::Answer(Answer::Switched { version, version_hash, profile_hash, .. }) => {
+                Ok(Switched { version, version_hash, profile_hash })
+            }
+            other => Err(self.break_off("switched", &other)),
+        }
     }
 
     /// Ends the session; another can be opened on the same connection.
