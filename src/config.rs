@@ -5,6 +5,9 @@ use std::time::Duration;
 /// Where `serve` listens unless told otherwise.
 pub const LISTEN: &str = "127.0.0.1:8080";
 
+/// The server that clients talk to unless told otherwise.
+pub const SERVER_URL: &str = "http://127.0.0.1:8080";
+
 /// Simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 

@@ -90,10 +90,11 @@ impl HttpClient {
     pub fn new(url: &str, token: Option<String>) -> Result<Self, HttpError> {
         let wrong = || HttpError::Url { url: url.to_owned() };
         let authority = url.strip_prefix("http://").ok_or_else(wrong)?.trim_end_matches('/');
-        let has_port = authority.rsplit_once(':').is_some_and(|(host, port)| {
-            !host.is_empty() && port.parse::<u16>().is_ok()
-        });
-        let is_plain = authority.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.:[]_".contains(&b));
+        let has_port = authority
+            .rsplit_once(':')
+            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok());
+        let is_plain =
+            authority.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.:[]_".contains(&b));
         match has_port && is_plain {
             true => Ok(Self { authority: authority.to_owned(), token }),
             false => Err(wrong()),
@@ -120,7 +121,11 @@ impl HttpClient {
     ///
     /// # Errors
     /// The server refuses, or does not answer any more.
-    pub async fn wait(&self, push: Push, seen: &mut dyn FnMut(&Push)) -> Result<Push, HttpError> {
+    pub async fn wait(
+        &self,
+        push: Push,
+        seen: &mut (dyn FnMut(&Push) + Send),
+    ) -> Result<Push, HttpError> {
         let (mut push, mut lost) = (push, 0);
         loop {
             seen(&push);
@@ -167,10 +172,8 @@ impl HttpClient {
             Some(body) => serde_json::to_vec(body).map_err(|error| self.unreadable(&error))?,
             None => Vec::new(),
         };
-        let request = Request::builder()
-            .method(method)
-            .uri(path)
-            .header(CONTENT_TYPE, "application/json");
+        let request =
+            Request::builder().method(method).uri(path).header(CONTENT_TYPE, "application/json");
         let full = Full::new(Bytes::from(body)).map_err(|never| match never {}).boxed_unsync();
         let answer = self.send(request, full, config::HTTP_TIMEOUT).await?;
         serde_json::from_slice(&answer).map_err(|error| self.unreadable(&error))
@@ -201,10 +204,9 @@ impl HttpClient {
         let stream = timeout(config::HTTP_CONNECT_TIMEOUT, TcpStream::connect(&self.authority));
         let stream = stream.await.map_err(|_| self.lost(&"cannot connect in time"))?;
         let stream = stream.map_err(|error| self.lost(&error))?;
-        let (mut sender, connection) =
-            hyper::client::conn::http1::handshake(TokioIo::new(stream))
-                .await
-                .map_err(|error| self.lost(&error))?;
+        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
+            .await
+            .map_err(|error| self.lost(&error))?;
         // Driven beside the request, and dropped with it.
         let exchanged = async {
             let answer = sender.send_request(request).await.map_err(|error| self.lost(&error))?;

@@ -22,7 +22,7 @@ use crate::protocol::message::{
 use connection::{Connection, Incoming};
 
 pub use crate::protocol::http::{
-    All, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
+    All, CellReport, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
 };
 pub use crate::protocol::message::{Open, Pose};
 pub use error::{ClientError, FrameError};
@@ -37,6 +37,7 @@ pub use observation::{ImageView, Observation};
 #[derive(Debug)]
 pub struct Client {
     url: String,
+    token: Token,
     name: String,
     connection: Option<Connection>,
     lost_because: String,
@@ -44,6 +45,15 @@ pub struct Client {
     session: Option<String>,
     next_seq: u64,
     answer_timeout: Duration,
+}
+
+/// Says nothing of itself.
+struct Token(Option<String>);
+
+impl std::fmt::Debug for Token {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(if self.0.is_some() { "a token" } else { "none" })
+    }
 }
 
 /// The server's answer to `hello`.
@@ -89,10 +99,23 @@ impl Client {
     /// # Errors
     /// The server cannot be reached in time, speaks another protocol, or refuses.
     pub async fn connect(url: &str, name: &str) -> Result<Self, ClientError> {
-        let mut connection = Connection::open(url).await?;
+        Self::connect_as(url, name, None).await
+    }
+
+    /// The same with a token, for a server that has tokens.
+    ///
+    /// # Errors
+    /// As [`Client::connect`].
+    pub async fn connect_as(
+        url: &str,
+        name: &str,
+        token: Option<String>,
+    ) -> Result<Self, ClientError> {
+        let mut connection = Connection::open(url, token.as_deref()).await?;
         let welcome = hello(&mut connection, name).await?;
         Ok(Self {
             url: url.to_owned(),
+            token: Token(token),
             name: name.to_owned(),
             connection: Some(connection),
             lost_because: String::new(),
@@ -130,7 +153,7 @@ impl Client {
     /// As [`Client::resume`]. After `unknown_session` another session can be opened.
     pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
         self.connection = None;
-        let mut connection = Connection::open(&self.url).await?;
+        let mut connection = Connection::open(&self.url, self.token.0.as_deref()).await?;
         self.welcome = hello(&mut connection, &self.name).await?;
         self.connection = Some(connection);
         let Some(session) = self.session.clone() else {

@@ -237,9 +237,15 @@ mod tests {
     fn a_file_of_tokens_is_refused_without_repeating_them() {
         for (text, place) in [
             (r#"{"tokens": []}"#, "tokens"),
-            (r#"{"tokens": [{"name": "a", "role": "king", "token": "secretsecretsecret"}]}"#, "line"),
+            (
+                r#"{"tokens": [{"name": "a", "role": "king", "token": "secretsecretsecret"}]}"#,
+                "line",
+            ),
             (r#"{"tokens": ["secretsecretsecret"]}"#, "line"),
-            (r#"{"tokens": [{"name": "a", "role": "drive", "token": "secret"}]}"#, "tokens[0].token"),
+            (
+                r#"{"tokens": [{"name": "a", "role": "drive", "token": "secret"}]}"#,
+                "tokens[0].token",
+            ),
             (r#"{"tokens": [{"name": "a", "role": "drive"}]}"#, "tokens[0]"),
             (r#"{"tokens": [{"name": "a", "role": "drive", "hash": "secret"}]}"#, "tokens[0].hash"),
         ] {

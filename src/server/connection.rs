@@ -174,7 +174,8 @@ impl Connection {
             }
             Command::Resume { session, last_seq } => {
                 let patience = self.server.limits.step;
-                let place = self.server.sessions.resume(&session, &self.grant.name, patience).await?;
+                let place =
+                    self.server.sessions.resume(&session, &self.grant.name, patience).await?;
                 if last_seq > place.answered {
                     let expected = format!("{} is the session's last answer", place.answered);
                     return Err(Fault::SeqOutOfOrder { seq: last_seq, expected });

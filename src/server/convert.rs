@@ -9,9 +9,7 @@ pub(super) use answer::{
     WireCode, closed, code, observation, opened, refusal_body, refused, resumed, switched, twin,
     twins, welcome,
 };
-pub(super) use http::{
-    new_push, new_upload, push, rollback, sessions, upload, version, versions,
-};
+pub(super) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
 pub(super) use request::{Command, Parsed, parse};
 
 /// The WebSocket subprotocol.

@@ -13,9 +13,7 @@ use crate::scene::chunk::cell_at;
 use crate::scene::manifest::Provenance;
 use crate::scene::{Gaussians, RenderProfile};
 use crate::session::{Changed, SessionError};
-use crate::store::{
-    Catalog, Change, Kind, Settings, Storage, StoreError, Version,
-};
+use crate::store::{Catalog, Change, Kind, Settings, Storage, StoreError, Version};
 
 use super::Server;
 use super::fault::Fault;
@@ -25,12 +23,7 @@ use super::spool::Upload;
 use super::uploads::blocking;
 
 /// Carries out a push in its turn, and ends it.
-pub(super) async fn run(
-    server: Arc<Server>,
-    push: Arc<Push>,
-    ask: Ask,
-    uploads: Vec<Arc<Upload>>,
-) {
+pub(super) async fn run(server: Arc<Server>, push: Arc<Push>, ask: Ask, uploads: Vec<Arc<Upload>>) {
     let done = async {
         let turn = server.pushes.turn.acquire().await;
         let _turn = turn.map_err(|_| Fault::ShuttingDown)?;
@@ -100,7 +93,8 @@ async fn publish(
     let latest = ask.base.map_or(Ok(latest), |_| latest_of(&catalog, &ask.twin).map(Some))?;
     let held = latest.map(|number| server.engine.hold_latest(&ask.twin, number));
     let asked = ask.clone();
-    let version = blocking(move || commit(&catalog, &told, &asked, &scene, base.as_deref())).await?;
+    let version =
+        blocking(move || commit(&catalog, &told, &asked, &scene, base.as_deref())).await?;
     tracing::info!(twin = ask.twin, version = version.number, "pushed");
 
     push.enter(State::Prefetching);
@@ -256,11 +250,7 @@ async fn validate(
 }
 
 /// The Gaussians within some cells.
-fn inside(
-    gaussians: &Arc<Gaussians>,
-    cells: &BTreeSet<[i32; 2]>,
-    left_out: u64,
-) -> Arc<Gaussians> {
+fn inside(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64) -> Arc<Gaussians> {
     if left_out == 0 {
         return gaussians.clone();
     }

@@ -4,7 +4,6 @@ use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use crate::residency::ResidencyError;
 use crate::session::SessionError;
 use crate::store::StoreError;
 
@@ -51,9 +50,7 @@ fn status(fault: &Fault) -> StatusCode {
         Fault::Unauthorized => StatusCode::UNAUTHORIZED,
         Fault::Forbidden { .. } => StatusCode::FORBIDDEN,
         Fault::UnknownUpload { .. } | Fault::UnknownPush { .. } => StatusCode::NOT_FOUND,
-        Fault::UploadOffset { .. } | Fault::Replaced => {
-            StatusCode::CONFLICT
-        }
+        Fault::UploadOffset { .. } | Fault::Replaced => StatusCode::CONFLICT,
         Fault::UploadDigest { .. } | Fault::Content { .. } => StatusCode::UNPROCESSABLE_ENTITY,
         Fault::StorageFull { .. } => StatusCode::INSUFFICIENT_STORAGE,
         Fault::TimedOut(_) => StatusCode::REQUEST_TIMEOUT,
@@ -74,9 +71,7 @@ fn of_session(error: &SessionError) -> StatusCode {
         SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
             StatusCode::CONFLICT
         }
-        SessionError::NoRoom(ResidencyError::NoRoom { .. }) | SessionError::Busy { .. } => {
-            StatusCode::SERVICE_UNAVAILABLE
-        }
+        SessionError::NoRoom(_) | SessionError::Busy { .. } => StatusCode::SERVICE_UNAVAILABLE,
         _ => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }

@@ -74,7 +74,8 @@ impl Ranges {
         let means_m = [0, 1, 2].map(axis);
         let scale = |ln: &f32| f64::from(*ln).exp();
         let opacity = |logit: &f32| 1.0 / (1.0 + (-f64::from(*logit)).exp());
-        let length = |quat: &[f32; 4]| quat.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
+        let length =
+            |quat: &[f32; 4]| quat.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
         (!gaussians.is_empty()).then(|| Self {
             mean_m: [means_m.map(|range| range[0]), means_m.map(|range| range[1])],
             scale_m: range(&mut gaussians.ln_scales.as_flattened().iter().map(scale)),

@@ -102,8 +102,7 @@ impl Spool {
                 io::Error::other("another server uses it: give one of them another --uploads DIR")
             }
         })?;
-        let spool =
-            Self { dir: dir.to_owned(), limits, uploads: Mutex::default(), _lock: lock };
+        let spool = Self { dir: dir.to_owned(), limits, uploads: Mutex::default(), _lock: lock };
         spool.take_up()?;
         Ok(spool)
     }
@@ -188,9 +187,8 @@ impl Spool {
             if fits && uploads.len() < self.limits.uploads {
                 return Ok(());
             }
-            let unused = |upload: &&Arc<Upload>| {
-                upload.is_complete() && Arc::strong_count(upload) == 1
-            };
+            let unused =
+                |upload: &&Arc<Upload>| upload.is_complete() && Arc::strong_count(upload) == 1;
             let oldest = uploads.values().filter(unused).min_by_key(|upload| upload.touched());
             let Some(id) = oldest.map(|upload| upload.id.clone()) else {
                 let (count, limits) = (uploads.len(), self.limits);
@@ -430,7 +428,9 @@ impl TryFrom<String> for Digest {
             Some(Self { algorithm, hash: *hash.as_bytes() })
         });
         parsed.ok_or_else(|| {
-            format!("{text:?} is no digest: expected blake3: or sha-256: and 64 lower-case hex digits")
+            format!(
+                "{text:?} is no digest: expected blake3: or sha-256: and 64 lower-case hex digits"
+            )
         })
     }
 }

@@ -148,8 +148,7 @@ fn scene(
 fn stations(changed: &Changed) -> Vec<Pose> {
     let Manifest { trajectories, .. } = &changed.before.manifest;
     let Some(log) = trajectories.first() else { return Vec::new() };
-    let changes =
-        |pose: &&Pose| changed.cells.contains(&cell_at(&pose.position_m.to_array()));
+    let changes = |pose: &&Pose| changed.cells.contains(&cell_at(&pose.position_m.to_array()));
     let keyframes: Vec<Pose> = log.keyframes.iter().map(|key| key.world_from_rig).collect();
     let near: Vec<&Pose> = keyframes.iter().filter(changes).collect();
     let from = if near.is_empty() { keyframes.iter().collect() } else { near };

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use crate::config::EPISODE_LINE_BYTES;
 use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
-use crate::residency::{Resident, ResidencyError};
+use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
 
 use super::record::{

@@ -140,8 +140,11 @@ async fn what_is_not_what_was_promised_is_refused_and_forgotten() {
     let wrong = "Content-Digest: sha-256=:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=:";
     append(&server, &path, 0, wrong, &good[..100]).await.refused(422, "upload_digest");
     assert_eq!(get(&server, &path).await.body["offset"], 0);
-    append(&server, &path, 0, "Content-Digest: sha-256=:x:", b"x").await.refused(400, "invalid_request");
-    let digest = "Content-Digest: sha-512=:eA==:, sha-256=:LCa0a2j/xo/5m0U8HTBBNBNCLXBkg7+g+YpeiGJm564=:";
+    append(&server, &path, 0, "Content-Digest: sha-256=:x:", b"x")
+        .await
+        .refused(400, "invalid_request");
+    let digest =
+        "Content-Digest: sha-512=:eA==:, sha-256=:LCa0a2j/xo/5m0U8HTBBNBNCLXBkg7+g+YpeiGJm564=:";
     let first = append(&server, &path, 0, digest, b"foo").await;
     assert_eq!((first.status, &first.body["offset"]), (200, &json!(3)), "{first:?}");
     send(server.address(), &format!("PATCH {path} HTTP/1.1\r\nContent-Length: 0"), b"")

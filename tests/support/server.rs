@@ -1,5 +1,7 @@
 //! A server with a painted world, and an agent that speaks raw WebSocket.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -58,9 +58,8 @@ pub(in crate::server) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Faul
         true => Ok(name),
         false => Err(Fault::InvalidName { field: field.to_owned(), name }),
     };
-    let out_of_range = |field: &str, must: String| {
-        Err(Fault::OutOfRange { field: field.to_owned(), must })
-    };
+    let out_of_range =
+        |field: &str, must: String| Err(Fault::OutOfRange { field: field.to_owned(), must });
     if !(1..=config::PUSH_FILES).contains(&files.len()) {
         let must = format!("{} entries; 1 to {} are accepted", files.len(), config::PUSH_FILES);
         return out_of_range("files", must);
@@ -242,6 +241,11 @@ pub(in crate::server) fn sessions(sessions: &[(String, About, bool)]) -> Value {
 
 /// Reads a body, and names the field of a mistake.
 fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Fault> {
+    // serde would take a list for the object's values in order.
+    if body.trim_ascii_start().first() == Some(&b'[') {
+        let reason = "expected one object, not a list".to_owned();
+        return Err(Fault::InvalidRequest { field: None, reason });
+    }
     let deserializer = &mut serde_json::Deserializer::from_slice(body);
     let parsed = serde_path_to_error::deserialize(&mut *deserializer);
     let parsed = parsed.map_err(|error| {
