@@ -170,7 +170,8 @@ pub(super) fn unpack(
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
     let width = columns(sh_degree);
-    let mut lanes = Vec::new();
+    // Exactly: growing by half again would take memory that no budget knows of.
+    let mut lanes = Vec::with_capacity(count.div_ceil(LANES) * width);
     let mut rest = bytes;
     for start in (0..count).step_by(PART) {
         let here = (count - start).min(PART);
