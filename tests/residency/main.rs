@@ -4,7 +4,6 @@
 #[path = "../support/images.rs"]
 mod images;
 #[path = "../support/scene_files.rs"]
-#[allow(dead_code, reason = "other test binaries use the rest of it")]
 mod scene_files;
 
 mod admission;
