@@ -8,12 +8,16 @@ use axum::extract::{Request, State};
 use axum::http::header;
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
+use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
-use prometheus_client::metrics::counter::Counter;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric as _};
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
-use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
+
+use crate::session::Engine;
 
 use super::Server;
 use super::auth::{Grant, Role};
@@ -45,7 +49,7 @@ pub(super) struct Metrics {
 }
 
 impl Metrics {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(engine: Arc<Engine>) -> Self {
         let mut registry = Registry::with_prefix("wildcity");
         // 1 ms to 33 s, each twice the one before: a step takes 0.1 s, and at most 60.
         let seconds = || Histogram::new(exponential_buckets(1e-3, 2.0, 16));
@@ -88,6 +92,7 @@ impl Metrics {
         registry.register("uploads", "Uploads on disk", m.uploads.clone());
         registry.register("spool_bytes", "Bytes announced of those", m.spool_bytes.clone());
         registry.register("pushes_open", "Pushes that wait or run", m.pushes_open.clone());
+        registry.register_collector(Box::new(Residency(engine)));
         Self { registry, ..metrics }
     }
 
@@ -99,6 +104,51 @@ impl Metrics {
     /// A push ended.
     pub(super) fn pushed(&self, outcome: &str) {
         self.pushes.get_or_create(&[("outcome", outcome.to_owned())]).inc();
+    }
+}
+
+/// What the pager counts by itself, read when it is asked for.
+#[derive(Debug)]
+struct Residency(Arc<Engine>);
+
+impl Collector for Residency {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        let stats = self.0.residency();
+        let failed = "Loads that failed because";
+        for (name, help, count) in [
+            ("hits", "Sections that frames found in memory".to_owned(), stats.hits),
+            ("misses", "Sections that frames had to wait for".to_owned(), stats.misses),
+            ("loads", "Sections that were loaded".to_owned(), stats.loads),
+            ("failed_damaged", format!("{failed} the bytes are damaged"), stats.failed_damaged),
+            ("failed_unreadable", format!("{failed} they cannot be read"), stats.failed_unreadable),
+            ("failed_crashed", format!("{failed} of a defect"), stats.failed_crashed),
+            ("retries", "Loads that were tried again".to_owned(), stats.retries),
+            ("evictions", "Sections that made room for others".to_owned(), stats.evictions),
+            ("prefetches_dropped", "Prefetches without room".to_owned(), stats.prefetches_dropped),
+            ("waits", "Frames that had to wait".to_owned(), stats.waits),
+            ("waits_given_up", "Frames not complete in time".to_owned(), stats.waits_given_up),
+        ] {
+            let counter = ConstCounter::new(count);
+            let name = format!("residency_{name}");
+            let kind = counter.metric_type();
+            counter.encode(encoder.encode_descriptor(&name, &help, None, kind)?)?;
+        }
+        let seconds = |duration: std::time::Duration| duration.as_secs_f64();
+        for (name, help, value) in [
+            ("wait_seconds", "How long frames waited, together", seconds(stats.wait_time)),
+            ("held_bytes", "Memory in use", stats.held_bytes as f64),
+            ("limit_bytes", "Memory there is", stats.limit_bytes as f64),
+            ("reserved_bytes", "Memory set aside for sessions", stats.reserved_bytes as f64),
+            ("held_sections", "Sections in memory", stats.held_sections as f64),
+            ("load_p50_seconds", "Median time of the last loads", seconds(stats.load_p50)),
+            ("load_p99_seconds", "99th percentile of the last loads", seconds(stats.load_p99)),
+        ] {
+            let gauge = ConstGauge::new(value);
+            let name = format!("residency_{name}");
+            let kind = gauge.metric_type();
+            gauge.encode(encoder.encode_descriptor(&name, help, None, kind)?)?;
+        }
+        Ok(())
     }
 }
 

@@ -98,7 +98,10 @@ async fn publish(
     tracing::info!(twin = ask.twin, version = version.number, "pushed");
 
     push.enter(State::Prefetching);
-    let prepared = server.engine.prepare(&ask.twin, version.number);
+    // Where sessions drive on that twin now, whoever switches need not wait.
+    let driving = server.sessions.list().into_iter().filter(|(_, about, _)| about.twin == ask.twin);
+    let frames = driving.map(|(_, about, _)| about.eyes).collect();
+    let prepared = server.engine.prepare(&ask.twin, version.number, frames);
     match timeout(config::PREFETCH_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}
         // It is committed and sound: whoever opens it waits, or is told why it does not fit.

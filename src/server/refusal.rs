@@ -4,6 +4,7 @@ use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
+use crate::residency::ResidencyError;
 use crate::session::SessionError;
 use crate::store::StoreError;
 
@@ -71,7 +72,9 @@ fn of_session(error: &SessionError) -> StatusCode {
         SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
             StatusCode::CONFLICT
         }
-        SessionError::NoRoom(_) | SessionError::Busy { .. } => StatusCode::SERVICE_UNAVAILABLE,
+        SessionError::Residency(ResidencyError::NoRoom { .. }) | SessionError::Busy { .. } => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
         _ => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }

@@ -8,6 +8,7 @@ use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
 use crate::geometry::Pose;
+use crate::residency::Eye;
 use crate::session::{Frame, Outcome, Session};
 
 use super::fault::Fault;
@@ -38,6 +39,8 @@ pub(super) struct About {
     pub(super) version: u64,
     pub(super) step: u64,
     pub(super) world_from_rig: Pose,
+    /// What its next frame needs, if it stays where it is.
+    pub(super) eyes: Vec<Eye>,
 }
 
 /// A session with what a lost connection must not lose.
@@ -213,6 +216,7 @@ impl Place {
             version: version.number,
             step: session.episode().step(),
             world_from_rig: session.episode().world_from_rig(),
+            eyes: session.eyes(),
         };
         if let Some(entry) = self.sessions.lock().get_mut(&self.name) {
             entry.about = Some(about);

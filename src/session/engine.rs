@@ -12,7 +12,7 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Resident};
+use crate::residency::{Cache, Eye, Lens, Reservation, Resident, Stats};
 use crate::store::Catalog;
 
 use super::SessionError;
@@ -20,11 +20,8 @@ use super::listing::{Listings, TwinSummary};
 
 /// What an engine is made of.
 pub struct EngineSettings {
-    /// The twins that can be opened.
-    pub catalog: Catalog,
-    /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
-    /// machine's.
-    pub resident_bytes: Option<u64>,
+    /// The twins that can be opened, and the memory for them.
+    pub cache: Cache,
     /// Where episodes are recorded.
     pub episodes: PathBuf,
     /// What renders.
@@ -40,7 +37,6 @@ pub struct EngineSettings {
 /// before is encoded. Frames are begun in the order in which they were asked for, and a session asks
 /// for one at a time, so that sessions take turns.
 pub struct Engine {
-    catalog: Catalog,
     listings: Arc<Listings>,
     cache: Cache,
     episodes: PathBuf,
@@ -81,7 +77,7 @@ impl Engine {
     /// # Errors
     /// A thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
+        let EngineSettings { cache, episodes, backend, step_timeout } = settings;
         let (jobs, queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
         for number in 0..backend.frames_at_once().max(1) {
@@ -91,21 +87,10 @@ impl Engine {
                 .spawn(move || draw_all(&queue))
                 .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         }
-        let listings = Arc::new(Listings::new(catalog.clone()));
-        let cache = Cache::limited(catalog.clone(), resident_bytes);
+        let listings = Arc::new(Listings::new(cache.catalog().clone()));
         let answers = Answers::default();
         let held = Mutex::default();
-        Ok(Arc::new(Self {
-            catalog,
-            listings,
-            cache,
-            episodes,
-            backend,
-            step_timeout,
-            jobs,
-            answers,
-            held,
-        }))
+        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers, held }))
     }
 
     /// The latest version of every twin, in order of name. A damaged one is logged and left out,
@@ -131,7 +116,7 @@ impl Engine {
 
     /// The twins that can be opened.
     pub fn catalog(&self) -> &Catalog {
-        &self.catalog
+        self.cache.catalog()
     }
 
     /// Frames that wait for the renderer.
@@ -145,12 +130,23 @@ impl Engine {
         HeldLatest { engine: self.clone(), twin: twin.to_owned() }
     }
 
-    /// Loads a version, so that whoever opens it or switches to it need not wait.
+    /// Opens a version and loads what frames of it need, for those who will switch to it where they
+    /// are: they need not wait.
     ///
     /// # Errors
-    /// It cannot be loaded.
-    pub async fn prepare(self: &Arc<Self>, twin: &str, number: u64) -> Result<(), SessionError> {
-        self.resident(twin.to_owned(), Some(number)).await.map(|_| ())
+    /// It cannot be opened, or what a frame needs cannot be loaded.
+    pub async fn prepare(
+        self: &Arc<Self>,
+        twin: &str,
+        number: u64,
+        frames: Vec<Vec<Eye>>,
+    ) -> Result<(), SessionError> {
+        let resident = self.resident(twin.to_owned(), Some(number)).await?;
+        let loaded = tokio::task::spawn_blocking(move || {
+            let profile = &resident.version.manifest.profile;
+            frames.iter().try_for_each(|eyes| resident.scene(eyes, profile).map(|_| ()))
+        });
+        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
 
     /// Name of the backend.
@@ -163,7 +159,12 @@ impl Engine {
         self.backend.detail()
     }
 
-    /// A version of a twin, or its latest, loaded if nobody has it.
+    /// What the pager did so far, and the memory that twins take now.
+    pub fn residency(&self) -> Stats {
+        self.cache.stats()
+    }
+
+    /// A version of a twin, or its latest. None of its Gaussians need be in memory.
     pub(super) async fn resident(
         self: &Arc<Self>,
         twin: String,
@@ -171,8 +172,17 @@ impl Engine {
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
         let version = version.or_else(|| lock(&self.held).get(&twin).copied());
-        let loaded = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
-        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
+        let opened = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
+        Ok(opened.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Sets aside the memory for the frames of a rig, if there is enough.
+    pub(super) async fn reserve(
+        resident: Arc<Resident>,
+        lens: Lens,
+    ) -> Result<Arc<Reservation>, SessionError> {
+        let reserved = tokio::task::spawn_blocking(move || resident.reserve(lens));
+        Ok(Arc::new(reserved.await.map_err(|_| SessionError::Crashed)??))
     }
 
     /// Does some work on a render thread when its turn comes, and tells how long it waited.
@@ -322,8 +332,7 @@ mod tests {
         for at_once in [1, 3] {
             let dir = tempfile::tempdir().unwrap();
             let engine = Engine::start(EngineSettings {
-                catalog: Catalog::open(dir.path()).unwrap(),
-                resident_bytes: None,
+                cache: Cache::new(Catalog::open(dir.path()).unwrap()),
                 episodes: dir.path().to_owned(),
                 backend: Arc::new(Takes(at_once)),
                 step_timeout: config::STEP_TIMEOUT,

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
-use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
@@ -123,6 +122,14 @@ pub enum ReplayError {
     /// The twin cannot be had.
     #[error(transparent)]
     Twin(#[from] ResidencyError),
+    /// What a frame needs cannot be had.
+    #[error("step {step}: {cause}")]
+    Residency {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: ResidencyError,
+    },
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
     Render {
@@ -229,8 +236,13 @@ impl Recording {
             }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
-                let hashes = redraw(&resident, backend, cameras, *world_from_rig, &mut pixels)
-                    .map_err(|cause| ReplayError::Render { step: frame.step, cause })?;
+                let (views, step) = (View::of_rig(cameras, *world_from_rig), frame.step);
+                let profile = &resident.version.manifest.profile;
+                let scene = resident.scene(&observation::eyes(&views), profile);
+                let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
+                let to_draw = RenderFrame { scene: &scene, profile, views: &views };
+                let hashes = redraw(backend, &to_draw, &mut pixels)
+                    .map_err(|cause| ReplayError::Render { step, cause })?;
                 for (((camera, rgb8), hash), recorded) in
                     cameras.iter().zip(&pixels).zip(hashes).zip(&mut recorded)
                 {
@@ -310,18 +322,12 @@ impl std::fmt::Display for Difference {
 
 /// Renders the colour images of one pose, and hashes them.
 fn redraw(
-    resident: &Resident,
     backend: &dyn Backend,
-    cameras: &[RigCamera],
-    world_from_rig: Pose,
+    frame: &RenderFrame<'_>,
     pixels: &mut [Vec<u8>],
 ) -> Result<Vec<blake3::Hash>, RenderError> {
-    let views = View::of_rig(cameras, world_from_rig);
     let mut targets: Vec<Target<'_>> =
         pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
-    let profile = &resident.version.manifest.profile;
-    let scene = &resident.scene(&observation::eyes(&views), profile);
-    let frame = RenderFrame { scene, profile, views: &views };
-    backend.render(&frame, &mut targets, &|_, _| {})?;
+    backend.render(frame, &mut targets, &|_, _| {})?;
     Ok(pixels.iter().map(|rgb8| blake3::hash(rgb8)).collect())
 }

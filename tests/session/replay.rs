@@ -133,6 +133,8 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         listen: "127.0.0.1:0".parse().unwrap(),
         twins: twins.path().to_owned(),
         episodes: episodes.path().to_owned(),
+        uploads: twins.path().join(".uploads"),
+        tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         limits: Limits::default(),
     };

@@ -56,7 +56,7 @@ pub(in crate::server) fn welcome(
 /// To `open`.
 pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let resident = session.resident();
-    let Version { number, hash, manifest, .. } = &resident.version;
+    let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let (depth, opacity) = session.depth_and_opacity();
@@ -82,7 +82,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
             .map(TrajectorySummary::of)
             .map(trajectory_info)
             .collect(),
-        resident_bytes: resident.bytes() as u64,
+        resident_bytes: session.reserved_bytes(),
     })))
 }
 
@@ -99,7 +99,7 @@ pub(in crate::server) fn resumed(
 
 /// To `switch_version`.
 pub(in crate::server) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
-    let Version { number, hash, .. } = &session.resident().version;
+    let Version { number, hash, .. } = &*session.resident().version;
     text(&Answer::Switched {
         seq,
         version: *number,
