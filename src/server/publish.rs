@@ -227,7 +227,7 @@ async fn validate(
         return Err(Fault::OutOfRange { field: "golden".to_owned(), must });
     }
     if let Some(base) = base.filter(|base| fits && base.manifest.sh_degree == gaussians.sh_degree) {
-        let changed: BTreeSet<_> = report.cells.iter().map(|(cell, _)| *cell).collect();
+        let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
         let changed = Changed {
             before: base.clone(),
             gaussians: inside(&gaussians, &changed, left_out),

@@ -39,9 +39,17 @@ pub(super) struct Report {
     pub(super) left_out: u64,
     pub(super) sh_degree: u8,
     pub(super) ranges: Option<Ranges>,
-    /// Cells that are replaced, with their Gaussians before and after, in order of (y, x).
-    pub(super) cells: Vec<([i32; 2], [u64; 2])>,
+    /// Cells that are replaced, in order of (y, x).
+    pub(super) cells: Vec<CellChange>,
     pub(super) golden: Vec<Golden>,
+}
+
+/// A cell that is replaced, and its Gaussians before and after.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct CellChange {
+    pub(super) cell: [i32; 2],
+    pub(super) before: u64,
+    pub(super) after: u64,
 }
 
 /// One file.
@@ -95,13 +103,13 @@ pub(super) fn cells(
     asked: &AskedCells,
     base: Option<&Manifest>,
     after: &BTreeMap<[i32; 2], u64>,
-) -> Result<(Vec<([i32; 2], [u64; 2])>, u64), Fault> {
+) -> Result<(Vec<CellChange>, u64), Fault> {
     let chunks = base.map_or(&[][..], |base| &base.chunks[..]);
     let before: BTreeMap<[i32; 2], u64> =
         chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect();
     let both = |cell: [i32; 2]| {
         let count = |of: &BTreeMap<[i32; 2], u64>| of.get(&cell).copied().unwrap_or(0);
-        (cell, [count(&before), count(after)])
+        CellChange { cell, before: count(&before), after: count(after) }
     };
     let mut cells: Vec<_> = match asked {
         AskedCells::These(cells) => cells.iter().map(|&cell| both(cell)).collect(),
@@ -111,38 +119,38 @@ pub(super) fn cells(
             all.into_iter().map(|&cell| both(cell)).collect()
         }
     };
-    cells.sort_by_key(|&([x, y], _)| [y, x]);
+    cells.sort_by_key(|change| (change.cell[1], change.cell[0]));
     let named = |cells: Vec<[i32; 2]>, reason: String| Err(Fault::Content { reason, cells });
     match asked {
         AskedCells::These(_) => {
-            let empty: Vec<_> = cells.iter().filter(|(_, [_, after])| *after == 0).collect();
-            if let Some(([x, y], _)) = empty.first() {
+            let empty: Vec<_> = cells.iter().filter(|change| change.after == 0).collect();
+            if let Some(CellChange { cell: [x, y], .. }) = empty.first() {
                 let reason = format!(
                     "{} of the cells named have no Gaussian in the push, as ({x}, {y}): leave them \
                      out of cells, or look at the axes and scale",
                     empty.len()
                 );
-                return named(empty.iter().map(|(cell, _)| *cell).collect(), reason);
+                return named(empty.iter().map(|change| change.cell).collect(), reason);
             }
         }
         AskedCells::Touched => {
-            let shrinks = |&&(_, [before, after]): &&([i32; 2], [u64; 2])| {
-                (after as f64) < config::SHRUNK_SHARE * before as f64
+            let shrinks = |change: &&CellChange| {
+                (change.after as f64) < config::SHRUNK_SHARE * change.before as f64
             };
             let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
-            if let Some(([x, y], [before, after])) = shrunk.first() {
+            if let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() {
                 let reason = format!(
                     "{} cells would lose nearly all that they have, as ({x}, {y}): {after} \
                      Gaussians in place of {before}. If that is meant, name the cells; if they are \
                      a neighbour's margin, name only the others",
                     shrunk.len()
                 );
-                return named(shrunk.iter().map(|(cell, _)| *cell).collect(), reason);
+                return named(shrunk.iter().map(|change| change.cell).collect(), reason);
             }
         }
         AskedCells::All => {}
     }
-    let kept: u64 = cells.iter().map(|(_, [_, after])| after).sum();
+    let kept: u64 = cells.iter().map(|change| change.after).sum();
     Ok((cells, after.values().sum::<u64>() - kept))
 }
 

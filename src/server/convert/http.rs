@@ -6,13 +6,13 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::config;
-use crate::ingest::Axes;
+use crate::ingest::{Axes, BadGaussian};
 use crate::protocol::http;
 use crate::scene::RenderProfile;
 use crate::scene::rig::is_name;
 use crate::server::fault::Fault;
 use crate::server::push::{Ask, AskedCells, AskedFile, Status};
-use crate::server::report::{Report, State};
+use crate::server::report::{CellChange, FileReport, Report, State};
 use crate::server::sessions::About;
 use crate::server::spool::{Announced, Upload};
 use crate::store::{LogEntry, Version};
@@ -176,7 +176,7 @@ fn report(report: &Report) -> http::PushReport {
         cells: report
             .cells
             .iter()
-            .map(|&(cell, [before, after])| http::CellReport { cell, before, after })
+            .map(|&CellChange { cell, before, after }| http::CellReport { cell, before, after })
             .collect(),
         golden: report
             .golden
@@ -189,8 +189,8 @@ fn report(report: &Report) -> http::PushReport {
     }
 }
 
-fn file(file: &crate::server::report::FileReport) -> http::FileReport {
-    let bad = |bad: &crate::ingest::BadGaussian| http::BadGaussian {
+fn file(file: &FileReport) -> http::FileReport {
+    let bad = |bad: &BadGaussian| http::BadGaussian {
         index: bad.index as u64,
         field: bad.field.clone(),
         value: bad.value.clone(),
