@@ -14,6 +14,7 @@ use wildcity::session::{
 };
 use wildcity::store::Catalog;
 
+use crate::metrics::scrape;
 use crate::support::{Agent, PATIENCE, Seen, TestServer, pose, refused};
 use crate::{get, in_cell, push};
 
@@ -192,6 +193,26 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     assert_eq!(latest().await, 1);
     drop(held);
     assert_eq!(latest().await, 2);
+}
+
+/// What a session needs of a new version is in memory when the push is ready.
+#[tokio::test]
+async fn a_ready_version_does_not_keep_its_sessions_waiting() {
+    let server = rendering(None).await;
+    let mut agent = driver(&server, "a").await;
+    agent.step(1.0).await;
+    push(&server, &in_cell([0, 0], 60, 1), |_| {}).await;
+    let waits = async || {
+        let text = scrape(&server).await;
+        let line =
+            text.lines().find_map(|line| line.strip_prefix("wildcity_residency_waits_total "));
+        line.expect("a count of waits").parse::<u64>().unwrap()
+    };
+    let before = waits().await;
+    let switched = agent.ask(json!({ "type": "switch_version" })).await;
+    assert_eq!(switched["version"], 2, "{switched}");
+    agent.step(1.0).await;
+    assert_eq!(waits().await, before);
 }
 
 #[tokio::test]
