@@ -159,6 +159,10 @@ pub const CLAMPED_SHARE: f64 = 1e-4;
 /// Largest record of a twin's log. One is about 150 bytes.
 pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 
+/// How often a commit is built upon the latest version, as long as somebody else is faster: each time
+/// one of those who try succeeds, so that 32 may try at once.
+pub const PUBLISH_TRIES: u32 = 32;
+
 /// Largest rig or trajectory file: what fits a manifest.
 pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
 

@@ -16,6 +16,8 @@ mod render;
 mod replay;
 mod scene_source;
 mod serve;
+mod time;
+mod twin;
 mod verify;
 
 use clap::{Parser, Subcommand};
@@ -36,6 +38,7 @@ enum Command {
     Inspect(inspect::Inspect),
     Lod(lod::Lod),
     Verify(verify::Verify),
+    Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
     Bench(bench::Bench),
@@ -53,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Verify(command) => command.run(),
+        Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Bench(command) => command.run(),

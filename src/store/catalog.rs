@@ -3,13 +3,14 @@
 use std::io::Read as _;
 use std::path::Path;
 
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 
 use crate::config;
 use crate::scene::manifest::{ChunkEntry, Section};
 use crate::scene::rig::is_name;
 use crate::scene::{Chunk, Manifest, sh};
 
+use super::log::LogRecord;
 use super::objects::{ObjectReader, Objects};
 use super::{StoreError, chunk_file, recover};
 
@@ -41,14 +42,6 @@ pub struct Version {
     pub created_us: i64,
     /// What it consists of.
     pub manifest: Manifest,
-}
-
-/// A record of the log, as JSON.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct LogRecord {
-    pub(super) manifest: String,
-    pub(super) created_us: i64,
 }
 
 impl Catalog {
@@ -94,7 +87,7 @@ impl Catalog {
         if !numbers.contains(&number) {
             return Err(StoreError::NoVersion { name: name.to_owned(), number, latest });
         }
-        let LogRecord { manifest: hash, created_us } = self.record(name, number)?;
+        let LogRecord { manifest: hash, created_us, .. } = self.record(name, number)?;
         let mut manifest = self.manifest(name, &hash)?;
         self.fill(&mut manifest)?;
         Ok(Version { number, hash, created_us, manifest })
@@ -168,6 +161,11 @@ impl Catalog {
             return Err(damaged(format!("{:?} is not a hash", record.manifest)));
         }
         Ok(record)
+    }
+
+    /// JSON with the fields in the order of the type: the same content, the same bytes.
+    pub(super) fn encode(&self, content: &impl serde::Serialize) -> Result<Vec<u8>, StoreError> {
+        serde_json::to_vec(content).map_err(|e| StoreError::io("encode for", self.dir())(e.into()))
     }
 
     /// Reads the sections of a manifest's chunks from its table.

@@ -79,6 +79,49 @@ pub enum StoreError {
         /// The version that was taken.
         number: u64,
     },
+    /// A commit got the same cell twice.
+    #[error(
+        "cell {cell:?} of twin {name:?} was put before: give all its Gaussians at once, or only \
+         the cells that are new"
+    )]
+    CellTwice {
+        /// The twin.
+        name: String,
+        /// Grid cell (x, y).
+        cell: [i32; 2],
+    },
+    /// Gaussians were stored in another way than the rest of the twin.
+    #[error(
+        "{field} is {stored}, but twin {name:?} has {needed}: store them so, or replace the whole twin"
+    )]
+    Field {
+        /// The twin.
+        name: String,
+        /// `sh_degree` or `record`.
+        field: &'static str,
+        /// What was put.
+        stored: String,
+        /// What is there.
+        needed: String,
+    },
+    /// Others changed the same cells or settings since the base of a change.
+    #[error(
+        "twin {name:?} changed since version {base}, in the same place: version {latest} has other \
+         {}; make the change from version {latest}",
+        overlap(cells, settings)
+    )]
+    Overlap {
+        /// The twin.
+        name: String,
+        /// The version that the change was made from.
+        base: u64,
+        /// The latest version.
+        latest: u64,
+        /// Grid cells (x, y) that both changed, in order of (y, x).
+        cells: Vec<[i32; 2]>,
+        /// Of `profile`, `rig`, `trajectories`, what both changed.
+        settings: Vec<&'static str>,
+    },
     /// A version is committed and visible, but the disk refused to say that it will stay.
     #[error(
         "version {number} of twin {name:?} is in place, but might not last through a power cut \
@@ -154,4 +197,18 @@ fn known_twins(known: &[String]) -> String {
         [] => "it holds none".to_owned(),
         names => format!("it holds {}", names.join(", ")),
     }
+}
+
+/// The first few cells, and the settings.
+fn overlap(cells: &[[i32; 2]], settings: &[&str]) -> String {
+    const NAMED: usize = 8;
+    let named = cells.iter().take(NAMED).map(|[x, y]| format!("({x}, {y})"));
+    let mut said: Vec<String> = Vec::new();
+    if !cells.is_empty() {
+        let more = cells.len().saturating_sub(NAMED);
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        said.push(format!("cells {}{more}", named.collect::<Vec<_>>().join(" ")));
+    }
+    said.extend(settings.iter().map(|&setting| setting.to_owned()));
+    said.join(", ")
 }

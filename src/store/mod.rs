@@ -3,8 +3,9 @@
 //! ```text
 //! <twins>/<name>/log/0000000001         which manifest version 1 is, and since when
 //! <twins>/<name>/objects/3f/3f9c...     manifests, their tables and chunks, named by their BLAKE3
-//! <twins>/.staging/<name>/              objects of a running import, invisible to everyone
-//! <twins>/.staging/<name>.lock          held while one runs
+//! <twins>/.staging/<name>@<commit>/     objects of a commit in the making, invisible to everyone
+//! <twins>/.staging/<name>@<commit>/lock held by its process as long as it lives
+//! <twins>/.staging/<name>.lock          held while a version is published
 //! ```
 //!
 //! Objects come first and the log's record last, put only if absent, so that whatever happens in
@@ -12,13 +13,20 @@
 
 mod catalog;
 mod chunk_file;
+mod commit;
+mod diff;
 mod error;
+mod log;
 mod objects;
-mod push;
+mod pack;
 mod recover;
 mod verify;
+mod whole;
 
 pub use catalog::{Catalog, Listing, Version};
+pub use commit::{Change, Commit, Settings, Storage, Stored};
+pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
-pub use push::{NewVersion, Storage};
+pub use log::{Kind, LogEntry};
 pub use verify::{Damage, Verified};
+pub use whole::NewVersion;

@@ -1,5 +1,6 @@
 //! The only file that opens files of a twin: objects by hash, log records by number, staging.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
 use std::io::{self, BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
@@ -82,6 +83,24 @@ impl Objects {
         })
     }
 
+    /// Whether an object is there, and as long as it should be; its bytes are not looked at.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if it is shorter or longer.
+    pub(super) fn check_present(
+        &self,
+        name: &str,
+        hash: &str,
+        bytes: u64,
+    ) -> Result<(), StoreError> {
+        let path = self.path(name, hash);
+        let found = fs::metadata(&path).map_err(StoreError::io("find", &path))?.len();
+        if found == bytes {
+            return Ok(());
+        }
+        Err(StoreError::Damaged { path, reason: format!("it has {found} bytes, not {bytes}") })
+    }
+
     /// Reads a part of an object, without comparing anything with a hash.
     ///
     /// # Errors
@@ -106,59 +125,139 @@ impl Objects {
         Ok(part)
     }
 
-    /// Names of the twins whose import was begun and not ended: it runs, or it was killed.
+    /// Names of the twins with a commit that was begun and not ended: it runs, or it was killed.
     pub(super) fn begun(&self) -> Result<Vec<String>, StoreError> {
-        let mut names = entries(&self.root.join(STAGING))?;
-        names.retain(|name| is_name(name) && self.root.join(STAGING).join(name).is_dir());
+        let mut names = Vec::new();
+        for entry in entries(&self.root.join(STAGING))? {
+            let name = entry.split_once(OF).map(|(name, _)| name);
+            names.extend(name.filter(|name| is_name(name)).map(str::to_owned));
+        }
+        names.dedup();
         Ok(names)
     }
 
-    /// Begins a commit: waits until no other one of this twin runs, then empties its staging.
-    pub(super) fn stage(&self, name: &str) -> Result<Staging, StoreError> {
+    /// Begins a commit: a directory of its own, locked for as long as the process lives.
+    pub(super) fn stage(&self, name: &str, commit: &str) -> Result<Staging, StoreError> {
         let dir = self.root.join(STAGING);
         create_dirs(&dir)?;
-        let (path, lock) = self.lock_file(name)?;
+        // Whoever sweeps has the turn, and must not find the directory before its lock is taken.
+        let _turn = self.turn(name)?;
+        let dir = dir.join(format!("{name}{OF}{commit}"));
+        fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;
+        let path = dir.join(LOCK);
+        let lock = File::create_new(&path).map_err(StoreError::io("create", &path))?;
         lock.lock().map_err(StoreError::io("lock", &path))?;
-        self.staging(name, lock)
+        Ok(Staging {
+            objects: self.clone(),
+            name: name.to_owned(),
+            dir,
+            placed: Vec::new(),
+            turn: None,
+            _lock: lock,
+        })
     }
 
-    /// Takes over the staging of a killed commit; none if it still runs.
-    pub(super) fn stage_abandoned(&self, name: &str) -> Result<Option<Staging>, StoreError> {
-        let (path, lock) = self.lock_file(name)?;
-        match lock.try_lock() {
-            Ok(()) => self.staging(name, lock).map(Some),
-            Err(TryLockError::WouldBlock) => Ok(None),
-            Err(TryLockError::Error(source)) => Err(StoreError::io("lock", &path)(source)),
+    /// Clears away what killed commits of a twin left: their staging, and objects they had placed
+    /// and `named` does not name. Commits that run stay.
+    pub(super) fn sweep(
+        &self,
+        name: &str,
+        named: impl FnOnce() -> Option<BTreeSet<String>>,
+    ) -> Result<(), StoreError> {
+        let (path, turn) = self.turn_file(name)?;
+        match turn.try_lock() {
+            Ok(()) => {}
+            // Somebody publishes or sweeps.
+            Err(TryLockError::WouldBlock) => return Ok(()),
+            Err(TryLockError::Error(cause)) => return Err(StoreError::io("lock", &path)(cause)),
+        }
+        let mut abandoned = Vec::new();
+        for entry in entries(&self.root.join(STAGING))? {
+            let dir = self.root.join(STAGING).join(&entry);
+            if entry.split_once(OF).is_some_and(|(of, _)| of == name) && is_abandoned(&dir)? {
+                abandoned.push(dir);
+            }
+        }
+        if abandoned.is_empty() {
+            return Ok(());
+        }
+        // The staging goes last: while it is there, the next start comes here again.
+        if let Some(named) = named() {
+            self.remove_unnamed(name, &named)?;
+        }
+        for dir in abandoned {
+            match fs::remove_dir_all(&dir) {
+                Err(error) if error.kind() != ErrorKind::NotFound => {
+                    return Err(StoreError::io("remove", &dir)(error));
+                }
+                _ => {}
+            }
+        }
+        self.remove_empty(name);
+        Ok(())
+    }
+
+    fn remove_unnamed(&self, name: &str, named: &BTreeSet<String>) -> Result<(), StoreError> {
+        let objects = self.root.join(name).join("objects");
+        for prefix in entries(&objects)? {
+            for hash in entries(&objects.join(&prefix))? {
+                if !named.contains(&hash) {
+                    let path = objects.join(&prefix).join(&hash);
+                    fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes the empty directories of a twin: all, if it never had a version. Whoever calls has
+    /// the turn.
+    fn remove_empty(&self, name: &str) {
+        let twin = self.root.join(name);
+        for prefix in entries(&twin.join("objects")).unwrap_or_default() {
+            let _ = fs::remove_dir(twin.join("objects").join(prefix));
+        }
+        for dir in [twin.join("objects"), twin.join("log"), twin] {
+            let _ = fs::remove_dir(dir);
         }
     }
 
-    /// The lock file stays for ever: were it removed, two imports could lock two files of a name.
-    fn lock_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
+    /// Waits until nobody else publishes a version of a twin.
+    fn turn(&self, name: &str) -> Result<File, StoreError> {
+        let (path, turn) = self.turn_file(name)?;
+        turn.lock().map_err(StoreError::io("lock", &path))?;
+        Ok(turn)
+    }
+
+    /// The file stays for ever: were it removed, two commits could lock two files of a name.
+    fn turn_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
         let file = File::options().create(true).append(true).open(&path);
         let file = file.map_err(StoreError::io("create", &path))?;
         Ok((path, file))
     }
+}
 
-    fn staging(&self, name: &str, lock: File) -> Result<Staging, StoreError> {
-        let dir = self.root.join(STAGING).join(name);
-        let staging = Staging {
-            objects: self.clone(),
-            name: name.to_owned(),
-            dir,
-            staged: Vec::new(),
-            placed: Vec::new(),
-            _lock: lock,
-        };
-        if staging.dir.exists() {
-            fs::remove_dir_all(&staging.dir).map_err(StoreError::io("empty", &staging.dir))?;
-        }
-        fs::create_dir(&staging.dir).map_err(StoreError::io("create", &staging.dir))?;
-        Ok(staging)
+/// Whether nobody holds a staging directory. Whoever asks has the turn.
+fn is_abandoned(dir: &Path) -> Result<bool, StoreError> {
+    let path = dir.join(LOCK);
+    match File::options().append(true).open(&path) {
+        Ok(lock) => match lock.try_lock() {
+            Ok(()) => Ok(true),
+            Err(TryLockError::WouldBlock) => Ok(false),
+            Err(TryLockError::Error(cause)) => Err(StoreError::io("lock", &path)(cause)),
+        },
+        // Killed before there was one, or its own process removes it right now.
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(dir.exists()),
+        Err(error) => Err(StoreError::io("open", &path)(error)),
     }
 }
 
 const STAGING: &str = ".staging";
+/// Between the twin's name and the commit's in the name of a staging directory; in neither of them.
+const OF: char = '@';
+/// The file of a staging directory that its commit holds locked.
+const LOCK: &str = "lock";
 
 /// Objects of a commit that nobody sees yet. Dropped before [`Staging::publish`] succeeds, it
 /// leaves nothing behind.
@@ -167,10 +266,10 @@ pub(super) struct Staging {
     objects: Objects,
     name: String,
     dir: PathBuf,
-    /// Hashes of the objects in `dir`.
-    staged: Vec<String>,
     /// Objects that were not there before this commit put them.
     placed: Vec<PathBuf>,
+    /// Held while publishing: others must not rely on an object that may be taken back.
+    turn: Option<File>,
     /// Released by the kernel when the process ends, however it ends.
     _lock: File,
 }
@@ -205,16 +304,27 @@ impl Staging {
         let (hash, bytes) = (hasher.finalize().to_hex().to_string(), hasher.count());
         let staged = self.dir.join(&hash);
         fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
-        self.staged.push(hash.clone());
         Ok(Put { hash, bytes })
     }
 
-    /// Makes the staged objects and then the log record visible.
+    /// Waits until nobody else publishes a version of this twin, and then nobody does until this is
+    /// dropped.
+    pub(super) fn take_turn(&mut self) -> Result<(), StoreError> {
+        self.turn = Some(self.objects.turn(&self.name)?);
+        Ok(())
+    }
+
+    /// Makes objects that were put and then the log record visible. Whoever calls has the turn.
     ///
     /// # Errors
     /// Nothing is visible, unless it is [`StoreError::NotSynced`].
-    pub(super) fn publish(mut self, number: u64, record: &[u8]) -> Result<(), StoreError> {
-        self.place_all()?;
+    pub(super) fn publish(
+        &mut self,
+        hashes: &BTreeSet<&str>,
+        number: u64,
+        record: &[u8],
+    ) -> Result<(), StoreError> {
+        self.place(hashes)?;
         let staged = self.dir.join("record");
         let failed = || StoreError::io("write", &staged);
         let mut file = File::create(&staged).map_err(failed())?;
@@ -231,10 +341,14 @@ impl Staging {
         sync_parent(&path).map_err(|error| self.not_synced(number, error))
     }
 
-    /// Puts the staged objects in the place of those of a version that is there already, which
-    /// heals damaged and lost ones, and sees to it that its record lasts.
-    pub(super) fn restore(mut self, number: u64) -> Result<(), StoreError> {
-        self.place_all()?;
+    /// Puts objects in the place of those of a version that is there already, which heals damaged
+    /// and lost ones, and sees to it that its record lasts. Whoever calls has the turn.
+    pub(super) fn restore(
+        &mut self,
+        hashes: &BTreeSet<&str>,
+        number: u64,
+    ) -> Result<(), StoreError> {
+        self.place(hashes)?;
         self.placed.clear();
         let path = self.objects.record_path(&self.name, number);
         sync_parent(&path).map_err(|error| self.not_synced(number, error))
@@ -244,52 +358,36 @@ impl Staging {
         StoreError::NotSynced { name: self.name.clone(), number, cause: Box::new(error) }
     }
 
-    /// Removes objects that no version names: what a killed commit had already placed.
-    pub(super) fn sweep(&self, is_named: impl Fn(&str) -> bool) -> Result<(), StoreError> {
-        let objects = self.objects.root.join(&self.name).join("objects");
-        for prefix in entries(&objects)? {
-            for hash in entries(&objects.join(&prefix))? {
-                if !is_named(&hash) {
-                    let path = objects.join(&prefix).join(&hash);
-                    fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
-                }
+    /// Moves those of the objects that were put here to their places, over older copies, too.
+    fn place(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
+        let mut changed = BTreeSet::new();
+        for hash in hashes {
+            let staged = self.dir.join(hash);
+            if !staged.exists() {
+                continue;
             }
-        }
-        Ok(())
-    }
-
-    /// Moves the staged objects to their places, over older copies, too.
-    fn place_all(&mut self) -> Result<(), StoreError> {
-        for hash in std::mem::take(&mut self.staged) {
-            let path = self.objects.path(&self.name, &hash);
+            let path = self.objects.path(&self.name, hash);
             create_parent(&path)?;
             if !path.exists() {
                 self.placed.push(path.clone());
             }
-            let staged = self.dir.join(&hash);
             fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
-            sync_parent(&path)?;
+            changed.insert(path.parent().map(Path::to_owned));
         }
-        Ok(())
+        changed.iter().flatten().try_for_each(|dir| sync(dir))
     }
 }
 
 impl Drop for Staging {
     /// What cannot be removed here is removed by the next start, so failures need no report.
     fn drop(&mut self) {
-        for path in &self.placed {
-            let _ = fs::remove_file(path);
+        if self.turn.is_some() {
+            for path in &self.placed {
+                let _ = fs::remove_file(path);
+            }
+            self.objects.remove_empty(&self.name);
         }
         let _ = fs::remove_dir_all(&self.dir);
-        let twin = self.objects.root.join(&self.name);
-        let prefixes = entries(&twin.join("objects")).unwrap_or_default();
-        for prefix in prefixes {
-            let _ = fs::remove_dir(twin.join("objects").join(prefix));
-        }
-        // Only empty directories go: those of a twin that never had a version.
-        for dir in [twin.join("objects"), twin.join("log"), twin] {
-            let _ = fs::remove_dir(dir);
-        }
     }
 }
 
@@ -407,7 +505,10 @@ fn create_dirs(dir: &Path) -> Result<(), StoreError> {
 
 /// Makes a new name last through a power cut: the directory is written out, too.
 fn sync_parent(path: &Path) -> Result<(), StoreError> {
-    let Some(dir) = path.parent() else { return Ok(()) };
+    path.parent().map_or(Ok(()), sync)
+}
+
+fn sync(dir: &Path) -> Result<(), StoreError> {
     let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
 }
@@ -421,9 +522,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let objects = Objects::new(dir.path());
         let commit = |content: &[u8]| {
-            let mut staging = objects.stage("street")?;
+            let mut staging = objects.stage("street", "a")?;
             let put = staging.put(|out| out.write_all(content))?;
-            staging.publish(1, content).map(|()| put)
+            staging.take_turn()?;
+            staging.publish(&BTreeSet::from([&*put.hash]), 1, content).map(|()| put)
         };
         let first = commit(b"first").unwrap();
         assert_eq!(
@@ -444,7 +546,7 @@ mod tests {
     fn a_version_that_may_not_last_is_not_said_to_be_gone() {
         let dir = tempfile::tempdir().unwrap();
         let objects = Objects::new(dir.path());
-        let staging = objects.stage("street").unwrap();
+        let staging = objects.stage("street", "a").unwrap();
         let source = StoreError::io("sync", dir.path())(ErrorKind::StorageFull.into());
         let said = staging.not_synced(3, source).to_string();
         assert!(said.starts_with("version 3 of twin \"street\" is in place, but"), "{said}");
@@ -475,13 +577,26 @@ mod tests {
     }
 
     #[test]
-    fn a_running_commit_is_not_taken_over() {
+    fn only_what_was_abandoned_is_swept() {
         let dir = tempfile::tempdir().unwrap();
         let objects = Objects::new(dir.path());
-        let running = objects.stage("street").unwrap();
-        assert!(objects.stage_abandoned("street").unwrap().is_none());
-        assert_eq!(objects.begun().unwrap(), ["street"]);
-        drop(running);
-        assert!(objects.stage_abandoned("street").unwrap().is_some());
+        let staged = || {
+            let mut names = entries(&dir.path().join(STAGING)).unwrap();
+            names.retain(|name| name.contains(OF));
+            names
+        };
+        let running = objects.stage("street", "a").unwrap();
+        let mut killed = objects.stage("street", "b").unwrap();
+        killed.put(|out| out.write_all(b"staged")).unwrap();
+        let (other, dir_of_b) = (objects.stage("avenue", "c").unwrap(), killed.dir.clone());
+        // As the kernel lets go of a killed process's files, and nothing else happens.
+        killed.dir = dir.path().join("elsewhere");
+        drop(killed);
+        assert!(dir_of_b.join(LOCK).exists());
+        assert_eq!(objects.begun().unwrap(), ["avenue", "street"]);
+        objects.sweep("street", || None).unwrap();
+        assert_eq!(staged(), ["avenue@c", "street@a"]);
+        drop((running, other));
+        assert_eq!(staged(), [""; 0]);
     }
 }

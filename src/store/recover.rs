@@ -1,30 +1,22 @@
-//! Cleaning up after imports that were killed.
+//! Cleaning up after commits that were killed.
 
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind};
 
 use super::{Catalog, StoreError};
 
-/// Removes what killed imports left: their staging, and objects they placed without a record.
+/// Removes what killed commits left: their staging, and objects they placed without a record.
 ///
 /// Who may only read the directory leaves that to those who may write.
 pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
     for name in catalog.objects.begun()? {
-        match clean_twin(catalog, &name) {
+        // With a damaged version nobody knows what it named, so every object stays.
+        match catalog.objects.sweep(&name, || named(catalog, &name).ok()) {
             Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
             cleaned => cleaned?,
         }
     }
     Ok(())
-}
-
-fn clean_twin(catalog: &Catalog, name: &str) -> Result<(), StoreError> {
-    let Some(staging) = catalog.objects.stage_abandoned(name)? else { return Ok(()) };
-    match named(catalog, name) {
-        Ok(named) => staging.sweep(|hash| named.contains(hash)),
-        // With a damaged version nobody knows what it named, so everything stays.
-        Err(_) => Ok(()),
-    }
 }
 
 fn is_read_only(error: &io::Error) -> bool {

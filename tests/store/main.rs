@@ -6,6 +6,7 @@ mod data;
 mod scene_files;
 
 mod command_line;
+mod commits;
 mod crash;
 mod damage;
 mod demo;

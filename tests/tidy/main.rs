@@ -20,7 +20,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("wgpu", &["render/gpu"]),
     (
         "rayon",
-        &["render", "scene/chunk.rs", "ingest/validate.rs", "store/push.rs", "residency/cache.rs"],
+        &["render", "scene/chunk.rs", "ingest/validate.rs", "store/pack.rs", "residency/cache.rs"],
     ),
     ("tokio", &["server", "client", "session", "cli"]),
     ("schemars", &["protocol"]),

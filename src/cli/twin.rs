@@ -1,0 +1,32 @@
+//! `wildcity twin`.
+
+mod diff;
+mod list;
+mod log;
+mod rollback;
+
+/// Keep twins: their versions, and what they take.
+#[derive(Debug, clap::Args)]
+pub(super) struct Twin {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    List(list::List),
+    Log(log::Log),
+    Diff(diff::Diff),
+    Rollback(rollback::Rollback),
+}
+
+impl Twin {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        match self.what {
+            What::List(list) => list.run(),
+            What::Log(log) => log.run(),
+            What::Diff(diff) => diff.run(),
+            What::Rollback(rollback) => rollback.run(),
+        }
+    }
+}

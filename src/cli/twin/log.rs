@@ -1,0 +1,43 @@
+//! `wildcity twin log`.
+
+use std::io::{self, Write};
+
+use crate::cli::places::Twins;
+use crate::cli::time::utc;
+use crate::store::{Catalog, LogEntry};
+
+/// Show all versions of a twin, from the first on: when, how, and made from which.
+#[derive(Debug, clap::Args)]
+pub(super) struct Log {
+    /// The twin's name.
+    #[arg(value_name = "TWIN")]
+    twin: String,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// Print one JSON object a line: number, hash, created_us, kind, parent, commit.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Log {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let mut out = io::stdout().lock();
+        for entry in Catalog::open(&self.twins.dir()?)?.versions(&self.twin)? {
+            let LogEntry { number, hash, created_us, commit, parent, kind } = entry;
+            if self.json {
+                let line = serde_json::json!({
+                    "number": number, "hash": hash, "created_us": created_us, "kind": kind,
+                    "parent": parent, "commit": commit,
+                });
+                writeln!(out, "{line}")?;
+            } else {
+                let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
+                let (how, when) = (format!("{kind}{from}"), utc(created_us));
+                writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}")?;
+            }
+        }
+        Ok(())
+    }
+}

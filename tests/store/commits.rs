@@ -1,0 +1,326 @@
+//! Versions in the making: put part by part, published at once, rebased, refused, rolled back.
+
+use std::collections::BTreeSet;
+
+use wildcity::scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity::store::{
+    Catalog, CellDiff, CellSize, Change, Commit, Kind, NewVersion, Settings, Storage, StoreError,
+    Version,
+};
+
+use crate::scene_files::gaussians;
+use crate::{commit, files, street};
+
+const EXACT: Storage = Storage { record: Record::F32, levels: false };
+
+/// Settings as `street` has them.
+fn settings() -> Settings {
+    let NewVersion { profile, rig, trajectories, provenance, .. } = street(&EMPTY);
+    Settings { profile, rig, trajectories, provenance }
+}
+
+static EMPTY: Gaussians = Gaussians {
+    sh_degree: 0,
+    means_m: Vec::new(),
+    quats_wxyz: Vec::new(),
+    ln_scales: Vec::new(),
+    logit_opacities: Vec::new(),
+    sh: Vec::new(),
+};
+
+/// A change of cells alone, by `who`.
+fn change(who: &str) -> Change {
+    let mut provenance = settings().provenance;
+    provenance.source = who.to_owned();
+    Change { profile: None, rig: None, trajectories: None, provenance }
+}
+
+/// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.
+fn cell(cell: [i32; 2], seed: u64) -> Gaussians {
+    let mut scene = gaussians(200, 0, 10.0, seed);
+    for mean_m in &mut scene.means_m {
+        for axis in 0..2 {
+            mean_m[axis] += 64.0 * f64::from(cell[axis]);
+        }
+    }
+    scene
+}
+
+fn put(commit: &mut Commit, scene: &Gaussians) {
+    commit.put(scene, None, &mut |_, _| {}).unwrap();
+}
+
+/// A twin of cells (0, 0), (1, 0) and (2, 0).
+fn three(dir: &tempfile::TempDir) -> (Catalog, Version) {
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let mut commit = catalog.begin("street", Kind::Import, EXACT).unwrap();
+    for x in 0..3 {
+        put(&mut commit, &cell([x, 0], 1));
+    }
+    let version = commit.replace(settings()).unwrap();
+    (catalog, version)
+}
+
+fn changed(catalog: &Catalog, cells: &[[i32; 2]], seed: u64) -> Commit {
+    let mut commit = catalog.begin("street", Kind::Push, EXACT).unwrap();
+    for &at in cells {
+        put(&mut commit, &cell(at, seed));
+    }
+    commit
+}
+
+fn object(manifest: &Manifest, cell: [i32; 2]) -> &str {
+    &manifest.chunks.iter().find(|chunk| chunk.cell == cell).unwrap().object
+}
+
+#[test]
+fn part_by_part_is_the_same_version_as_at_once() {
+    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let scene = gaussians(5_000, 1, 150.0, 3);
+    let storage = Storage::default();
+    let whole = commit(one.path(), NewVersion { storage, ..street(&scene) }).unwrap();
+
+    let catalog = Catalog::open(two.path()).unwrap();
+    let mut parts = catalog.begin("street", Kind::Import, storage).unwrap();
+    let cells: Vec<_> = whole.manifest.chunks.iter().map(|chunk| chunk.cell).collect();
+    assert!(cells.len() > 9);
+    let mut left_out = 0;
+    // Not in order, and each part of the whole scene.
+    for cells in cells.chunks(4).rev() {
+        let only: BTreeSet<_> = cells.iter().copied().collect();
+        let mut seen = (0, 0);
+        let stored =
+            parts.put(&scene, Some(&only), &mut |done, total| seen = (done, total)).unwrap();
+        assert_eq!(stored.chunks.iter().map(|chunk| chunk.cell).collect::<Vec<_>>(), cells);
+        let count: u64 = stored.chunks.iter().map(|chunk| chunk.count).sum();
+        assert_eq!((count + stored.left_out, seen), (5_000, (count, count)));
+        left_out += stored.left_out;
+    }
+    assert_eq!(left_out, 5_000 * (cells.len().div_ceil(4) as u64 - 1));
+    let version = parts.replace(settings()).unwrap();
+    assert_eq!((version.hash, version.manifest), (whole.hash, whole.manifest));
+}
+
+#[test]
+fn a_dropped_commit_leaves_nothing_and_is_in_nobodys_way() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    let before = files(dir.path());
+    let (one, two) = (changed(&catalog, &[[0, 0]], 2), changed(&catalog, &[[0, 0]], 3));
+    assert_ne!(one.id(), two.id());
+    // Others that start sweep what was abandoned, and nothing else.
+    assert_eq!(Catalog::open(dir.path()).unwrap().version("street", None).unwrap(), first);
+    assert!(files(dir.path()).len() > before.len());
+    drop(one);
+    let mut provenance = settings().provenance;
+    provenance.source = "two".into();
+    let second = two.change(1, Change { provenance, ..change("") }).unwrap();
+    assert_eq!(second.number, 2);
+    let objects = ["the chunk", "the table", "the manifest", "the record"].len();
+    assert_eq!(files(dir.path()).len(), before.len() + objects);
+}
+
+#[test]
+fn a_change_keeps_every_other_cell() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    let second = changed(&catalog, &[[1, 0], [5, -2]], 2).change(1, change("push")).unwrap();
+    assert_eq!(catalog.version("street", None).unwrap(), second);
+    for cell in [[0, 0], [2, 0]] {
+        assert_eq!(object(&first.manifest, cell), object(&second.manifest, cell));
+    }
+    assert_ne!(object(&first.manifest, [1, 0]), object(&second.manifest, [1, 0]));
+    let cells: Vec<_> = second.manifest.chunks.iter().map(|chunk| chunk.cell).collect();
+    assert_eq!(cells, [[5, -2], [0, 0], [1, 0], [2, 0]], "in order of (y, x)");
+    // What the twin would be if it had been put whole.
+    let other = tempfile::tempdir().unwrap();
+    let mut whole =
+        Catalog::open(other.path()).unwrap().begin("street", Kind::Import, EXACT).unwrap();
+    for (at, seed) in [([0, 0], 1), ([1, 0], 2), ([2, 0], 1), ([5, -2], 2)] {
+        put(&mut whole, &cell(at, seed));
+    }
+    let provenance = change("push").provenance;
+    assert_eq!(whole.replace(Settings { provenance, ..settings() }).unwrap().hash, second.hash);
+
+    let mut profile = RenderProfile::default();
+    profile.set("near=0.3").unwrap();
+    let change = Change { profile: Some(profile), ..change("profile") };
+    let third = changed(&catalog, &[], 0).change(2, change).unwrap();
+    assert_eq!(third.manifest.profile, profile);
+    assert_eq!(third.manifest.chunks, second.manifest.chunks);
+}
+
+#[test]
+fn changes_of_other_cells_are_both_in_and_of_the_same_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    let [one, two, late] = [[[0, 0], [7, 7]], [[1, 0], [1, 1]], [[1, 0], [2, 0]]]
+        .map(|cells| changed(&catalog, &cells, 2));
+    let late_id = late.id().to_owned();
+    assert_eq!(one.change(1, change("one")).unwrap().number, 2);
+    let both = two.change(1, change("two")).unwrap();
+    assert_eq!(both.number, 3);
+    assert_eq!(both.manifest.chunks.len(), 5);
+    assert_eq!(both.manifest.provenance.source, "two");
+
+    let before = files(dir.path());
+    let error = late.change(1, change("late")).unwrap_err();
+    let said = error.to_string();
+    let StoreError::Overlap { base: 1, latest: 3, cells, settings, .. } = error else {
+        panic!("{said}")
+    };
+    assert_eq!((&cells[..], settings.len()), (&[[1, 0]][..], 0));
+    assert!(said.contains("cells (1, 0); make the change from version 3"), "{said}");
+    let left: Vec<_> =
+        files(dir.path()).into_iter().filter(|path| !before.contains(path)).collect();
+    assert_eq!(left, [""; 0].map(std::path::PathBuf::from), "commit {late_id}");
+    // Made again from the latest, it is one.
+    let fourth = changed(&catalog, &[[1, 0], [2, 0]], 4).change(3, change("late")).unwrap();
+    assert_eq!(fourth.number, 4);
+}
+
+#[test]
+fn settings_overlap_too() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    let mut near = RenderProfile::default();
+    near.set("near=0.3").unwrap();
+    let commits = [(); 2].map(|()| changed(&catalog, &[], 0));
+    let [one, two] = commits;
+    one.change(1, Change { profile: Some(near), ..change("one") }).unwrap();
+    near.set("near=0.4").unwrap();
+    let said =
+        two.change(1, Change { profile: Some(near), ..change("two") }).unwrap_err().to_string();
+    assert!(said.contains("version 2 has other profile; make"), "{said}");
+}
+
+#[test]
+fn many_changes_at_once_are_all_in() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    std::thread::scope(|scope| {
+        for x in 0..8 {
+            let catalog = &catalog;
+            scope.spawn(move || changed(catalog, &[[x, 9]], 5).change(1, change("many")).unwrap());
+        }
+    });
+    let last = catalog.version("street", None).unwrap();
+    assert_eq!((last.number, last.manifest.chunks.len()), (9, 11));
+    assert_eq!(catalog.verify("street", &mut |_, _| {}).unwrap().damaged.len(), 0);
+}
+
+#[test]
+fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    let before = files(dir.path());
+    let mut twice = changed(&catalog, &[[1, 0]], 2);
+    let error = twice.put(&cell([1, 0], 3), None, &mut |_, _| {}).unwrap_err();
+    assert!(matches!(error, StoreError::CellTwice { cell: [1, 0], .. }), "{error}");
+    let said = twice.put(&gaussians(9, 2, 1.0, 1), None, &mut |_, _| {}).unwrap_err().to_string();
+    assert_eq!(
+        said,
+        "sh_degree is 2, but twin \"street\" has 0: store them so, or replace the whole twin"
+    );
+    drop(twice);
+
+    let mut other = catalog.begin("street", Kind::Push, Storage::default()).unwrap();
+    put(&mut other, &cell([1, 0], 2));
+    let said = other.change(1, change("q32")).unwrap_err().to_string();
+    assert!(said.starts_with("record is q32, but twin \"street\" has f32"), "{said}");
+
+    let mut other = catalog.begin("street", Kind::Push, EXACT).unwrap();
+    put(&mut other, &gaussians(9, 1, 1.0, 1));
+    let said = other.change(1, change("degree")).unwrap_err().to_string();
+    assert!(said.starts_with("sh_degree is 1, but twin \"street\" has 0"), "{said}");
+
+    let error = changed(&catalog, &[[0, 0]], 2).change(9, change("from")).unwrap_err();
+    assert!(matches!(error, StoreError::NoVersion { number: 9, latest: 1, .. }), "{error}");
+    let log = Trajectory { name: "log".into(), keyframes: Vec::new() };
+    let change = Change { trajectories: Some(vec![log]), ..change("empty") };
+    let error = changed(&catalog, &[], 2).change(1, change).unwrap_err();
+    assert!(matches!(error, StoreError::Trajectory(_)), "{error}");
+    assert_eq!(files(dir.path()), before);
+    assert!(matches!(
+        catalog.begin("a@b", Kind::Push, EXACT).unwrap_err(),
+        StoreError::Name { .. }
+    ));
+}
+
+#[test]
+fn an_old_version_comes_back_under_a_new_number_and_the_log_says_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    let push = changed(&catalog, &[[0, 0]], 2);
+    let id = push.id().to_owned();
+    let second = push.change(1, change("push")).unwrap();
+    let before = files(dir.path()).len();
+    let third = catalog.rollback("street", 1).unwrap();
+    assert_eq!((third.number, &third.hash, &third.manifest), (3, &first.hash, &first.manifest));
+    assert_eq!(files(dir.path()).len(), before + 1, "the record alone");
+    assert_eq!(catalog.version("street", None).unwrap(), third);
+    // The latest is what it is already.
+    assert_eq!(catalog.rollback("street", 1).unwrap(), third);
+    assert_eq!(catalog.rollback("street", 2).unwrap().number, 4);
+
+    let log = catalog.versions("street").unwrap();
+    let told: Vec<_> = log.iter().map(|entry| (entry.number, entry.kind, entry.parent)).collect();
+    assert_eq!(
+        told,
+        [
+            (1, Kind::Import, None),
+            (2, Kind::Push, Some(1)),
+            (3, Kind::Rollback, Some(1)),
+            (4, Kind::Rollback, Some(2))
+        ]
+    );
+    assert_eq!(log[1].commit, Some(id));
+    assert_eq!((&log[2].hash, &log[3].hash), (&first.hash, &second.hash));
+    assert_eq!(log[0].created_us, first.created_us);
+    let error = catalog.rollback("street", 9).unwrap_err();
+    assert!(matches!(error, StoreError::NoVersion { number: 9, latest: 4, .. }), "{error}");
+}
+
+#[test]
+fn a_version_that_lost_an_object_does_not_come_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    changed(&catalog, &[[0, 0]], 2).change(1, change("push")).unwrap();
+    let lost = object(&first.manifest, [0, 0]);
+    let path = dir.path().join("street/objects").join(&lost[..2]).join(lost);
+    std::fs::remove_file(&path).unwrap();
+    let said = catalog.rollback("street", 1).unwrap_err().to_string();
+    assert!(said.contains("cannot find") && said.contains(lost), "{said}");
+    std::fs::write(&path, "short").unwrap();
+    let error = catalog.rollback("street", 1).unwrap_err();
+    assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
+    assert_eq!(catalog.version("street", None).unwrap().number, 2);
+}
+
+#[test]
+fn a_diff_names_cells_and_sizes() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    let mut whole = catalog.begin("street", Kind::Import, EXACT).unwrap();
+    put(&mut whole, &cell([1, 0], 1));
+    put(&mut whole, &cell([2, 0], 9));
+    put(&mut whole, &cell([3, 0], 1));
+    let mut settings = settings();
+    settings.profile.set("near=0.3").unwrap();
+    let second = whole.replace(settings).unwrap();
+    let size = |version: &Version, cell| {
+        let chunk = version.manifest.chunks.iter().find(|chunk| chunk.cell == cell)?;
+        assert_eq!(chunk.count, 200);
+        Some(CellSize { gaussians: 200, bytes: chunk.bytes })
+    };
+    let wanted = [[0, 0], [2, 0], [3, 0]].map(|cell| CellDiff {
+        cell,
+        before: size(&first, cell),
+        after: size(&second, cell),
+    });
+    let diff = catalog.diff("street", 1, 2).unwrap();
+    assert_eq!((&diff.cells[..], diff.kept), (&wanted[..], 1));
+    assert_eq!((wanted[0].after, wanted[2].before), (None, None));
+    assert_eq!(diff.settings, ["profile"]);
+    assert_eq!(catalog.diff("street", 2, 2).unwrap().cells, []);
+}
