@@ -12,7 +12,7 @@ use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::automatic::{Automatic, automatic};
 use crate::render::cpu::{Cpu, Simd};
-use crate::render::gpu::{AdapterChoice, Gpu};
+use crate::render::gpu::{AdapterChoice, Gpu, Limits};
 use crate::render::reference::Reference;
 use crate::render::relay::Relay;
 use crate::render::stage::Stage;
@@ -81,6 +81,11 @@ pub(super) struct Machine {
     /// kind if not given.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
+
+    /// Memory of the GPU that Gaussians may take, in GiB; those not drawn for longest make room for
+    /// others. What is drawn on the way to the pixels comes on top [default: as much as it has]
+    #[arg(long, value_name = "N", value_parser = gib)]
+    gpu_memory_gib: Option<f64>,
 
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
@@ -151,10 +156,11 @@ impl From<SimdName> for Simd {
 impl Engine {
     /// Makes the backend, and says on standard error which one it is if nobody named it.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        let Machine { threads, device, simd } = &self.machine;
+        let Machine { threads, device, simd, .. } = &self.machine;
         match (self.backend, device) {
             (BackendName::Auto, None) => {
-                let Automatic { backend, reason } = automatic(*threads, (*simd).into())?;
+                let limits = self.machine.limits();
+                let Automatic { backend, reason } = automatic(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
@@ -186,7 +192,12 @@ impl Machine {
     /// The gpu backend.
     pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
-        Ok(Gpu::new(&choice, self.threads)?)
+        Ok(Gpu::with_limits(&choice, self.threads, self.limits())?)
+    }
+
+    fn limits(&self) -> Limits {
+        let bytes = |gib: f64| (gib * f64::from(1 << 30)) as u64;
+        Limits { mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes), ..Limits::default() }
     }
 }
 
@@ -211,6 +222,13 @@ fn threads(text: &str) -> Result<usize, String> {
     match text.parse() {
         Ok(threads) if threads <= config::RENDER_THREADS => Ok(threads),
         _ => Err(format!("expected 0 to {}", config::RENDER_THREADS)),
+    }
+}
+
+fn gib(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
+        _ => Err("expected a number above 0, to 65536".to_owned()),
     }
 }
 
