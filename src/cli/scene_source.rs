@@ -1,6 +1,8 @@
 //! What the rendering commands share: a scene to render, cameras, a profile, a backend.
 
+use std::borrow::Cow;
 use std::io::{self, Write};
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -17,7 +19,7 @@ use crate::render::reference::Reference;
 use crate::render::relay::Relay;
 use crate::render::stage::Stage;
 use crate::render::{Backend, View};
-use crate::residency::{Cache, Resident};
+use crate::residency::{Cache, Pinned, Resident};
 use crate::scene::{RenderProfile, Scene};
 use crate::session;
 use crate::store::Catalog;
@@ -235,8 +237,6 @@ fn gib(text: &str) -> Result<f64, String> {
 /// What a rendering command draws.
 pub(super) struct Ready {
     source: Source,
-    /// What one frame of all shots draws.
-    pub(super) scene: Scene,
     pub(super) shots: Vec<Shot>,
 }
 
@@ -255,23 +255,45 @@ enum Source {
     Twin(Arc<Resident>),
 }
 
-impl Source {
-    fn scene(&self, shots: &[Shot]) -> Scene {
-        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
-        match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => {
-                resident.scene(&session::eyes(&views), &first.profile)
-            }
-            (Self::Twin(_), []) => Scene::default(),
-            (Self::File(scene), _) => scene.clone(),
+/// What is drawn of a source, in memory for as long as this lives.
+pub(super) enum Drawn<'a> {
+    Whole(Cow<'a, Scene>),
+    Needed(Pinned),
+}
+
+impl Deref for Drawn<'_> {
+    type Target = Scene;
+
+    fn deref(&self) -> &Scene {
+        match self {
+            Self::Whole(scene) => scene,
+            Self::Needed(pinned) => pinned,
         }
+    }
+}
+
+impl Source {
+    fn scene(&self, shots: &[Shot]) -> anyhow::Result<Drawn<'_>> {
+        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
+        Ok(match (self, shots) {
+            (Self::Twin(resident), [first, ..]) => {
+                Drawn::Needed(resident.scene(&session::eyes(&views), &first.profile)?)
+            }
+            (Self::Twin(_), []) => Drawn::Whole(Cow::default()),
+            (Self::File(scene), _) => Drawn::Whole(Cow::Borrowed(scene)),
+        })
     }
 }
 
 impl Ready {
     /// What a frame of one shot draws.
-    pub(super) fn scene_of(&self, shot: &Shot) -> Scene {
+    pub(super) fn scene_of(&self, shot: &Shot) -> anyhow::Result<Drawn<'_>> {
         self.source.scene(std::slice::from_ref(shot))
+    }
+
+    /// What one frame of all shots draws.
+    pub(super) fn scene(&self) -> anyhow::Result<Drawn<'_>> {
+        self.source.scene(&self.shots)
     }
 }
 
@@ -283,8 +305,7 @@ impl SceneSource {
         let (source, profile) = self.source()?;
         let shots = cameras.into_iter().map(|camera| self.shot(camera, profile));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
-        let scene = source.scene(&shots);
-        Ok(Ready { source, scene, shots })
+        Ok(Ready { source, shots })
     }
 
     /// A camera's own near counts more than the twin's, and less than one on the command line.

@@ -30,6 +30,7 @@ use tokio::sync::Semaphore;
 
 use crate::config;
 use crate::render::Backend;
+use crate::residency::Cache;
 use crate::session::{Engine, EngineSettings, SessionError};
 use crate::store::{Catalog, StoreError};
 
@@ -122,13 +123,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     }
     std::fs::create_dir_all(&episodes)
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
-    let settings = EngineSettings {
-        catalog: Catalog::open(&twins)?,
-        resident_bytes: limits.resident_bytes,
-        episodes,
-        backend,
-        step_timeout: limits.step,
-    };
+    let cache = Cache::limited(Catalog::open(&twins)?, limits.resident_bytes);
+    let settings = EngineSettings { cache, episodes, backend, step_timeout: limits.step };
     let engine = Engine::start(settings)?;
     let failed = |cause| ServerError::Listen { address: listen, cause };
     let listener = TcpListener::bind(listen).await.map_err(failed)?;

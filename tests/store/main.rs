@@ -11,7 +11,6 @@ mod crash;
 mod damage;
 mod demo;
 mod real_scenes;
-mod residency;
 mod round_trip;
 
 use std::path::{Path, PathBuf};
