@@ -110,7 +110,8 @@ impl Route {
         let node = ((s_m - self.first_s_m) / NODE_M).floor().clamp(0.0, last);
         let node_s_m = self.first_s_m + node * NODE_M;
         let rest_m = s_m - node_s_m;
-        let point_m = self.nodes_m[node as usize] + rest_m * self.bends.direction(node_s_m + 0.5 * rest_m);
+        let point_m =
+            self.nodes_m[node as usize] + rest_m * self.bends.direction(node_s_m + 0.5 * rest_m);
         let forward = self.bends.direction(s_m);
         Station { point_m, forward, left: DVec3::new(-forward.y, forward.x, 0.0) }
     }

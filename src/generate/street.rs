@@ -89,9 +89,8 @@ fn park(route: &Route, crossing_m: f64, seed: u64) -> Vec<Car> {
         for (index, s_m) in along(route, BAY_M).enumerate() {
             let beyond_m = route.beyond_m(s_m);
             let mut random = Random::new(seed, name, index);
-            let free = random.chance(0.34)
-                || beyond_m > 45.0
-                || (s_m - crossing_m).abs() < CLEAR_M + 2.0;
+            let free =
+                random.chance(0.34) || beyond_m > 45.0 || (s_m - crossing_m).abs() < CLEAR_M + 2.0;
             if free {
                 continue;
             }
