@@ -374,7 +374,7 @@ impl CellRun {
     }
 }
 
-/// The cell (x, y) of a centre in metres.
+/// The grid cell (x, y) of a centre, in metres.
 pub fn cell_at(mean_m: &[f64; 3]) -> [i32; 2] {
     [cell_of(mean_m[0]), cell_of(mean_m[1])]
 }
