@@ -121,6 +121,7 @@ impl Incoming {
             Self::Answer(
                 Answer::Welcome { seq, .. }
                 | Answer::Resumed { seq, .. }
+                | Answer::Ok { seq }
                 | Answer::Closed { seq, .. },
             ) => Some(*seq),
         }

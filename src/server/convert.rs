@@ -5,7 +5,7 @@ mod fault;
 mod request;
 
 pub(super) use answer::{
-    closed, observation, opened, refusal_body, refused, resumed, twins, welcome,
+    closed, observation, ok, opened, refusal_body, refused, resumed, twins, welcome,
 };
 pub(super) use request::{Command, Parsed, parse};
 

@@ -26,7 +26,7 @@ fn every_json_example_is_a_message() {
         }
     }
     // Each request but the two of `open` once, each answer once.
-    assert_eq!(counts, [8, 5, 1]);
+    assert_eq!(counts, [9, 6, 1]);
 }
 
 #[test]
@@ -41,8 +41,8 @@ fn the_hex_example_is_the_golden_frame() {
             bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
         assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
     }
-    assert!(page.contains("(3,112 bytes) has N = 0x818 = 2,072"));
-    assert_eq!((frame.len(), &frame[..8]), (3112, &2072_u64.to_le_bytes()[..]));
+    assert!(page.contains("(3,216 bytes) has N = 0x880 = 2,176"));
+    assert_eq!((frame.len(), &frame[..8]), (3216, &2176_u64.to_le_bytes()[..]));
 }
 
 /// Every code is explained, and no other.
@@ -72,6 +72,7 @@ fn limits_are_those_of_the_configuration() {
         format!("| `ego.history_xyz` | F32 [{poses}, 3] |"),
         format!("| `ego.history_rot` | F32 [{poses}, 3, 3] |"),
         format!("| poses of one `observe` | {} |", config::OBSERVE_POSES),
+        format!("| poses of one `prefetch` | {} |", config::PREFETCH_POSES),
         format!("| cameras of a rig | {} |", wildcity::scene::Rig::MAX_CAMERAS),
         format!("| message to the server | {} MiB |", config::INBOUND_MESSAGE_BYTES >> 20),
         format!("| `hello` after connecting | {} s |", seconds(config::HELLO_TIMEOUT)),

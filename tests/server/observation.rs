@@ -50,7 +50,7 @@ async fn nothing_of_what_was_opened_is_implicit() {
         "depth": false, "opacity": false,
     });
     assert_eq!(opened["outputs"], outputs);
-    assert!(opened["resident_bytes"].as_u64().unwrap() > 64 * 11 * 4);
+    assert!(opened["reserved_bytes"].as_u64().unwrap() > 64 * 11 * 4);
     assert_eq!(agent.ask(json!({ "type": "close" })).await["summary"]["steps"], 0);
 }
 
