@@ -293,8 +293,8 @@ mod tests {
                 let same = self.get(*id).is_some_and(|here| Arc::ptr_eq(here, chunk));
                 assert!(same, "section {id} was dropped while a frame held it");
             }
-            for (key, &id) in &self.ids.iter().collect::<BTreeMap<_, _>>() {
-                assert_eq!(self.slots[id as usize].key, **key);
+            for (key, id) in self.ids.iter().collect::<BTreeMap<_, _>>() {
+                assert_eq!(self.slots[*id as usize].key, *key);
             }
             assert_eq!(self.ids.len() + self.vacant.len(), self.slots.len());
         }
