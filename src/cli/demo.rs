@@ -68,6 +68,8 @@ impl Demo {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             twins,
             episodes: self.out.join("episodes"),
+            uploads: self.out.join("uploads"),
+            tokens: None,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits::default(),
         };

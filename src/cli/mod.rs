@@ -12,6 +12,7 @@ mod lod;
 mod output;
 mod places;
 mod progress;
+mod push;
 mod render;
 mod replay;
 mod scene_source;
@@ -36,6 +37,7 @@ enum Command {
     Serve(serve::Serve),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    Push(push::Push),
     Lod(lod::Lod),
     Verify(verify::Verify),
     Twin(twin::Twin),
@@ -54,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Verify(command) => command.run(),
         Command::Twin(command) => command.run(),

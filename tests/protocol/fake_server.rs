@@ -118,6 +118,7 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
         | Request::Observe { seq, .. }
         | Request::Prefetch { seq, .. }
         | Request::Reset { seq, .. }
+        | Request::SwitchVersion { seq, .. }
         | Request::Close { seq }
         | Request::Resume { seq, .. } => *seq,
     }

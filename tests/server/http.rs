@@ -106,6 +106,8 @@ async fn public_addresses_are_refused() {
         listen: "0.0.0.0:0".parse().unwrap(),
         twins: server.twins.path().to_owned(),
         episodes: server.episodes.path().to_owned(),
+        uploads: server.twins.path().join(".uploads"),
+        tokens: None,
         backend: server.painter.clone(),
         limits: Limits::default(),
     };
