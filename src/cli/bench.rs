@@ -1,5 +1,6 @@
 //! `wildcity bench`.
 
+mod drive;
 mod gpu;
 mod step;
 mod timed;
@@ -15,6 +16,7 @@ pub(super) struct Bench {
 enum What {
     Step(step::Step),
     Gpu(gpu::Gpu),
+    Drive(Box<drive::Drive>),
 }
 
 impl Bench {
@@ -22,6 +24,7 @@ impl Bench {
         match self.what {
             What::Step(step) => step.run(),
             What::Gpu(gpu) => gpu.run(),
+            What::Drive(drive) => drive.run(),
         }
     }
 }

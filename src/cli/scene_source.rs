@@ -229,7 +229,7 @@ fn threads(text: &str) -> Result<usize, String> {
     }
 }
 
-/// A size of memory in GiB on the command line.
+/// A number of GiB on the command line.
 pub(super) fn gib(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),

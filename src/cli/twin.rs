@@ -1,6 +1,7 @@
 //! `wildcity twin`.
 
 mod diff;
+mod generate;
 mod list;
 mod log;
 mod rollback;
@@ -15,6 +16,7 @@ pub(super) struct Twin {
 #[derive(Debug, clap::Subcommand)]
 enum What {
     List(list::List),
+    Generate(generate::Generate),
     Log(log::Log),
     Diff(diff::Diff),
     Rollback(rollback::Rollback),
@@ -24,6 +26,7 @@ impl Twin {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.what {
             What::List(list) => list.run(),
+            What::Generate(generate) => generate.run(),
             What::Log(log) => log.run(),
             What::Diff(diff) => diff.run(),
             What::Rollback(rollback) => rollback.run(),
