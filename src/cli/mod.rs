@@ -18,7 +18,6 @@ mod scene_source;
 mod serve;
 mod time;
 mod twin;
-mod verify;
 
 use clap::{Parser, Subcommand};
 
@@ -37,7 +36,6 @@ enum Command {
     Import(import::Import),
     Inspect(inspect::Inspect),
     Lod(lod::Lod),
-    Verify(verify::Verify),
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
@@ -55,7 +53,6 @@ pub fn main() -> ExitCode {
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Lod(command) => command.run(),
-        Command::Verify(command) => command.run(),
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),

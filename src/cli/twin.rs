@@ -1,6 +1,8 @@
 //! `wildcity twin`.
 
 mod diff;
+mod fsck;
+mod gc;
 mod list;
 mod log;
 mod rollback;
@@ -18,6 +20,8 @@ enum What {
     Log(log::Log),
     Diff(diff::Diff),
     Rollback(rollback::Rollback),
+    Gc(gc::Gc),
+    Fsck(fsck::Fsck),
 }
 
 impl Twin {
@@ -27,6 +31,8 @@ impl Twin {
             What::Log(log) => log.run(),
             What::Diff(diff) => diff.run(),
             What::Rollback(rollback) => rollback.run(),
+            What::Gc(gc) => gc.run(),
+            What::Fsck(fsck) => fsck.run(),
         }
     }
 }

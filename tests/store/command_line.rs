@@ -95,7 +95,7 @@ fn import_inspect_and_verify_tell_what_is_there() {
     }
 
     let twins = dir.path().join("twins");
-    let verify = wildcity().args(["verify", "street", "--twins"]).arg(twins).output().unwrap();
+    let verify = wildcity().args(["twin", "fsck", "street", "--twins"]).arg(twins).output().unwrap();
     let said = stdout(&verify);
     assert!(said.starts_with(&format!("twin street: {} objects, ", chunks.len() + 2)), "{said}");
     assert!(said.ends_with("all sound\n"));
