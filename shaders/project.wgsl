@@ -44,7 +44,9 @@ fn cull(
         atomicStore(&mask[thread], 0u);
     }
     workgroupBarrier();
-    if project_shape(geometry(item.cluster, thread), chunk_views[item.chunk_view], false).visible {
+    // Behind the last Gaussian lie other clusters.
+    if thread < gaussians[item.line * STRIP + 2u]
+        && project_shape(geometry(item.line, thread), chunk_views[item.chunk_view], false).visible {
         atomicOr(&mask[thread / 32u], 1u << (thread % 32u));
     }
     workgroupBarrier();
@@ -86,10 +88,10 @@ fn project(
         return;
     }
     let chunk_view = chunk_views[item.chunk_view];
-    let own = geometry(item.cluster, thread);
+    let own = geometry(item.line, thread);
     let projected = project_shape(own, chunk_view, true);
     shapes[place] = projected.shape;
-    let rgb = color(item.cluster, thread, own.mean_m - chunk_view.camera_m);
+    let rgb = color(item.line, thread, own.mean_m - chunk_view.camera_m);
     colors[place] = SplatColor(rgb, projected.depth_m);
     let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
     keys[place] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
@@ -222,15 +224,15 @@ struct Geometry {
     quat_wxyz: vec4f,
 }
 
-// Decodes what `src/render/gpu/mirror.rs` encodes: word after word, 256 Gaussians side by side.
-fn geometry(cluster: u32, thread: u32) -> Geometry {
-    var at = cluster_start(cluster) + CLUSTER_HEADER_WORDS + thread;
+// Decodes what `src/render/gpu/mirror/encode.rs` encodes: strips of 32 Gaussians, word after word.
+fn geometry(line: u32, thread: u32) -> Geometry {
+    var at = first_word(line, thread);
     var own: Geometry;
-    own.mean_m = vec3f(float(at), float(at + CLUSTER), float(at + 2u * CLUSTER));
-    at += 3u * CLUSTER;
-    own.scale_m = vec3f(float(at), float(at + CLUSTER), float(at + 2u * CLUSTER));
-    own.log2_opacity = float(at + 3u * CLUSTER);
-    own.quat_wxyz = quat_from_bits(gaussians[at + 4u * CLUSTER], gaussians[at + 5u * CLUSTER]);
+    own.mean_m = vec3f(float(at), float(at + STRIP), float(at + 2u * STRIP));
+    at += 3u * STRIP;
+    own.scale_m = vec3f(float(at), float(at + STRIP), float(at + 2u * STRIP));
+    own.log2_opacity = float(at + 3u * STRIP);
+    own.quat_wxyz = quat_from_bits(gaussians[at + 4u * STRIP], gaussians[at + 5u * STRIP]);
     return own;
 }
 
@@ -251,9 +253,10 @@ fn coefficients() -> u32 {
     return (SH_DEGREE + 1u) * (SH_DEGREE + 1u);
 }
 
-fn cluster_start(cluster: u32) -> u32 {
+// Where a Gaussian begins, of a cluster whose header is a line.
+fn first_word(line: u32, thread: u32) -> u32 {
     let words = GEOMETRY_WORDS + (3u * coefficients() + 1u) / 2u;
-    return cluster * (CLUSTER_HEADER_WORDS + CLUSTER * words);
+    return (line + 1u + thread / STRIP * words) * STRIP + thread % STRIP;
 }
 
 fn float(at: u32) -> f32 {
@@ -261,10 +264,9 @@ fn float(at: u32) -> f32 {
 }
 
 // `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
-fn color(cluster: u32, thread: u32, toward: vec3f) -> vec3f {
-    let start = cluster_start(cluster);
-    let scale = vec2f(float(start), float(start + 1u));
-    let at = start + CLUSTER_HEADER_WORDS + GEOMETRY_WORDS * CLUSTER + thread;
+fn color(line: u32, thread: u32, toward: vec3f) -> vec3f {
+    let scale = vec2f(float(line * STRIP), float(line * STRIP + 1u));
+    let at = first_word(line, thread) + GEOMETRY_WORDS * STRIP;
     var rgb = 0.28209479177387814 * scale.x * coefficient(at, 0u) + 0.5;
     if SH_DEGREE > 0u {
         let d = toward * (1.0 / sqrt(max(dot(toward, toward), 1e-30)));
@@ -303,8 +305,8 @@ fn third_band(at: u32, d: vec3f) -> vec3f {
 
 // Red, green and blue of coefficient `k`, before the cluster's scale: two values to a word.
 fn coefficient(at: u32, k: u32) -> vec3f {
-    let word = at + (3u * k / 2u) * CLUSTER;
+    let word = at + (3u * k / 2u) * STRIP;
     let first = unpack2x16snorm(gaussians[word]);
-    let second = unpack2x16snorm(gaussians[word + CLUSTER]);
+    let second = unpack2x16snorm(gaussians[word + STRIP]);
     return select(vec3f(first.y, second), vec3f(first, second.x), k % 2u == 0u);
 }

@@ -185,6 +185,9 @@ pub const REMOTE_THREADS: usize = 2;
 /// Objects of one commit that are uploaded at once, each held in memory: cells of 10 MB.
 pub const UPLOADS_AT_ONCE: usize = 8;
 
+/// What is kept on disk of twins from elsewhere, in GiB, unless told otherwise: half of a log's 32 GB.
+pub const CACHE_GIB: u32 = 16;
+
 /// Versions that garbage collection keeps, unless told otherwise: a day of hourly pushes, twice.
 pub const GC_KEEP: u32 = 50;
 
@@ -200,6 +203,34 @@ pub const CAMERA_LIST_BYTES: u64 = 16 << 20;
 /// Memory of all twins in use where the machine does not say how much it has; else they may take
 /// three quarters of it. The demo street is 439,000 Gaussians of 92 bytes, 40 MB.
 pub const RESIDENT_BYTES: u64 = 16 << 30;
+
+/// Threads that load sections. A core reads and decodes 100 MB/s of records and more, ten times what
+/// 30 m/s need; eight keep a remote store's answers of 50 ms coming, and one that hangs stops no other.
+pub const LOADERS: usize = 8;
+
+/// How often a section is tried before the frames that wait for it are told.
+pub const LOAD_ATTEMPTS: u32 = 3;
+
+/// Pause before the second attempt; the third comes after four times as long, together 0.25 s.
+pub const LOAD_BACKOFF: Duration = Duration::from_millis(50);
+
+/// Loads whose times are remembered: 256 give the 99th percentile, and are some seconds of driving.
+pub const LOAD_TIMES: usize = 256;
+
+/// How soon a load that waits for room looks again if nobody says that there is some: whoever
+/// draws does say.
+pub const ROOM_POLL: Duration = Duration::from_secs(1);
+
+/// Sections in the queue beyond which nothing more is prefetched: 40 B each, so 10 MB; a frame of
+/// 300 m around is some thousands.
+pub const QUEUED_SECTIONS: usize = 1 << 18;
+
+/// Squares that the search for a twin's worst place looks at. A square cell of 64 m of 20 km of road is
+/// one of 320 in a row, and twice as many lie above them.
+pub const WORST_PLACES: usize = 4096;
+
+/// Rigs whose worst place in a twin is remembered, so that sessions open at once.
+pub const REMEMBERED_LENSES: usize = 16;
 
 /// Most Gaussians of a street of `wildcity bench gpu`: 200 B each while it is made.
 pub const BENCH_GAUSSIANS: i64 = 100_000_000;

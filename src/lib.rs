@@ -10,11 +10,11 @@
 //! | [`generate`] | the procedural demo twin | geometry, scene |
 //! | [`ingest`] | one file per outside format | config, geometry, scene |
 //! | [`store`] | twins on disk or in an object store, versioned, content-addressed | config, geometry, scene, ingest |
-//! | [`residency`] | what is in memory now, what a frame draws | config, scene, store |
+//! | [`residency`] | what is in memory now, what a frame draws | config, geometry, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
 //! | [`protocol`] | the wire, and only the wire | nothing |
-//! | [`server`] | WebSocket and HTTP | config, geometry, scene, store, render, session, protocol |
+//! | [`server`] | WebSocket and HTTP | config, geometry, scene, store, residency, render, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
 //! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, server, client |
 //!

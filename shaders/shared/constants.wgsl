@@ -8,7 +8,7 @@ const DEPTH_BITS: u32 = 28;
 const MAX_VIEWS: u32 = 16;
 
 const CLUSTER: u32 = 256;
-const CLUSTER_HEADER_WORDS: u32 = 32;
+const STRIP: u32 = 32;
 const GEOMETRY_WORDS: u32 = 9;
 
 const WORKGROUP: u32 = 256;

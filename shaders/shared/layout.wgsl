@@ -42,7 +42,7 @@ struct ChunkView {
 }
 
 struct Item {
-    cluster: u32,
+    line: u32,
     chunk_view: u32,
 }
 

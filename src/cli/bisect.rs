@@ -44,7 +44,8 @@ impl Bisect {
         let mut wrong = None;
         for shot in &ready.shots {
             let views = std::slice::from_ref(&shot.view);
-            let frame = Frame { scene: &ready.scene_of(shot), profile: &shot.profile, views };
+            let scene = ready.scene_of(shot)?;
+            let frame = Frame { scene: &scene, profile: &shot.profile, views };
             let bisection = bisect(&cpu, &gpu, &frame)?;
             write!(out, "{:<12}", shot.name)?;
             for (_, db) in &bisection.psnr_db {

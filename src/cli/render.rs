@@ -60,8 +60,9 @@ impl Render {
         let mut out = io::stdout().lock();
         for shot in &ready.shots {
             let pixels = shot.view.camera.pixels();
+            let scene = ready.scene_of(shot)?;
             let frame = Frame {
-                scene: &ready.scene_of(shot),
+                scene: &scene,
                 profile: &shot.profile,
                 views: std::slice::from_ref(&shot.view),
             };

@@ -1,6 +1,8 @@
 //! What the rendering commands share: a scene to render, cameras, a profile, a backend.
 
+use std::borrow::Cow;
 use std::io::{self, Write};
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -12,15 +14,14 @@ use crate::ingest::cameras::{self, ListedCamera};
 use crate::ingest::{self};
 use crate::render::automatic::{Automatic, automatic};
 use crate::render::cpu::{Cpu, Simd};
-use crate::render::gpu::{AdapterChoice, Gpu};
+use crate::render::gpu::{AdapterChoice, Gpu, Limits};
 use crate::render::reference::Reference;
 use crate::render::relay::Relay;
 use crate::render::stage::Stage;
 use crate::render::{Backend, View};
-use crate::residency::{Cache, Resident};
+use crate::residency::{Cache, Pinned, Resident};
 use crate::scene::{RenderProfile, Scene};
 use crate::session;
-use crate::store::Catalog;
 
 use super::places::{TwinVersion, Twins};
 use super::progress;
@@ -81,6 +82,11 @@ pub(super) struct Machine {
     /// kind if not given.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
+
+    /// Memory of the GPU that Gaussians may take, in GiB; those not drawn for longest make room for
+    /// others. What is drawn on the way to the pixels comes on top [default: as much as it has]
+    #[arg(long, value_name = "N", value_parser = gib)]
+    gpu_memory_gib: Option<f64>,
 
     /// Instruction set of the cpu backend.
     #[arg(long, value_enum, default_value_t)]
@@ -151,10 +157,11 @@ impl From<SimdName> for Simd {
 impl Engine {
     /// Makes the backend, and says on standard error which one it is if nobody named it.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        let Machine { threads, device, simd } = &self.machine;
+        let Machine { threads, device, simd, .. } = &self.machine;
         match (self.backend, device) {
             (BackendName::Auto, None) => {
-                let Automatic { backend, reason } = automatic(*threads, (*simd).into())?;
+                let limits = self.machine.limits();
+                let Automatic { backend, reason } = automatic(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
@@ -186,7 +193,12 @@ impl Machine {
     /// The gpu backend.
     pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
-        Ok(Gpu::new(&choice, self.threads)?)
+        Ok(Gpu::with_limits(&choice, self.threads, self.limits())?)
+    }
+
+    fn limits(&self) -> Limits {
+        let bytes = |gib: f64| (gib * f64::from(1 << 30)) as u64;
+        Limits { mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes), ..Limits::default() }
     }
 }
 
@@ -214,11 +226,16 @@ fn threads(text: &str) -> Result<usize, String> {
     }
 }
 
+fn gib(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
+        _ => Err("expected a number above 0, to 65536".to_owned()),
+    }
+}
+
 /// What a rendering command draws.
 pub(super) struct Ready {
     source: Source,
-    /// What one frame of all shots draws.
-    pub(super) scene: Scene,
     pub(super) shots: Vec<Shot>,
 }
 
@@ -237,23 +254,45 @@ enum Source {
     Twin(Arc<Resident>),
 }
 
-impl Source {
-    fn scene(&self, shots: &[Shot]) -> Scene {
-        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
-        match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => {
-                resident.scene(&session::eyes(&views), &first.profile)
-            }
-            (Self::Twin(_), []) => Scene::default(),
-            (Self::File(scene), _) => scene.clone(),
+/// What is drawn of a source, in memory for as long as this lives.
+pub(super) enum Drawn<'a> {
+    Whole(Cow<'a, Scene>),
+    Needed(Pinned),
+}
+
+impl Deref for Drawn<'_> {
+    type Target = Scene;
+
+    fn deref(&self) -> &Scene {
+        match self {
+            Self::Whole(scene) => scene,
+            Self::Needed(pinned) => pinned,
         }
+    }
+}
+
+impl Source {
+    fn scene(&self, shots: &[Shot]) -> anyhow::Result<Drawn<'_>> {
+        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
+        Ok(match (self, shots) {
+            (Self::Twin(resident), [first, ..]) => {
+                Drawn::Needed(resident.scene(&session::eyes(&views), &first.profile)?)
+            }
+            (Self::Twin(_), []) => Drawn::Whole(Cow::default()),
+            (Self::File(scene), _) => Drawn::Whole(Cow::Borrowed(scene)),
+        })
     }
 }
 
 impl Ready {
     /// What a frame of one shot draws.
-    pub(super) fn scene_of(&self, shot: &Shot) -> Scene {
+    pub(super) fn scene_of(&self, shot: &Shot) -> anyhow::Result<Drawn<'_>> {
         self.source.scene(std::slice::from_ref(shot))
+    }
+
+    /// What one frame of all shots draws.
+    pub(super) fn scene(&self) -> anyhow::Result<Drawn<'_>> {
+        self.source.scene(&self.shots)
     }
 }
 
@@ -265,8 +304,7 @@ impl SceneSource {
         let (source, profile) = self.source()?;
         let shots = cameras.into_iter().map(|camera| self.shot(camera, profile));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
-        let scene = source.scene(&shots);
-        Ok(Ready { source, scene, shots })
+        Ok(Ready { source, shots })
     }
 
     /// A camera's own near counts more than the twin's, and less than one on the command line.
@@ -292,7 +330,7 @@ impl SceneSource {
             return Ok((Source::File(scene), RenderProfile::default()));
         }
         let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
-        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let cache = Cache::new(self.twins.catalog()?);
         let resident = cache.open(&named.name, named.number).with_context(|| {
             format!("{:?} is no file, and as the name of a twin it fails", self.scene)
         })?;

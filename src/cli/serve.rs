@@ -8,7 +8,6 @@ use tracing_subscriber::EnvFilter;
 
 use crate::config;
 use crate::server::{self, Limits};
-use crate::store::Catalog;
 
 use super::places::{Episodes, Twins};
 use super::scene_source::Engine;
@@ -63,13 +62,14 @@ impl Serve {
             "--twins {} is not a directory",
             twins.display()
         );
-        if Catalog::open(&twins)?.twins()?.is_empty() {
+        if self.twins.catalog()?.twins()?.is_empty() {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
         let config = server::Config {
             listen: self.listen,
             twins,
+            cache: self.twins.cache(),
             episodes: self.episodes.dir()?,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits {

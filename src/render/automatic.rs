@@ -8,7 +8,7 @@ use crate::geometry::{Camera, Pose};
 use crate::scene::{Gaussians, RenderProfile, Scene, sh};
 
 use super::cpu::{Cpu, CpuError, Simd};
-use super::gpu::{AdapterChoice, Gpu, GpuError};
+use super::gpu::{AdapterChoice, Gpu, GpuError, Limits};
 use super::psnr::{RIGHT_DB, psnr_db};
 use super::{Backend, Frame, RenderError, Target, View};
 
@@ -21,13 +21,13 @@ pub struct Automatic {
 }
 
 /// Takes the fastest device in hardware that draws the card right, or else the cpu backend.
-/// Devices in software are right and slow, and never taken.
+/// Devices in software are right and slow, and never taken. `limits` are for a device.
 ///
 /// # Errors
 /// As [`Cpu::new`].
-pub fn automatic(threads: usize, simd: Simd) -> Result<Automatic, CpuError> {
+pub fn automatic(threads: usize, simd: Simd, limits: Limits) -> Result<Automatic, CpuError> {
     let cpu = Cpu::new(threads, simd)?;
-    let reason = match Gpu::new(&AdapterChoice::Hardware, threads) {
+    let reason = match Gpu::with_limits(&AdapterChoice::Hardware, threads, limits) {
         Ok(gpu) => match trial(&gpu, &cpu) {
             Ok(db) => {
                 let reason = format!("gpu: {}, {db:.1} dB against the cpu backend", gpu.detail());

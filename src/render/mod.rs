@@ -120,6 +120,17 @@ pub enum RenderError {
         /// How many fit.
         limit: u64,
     },
+    /// The scene alone is more than the device may hold.
+    #[error(
+        "the scene takes at least {needed_bytes} bytes of the GPU's memory and {limit_bytes} are \
+         allowed: allow more with --gpu-memory-gib, or draw less with the profile's tau_px and reach_m"
+    )]
+    DeviceMemory {
+        /// What its Gaussians take, without the ends of pages that no cluster fits into.
+        needed_bytes: u64,
+        /// What they may take.
+        limit_bytes: u64,
+    },
     /// The device failed. It is opened anew for the next frame.
     #[error("{device} failed: {reason}")]
     Device {

@@ -1,65 +1,94 @@
-//! How much memory twins may take together.
+//! How much memory twins may take together, and who has how much of it set aside.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::config;
-use crate::scene::{Chunk, Manifest};
 
 use super::ResidencyError;
 
-/// Bytes that twins in memory may take, and what is taken.
+/// Bytes that are set aside for the worst frames of sessions, by version.
+///
+/// Sessions on one version share what they draw, so that together they never need more than all of
+/// it.
 #[derive(Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
-    held_bytes: Arc<AtomicU64>,
+    versions: BTreeMap<String, Claims>,
 }
 
-/// A part of the budget, given back when dropped.
-#[derive(Debug)]
-pub(super) struct Room {
-    held_bytes: Arc<AtomicU64>,
-    bytes: u64,
+#[derive(Clone, Copy, Debug)]
+struct Claims {
+    sessions: u64,
+    sum_bytes: u64,
+    whole_bytes: u64,
+}
+
+/// The worst frame of a session.
+#[derive(Clone, Debug)]
+pub(super) struct Claim {
+    /// The twin, for the error.
+    pub(super) twin: String,
+    /// The version's hash.
+    pub(super) version: String,
+    /// What it needs at once.
+    pub(super) bytes: u64,
+    /// What all of its version takes, in all levels of detail.
+    pub(super) whole_bytes: u64,
 }
 
 impl Budget {
-    /// So many bytes, or three quarters of the machine's memory.
-    pub(super) fn new(limit_bytes: Option<u64>) -> Self {
-        let limit_bytes = limit_bytes.unwrap_or_else(|| {
-            physical_bytes().map_or(config::RESIDENT_BYTES, |physical| physical / 4 * 3)
-        });
-        Self { limit_bytes, held_bytes: Arc::default() }
+    pub(super) fn new(limit_bytes: u64) -> Self {
+        Self { limit_bytes, versions: BTreeMap::new() }
     }
 
-    /// Takes what a version will hold, before any of it is loaded.
+    /// Sets memory aside.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
-    pub(super) fn take(&self, manifest: &Manifest) -> Result<Room, ResidencyError> {
-        let chunks = manifest.chunks.iter();
-        let bytes: u64 = chunks
-            .flat_map(|chunk| &chunk.sections)
-            .map(|section| Chunk::bytes_of(manifest.sh_degree, section.count.into()))
-            .fold(0, u64::saturating_add);
-        let fits = |held: u64| held.checked_add(bytes).filter(|sum| *sum <= self.limit_bytes);
-        match self.held_bytes.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
-            Ok(_) => Ok(Room { held_bytes: self.held_bytes.clone(), bytes }),
-            Err(held_bytes) => Err(ResidencyError::NoRoom {
-                twin: manifest.twin.clone(),
-                needed_bytes: bytes,
-                held_bytes,
-                limit_bytes: self.limit_bytes,
-            }),
+    pub(super) fn take(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
+        let Claim { twin, version, bytes, whole_bytes } = claim;
+        let held_bytes = self.held_bytes();
+        let nobody = Claims { sessions: 0, sum_bytes: 0, whole_bytes: *whole_bytes };
+        let before = self.versions.get(version).copied().unwrap_or(nobody);
+        let (sessions, sum_bytes) = (before.sessions + 1, before.sum_bytes.saturating_add(*bytes));
+        let after = Claims { sessions, sum_bytes, ..before };
+        let needed_bytes = after.bytes() - before.bytes();
+        if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
+            let (twin, limit_bytes) = (twin.clone(), self.limit_bytes);
+            return Err(ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes });
         }
+        self.versions.insert(version.clone(), after);
+        Ok(())
+    }
+
+    /// Gives back what [`Budget::take`] took.
+    pub(super) fn give_back(&mut self, claim: &Claim) {
+        if let Some(claims) = self.versions.get_mut(&claim.version) {
+            claims.sessions -= 1;
+            claims.sum_bytes -= claim.bytes;
+            if claims.sessions == 0 {
+                self.versions.remove(&claim.version);
+            }
+        }
+    }
+
+    /// Bytes that are set aside.
+    pub(super) fn held_bytes(&self) -> u64 {
+        self.versions.values().map(Claims::bytes).sum()
     }
 }
 
-impl Drop for Room {
-    fn drop(&mut self) {
-        self.held_bytes.fetch_sub(self.bytes, Ordering::Relaxed);
+impl Claims {
+    fn bytes(&self) -> u64 {
+        self.sum_bytes.min(self.whole_bytes)
     }
+}
+
+/// Three quarters of the machine's memory.
+pub(super) fn default_bytes() -> u64 {
+    physical_bytes().map_or(config::RESIDENT_BYTES, |physical| physical / 4 * 3)
 }
 
 /// Memory of the machine; none where /proc does not say.

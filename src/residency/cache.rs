@@ -1,55 +1,67 @@
-//! One copy in memory of every twin version in use.
+//! The twins that are open, and the memory that they share.
 
 use std::collections::BTreeMap;
+use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Instant;
 
-use rayon::prelude::*;
-
-use crate::scene::manifest::ChunkEntry;
-use crate::scene::{Chunk, RenderProfile, Scene};
+use crate::scene::manifest::{ChunkEntry, Section};
+use crate::scene::{Chunk, Manifest, RenderProfile};
 use crate::store::{Catalog, Listing, StoreError, Version};
 
-use super::budget::{Budget, Room};
-use super::{Eye, Needed, ResidencyError, demand};
+use super::budget::{Budget, default_bytes};
+use super::pager::{Done, Pager, Waiting, Wanted};
+use super::reservation::Reservation;
+use super::table::{Id, Key};
+use super::worst::{Lens, worst_bytes};
+use super::{Eye, Index, Needed, Pinned, ResidencyError, Source, Stats};
 
-/// A version of a twin, ready to be rendered.
-#[derive(Debug)]
-pub struct Resident {
-    /// What was loaded.
-    pub version: Version,
-    /// `[chunk][section]`, as in the manifest.
-    sections: Vec<Vec<Arc<Chunk>>>,
-    _room: Room,
-}
-
-impl Resident {
-    /// What a frame of these cameras draws; `profile` is the version's unless somebody knows better.
-    pub fn scene(&self, eyes: &[Eye], profile: &RenderProfile) -> Scene {
-        let needed = demand(&self.version.manifest, eyes, profile);
-        let chunk = |n: Needed| self.sections[n.chunk][n.section].clone();
-        Scene { chunks: needed.into_iter().map(chunk).collect() }
-    }
-
-    /// Memory that its Gaussians take, all levels, in bytes.
-    pub fn bytes(&self) -> usize {
-        self.sections.iter().flatten().map(|chunk| chunk.bytes()).sum()
-    }
-}
-
-/// Loads twin versions and shares them between sessions for as long as one holds them; the one that
-/// was opened last stays for the next session, so that episodes in a row load once.
+/// Opens versions of twins, and shares the memory for what their frames need.
 #[derive(Debug)]
 pub struct Cache {
     catalog: Catalog,
-    budget: Budget,
+    shared: Arc<Shared>,
     /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is
-    /// held while loading, so that others wait for the result rather than load again; a failed load
-    /// leaves an empty slot, and the next one tries.
+    /// held while opening, so that others wait for the result rather than read again.
     slots: Mutex<BTreeMap<(String, u64), Slot>>,
+    /// The version that was opened last stays for the next session: its table has megabytes.
     last: Mutex<Option<Arc<Resident>>>,
 }
 
 type Slot = Arc<Mutex<Weak<Resident>>>;
+
+/// What all versions share.
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) pager: Pager,
+    pub(super) budget: Mutex<Budget>,
+}
+
+/// A version of a twin, ready to be rendered. What its frames need comes into memory as they ask.
+#[derive(Debug)]
+pub struct Resident {
+    /// The version.
+    pub version: Arc<Version>,
+    pub(super) shared: Arc<Shared>,
+    index: Index,
+    /// Names in the pager's table, chunk after chunk, section after section.
+    ids: Vec<Id>,
+    /// Where each chunk begins in `ids`.
+    first: Vec<usize>,
+    /// All levels of all of it, in bytes.
+    whole_bytes: u64,
+    /// The most that a frame needs, by lens: looking for it takes a while.
+    worst: Mutex<Vec<(Lens, u64)>>,
+}
+
+/// A frame that waits for what it needs. Dropped, it waits no more.
+#[derive(Debug)]
+pub struct Ticket {
+    resident: Arc<Resident>,
+    waiting: Waiting,
+    needed: usize,
+    asked: Instant,
+}
 
 impl Cache {
     /// Nothing in memory yet, and room for three quarters of the machine's memory.
@@ -59,8 +71,20 @@ impl Cache {
 
     /// The same with room for so many bytes of twins, if it is said.
     pub fn limited(catalog: Catalog, limit_bytes: Option<u64>) -> Self {
-        let budget = Budget::new(limit_bytes);
-        Self { catalog, budget, slots: Mutex::default(), last: Mutex::default() }
+        let source = Arc::new(catalog.clone());
+        Self::with_source(catalog, source, limit_bytes)
+    }
+
+    /// The same with sections that come from somewhere else.
+    pub fn with_source(
+        catalog: Catalog,
+        source: Arc<dyn Source>,
+        limit_bytes: Option<u64>,
+    ) -> Self {
+        let limit_bytes = limit_bytes.unwrap_or_else(default_bytes);
+        let pager = Pager::new(source, limit_bytes);
+        let shared = Arc::new(Shared { pager, budget: Mutex::new(Budget::new(limit_bytes)) });
+        Self { catalog, shared, slots: Mutex::default(), last: Mutex::default() }
     }
 
     /// The twins that can be opened.
@@ -71,50 +95,177 @@ impl Cache {
         self.catalog.twins()
     }
 
-    /// One version of a twin, or the latest, loaded if nobody holds it. Blocks while it loads.
+    /// Where the twins are.
+    pub fn catalog(&self) -> &Catalog {
+        &self.catalog
+    }
+
+    /// One version of a twin, or the latest. Reads its table, if nobody has it open; blocks meanwhile.
     ///
     /// # Errors
-    /// As [`Catalog::version`] and [`Catalog::section`]; [`ResidencyError::NoRoom`], before anything
-    /// is loaded, if it does not fit beside the twins in use.
+    /// As [`Catalog::version`]; [`ResidencyError::Thread`] the first time.
     pub fn open(&self, name: &str, number: Option<u64>) -> Result<Arc<Resident>, ResidencyError> {
+        self.shared.pager.start()?;
         let version = self.catalog.version(name, number)?;
         let slot = self.slot(&version);
         let mut held = lock(&slot);
         let resident = match held.upgrade() {
             Some(resident) => resident,
-            None => {
-                // Let go first: never two twins in memory for one session's sake.
-                *lock(&self.last) = None;
-                Arc::new(self.load(version)?)
-            }
+            None => Arc::new(Resident::new(version, self.shared.clone())),
         };
         *held = Arc::downgrade(&resident);
         *lock(&self.last) = Some(resident.clone());
         Ok(resident)
     }
 
-    /// The slot of a version. Slots that nobody holds or loads are dropped, so that they do not
+    /// What was done so far, and what is held now.
+    pub fn stats(&self) -> Stats {
+        let reserved_bytes = lock(&self.shared.budget).held_bytes();
+        Stats { reserved_bytes, ..self.shared.pager.stats() }
+    }
+
+    /// The slot of a version. Slots that nobody holds or opens are dropped, so that they do not
     /// pile up as versions come and go.
     fn slot(&self, version: &Version) -> Slot {
         let mut slots = lock(&self.slots);
         slots.retain(|_, slot| Arc::strong_count(slot) > 1 || lock(slot).strong_count() > 0);
         slots.entry((version.hash.clone(), version.number)).or_default().clone()
     }
+}
 
-    fn load(&self, version: Version) -> Result<Resident, ResidencyError> {
-        let room = self.budget.take(&version.manifest)?;
-        let load = |chunk: &ChunkEntry| {
-            let sections = chunk.sections.par_iter();
-            let loaded = sections.map(|s| self.catalog.section(&version, chunk, s).map(Arc::new));
-            loaded.collect::<Result<Vec<_>, StoreError>>()
-        };
-        let sections = version.manifest.chunks.par_iter().map(load);
-        let sections = sections.collect::<Result<_, StoreError>>()?;
-        Ok(Resident { version, sections, _room: room })
+impl Resident {
+    fn new(version: Version, shared: Arc<Shared>) -> Self {
+        let manifest = &version.manifest;
+        let (mut keys, mut first) = (Vec::new(), Vec::with_capacity(manifest.chunks.len()));
+        for chunk in &manifest.chunks {
+            first.push(keys.len());
+            keys.extend(chunk.sections.iter().map(|section| {
+                let bytes = Chunk::bytes_of(manifest.sh_degree, section.count.into());
+                (key(manifest, chunk, section), bytes)
+            }));
+        }
+        let whole_bytes = keys.iter().map(|(_, bytes)| bytes).sum();
+        let ids = shared.pager.with_table(|table| {
+            keys.into_iter().map(|(key, bytes)| table.register(key, bytes)).collect()
+        });
+        let index = Index::new(manifest);
+        let (version, worst) = (Arc::new(version), Mutex::default());
+        Self { version, shared, index, ids, first, whole_bytes, worst }
+    }
+
+    /// What a frame of these cameras draws; `profile` is the version's unless somebody knows better.
+    pub fn demand(&self, eyes: &[Eye], profile: &RenderProfile) -> Vec<Needed> {
+        self.index.demand(&self.version.manifest, eyes, profile)
+    }
+
+    /// Tells `done` as soon as everything that a frame needs is in memory, from another thread or
+    /// from this one: at once if it is. Until then the frame holds nothing.
+    ///
+    /// # Errors
+    /// [`ResidencyError::TooLarge`] if it can never be.
+    pub fn ask(
+        self: &Arc<Self>,
+        eyes: &[Eye],
+        profile: &RenderProfile,
+        done: Done,
+    ) -> Result<Ticket, ResidencyError> {
+        let wanted = self.wanted(self.demand(eyes, profile));
+        let (needed, asked) = (wanted.needed.len(), Instant::now());
+        let waiting = self.shared.pager.ask(wanted, done)?;
+        Ok(Ticket { resident: self.clone(), waiting, needed, asked })
+    }
+
+    /// What a frame of these cameras draws, all of it in memory. Blocks until it is.
+    ///
+    /// # Errors
+    /// [`ResidencyError::TooLarge`], or [`ResidencyError::Load`] if something cannot be read.
+    pub fn scene(
+        self: &Arc<Self>,
+        eyes: &[Eye],
+        profile: &RenderProfile,
+    ) -> Result<Pinned, ResidencyError> {
+        let (tell, told) = sync_channel(1);
+        let done: Done = Box::new(move |pinned| {
+            // Nobody listens any more only if this very call has ended.
+            let _ = tell.send(pinned);
+        });
+        let ticket = self.ask(eyes, profile, done)?;
+        told.recv().unwrap_or_else(|_| Err(ticket.late()))
+    }
+
+    /// Sets aside the most that a frame of a rig anywhere in the twin needs.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoom`] with the numbers.
+    pub fn reserve(self: &Arc<Self>, lens: Lens) -> Result<Reservation, ResidencyError> {
+        Reservation::new(self.clone(), self.worst_bytes(lens))
+    }
+
+    /// The most that a frame of a rig anywhere in the twin needs, in bytes.
+    pub fn worst_bytes(&self, lens: Lens) -> u64 {
+        if let Some((_, bytes)) = lock(&self.worst).iter().find(|(known, _)| *known == lens) {
+            return *bytes;
+        }
+        let manifest = &self.version.manifest;
+        let bytes = worst_bytes(&self.index, manifest, lens, &manifest.profile);
+        let mut worst = lock(&self.worst);
+        worst.truncate(crate::config::REMEMBERED_LENSES - 1);
+        worst.insert(0, (lens, bytes));
+        bytes
+    }
+
+    /// Memory that all levels of all of it would take, in bytes.
+    pub fn whole_bytes(&self) -> u64 {
+        self.whole_bytes
+    }
+
+    /// What was done for all twins so far, and what is held now.
+    pub fn stats(&self) -> Stats {
+        self.shared.pager.stats()
+    }
+
+    pub(super) fn wanted(&self, needed: Vec<Needed>) -> Wanted {
+        let ids = needed.iter().map(|n| self.ids[self.first[n.chunk] + n.section]).collect();
+        Wanted { version: self.version.clone(), needed, ids }
     }
 }
 
+impl Drop for Resident {
+    fn drop(&mut self) {
+        self.shared.pager.with_table(|table| self.ids.iter().for_each(|&id| table.unregister(id)));
+    }
+}
+
+impl Ticket {
+    /// Why there is no frame, now that its time is up.
+    pub fn late(&self) -> ResidencyError {
+        ResidencyError::Late {
+            twin: self.resident.version.manifest.twin.clone(),
+            missing: self.waiting.missing(),
+            needed: self.needed,
+            waited: self.asked.elapsed(),
+        }
+    }
+}
+
+/// What the chunk of a section is a function of.
+fn key(manifest: &Manifest, chunk: &ChunkEntry, section: &Section) -> Key {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(&section.hash);
+    chunk.cell.iter().for_each(|cell| {
+        hasher.update(&cell.to_le_bytes());
+    });
+    chunk.origin_m.to_array().iter().for_each(|m| {
+        hasher.update(&m.to_le_bytes());
+    });
+    hasher.update(&section.count.to_le_bytes());
+    hasher.update(&[section.block, section.level, manifest.sh_degree, manifest.record as u8]);
+    let mut key = [0; 16];
+    key.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
+    Key(key)
+}
+
 /// A panic elsewhere leaves nothing half-done behind these locks.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -2,7 +2,10 @@
 
 use glam::DVec3;
 
+use crate::scene::manifest::Section;
 use crate::scene::{Manifest, RenderProfile};
+
+use super::Index;
 
 /// A camera, as far as it matters here.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,26 +32,21 @@ pub struct Needed {
 /// An error of `e` metres at a distance of `d` is `f e / d` pixels wide. A block is drawn at the
 /// coarsest level for which that is at most `tau_px`, with the longest focal length of the frame, and
 /// the distance of the nearest camera from the box of everything in the block. Memory has no say.
+///
+/// Looks at every block of the twin; whoever asks often keeps an [`Index`].
 pub fn demand(manifest: &Manifest, eyes: &[Eye], profile: &RenderProfile) -> Vec<Needed> {
-    let focal_px = eyes.iter().fold(0.0_f64, |most, eye| most.max(eye.focal_px));
-    let mut needed = Vec::new();
-    for (chunk, entry) in manifest.chunks.iter().enumerate() {
-        let mut first = 0;
-        for block in entry.sections.chunk_by(|a, b| a.block == b.block) {
-            let bounds = entry.section_bounds(&block[0]);
-            let distance_m = eyes
-                .iter()
-                .map(|eye| bounds.distance_m(eye.position_m))
-                .fold(f64::INFINITY, f64::min);
-            if profile.reach_m.is_none_or(|reach_m| distance_m <= reach_m) {
-                // Errors rise with the level, and level 0 has none.
-                let small =
-                    |error_m: f32| focal_px * f64::from(error_m) <= profile.tau_px * distance_m;
-                let coarsest = block.iter().rposition(|section| small(section.error_m));
-                needed.push(Needed { chunk, section: first + coarsest.unwrap_or(0) });
-            }
-            first += block.len();
-        }
-    }
-    needed
+    Index::new(manifest).demand(manifest, eyes, profile)
+}
+
+/// The coarsest level of a block, an index of its sections in order of level, whose error is at most
+/// `tau_px` from a distance.
+pub(super) fn level(block: &[Section], focal_px: f64, distance_m: f64, tau_px: f64) -> usize {
+    // Errors rise with the level, and level 0 has none.
+    let small = |error_m: f32| focal_px * f64::from(error_m) <= tau_px * distance_m;
+    block.iter().rposition(|section| small(section.error_m)).unwrap_or(0)
+}
+
+/// The longest focal length of a frame, in pixels.
+pub(super) fn longest_px(eyes: &[Eye]) -> f64 {
+    eyes.iter().fold(0.0_f64, |most, eye| most.max(eye.focal_px))
 }

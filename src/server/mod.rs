@@ -30,8 +30,9 @@ use tokio::sync::Semaphore;
 
 use crate::config;
 use crate::render::Backend;
+use crate::residency::Cache;
 use crate::session::{Engine, EngineSettings, SessionError};
-use crate::store::{Catalog, StoreError};
+use crate::store::{CacheSettings, Catalog, StoreError};
 
 pub use shutdown::{Running, stop_signal};
 
@@ -40,8 +41,10 @@ pub use shutdown::{Running, stop_signal};
 pub struct Config {
     /// Where to listen; port 0 takes a free one. A loopback address.
     pub listen: SocketAddr,
-    /// Directory of twins.
+    /// Directory of twins, or their URL.
     pub twins: PathBuf,
+    /// Where parts of twins at a URL are kept on disk.
+    pub cache: Option<CacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
     /// What renders.
@@ -116,19 +119,15 @@ pub enum ServerError {
 /// # Errors
 /// The address is not a loopback address or cannot be used, or a directory cannot.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, episodes, backend, limits } = config;
+    let Config { listen, twins, cache, episodes, backend, limits } = config;
     if !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
     std::fs::create_dir_all(&episodes)
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
-    let settings = EngineSettings {
-        catalog: Catalog::open(&twins)?,
-        resident_bytes: limits.resident_bytes,
-        episodes,
-        backend,
-        step_timeout: limits.step,
-    };
+    let cache =
+        Cache::limited(Catalog::open_cached(&twins, cache.as_ref())?, limits.resident_bytes);
+    let settings = EngineSettings { cache, episodes, backend, step_timeout: limits.step };
     let engine = Engine::start(settings)?;
     let failed = |cause| ServerError::Listen { address: listen, cause };
     let listener = TcpListener::bind(listen).await.map_err(failed)?;
@@ -181,10 +180,11 @@ impl Default for Limits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, episodes, backend, limits } = self;
+        let Self { listen, twins, cache, episodes, backend, limits } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
+            .field("cache", cache)
             .field("episodes", episodes)
             .field("backend", &backend.name())
             .field("limits", limits)

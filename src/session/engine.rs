@@ -11,19 +11,15 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Resident};
-use crate::store::Catalog;
+use crate::residency::{Cache, Lens, Reservation, Resident, Stats};
 
 use super::SessionError;
 use super::listing::{Listings, TwinSummary};
 
 /// What an engine is made of.
 pub struct EngineSettings {
-    /// The twins that can be opened.
-    pub catalog: Catalog,
-    /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
-    /// machine's.
-    pub resident_bytes: Option<u64>,
+    /// The twins that can be opened, and the memory for them.
+    pub cache: Cache,
     /// Where episodes are recorded.
     pub episodes: PathBuf,
     /// What renders.
@@ -71,7 +67,7 @@ impl Engine {
     /// # Errors
     /// A thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { catalog, resident_bytes, episodes, backend, step_timeout } = settings;
+        let EngineSettings { cache, episodes, backend, step_timeout } = settings;
         let (jobs, queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
         for number in 0..backend.frames_at_once().max(1) {
@@ -81,8 +77,8 @@ impl Engine {
                 .spawn(move || draw_all(&queue))
                 .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         }
-        let listings = Arc::new(Listings::new(catalog.clone()));
-        let (cache, answers) = (Cache::limited(catalog, resident_bytes), Answers::default());
+        let listings = Arc::new(Listings::new(cache.catalog().clone()));
+        let answers = Answers::default();
         Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
     }
 
@@ -117,15 +113,29 @@ impl Engine {
         self.backend.detail()
     }
 
-    /// A version of a twin, or its latest, loaded if nobody has it.
+    /// What the pager did so far, and the memory that twins take now.
+    pub fn residency(&self) -> Stats {
+        self.cache.stats()
+    }
+
+    /// A version of a twin, or its latest. None of its Gaussians need be in memory.
     pub(super) async fn resident(
         self: &Arc<Self>,
         twin: String,
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
-        let loaded = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
-        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
+        let opened = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
+        Ok(opened.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// Sets aside the memory for the frames of a rig, if there is enough.
+    pub(super) async fn reserve(
+        resident: Arc<Resident>,
+        lens: Lens,
+    ) -> Result<Arc<Reservation>, SessionError> {
+        let reserved = tokio::task::spawn_blocking(move || resident.reserve(lens));
+        Ok(Arc::new(reserved.await.map_err(|_| SessionError::Crashed)??))
     }
 
     /// Does some work on a render thread when its turn comes, and tells how long it waited.
@@ -230,6 +240,7 @@ impl Drop for Hold {
 mod tests {
     use super::*;
     use crate::render;
+    use crate::store::Catalog;
 
     #[test]
     fn huge_images_are_not_kept() {
@@ -264,8 +275,7 @@ mod tests {
         for at_once in [1, 3] {
             let dir = tempfile::tempdir().unwrap();
             let engine = Engine::start(EngineSettings {
-                catalog: Catalog::open(dir.path()).unwrap(),
-                resident_bytes: None,
+                cache: Cache::new(Catalog::open(dir.path()).unwrap()),
                 episodes: dir.path().to_owned(),
                 backend: Arc::new(Takes(at_once)),
                 step_timeout: config::STEP_TIMEOUT,

@@ -12,9 +12,9 @@ pub enum SessionError {
     /// The twin cannot be had.
     #[error(transparent)]
     Twin(#[from] StoreError),
-    /// The twin does not fit into memory.
+    /// What is to be drawn does not fit into memory, or could not be loaded.
     #[error(transparent)]
-    NoRoom(ResidencyError),
+    Residency(ResidencyError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
@@ -110,7 +110,7 @@ impl From<ResidencyError> for SessionError {
     fn from(error: ResidencyError) -> Self {
         match error {
             ResidencyError::Store(error) => Self::Twin(error),
-            no_room @ ResidencyError::NoRoom { .. } => Self::NoRoom(no_room),
+            other => Self::Residency(other),
         }
     }
 }

@@ -18,11 +18,13 @@ mod replay;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::time::Instant;
+use tokio::sync::oneshot;
+use tokio::time::{Instant, timeout_at};
 
 use crate::config;
 use crate::geometry::Pose;
-use crate::residency::Resident;
+use crate::render::View;
+use crate::residency::{Eye, Lens, Pinned, Reservation, Resident};
 use crate::scene::rig::{Rig, RigCamera};
 
 pub use buffer::Buffer;
@@ -46,7 +48,7 @@ use record::{Line, Recorder};
 #[derive(Debug)]
 pub struct Session {
     engine: Arc<Engine>,
-    resident: Arc<Resident>,
+    reservation: Arc<Reservation>,
     name: String,
     profile_hash: blake3::Hash,
     rig_name: String,
@@ -61,7 +63,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// Opens a session, loading the twin if nobody else has it.
+    /// Opens a session, and sets aside the memory for its worst frame.
     ///
     /// # Errors
     /// Names the first field of `opening` that cannot be had; nothing was opened then.
@@ -86,11 +88,13 @@ impl Session {
         let manifest = &resident.version.manifest;
         let (rig_name, cameras) = choose_cameras(&resident, opening.rig, &opening.outputs)?;
         let Outputs { encoding, depth, opacity, .. } = opening.outputs;
+        let lens = lens(&cameras);
         let layout = Layout::new(cameras, encoding, depth, opacity)?;
         let start = match &opening.start {
             Some(start) => resolve_start(&resident, start)?,
             None => manifest.trajectories.first().map_or(Pose::IDENTITY, |log| log.at_station(0.0)),
         };
+        let reservation = Engine::reserve(resident.clone(), lens).await?;
         Ok(Self {
             profile_hash: record::profile_hash(&manifest.profile),
             rig_name,
@@ -102,7 +106,7 @@ impl Session {
             episode_number: 0,
             recorder: None,
             engine,
-            resident,
+            reservation,
             name,
         })
     }
@@ -141,7 +145,7 @@ impl Session {
     /// As [`Session::step`]: the old episode goes on.
     pub async fn reset(&mut self, seed: u64, start: Option<Start>) -> Result<Frame, SessionError> {
         let start = match &start {
-            Some(start) => resolve_start(&self.resident, start)?,
+            Some(start) => resolve_start(self.resident(), start)?,
             None => self.start,
         };
         let next = Episode::new(seed, start, self.dt_us);
@@ -165,9 +169,14 @@ impl Session {
         &self.name
     }
 
-    /// The twin's version and the Gaussians that all its sessions share.
+    /// The twin's version.
     pub fn resident(&self) -> &Arc<Resident> {
-        &self.resident
+        self.reservation.resident()
+    }
+
+    /// The memory that is set aside for its worst frame, in bytes.
+    pub fn reserved_bytes(&self) -> u64 {
+        self.reservation.bytes()
     }
 
     /// BLAKE3 of the render profile's JSON.
@@ -221,17 +230,40 @@ impl Session {
         let mut assembly =
             Assembly::new(self.layout.clone(), self.engine.answers(), episode, poses.len())?;
         for world_from_rig in poses {
-            let resident = self.resident.clone();
+            let views = View::of_rig(self.layout.cameras(), world_from_rig);
+            // Before the job is queued: no render thread waits for a disk.
+            let pinned = self.pin(deadline, eyes(&views)).await?;
+            let profile = self.resident().version.manifest.profile;
             let (drawn, queued) = self
                 .engine
                 .run(deadline, move |scratch, backend| {
-                    assembly.draw(&resident, backend, world_from_rig, scratch).map(|()| assembly)
+                    assembly.draw(&pinned, &profile, backend, &views, scratch).map(|()| assembly)
                 })
                 .await?;
             assembly = drawn?;
             assembly.add_queue_time(queued);
         }
         assembly.finish()
+    }
+
+    /// Waits until everything that a frame needs is in memory, all at once.
+    async fn pin(&self, deadline: Instant, eyes: Vec<Eye>) -> Result<Pinned, SessionError> {
+        let (reply, answer) = oneshot::channel();
+        let resident = self.resident().clone();
+        let ask = move || {
+            let done = Box::new(move |pinned| {
+                // Nobody waits any more: the deadline has passed.
+                let _ = reply.send(pinned);
+            });
+            resident.ask(&eyes, &resident.version.manifest.profile, done)
+        };
+        let ticket =
+            tokio::task::spawn_blocking(ask).await.map_err(|_| SessionError::Crashed)??;
+        match timeout_at(deadline, answer).await {
+            Ok(Ok(pinned)) => Ok(pinned?),
+            Ok(Err(_)) => Err(SessionError::Crashed),
+            Err(_) => Err(ticket.late().into()),
+        }
     }
 
     /// Writes what was rendered to the episode's file, which begins with its first frame.
@@ -259,7 +291,7 @@ impl Session {
         episode: &Episode,
         first_frame: Line,
     ) -> Result<(Recorder, u64), SessionError> {
-        let version = &self.resident.version;
+        let version = &self.resident().version;
         let (depth, opacity) = self.layout.depth_and_opacity();
         let cameras = self.layout.cameras().to_vec();
         let header = EpisodeHeader {
@@ -295,6 +327,15 @@ impl Session {
         if let Err(error) = append(recorder, Line::End(self.episode.summary(outcome))).await {
             tracing::warn!(session = self.name, "the episode's summary is missing: {error}");
         }
+    }
+}
+
+/// What of a rig decides how much memory its frames need.
+fn lens(cameras: &[RigCamera]) -> Lens {
+    let eyes = eyes(&View::of_rig(cameras, Pose::IDENTITY));
+    Lens {
+        focal_px: eyes.iter().fold(0.0, |most, eye| eye.focal_px.max(most)),
+        radius_m: eyes.iter().fold(0.0, |most, eye| eye.position_m.length().max(most)),
     }
 }
 

@@ -14,10 +14,10 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use crate::config;
-use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
-use crate::residency::{Eye, Resident};
+use crate::residency::Eye;
 use crate::scene::rig::{Rig, RigCamera};
+use crate::scene::{RenderProfile, Scene};
 
 use super::buffer::Buffer;
 use super::encode::{Drawn, Encoding, encode};
@@ -231,13 +231,13 @@ impl Assembly {
     /// Renders the next pose.
     pub(super) fn draw(
         &mut self,
-        resident: &Resident,
+        scene: &Scene,
+        profile: &RenderProfile,
         backend: &dyn Backend,
-        world_from_rig: Pose,
+        views: &[View],
         scratch: &mut Scratch,
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
-        let views = View::of_rig(&layout.cameras, world_from_rig);
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
         let mut targets = self.targets(scratch);
@@ -251,9 +251,7 @@ impl Assembly {
             let _ = slots[view].set(drawn);
         };
         let started = Instant::now();
-        let profile = &resident.version.manifest.profile;
-        let scene = resident.scene(&eyes(&views), profile);
-        let frame = RenderFrame { scene: &scene, profile, views: &views };
+        let frame = RenderFrame { scene, profile, views };
         let stats = backend.render(&frame, &mut targets, &finished)?;
         self.timings.render += started.elapsed();
         for (stage, ms) in stats.stages_ms {

@@ -3,13 +3,12 @@
 use std::fs::File;
 use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
-use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
-use crate::residency::Resident;
+use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
-use crate::store::StoreError;
 
 use super::record::{BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, profile_hash};
 use super::{Summary, observation};
@@ -116,9 +115,14 @@ pub enum ReplayError {
     /// The recorded cameras cannot be used.
     #[error(transparent)]
     Rig(#[from] RigError),
-    /// The twin cannot be had.
-    #[error(transparent)]
-    Twin(#[from] StoreError),
+    /// What a frame needs cannot be had.
+    #[error("step {step}: {cause}")]
+    Residency {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: ResidencyError,
+    },
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
     Render {
@@ -200,7 +204,7 @@ impl Recording {
     /// The backend refuses a frame, or `visit` fails.
     pub fn replay(
         &self,
-        resident: &Resident,
+        resident: &Arc<Resident>,
         backend: &dyn Backend,
         extent: Extent,
         visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
@@ -213,8 +217,13 @@ impl Recording {
         for (index, frame) in self.frames.iter().enumerate() {
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
-                let hashes = redraw(resident, backend, cameras, *world_from_rig, &mut pixels)
-                    .map_err(|cause| ReplayError::Render { step: frame.step, cause })?;
+                let (views, step) = (View::of_rig(cameras, *world_from_rig), frame.step);
+                let profile = &resident.version.manifest.profile;
+                let scene = resident.scene(&observation::eyes(&views), profile);
+                let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
+                let to_draw = RenderFrame { scene: &scene, profile, views: &views };
+                let hashes = redraw(backend, &to_draw, &mut pixels)
+                    .map_err(|cause| ReplayError::Render { step, cause })?;
                 for (((camera, rgb8), hash), recorded) in
                     cameras.iter().zip(&pixels).zip(hashes).zip(&mut recorded)
                 {
@@ -281,18 +290,12 @@ impl std::fmt::Display for Difference {
 
 /// Renders the colour images of one pose, and hashes them.
 fn redraw(
-    resident: &Resident,
     backend: &dyn Backend,
-    cameras: &[RigCamera],
-    world_from_rig: Pose,
+    frame: &RenderFrame<'_>,
     pixels: &mut [Vec<u8>],
 ) -> Result<Vec<blake3::Hash>, RenderError> {
-    let views = View::of_rig(cameras, world_from_rig);
     let mut targets: Vec<Target<'_>> =
         pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
-    let profile = &resident.version.manifest.profile;
-    let scene = &resident.scene(&observation::eyes(&views), profile);
-    let frame = RenderFrame { scene, profile, views: &views };
-    backend.render(&frame, &mut targets, &|_, _| {})?;
+    backend.render(frame, &mut targets, &|_, _| {})?;
     Ok(pixels.iter().map(|rgb8| blake3::hash(rgb8)).collect())
 }

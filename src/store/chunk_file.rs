@@ -181,6 +181,8 @@ pub(super) fn unpack(
         let raw = zstd::bulk::decompress(part, record.part_bytes(sh_degree, here));
         let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
         let first = lanes.len();
+        // Exactly: growing by half again would take memory that no budget knows of.
+        lanes.reserve_exact(here.div_ceil(LANES) * width);
         lanes.resize(first + here.div_ceil(LANES) * width, Lanes([0.0; LANES]));
         record.decode(&raw, sh_degree, here, &mut lanes[first..])?;
     }

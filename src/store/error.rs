@@ -51,7 +51,9 @@ pub enum StoreError {
         latest: u64,
     },
     /// The version's objects were removed.
-    #[error("version {number} of twin {name:?} was removed by `wildcity twin gc`: take a later one")]
+    #[error(
+        "version {number} of twin {name:?} was removed by `wildcity twin gc`: take a later one"
+    )]
     Collected {
         /// The twin.
         name: String,

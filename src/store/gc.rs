@@ -136,7 +136,8 @@ impl Catalog {
         }
         // A record that cannot be read names nothing that could be lost.
         for number in numbers.into_iter().filter(|number| !kept.contains(number)) {
-            if self.record(name, number).is_ok_and(|record| plan.remove.contains(&record.manifest)) {
+            if self.record(name, number).is_ok_and(|record| plan.remove.contains(&record.manifest))
+            {
                 plan.gone.insert(number);
             }
         }

@@ -81,21 +81,3 @@ fn one_size_of_subgroups() {
     let line = format!("\nsubgroups of {} to {} threads\n", threads.start(), threads.end());
     std::io::stdout().write_all(line.as_bytes()).unwrap();
 }
-
-#[test]
-fn memory_is_what_is_resident() {
-    let (backend, profile) = (gpu(), RenderProfile::default());
-    let bytes = || backend.usage().unwrap().mirror_bytes;
-    let street_of = |seed| Scene::from_gaussians(&street(40_000, 1, seed));
-    let first = street_of(16);
-    render(&backend, &first, &profile, &views()[..1]);
-    let one = bytes();
-    // Three chunks, each padded to a cluster of 256.
-    let padded = 40_000 + 256 * first.chunks.len() as u64;
-    assert!(one <= 61 * padded, "{one} B for 40,000 Gaussians");
-    for seed in 17..27 {
-        let scene = street_of(seed);
-        render(&backend, &scene, &profile, &views()[..1]);
-        assert!(bytes() <= 3 * one, "{} B after scene {seed}", bytes());
-    }
-}

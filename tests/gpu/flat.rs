@@ -9,7 +9,7 @@ use wildcity::render::{Backend, Frame, RenderError, Target, View};
 use wildcity::scene::{RenderProfile, Scene};
 
 use crate::blobs::{self, Blob};
-use crate::gpu::{gpu, gpu_with_binding_limit};
+use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::look;
 use crate::streets::street;
 
@@ -52,7 +52,7 @@ fn ten_thousand_steps() {
 #[test]
 #[ignore = "a process of its own, started by memory_is_flat_over_changing_scenes_and_frames_that_fail"]
 fn three_at_once() {
-    let gpu = gpu_with_binding_limit(64 << 10);
+    let gpu = gpu_with_limits(bindings(64 << 10));
     let layer = |i| Blob {
         mean_m: DVec3::new(0.0, 0.0, 40.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),

@@ -25,6 +25,7 @@ mod devices;
 mod encoding;
 mod extremes;
 mod flat;
+mod mirror;
 mod overlap;
 mod parity;
 mod parts;

@@ -4,7 +4,7 @@ use glam::DVec3;
 use wildcity::render::{Backend, Frame, RenderError, Target, View};
 use wildcity::scene::{Gaussians, RenderProfile, Scene};
 
-use crate::gpu::{gpu, gpu_with_binding_limit};
+use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{agree, cpu, look, render, render_one};
 use crate::scene_files::{Random, gaussians};
 use crate::streets::{street, turning_views};
@@ -38,7 +38,7 @@ fn the_image_does_not_depend_on_the_parts() {
         assert_eq!(whole.usage().unwrap().parts, 1);
         // Groups of views, and bands of views.
         let parts = [256 << 10, 128 << 10, 64 << 10].map(|binding_bytes| {
-            let limited = gpu_with_binding_limit(binding_bytes);
+            let limited = gpu_with_limits(bindings(binding_bytes));
             assert!(render(&limited, &scene, &profile, &views) == expected, "{binding_bytes} B");
             limited.usage().unwrap().parts
         });
@@ -51,7 +51,7 @@ fn the_image_does_not_depend_on_the_parts() {
 fn parts_are_known_from_the_frame_before() {
     let (scene, profile, views) = (misty(12_000, 4, 32), RenderProfile::default(), turning_views());
     let other = misty(9_000, 100, 33);
-    let limited = gpu_with_binding_limit(256 << 10);
+    let limited = gpu_with_limits(bindings(256 << 10));
     let expected = render(&limited, &scene, &profile, &views);
     render(&limited, &other, &profile, &views);
     let known = limited.usage().unwrap();
@@ -80,7 +80,7 @@ fn a_row_of_tiles_that_exceeds_a_device_is_an_error() {
         wall.sh.extend([0.5; 3]);
     }
     let (scene, profile) = (Scene::from_gaussians(&wall), RenderProfile::default());
-    let limited = gpu_with_binding_limit(64 << 10);
+    let limited = gpu_with_limits(bindings(64 << 10));
     let one_row = look([64, 16], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let rows = look([64, 64], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     for view in [one_row, rows] {
@@ -131,7 +131,7 @@ fn more_instances_than_lavapipe_holds_at_once() {
 
 /// Draws what exceeds bindings of 128 MiB, whatever the device could do.
 fn exceeds_lavapipe(scene: &Scene, view: View) {
-    let limited = gpu_with_binding_limit(128 << 20);
+    let limited = gpu_with_limits(bindings(128 << 20));
     let image = render_one(&limited, scene, &RenderProfile::default(), view);
     let parts = limited.usage().unwrap().parts;
     assert!(parts >= 2, "it fitted");

@@ -27,7 +27,7 @@ fn constants_are_the_same() {
         ("DEPTH_BITS", Literal::U32(constants::DEPTH_BITS)),
         ("MAX_VIEWS", Literal::U32(MAX_VIEWS as u32)),
         ("CLUSTER", Literal::U32(chunk::CLUSTER as u32)),
-        ("CLUSTER_HEADER_WORDS", Literal::U32(layout::CLUSTER_HEADER_WORDS)),
+        ("STRIP", Literal::U32(layout::STRIP)),
         ("GEOMETRY_WORDS", Literal::U32(layout::GEOMETRY_WORDS)),
         ("WORKGROUP", Literal::U32(layout::WORKGROUP)),
         ("SCAN_BLOCK", Literal::U32(layout::SCAN_BLOCK)),
@@ -80,7 +80,7 @@ fn layouts_are_the_same() {
         ChunkView {
             camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
         }
-        Item { cluster, chunk_view }
+        Item { line, chunk_view }
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }

@@ -19,7 +19,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use wildcity::render::View;
-use wildcity::residency::{Cache, Eye, Resident};
+use wildcity::residency::{Cache, Eye, Pinned, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::{Gaussians, Record, RenderProfile, Scene};
 use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
@@ -44,11 +44,24 @@ fn commit(dir: &Path, gaussians: &Gaussians, storage: Storage) -> Result<Version
     Catalog::open(dir)?.commit(new, &mut |_, _| {})
 }
 
-/// A scene that was stored and read again.
-fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Arc<Resident> {
+/// A scene that was stored.
+struct Stored {
+    resident: Arc<Resident>,
+    _dir: tempfile::TempDir,
+}
+
+fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Stored {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), gaussians, Storage { record, levels }).unwrap();
-    Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap()
+    let resident = Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap();
+    Stored { resident, _dir: dir }
+}
+
+impl Stored {
+    /// What is read again for a frame.
+    fn scene(&self, eyes: &[Eye], profile: &RenderProfile) -> Pinned {
+        self.resident.scene(eyes, profile).unwrap()
+    }
 }
 
 fn eyes(views: &[View]) -> Vec<Eye> {

@@ -33,7 +33,7 @@ async fn recorded() -> (TestServer, PathBuf) {
 
 fn replay(server: &TestServer, path: &Path, backend: &dyn Backend) -> Result<Report, ReplayError> {
     let recording = Recording::read(path)?;
-    let resident = Cache::new(Catalog::open(server.twins.path())?)
+    let resident = Cache::new(Catalog::open(server.twins.path()).unwrap())
         .open(&recording.header.twin, Some(recording.header.version))
         .unwrap();
     recording.replay(&resident, backend, Extent::FirstDifference, &mut |_| Ok(()))
@@ -133,6 +133,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let config = Config {
         listen: "127.0.0.1:0".parse().unwrap(),
         twins: twins.path().to_owned(),
+        cache: None,
         episodes: episodes.path().to_owned(),
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         limits: Limits::default(),

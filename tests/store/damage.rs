@@ -3,8 +3,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use wildcity::residency::Cache;
+use glam::DVec3;
+use wildcity::residency::{Cache, Eye, Pinned, ResidencyError};
 use wildcity::scene::Gaussians;
+use wildcity::scene::RenderProfile;
 use wildcity::store::{Catalog, StoreError, Version};
 
 use crate::scene_files::gaussians;
@@ -32,7 +34,7 @@ impl Twin {
     fn assert_found(&self, hash: &str, wanted: &str) {
         self.assert_verify_finds(hash);
         let catalog = Catalog::open(self.dir.path()).unwrap();
-        let text = Cache::new(catalog).open("street", None).unwrap_err().to_string();
+        let text = everything(catalog).unwrap_err().to_string();
         assert!(text.contains(hash) && text.contains(wanted), "{text}");
     }
 
@@ -59,8 +61,15 @@ impl Twin {
         let verified = catalog.verify("street", &mut |_, _| {}).unwrap();
         assert_eq!(verified.damaged.len(), 0);
         assert_eq!(verified.objects, self.version.manifest.chunks.len() + 2);
-        Cache::new(catalog).open("street", None).unwrap();
+        everything(catalog).unwrap();
     }
+}
+
+/// Reads all of the twin but its coarse levels.
+fn everything(catalog: Catalog) -> Result<Pinned, ResidencyError> {
+    let resident = Cache::new(catalog).open("street", None)?;
+    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    resident.scene(&[eye], &RenderProfile { tau_px: 0.0, ..RenderProfile::default() })
 }
 
 fn flip(path: &Path, byte: usize) {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use wildcity::store::{Catalog, Keep, StoreError, Sum};
 
-use crate::places::{Place, change, commit, cells_alone, everywhere};
+use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
 use crate::wildcity;
 
@@ -61,7 +61,10 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
         assert!(matches!(error, StoreError::Collected { number: 3, .. }), "{error}");
         let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound(), "{checked:?}");
-        assert_eq!((&checked.collected[..], checked.unreferenced), (&[1, 2, 3][..], Sum::default()));
+        assert_eq!(
+            (&checked.collected[..], checked.unreferenced),
+            (&[1, 2, 3][..], Sum::default())
+        );
         // And a killed commit's rest can still be told from it.
         assert_eq!(change(&catalog, [9, 9], 1).change(5, cells_alone()).unwrap().number, 6);
         let listed = catalog.versions("street").unwrap();

@@ -16,7 +16,6 @@ mod garbage;
 mod places;
 mod real_scenes;
 mod remote;
-mod residency;
 mod round_trip;
 
 use std::path::{Path, PathBuf};

@@ -11,33 +11,33 @@ use crate::s3::{S3, keys};
 use crate::scene_files::gaussians;
 use crate::{files, street};
 
-pub enum Place {
+pub(crate) enum Place {
     Directory(tempfile::TempDir),
     S3(S3),
 }
 
 impl Place {
-    pub fn catalog(&self) -> Catalog {
+    pub(crate) fn catalog(&self) -> Catalog {
         match self {
             Self::Directory(dir) => Catalog::open(dir.path()).unwrap(),
             Self::S3(s3) => s3.catalog(),
         }
     }
 
-    pub fn twins(&self) -> PathBuf {
+    pub(crate) fn twins(&self) -> PathBuf {
         match self {
             Self::Directory(dir) => dir.path().to_owned(),
             Self::S3(s3) => s3.twins(),
         }
     }
 
-    pub fn objects(&self) -> Vec<PathBuf> {
+    pub(crate) fn objects(&self) -> Vec<PathBuf> {
         let of = self.twins().join("street/objects");
         if matches!(self, Self::S3(_)) { keys(&of) } else { files(&of) }
     }
 }
 
-pub fn everywhere(test: impl Fn(&Place)) {
+pub(crate) fn everywhere(test: impl Fn(&Place)) {
     test(&Place::Directory(tempfile::tempdir().unwrap()));
     test(&Place::S3(S3::start()));
 }
@@ -46,12 +46,12 @@ fn whole(scene: &Gaussians) -> NewVersion<'_> {
     NewVersion { storage: Storage::default(), ..street(scene) }
 }
 
-pub fn commit(catalog: &Catalog, scene: &Gaussians) -> Version {
+pub(crate) fn commit(catalog: &Catalog, scene: &Gaussians) -> Version {
     catalog.commit(whole(scene), &mut |_, _| {}).unwrap()
 }
 
 /// A change of one cell, in preparation.
-pub fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
+pub(crate) fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
     let mut scene = gaussians(300, 0, 10.0, seed);
     for mean_m in &mut scene.means_m {
         mean_m[0] += 64.0 * f64::from(cell[0]);
@@ -62,7 +62,7 @@ pub fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
     commit
 }
 
-pub fn cells_alone() -> Change {
+pub(crate) fn cells_alone() -> Change {
     let provenance = street(&gaussians(0, 0, 1.0, 0)).provenance;
     Change { profile: None, rig: None, trajectories: None, provenance }
 }

@@ -1,5 +1,6 @@
 use glam::DVec3;
 use wildcity::geometry::Pose;
+use wildcity::residency::{Cache, Eye};
 use wildcity::scene::chunk::columns;
 use wildcity::scene::trajectory::Keyframe;
 use wildcity::scene::{Chunk, Scene, Trajectory};
@@ -171,6 +172,8 @@ fn a_twin_may_be_empty() {
     assert_eq!(version.manifest.chunks, []);
     let catalog = Catalog::open(dir.path()).unwrap();
     assert_eq!(catalog.version("street", None).unwrap(), version);
-    let resident = wildcity::residency::Cache::new(catalog).open("street", None).unwrap();
-    assert_eq!(resident.bytes(), 0);
+    let resident = Cache::new(catalog).open("street", None).unwrap();
+    assert_eq!(resident.whole_bytes(), 0);
+    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    assert!(resident.scene(&[eye], &version.manifest.profile).unwrap().chunks.is_empty());
 }

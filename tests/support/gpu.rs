@@ -5,7 +5,7 @@ use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError};
+use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError, Limits};
 use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The best device of this machine.
@@ -23,9 +23,14 @@ pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
     watched(|| Gpu::with_shaders(&AdapterChoice::Best, 0, shaders))
 }
 
-/// The same with smaller bindings.
-pub(crate) fn gpu_with_binding_limit(binding_bytes: u64) -> Watched {
-    watched(|| Gpu::with_binding_limit(&AdapterChoice::Best, 0, binding_bytes))
+/// Bindings of so many bytes.
+pub(crate) fn bindings(binding_bytes: u64) -> Limits {
+    Limits { binding_bytes, ..Limits::default() }
+}
+
+/// The same with less of the device than it has.
+pub(crate) fn gpu_with_limits(limits: Limits) -> Watched {
+    watched(|| Gpu::with_limits(&AdapterChoice::Best, 0, limits))
 }
 
 fn watched(open: impl FnOnce() -> Result<Gpu, GpuError>) -> Watched {

@@ -23,7 +23,7 @@ const BUCKET: &str = "bucket";
 
 /// What a request meets with instead of its answer.
 #[derive(Clone, Copy, Debug)]
-pub enum Fault {
+pub(crate) enum Fault {
     /// This status, and nothing is done.
     Status(u16),
     /// It is done, but the connection breaks before the answer.
@@ -47,15 +47,15 @@ struct Rule {
 }
 
 /// A running server and the folder of its buckets.
-pub struct S3 {
-    pub dir: tempfile::TempDir,
+pub(crate) struct S3 {
+    pub(crate) dir: tempfile::TempDir,
     port: u16,
     rules: Arc<Mutex<Vec<Rule>>>,
     _runtime: tokio::runtime::Runtime,
 }
 
 impl S3 {
-    pub fn start() -> Self {
+    pub(crate) fn start() -> Self {
         // Another test may have said so before.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let dir = tempfile::tempdir().unwrap();
@@ -76,26 +76,26 @@ impl S3 {
     }
 
     /// The next requests of this kind fail.
-    pub fn fail(&self, method: &'static str, path: &str, times: usize, fault: Fault) {
+    pub(crate) fn fail(&self, method: &'static str, path: &str, times: usize, fault: Fault) {
         let rule = Rule { method, path: path.to_owned(), times, fault };
         self.rules.lock().unwrap().push(rule);
     }
 
     /// How many requests are still to fail.
-    pub fn to_fail(&self) -> usize {
+    pub(crate) fn to_fail(&self) -> usize {
         self.rules.lock().unwrap().iter().map(|rule| rule.times).sum()
     }
 
-    pub fn url() -> String {
+    pub(crate) fn url() -> String {
         format!("s3://{BUCKET}/twins")
     }
 
     /// Where the twins' keys are, as files.
-    pub fn twins(&self) -> PathBuf {
+    pub(crate) fn twins(&self) -> PathBuf {
         self.dir.path().join(BUCKET).join("twins")
     }
 
-    pub fn store(&self) -> Arc<dyn ObjectStore> {
+    pub(crate) fn store(&self) -> Arc<dyn ObjectStore> {
         let store = AmazonS3Builder::new()
             .with_endpoint(format!("http://127.0.0.1:{}", self.port))
             .with_allow_http(true)
@@ -108,16 +108,16 @@ impl S3 {
         Arc::new(store.unwrap())
     }
 
-    pub fn catalog(&self) -> Catalog {
+    pub(crate) fn catalog(&self) -> Catalog {
         self.cached(None).unwrap()
     }
 
-    pub fn cached(&self, cache: Option<&CacheSettings>) -> Result<Catalog, StoreError> {
+    pub(crate) fn cached(&self, cache: Option<&CacheSettings>) -> Result<Catalog, StoreError> {
         Catalog::over(self.store(), &Self::url(), "twins", cache, quick())
     }
 
     /// What a process needs to know of the server.
-    pub fn environment<'a>(&self, command: &'a mut Command) -> &'a mut Command {
+    pub(crate) fn environment<'a>(&self, command: &'a mut Command) -> &'a mut Command {
         command
             .env("AWS_ENDPOINT", format!("http://127.0.0.1:{}", self.port))
             .env("AWS_ALLOW_HTTP", "true")
@@ -128,12 +128,12 @@ impl S3 {
 }
 
 /// The patience of tests.
-pub fn quick() -> Patience {
+pub(crate) fn quick() -> Patience {
     Patience { timeout: Duration::from_secs(3), tries: 3, backoff: Duration::from_millis(10) }
 }
 
 /// All files below a folder that are objects of the server: it keeps notes of its own beside them.
-pub fn keys(dir: &Path) -> Vec<PathBuf> {
+pub(crate) fn keys(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(dir).into_iter().flatten() {
         let path = entry.unwrap().path();

@@ -174,6 +174,7 @@ impl TestServer {
         let config = Config {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
             twins: twins.path().to_owned(),
+            cache: None,
             episodes: episodes.path().to_owned(),
             backend: painter.clone(),
             limits,

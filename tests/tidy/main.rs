@@ -18,10 +18,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("indicatif", &["cli"]),
     ("fearless_simd", &["render/cpu"]),
     ("wgpu", &["render/gpu"]),
-    (
-        "rayon",
-        &["render", "scene/chunk.rs", "ingest/validate.rs", "store/pack.rs", "residency/cache.rs"],
-    ),
+    ("rayon", &["render", "scene/chunk.rs", "ingest/validate.rs", "store/pack.rs"]),
     ("tokio", &["server", "client", "session", "cli", "store/remote"]),
     // The catalog is made from one that is open.
     ("object_store", &["store/remote", "store/catalog.rs"]),

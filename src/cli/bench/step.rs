@@ -51,11 +51,12 @@ impl Step {
                 ready.shots[0].name
             );
         }
-        let frame = Frame { scene: &ready.scene, profile: &profile, views: &views };
+        let scene = ready.scene()?;
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
         // The first frame makes room, and is not counted.
         time(&*backend, &frame, 1, "rendering")?;
         let timed = time(&*backend, &frame, self.repeat, "rendering")?;
-        self.report(&ready.scene, &views, &*backend, &timed)
+        self.report(&scene, &views, &*backend, &timed)
     }
 
     fn report(

@@ -46,7 +46,7 @@ pub(super) fn draw(
     let mut drawn: Vec<Vec<RgbImage>> = Vec::new();
     let mut lines = Vec::new();
     for profile in &profiles {
-        let scene = resident.scene(&eyes, profile);
+        let scene = resident.scene(&eyes, profile)?;
         drawn.push(render(&*backend, &scene, profile, &views)?);
         let share = 100.0 * scene.gaussians() as f64 / version.manifest.gaussians() as f64;
         let (full, now) = (&drawn[0], &drawn[drawn.len() - 1]);

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::places::Twins;
 use crate::cli::progress;
-use crate::store::{Catalog, Checked};
+use crate::store::Checked;
 
 /// Read every object of every version of a twin again and compare it with its hash; and look for what
 /// the log lost, and what no version names.
@@ -28,7 +28,7 @@ pub(super) struct Fsck {
 
 impl Fsck {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let bar = progress::bytes("checking");
         let checked = catalog.fsck(&self.twin, &mut progress::show(&bar))?;
         bar.finish_and_clear();
@@ -78,12 +78,13 @@ impl Fsck {
 }
 
 fn json(checked: &Checked) -> serde_json::Value {
-    let damaged = checked.verified.damaged.iter().map(|damage| {
-        serde_json::json!({ "object": damage.object, "error": damage.error.to_string() })
-    });
-    let records = checked.records.iter().map(|(number, error)| {
-        serde_json::json!({ "number": number, "error": error.to_string() })
-    });
+    let damaged = checked.verified.damaged.iter().map(
+        |damage| serde_json::json!({ "object": damage.object, "error": damage.error.to_string() }),
+    );
+    let records = checked
+        .records
+        .iter()
+        .map(|(number, error)| serde_json::json!({ "number": number, "error": error.to_string() }));
     serde_json::json!({
         "sound": checked.is_sound(),
         "objects": checked.verified.objects,

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::cli::places::Twins;
 use crate::config;
-use crate::store::{Catalog, Keep};
+use crate::store::Keep;
 
 /// Remove objects of a twin that no version to be kept names.
 ///
@@ -40,7 +40,7 @@ pub(super) struct Gc {
 
 impl Gc {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let keep = Keep { versions: self.keep as usize, grace: self.grace };
         let found = catalog.collect(&self.twin, keep, self.dry_run)?;
         let kept: Vec<_> = found.kept.iter().map(u64::to_string).collect();

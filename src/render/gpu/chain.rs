@@ -90,13 +90,17 @@ impl Source<'_> {
 }
 
 impl Chain {
-    /// Compiles what every frame needs.
+    /// Compiles what every frame needs; Gaussians will take up to `mirror_bytes`.
     ///
     /// # Errors
     /// A shader does not compile, or memory is out.
-    pub(super) fn new(device: Device, shaders: &Shaders) -> Result<Self, RenderError> {
+    pub(super) fn new(
+        device: Device,
+        shaders: &Shaders,
+        mirror_bytes: u64,
+    ) -> Result<Self, RenderError> {
         let chain = Self {
-            mirror: Mirror::default(),
+            mirror: Mirror::new(mirror_bytes),
             plan: Plan::new(&device, shaders),
             scan: Scan::new(&device, shaders),
             project: Project::new(&device, shaders),
@@ -139,7 +143,7 @@ impl Chain {
         cull: &ThreadPool,
     ) -> Result<Drawn, RenderError> {
         let start = Instant::now();
-        cull.install(|| self.mirror.hold(&self.device, frame.scene));
+        cull.install(|| self.mirror.hold(&self.device, frame.scene))?;
         let (mut gpu_frame, read_back) = self.begin(frame, planes);
         let mut stats = FrameStats::default();
         add(&mut stats, "prepare", start.elapsed());

@@ -31,8 +31,9 @@ pub const BIG_SPLAT_MACROS: u32 = 16;
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Words before a cluster's columns: two are used, 128 B keep the columns aligned.
-pub const CLUSTER_HEADER_WORDS: u32 = 32;
+/// Gaussians side by side in the mirror, and words of one of its lines: 128 B, what a warp reads at
+/// once. A cluster's header is a line, of which three words are used.
+pub const STRIP: u32 = 32;
 /// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
 pub const GEOMETRY_WORDS: u32 = 9;
 
@@ -189,8 +190,8 @@ impl ChunkView {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Item {
-    /// Which cluster of its page of the mirror.
-    pub cluster: u32,
+    /// First line of the cluster on its page of the mirror.
+    pub line: u32,
     /// Which [`ChunkView`].
     pub chunk_view: u32,
 }

@@ -1,8 +1,12 @@
-//! The mirror: what is resident in main memory, encoded for the device and uploaded once.
+//! The mirror: what is resident in main memory, encoded for the device (`mirror/encode.rs`) and uploaded
+//! once.
 //!
-//! A cluster of 256 Gaussians is a header of 32 words and then word after word, 256 side by side:
-//! mean and scale (f32 x 3 each), opacity (f32), a quaternion in 64 bits, and colour as two 16-bit
-//! fractions per word of the cluster's largest value: 60.5 B per Gaussian at degree 1.
+//! It lies in pages, one buffer each, whose free lines are handed out cluster by cluster. What main
+//! memory drops is dropped here, and where there is a limit, what was not drawn for longest goes when
+//! something else is drawn.
+
+mod encode;
+mod free;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -11,86 +15,81 @@ use std::sync::{Arc, Weak};
 use rayon::prelude::*;
 use wgpu::{Buffer, BufferUsages};
 
+use self::encode::{LINE_BYTES, MOST_LINES};
+use self::free::Free;
 use super::device::Device;
-use super::layout::{CLUSTER_HEADER_WORDS, GEOMETRY_WORDS};
-use crate::scene::chunk::{CLUSTER, column};
-use crate::scene::{Chunk, Scene, sh};
+use super::layout::STRIP;
+use crate::render::RenderError;
+use crate::scene::{Chunk, Scene};
 
-/// Clusters encoded at a time: at most 2^11 of 34 kB, so that staging memory stays below 70 MB.
-const UPLOAD_CLUSTERS: u32 = 1 << 11;
-
-/// Opacity of what must never be seen, as a base-2 logarithm. WGSL may assume that no number is
-/// infinite, so minus infinity does not travel.
-const INVISIBLE: f32 = -1e30;
+/// Lines encoded at a time: 64 MiB, the most of staging memory.
+const UPLOAD_LINES: u32 = 1 << 19;
 
 /// All chunks on one device.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Mirror {
+    /// Most bytes of all pages.
+    limit_bytes: u64,
     pages: Vec<Option<Page>>,
     /// By address, which is a chunk's own for as long as the weak pointer lives.
     resident: BTreeMap<usize, Resident>,
+    /// Counts calls of [`Mirror::hold`].
+    frame: u64,
 }
 
 /// One buffer: a binding is limited, so a scene may need several.
 #[derive(Debug)]
 struct Page {
-    sh_degree: u8,
     buffer: Buffer,
-    clusters: u32,
-    free: Vec<Range<u32>>,
+    lines: u32,
+    free: Free,
 }
 
 #[derive(Debug)]
 struct Resident {
     chunk: Weak<Chunk>,
-    runs: Vec<Run>,
+    places: Vec<Place>,
+    last_frame: u64,
 }
 
-/// Consecutive clusters of a chunk on one page.
+/// Where a cluster lies.
 #[derive(Clone, Debug)]
-pub(super) struct Run {
-    /// Which page.
+pub(super) struct Place {
+    /// On which page.
     pub(super) page: usize,
-    /// Its clusters of the page.
-    pub(super) clusters: Range<u32>,
+    /// Its lines of the page.
+    pub(super) lines: Range<u32>,
 }
 
 impl Mirror {
+    /// An empty one that takes so much of the device's memory at most.
+    pub(super) fn new(limit_bytes: u64) -> Self {
+        Self { limit_bytes, pages: Vec::new(), resident: BTreeMap::new(), frame: 0 }
+    }
+
     /// Makes a scene resident. What main memory has dropped is dropped here too.
-    pub(super) fn hold(&mut self, device: &Device, scene: &Scene) {
-        let missing: Vec<&Arc<Chunk>> = {
-            let is_missing = |chunk: &&Arc<Chunk>| !self.resident.contains_key(&address(chunk));
-            scene.chunks.iter().filter(is_missing).collect()
-        };
+    ///
+    /// # Errors
+    /// [`RenderError::DeviceMemory`] if it is more than the limit by itself.
+    pub(super) fn hold(&mut self, device: &Device, scene: &Scene) -> Result<(), RenderError> {
+        self.frame += 1;
         self.drop_dead();
-        if missing.is_empty() {
-            return;
+        if self.hold_beside_others(device, scene).is_err() {
+            // Its clusters would fit, but not between the others: everything goes, and they come anew.
+            self.resident.clear();
+            self.pages.clear();
+            self.hold_beside_others(device, scene).map_err(|Full| RenderError::DeviceMemory {
+                needed_bytes: scene.chunks.iter().map(|chunk| lines_of(chunk)).sum::<u64>()
+                    * LINE_BYTES,
+                limit_bytes: self.limit_bytes,
+            })?;
         }
-        // A dead chunk's address may have been taken by another chunk only after it was dropped
-        // here, since the weak pointer keeps the allocation: what was not missing still is not.
-        let mut needed: u32 = missing.iter().map(|chunk| chunk.clusters().len() as u32).sum();
-        for chunk in missing {
-            let mut runs = Vec::new();
-            let mut rest = chunk.clusters().len() as u32;
-            while rest > 0 {
-                let run = match self.take(chunk.sh_degree(), rest) {
-                    Some(run) => run,
-                    None => self.take_from_new_page(device, chunk.sh_degree(), rest, needed),
-                };
-                let count = run.clusters.end - run.clusters.start;
-                rest -= count;
-                needed -= count;
-                runs.push(run);
-            }
-            self.upload(device, chunk, &runs);
-            let resident = Resident { chunk: Arc::downgrade(chunk), runs };
-            self.resident.insert(address(chunk), resident);
-        }
+        Ok(())
     }
 
     /// Where a chunk's clusters lie, in order. Empty unless [`Mirror::hold`] has seen it.
-    pub(super) fn runs(&self, chunk: &Arc<Chunk>) -> &[Run] {
-        self.resident.get(&address(chunk)).map_or(&[], |resident| &resident.runs)
+    pub(super) fn places(&self, chunk: &Arc<Chunk>) -> &[Place] {
+        self.resident.get(&address(chunk)).map_or(&[], |resident| &resident.places)
     }
 
     /// The buffer of a page.
@@ -108,169 +107,143 @@ impl Mirror {
         self.pages.iter().flatten().map(|page| page.buffer.size()).sum()
     }
 
-    fn drop_dead(&mut self) {
-        let pages = &mut self.pages;
-        self.resident.retain(|_, resident| {
-            let lives = resident.chunk.strong_count() > 0;
-            if !lives {
-                for run in &resident.runs {
-                    if let Some(page) = &mut pages[run.page] {
-                        page.free(run.clusters.clone());
+    fn hold_beside_others(&mut self, device: &Device, scene: &Scene) -> Result<(), Full> {
+        let mut missing = Vec::new();
+        for chunk in &scene.chunks {
+            match self.resident.get_mut(&address(chunk)) {
+                Some(resident) => resident.last_frame = self.frame,
+                None => missing.push(chunk),
+            }
+        }
+        let mut needed = missing.iter().map(|chunk| lines_of(chunk)).sum();
+        for chunk in missing {
+            let mut places = Vec::with_capacity(chunk.clusters().len());
+            for lines in encode::lines(chunk) {
+                match self.place(device, lines, needed) {
+                    Ok(place) => places.push(place),
+                    Err(full) => {
+                        self.give_back(&places);
+                        return Err(full);
                     }
                 }
+                needed -= u64::from(lines);
             }
-            lives
-        });
-        for slot in pages {
-            if slot.as_ref().is_some_and(Page::is_unused) {
+            self.upload(device, chunk, &places);
+            let (chunk, last_frame) = (Arc::downgrade(chunk), self.frame);
+            let address = chunk.as_ptr() as usize;
+            self.resident.insert(address, Resident { chunk, places, last_frame });
+        }
+        Ok(())
+    }
+
+    /// Takes consecutive lines, of a new page or of what this frame does not draw if it must be;
+    /// `needed` are those that the frame will take.
+    fn place(&mut self, device: &Device, lines: u32, needed: u64) -> Result<Place, Full> {
+        loop {
+            let found = self.pages.iter_mut().enumerate().find_map(|(index, page)| {
+                Some(Place { page: index, lines: page.as_mut()?.free.take(lines)? })
+            });
+            match found {
+                Some(place) => return Ok(place),
+                None if self.add_page(device, lines, needed) => {}
+                None => self.evict()?,
+            }
+        }
+    }
+
+    /// Adds a page with room for a cluster and, if the device and the limit have it, for what the frame
+    /// needs, or a quarter of what there is: as a twin streams by, pages must not become many.
+    fn add_page(&mut self, device: &Device, lines: u32, needed: u64) -> bool {
+        let held = self.bytes();
+        let wanted = needed.max(held / 4 / LINE_BYTES);
+        let most = self.limit_bytes.saturating_sub(held).min(device.binding_bytes()) / LINE_BYTES;
+        // Buffers have a multiple of two lines.
+        let lines_of_page = wanted.next_multiple_of(2).min(most & !1);
+        if lines_of_page < u64::from(lines) {
+            return false;
+        }
+        // A binding has less than 2^32 bytes on any device, and a line has 2^7.
+        let lines = u32::try_from(lines_of_page).unwrap_or(u32::MAX);
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let buffer = device.buffer("gaussians", u64::from(lines) * LINE_BYTES, usage);
+        let page = Page { buffer, lines, free: Free::all(lines) };
+        match self.pages.iter_mut().find(|page| page.is_none()) {
+            Some(slot) => *slot = Some(page),
+            None => self.pages.push(Some(page)),
+        }
+        true
+    }
+
+    /// Drops what was not drawn for longest.
+    fn evict(&mut self) -> Result<(), Full> {
+        let others = self.resident.iter().filter(|(_, resident)| resident.last_frame < self.frame);
+        let oldest = others.min_by_key(|(_, resident)| resident.last_frame);
+        let address = *oldest.ok_or(Full)?.0;
+        if let Some(Resident { places, .. }) = self.resident.remove(&address) {
+            self.give_back(&places);
+        }
+        Ok(())
+    }
+
+    fn drop_dead(&mut self) {
+        let dead: Vec<usize> = (self.resident.iter())
+            .filter(|(_, resident)| resident.chunk.strong_count() == 0)
+            .map(|(&address, _)| address)
+            .collect();
+        for address in dead {
+            if let Some(Resident { places, .. }) = self.resident.remove(&address) {
+                self.give_back(&places);
+            }
+        }
+        for slot in &mut self.pages {
+            if slot.as_ref().is_some_and(|page| page.free.is_all(page.lines)) {
                 *slot = None;
             }
         }
     }
 
-    /// Takes up to `most` consecutive clusters of a page of this degree.
-    fn take(&mut self, sh_degree: u8, most: u32) -> Option<Run> {
-        self.pages.iter_mut().enumerate().find_map(|(index, slot)| {
-            let page = slot.as_mut().filter(|page| page.sh_degree == sh_degree)?;
-            Some(Run { page: index, clusters: page.take(most)? })
-        })
+    fn give_back(&mut self, places: &[Place]) {
+        for place in places {
+            if let Some(Some(page)) = self.pages.get_mut(place.page) {
+                page.free.give_back(place.lines.clone());
+            }
+        }
     }
 
-    /// Adds a page for `needed` clusters, or as many as one binding holds, and takes up to `most`.
-    fn take_from_new_page(
-        &mut self,
-        device: &Device,
-        sh_degree: u8,
-        most: u32,
-        needed: u32,
-    ) -> Run {
-        let bytes = cluster_words(sh_degree) as u64 * 4;
-        let clusters = u64::from(needed).clamp(1, device.binding_bytes() / bytes) as u32;
-        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
-        let buffer = device.buffer("gaussians", bytes * u64::from(clusters), usage);
-        let taken = 0..most.min(clusters);
-        let mut page = Page { sh_degree, buffer, clusters, free: Vec::new() };
-        if taken.end < clusters {
-            page.free.push(taken.end..clusters);
-        }
-        let index = self.pages.iter().position(Option::is_none).unwrap_or(self.pages.len());
-        if index == self.pages.len() {
-            self.pages.push(None);
-        }
-        self.pages[index] = Some(page);
-        Run { page: index, clusters: taken }
-    }
-
-    fn upload(&self, device: &Device, chunk: &Chunk, runs: &[Run]) {
-        let words = cluster_words(chunk.sh_degree());
+    fn upload(&self, device: &Device, chunk: &Chunk, places: &[Place]) {
         let mut next = 0;
-        for Run { page, clusters } in runs {
-            let Some(buffer) = self.page(*page) else { continue };
-            for first in clusters.clone().step_by(UPLOAD_CLUSTERS as usize) {
-                let count = UPLOAD_CLUSTERS.min(clusters.end - first) as usize;
-                let mut block = vec![0; count * words];
-                block.par_chunks_exact_mut(words).enumerate().for_each(|(k, cluster)| {
-                    encode(chunk, next + k, cluster);
+        for run in places.chunk_by(|a, b| a.page == b.page && a.lines.end == b.lines.start) {
+            let Some(buffer) = self.page(run[0].page) else { continue };
+            let most = (UPLOAD_LINES / MOST_LINES) as usize;
+            for together in run.chunks(most) {
+                let lines = together[0].lines.start..together[together.len() - 1].lines.end;
+                let mut words = vec![0; lines.len() * STRIP as usize];
+                let mut rest = &mut words[..];
+                let mut clusters = Vec::with_capacity(together.len());
+                for place in together {
+                    let own;
+                    (own, rest) = rest.split_at_mut(place.lines.len() * STRIP as usize);
+                    clusters.push(own);
+                }
+                clusters.into_par_iter().enumerate().for_each(|(k, words)| {
+                    encode::encode(chunk, next + k, words);
                 });
-                next += count;
-                let offset = u64::from(first) * words as u64 * 4;
-                device.write_now(buffer, offset, bytemuck::cast_slice(&block));
+                next += together.len();
+                let offset = u64::from(lines.start) * LINE_BYTES;
+                device.write_now(buffer, offset, bytemuck::cast_slice(&words));
             }
         }
     }
 }
 
-impl Page {
-    fn take(&mut self, most: u32) -> Option<Range<u32>> {
-        let range = self.free.first_mut()?;
-        let taken = range.start..range.end.min(range.start + most);
-        range.start = taken.end;
-        if range.start == range.end {
-            self.free.remove(0);
-        }
-        Some(taken)
-    }
-
-    fn free(&mut self, range: Range<u32>) {
-        let place = self.free.partition_point(|free| free.start < range.start);
-        self.free.insert(place, range);
-        self.free.dedup_by(|next, before| {
-            let adjoins = before.end == next.start;
-            if adjoins {
-                before.end = next.end;
-            }
-            adjoins
-        });
-    }
-
-    fn is_unused(&self) -> bool {
-        self.free.first() == Some(&(0..self.clusters))
-    }
-}
+/// There is no room within the limit.
+#[derive(Debug)]
+struct Full;
 
 fn address(chunk: &Arc<Chunk>) -> usize {
     Arc::as_ptr(chunk) as usize
 }
 
-/// Words of a cluster of a degree.
-fn cluster_words(sh_degree: u8) -> usize {
-    let color = (3 * sh::coefficients(sh_degree)).div_ceil(2);
-    CLUSTER_HEADER_WORDS as usize + CLUSTER * (GEOMETRY_WORDS as usize + color)
-}
-
-/// Encodes cluster `index` of a chunk; places without a Gaussian are invisible.
-fn encode(chunk: &Chunk, index: usize, words: &mut [u32]) {
-    let values = 3 * sh::coefficients(chunk.sh_degree());
-    let (header, columns) = words.split_at_mut(CLUSTER_HEADER_WORDS as usize);
-    let first = index * CLUSTER;
-    let count = (chunk.len() - first).min(CLUSTER);
-    let largest = |range: Range<usize>| {
-        let of = |i| range.clone().map(move |c| chunk.value(first + i, column::SH + c).abs());
-        (0..count).flat_map(of).fold(0.0, f32::max).max(f32::MIN_POSITIVE)
-    };
-    let scales = [largest(0..3), largest(3..values)];
-    header[..2].copy_from_slice(&scales.map(f32::to_bits));
-    let (geometry, colors) = columns.split_at_mut(CLUSTER * GEOMETRY_WORDS as usize);
-    geometry[CLUSTER * 6 + count..CLUSTER * 7].fill(INVISIBLE.to_bits());
-    for i in 0..count {
-        let value = |column| chunk.value(first + i, column);
-        let mut set = |word: usize, bits| geometry[CLUSTER * word + i] = bits;
-        for axis in 0..3 {
-            set(axis, value(column::MEAN + axis).to_bits());
-            set(3 + axis, value(column::SCALE + axis).to_bits());
-        }
-        set(6, value(column::LOG2_OPACITY).max(INVISIBLE).to_bits());
-        let [low, high] = quat_bits([0, 1, 2, 3].map(|k| value(column::QUAT + k)));
-        set(7, low);
-        set(8, high);
-        let fraction = |j: usize| {
-            let scale = scales[usize::from(j >= 3)];
-            if j < values { (value(column::SH + j) / scale * 32_767.0).round() as i16 } else { 0 }
-        };
-        for j in (0..values).step_by(2) {
-            let (low, high) = (fraction(j) as u16, fraction(j + 1) as u16);
-            colors[CLUSTER * (j / 2) + i] = u32::from(low) | u32::from(high) << 16;
-        }
-    }
-}
-
-/// A unit quaternion in 62 bits: which component is the largest, and the other three, at most √½,
-/// in 20 bits each. Off by at most 7e-7: a needle of 10,000 px moves by less than 0.01 px. (With
-/// 16 bits for each of four it would move by 0.2 px.)
-fn quat_bits(wxyz: [f32; 4]) -> [u32; 2] {
-    let mut index = 0;
-    for k in 1..4 {
-        if wxyz[k].abs() > wxyz[index].abs() {
-            index = k;
-        }
-    }
-    // q and -q are one rotation, so the largest can be made positive.
-    let sign = f64::from(wxyz[index].signum());
-    let steps = |value: f32| {
-        let share = sign * f64::from(value) * std::f64::consts::SQRT_2 * 0.5 + 0.5;
-        (share.clamp(0.0, 1.0) * 1_048_575.0).round() as u64
-    };
-    let small = (0..4).filter(|&k| k != index).map(|k| steps(wxyz[k]));
-    let bits = small.enumerate().fold((index as u64) << 60, |bits, (k, s)| bits | s << (20 * k));
-    [bits as u32, (bits >> 32) as u32]
+fn lines_of(chunk: &Chunk) -> u64 {
+    encode::lines(chunk).map(u64::from).sum()
 }

@@ -52,7 +52,7 @@ pub struct Gpu {
     /// The device and its driver, the same for as long as the backend lives.
     info: AdapterInfo,
     shaders: Shaders,
-    binding_limit: u64,
+    limits: Limits,
     /// Delivers images, and runs what `finished` does with them.
     deliver: ThreadPool,
     /// Culls clusters: threads of its own, so that a frame that is drawn does not wait for one that
@@ -61,6 +61,23 @@ pub struct Gpu {
     turns: Turns,
     /// Gone after the device failed, and made again by the next frame.
     chain: Mutex<Option<Chain>>,
+}
+
+/// How much of a device is used, where that is less than what it has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Bytes of resident Gaussians: what was not drawn for longest goes when there would be more.
+    pub mirror_bytes: u64,
+    /// Bytes that a binding may hold; below `config::BINDING_BYTES_MIN` it is that. Frames that need
+    /// more are drawn part by part.
+    pub binding_bytes: u64,
+}
+
+impl Default for Limits {
+    /// What the device has.
+    fn default() -> Self {
+        Self { mirror_bytes: u64::MAX, binding_bytes: u64::MAX }
+    }
 }
 
 /// What a device holds and has done since it was opened.
@@ -86,7 +103,7 @@ impl Gpu {
     /// # Errors
     /// There is no such device, or it cannot do what the stages need.
     pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
-        Self::with_shaders(choice, threads, Shaders::default())
+        Self::open(choice, threads, Shaders::default(), Limits::default())
     }
 
     /// The same with other shaders: for tests that break one and see that it is noticed.
@@ -98,35 +115,35 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, shaders, u64::MAX)
+        Self::open(choice, threads, shaders, Limits::default())
     }
 
-    /// The same as if a binding held no more than so many bytes: for tests of frames that do not
-    /// fit a device at once. Below `config::BINDING_BYTES_MIN` it is that.
+    /// The same with less of the device than it has.
     ///
     /// # Errors
     /// As [`Gpu::new`].
-    pub fn with_binding_limit(
+    pub fn with_limits(
         choice: &AdapterChoice,
         threads: usize,
-        binding_bytes: u64,
+        limits: Limits,
     ) -> Result<Self, GpuError> {
-        let limit = binding_bytes.max(config::BINDING_BYTES_MIN);
-        Self::open(choice, threads, Shaders::default(), limit)
+        Self::open(choice, threads, Shaders::default(), limits)
     }
 
     fn open(
         choice: &AdapterChoice,
         threads: usize,
         shaders: Shaders,
-        binding_limit: u64,
+        limits: Limits,
     ) -> Result<Self, GpuError> {
         if threads > config::RENDER_THREADS {
             let limit = config::RENDER_THREADS;
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
-        let device = Device::open(choice, binding_limit)?;
+        let limits =
+            Limits { binding_bytes: limits.binding_bytes.max(config::BINDING_BYTES_MIN), ..limits };
+        let device = Device::open(choice, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
@@ -136,11 +153,11 @@ impl Gpu {
         Ok(Self {
             choice: choice.clone(),
             info: device.info.clone(),
-            binding_limit,
+            limits,
             deliver,
             cull,
             turns: Turns::default(),
-            chain: Mutex::new(Some(Chain::new(device, &shaders)?)),
+            chain: Mutex::new(Some(Chain::new(device, &shaders, limits.mirror_bytes)?)),
             shaders,
         })
     }
@@ -221,7 +238,7 @@ impl Gpu {
             None => {
                 let failed =
                     |reason| RenderError::Device { device: self.info.name.clone(), reason };
-                let device = Device::open(&self.choice, self.binding_limit);
+                let device = Device::open(&self.choice, self.limits.binding_bytes);
                 let device = device.map_err(|error| failed(error.to_string()))?;
                 // Another one would draw other bytes, and nobody has asked for it.
                 if device.info != self.info {
@@ -229,7 +246,7 @@ impl Gpu {
                     return Err(failed(reason));
                 }
                 tracing::info!(device = device.info.name, "the GPU is opened again");
-                slot.insert(Chain::new(device, &self.shaders)?)
+                slot.insert(Chain::new(device, &self.shaders, self.limits.mirror_bytes)?)
             }
         };
         let done = work(chain);

@@ -48,9 +48,9 @@ impl Work {
             let chunk_view = work.chunk_views.len() as u32;
             let from = CpuChunkView::new(&frame.views[view], chunk);
             work.chunk_views.push(ChunkView::new(view as u32, &from));
-            for (page, cluster) in clusters {
+            for (page, line) in clusters {
                 pages[page].push(work.items.len() as u32);
-                work.items.push(Item { cluster, chunk_view });
+                work.items.push(Item { line, chunk_view });
             }
         }
         for (page, items) in pages.into_iter().enumerate().filter(|(_, items)| !items.is_empty()) {
@@ -67,7 +67,7 @@ impl Work {
     }
 }
 
-/// Page and cluster of what one view may see of a chunk, in order.
+/// Page and first line of the clusters that one view may see of a chunk, in order.
 fn visible(
     frame: &Frame<'_>,
     view: usize,
@@ -75,12 +75,10 @@ fn visible(
     mirror: &Mirror,
 ) -> Vec<(usize, u32)> {
     let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
-    let runs = mirror.runs(chunk).iter();
-    let places = runs.flat_map(|run| run.clusters.clone().map(|cluster| (run.page, cluster)));
-    let places = places.zip(chunk.clusters());
+    let places = mirror.places(chunk).iter().zip(chunk.clusters());
     places
         .filter(|(_, cluster)| frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m))
-        .map(|(place, _)| place)
+        .map(|(place, _)| (place.page, place.lines.start))
         .collect()
 }
 

@@ -1,8 +1,7 @@
 //! The least that each stage must move, from what a frame counted: its memory roofline.
 
 use super::layout::{
-    CLUSTER_HEADER_WORDS, Counters, DIGITS, Frame as GpuFrame, GEOMETRY_WORDS, RASTER_BATCH,
-    SORT_BLOCK,
+    Counters, DIGITS, Frame as GpuFrame, GEOMETRY_WORDS, RASTER_BATCH, SORT_BLOCK, STRIP,
 };
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
@@ -83,7 +82,7 @@ impl FrameWork {
         let cluster = CLUSTER as u64;
         let geometry = 4 * u64::from(GEOMETRY_WORDS);
         let color = 4 * (3 * sh::coefficients(self.sh_degree) as u64).div_ceil(2);
-        let header = 4 * u64::from(CLUSTER_HEADER_WORDS);
+        let header = 4 * u64::from(STRIP);
         // A counter is written, read and written by the prefix sum, read once more to add up its
         // block, and read to place keys.
         let counters = |keys: u64| keys.div_ceil(SORT_BLOCK.into()) * u64::from(DIGITS) * 4 * 5;

@@ -55,7 +55,7 @@ pub(in crate::server) fn welcome(
 /// To `open`.
 pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let resident = session.resident();
-    let Version { number, hash, manifest, .. } = &resident.version;
+    let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = match serde_json::to_value(manifest.profile) {
         Ok(serde_json::Value::Object(profile)) => profile,
         other => return Err(Fault::Internal(format!("the profile is no object: {other:?}"))),
@@ -84,7 +84,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
             .map(TrajectorySummary::of)
             .map(trajectory_info)
             .collect(),
-        resident_bytes: resident.bytes() as u64,
+        resident_bytes: session.reserved_bytes(),
     })))
 }
 

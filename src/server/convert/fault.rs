@@ -3,6 +3,7 @@
 use crate::geometry::PoseError;
 use crate::protocol::error::Code;
 use crate::render::RenderError;
+use crate::residency::ResidencyError;
 use crate::scene::rig::RigError;
 use crate::server::fault::Fault;
 use crate::session::SessionError;
@@ -58,7 +59,16 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
         SessionError::Twin(StoreError::NoVersion { .. }) => {
             (Code::UnknownVersion, field("version"))
         }
-        SessionError::NoRoom(_) => (Code::Busy, field("twin")),
+        SessionError::Residency(error) => match error {
+            ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => {
+                (Code::Busy, field("twin"))
+            }
+            ResidencyError::Late { .. } => (Code::DeadlineExceeded, None),
+            ResidencyError::Load { .. } | ResidencyError::Store(_) => {
+                (Code::TwinDamaged, field("twin"))
+            }
+            ResidencyError::Thread { .. } => (Code::Internal, None),
+        },
         SessionError::Twin(_) => (Code::TwinDamaged, field("twin")),
         SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
         SessionError::UnknownCamera { index, .. } => {

@@ -294,7 +294,9 @@ impl Local {
         for prefix in entries(&twin.join("objects")).unwrap_or_default() {
             let _ = fs::remove_dir(twin.join("objects").join(prefix));
         }
-        for dir in [twin.join("objects"), twin.join("log"), twin.join("leases"), twin.join("gc"), twin] {
+        for dir in
+            [twin.join("objects"), twin.join("log"), twin.join("leases"), twin.join("gc"), twin]
+        {
             let _ = fs::remove_dir(dir);
         }
     }

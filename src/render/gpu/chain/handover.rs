@@ -56,7 +56,7 @@ impl Chain {
                 Source::Between(between)
             }
             None => {
-                cull.install(|| self.mirror.hold(&self.device, frame.scene));
+                cull.install(|| self.mirror.hold(&self.device, frame.scene))?;
                 work = cull.install(|| Work::new(frame, 0..frame.views.len(), &self.mirror));
                 self.project.upload(&self.device, &work);
                 Source::Gaussians(&work)

@@ -1,0 +1,265 @@
+//! Which sections are in memory: plain bookkeeping, without threads and without a clock.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use crate::scene::Chunk;
+
+/// What the content of a section depends on, hashed: versions that share a section share its memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) struct Key(pub(super) [u8; 16]);
+
+/// Name of a section in the table, for as long as a version that has it is open.
+pub(super) type Id = u32;
+
+/// No section: the end of the list.
+const NONE: Id = Id::MAX;
+
+/// Sections by what they are, those in memory in the order in which they were last wanted.
+///
+/// A section may be dropped if the table alone holds it (a frame's scene holds what it draws), and
+/// nobody with an older right waits for it.
+#[derive(Debug)]
+pub(super) struct Table {
+    limit_bytes: u64,
+    held_bytes: u64,
+    held_sections: u64,
+    ids: HashMap<Key, Id>,
+    slots: Vec<Slot>,
+    vacant: Vec<Id>,
+    oldest: Id,
+    newest: Id,
+    /// Frames that wait for others beside a section, by their numbers, rising.
+    waiting: BTreeMap<Id, Vec<u64>>,
+}
+
+#[derive(Debug)]
+struct Slot {
+    key: Key,
+    bytes: u64,
+    state: State,
+    /// Open versions that have it.
+    versions: u32,
+    /// When it was last wanted, in requests since the start.
+    stamp: u64,
+    older: Id,
+    newer: Id,
+}
+
+#[derive(Debug)]
+enum State {
+    Absent,
+    Loading,
+    Here(Arc<Chunk>),
+}
+
+/// Whose load it is, and so what it may push out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Asker {
+    /// A frame that waits: everything but what older frames wait for. So the oldest frame always gets
+    /// on, and no two can block each other.
+    Frame(u64),
+    /// Nobody waits yet: only what has not been wanted since a request of this number.
+    Prefetch(u64),
+}
+
+impl Table {
+    pub(super) fn new(limit_bytes: u64) -> Self {
+        Self {
+            limit_bytes,
+            held_bytes: 0,
+            held_sections: 0,
+            ids: HashMap::new(),
+            slots: Vec::new(),
+            vacant: Vec::new(),
+            oldest: NONE,
+            newest: NONE,
+            waiting: BTreeMap::new(),
+        }
+    }
+
+    /// The name of a section that a version has, once per version.
+    pub(super) fn register(&mut self, key: Key, bytes: u64) -> Id {
+        if let Some(&id) = self.ids.get(&key) {
+            self.slots[id as usize].versions += 1;
+            return id;
+        }
+        let (state, versions, stamp) = (State::Absent, 1, 0);
+        let slot = Slot { key, bytes, state, versions, stamp, older: NONE, newer: NONE };
+        let id = match self.vacant.pop() {
+            Some(id) => {
+                self.slots[id as usize] = slot;
+                id
+            }
+            None => {
+                self.slots.push(slot);
+                (self.slots.len() - 1) as Id
+            }
+        };
+        self.ids.insert(key, id);
+        id
+    }
+
+    /// A version that has it was closed. What is in memory stays until its room is needed: the next
+    /// version may have it, too.
+    pub(super) fn unregister(&mut self, id: Id) {
+        self.slots[id as usize].versions -= 1;
+        self.forget_if_unused(id);
+    }
+
+    /// The section, if it is in memory.
+    pub(super) fn get(&self, id: Id) -> Option<&Arc<Chunk>> {
+        match &self.slots[id as usize].state {
+            State::Here(chunk) => Some(chunk),
+            State::Absent | State::Loading => None,
+        }
+    }
+
+    /// Whether it is neither in memory nor on its way.
+    pub(super) fn is_absent(&self, id: Id) -> bool {
+        matches!(self.slots[id as usize].state, State::Absent)
+    }
+
+    /// What it takes, in bytes.
+    pub(super) fn bytes(&self, id: Id) -> u64 {
+        self.slots[id as usize].bytes
+    }
+
+    /// Notes that it is wanted now: the last to be dropped.
+    pub(super) fn want(&mut self, id: Id, stamp: u64) {
+        self.slots[id as usize].stamp = stamp;
+        if self.get(id).is_some() {
+            self.unlink(id);
+            self.link_newest(id);
+        }
+    }
+
+    /// A frame waits until this section and others are there together.
+    pub(super) fn wait(&mut self, id: Id, frame: u64) {
+        self.waiting.entry(id).or_default().push(frame);
+    }
+
+    /// It waits no more.
+    pub(super) fn unwait(&mut self, id: Id, frame: u64) {
+        if let Some(frames) = self.waiting.get_mut(&id) {
+            frames.retain(|&other| other != frame);
+            if frames.is_empty() {
+                self.waiting.remove(&id);
+            }
+        }
+    }
+
+    /// The frames that wait for it, the oldest first.
+    pub(super) fn waiting(&self, id: Id) -> &[u64] {
+        self.waiting.get(&id).map_or(&[], Vec::as_slice)
+    }
+
+    /// Takes the room of a section that is to be loaded, and returns what was dropped for it. If there
+    /// is not enough that may be dropped, nothing is, and nothing is taken.
+    pub(super) fn reserve(&mut self, id: Id, asker: Asker) -> Option<Vec<Id>> {
+        let bytes = self.slots[id as usize].bytes;
+        let free_bytes = self.limit_bytes - self.held_bytes;
+        let mut victims = Vec::new();
+        let (mut gained_bytes, mut next) = (0, self.oldest);
+        while free_bytes + gained_bytes < bytes {
+            if next == NONE {
+                return None;
+            }
+            let slot = &self.slots[next as usize];
+            if let Asker::Prefetch(since) = asker
+                && slot.stamp >= since
+            {
+                return None;
+            }
+            if self.may_drop(next, asker) {
+                gained_bytes += slot.bytes;
+                victims.push(next);
+            }
+            next = slot.newer;
+        }
+        victims.iter().for_each(|&victim| self.drop_section(victim));
+        self.slots[id as usize].state = State::Loading;
+        self.held_bytes += bytes;
+        Some(victims)
+    }
+
+    /// A section has arrived.
+    pub(super) fn fill(&mut self, id: Id, chunk: Arc<Chunk>) {
+        self.slots[id as usize].state = State::Here(chunk);
+        self.held_sections += 1;
+        self.link_newest(id);
+    }
+
+    /// A section has not arrived.
+    pub(super) fn fail(&mut self, id: Id) {
+        let slot = &mut self.slots[id as usize];
+        slot.state = State::Absent;
+        self.held_bytes -= slot.bytes;
+        self.forget_if_unused(id);
+    }
+
+    /// Bytes of memory in use, what is being loaded included.
+    pub(super) fn held_bytes(&self) -> u64 {
+        self.held_bytes
+    }
+
+    /// Bytes of memory there are.
+    pub(super) fn limit_bytes(&self) -> u64 {
+        self.limit_bytes
+    }
+
+    /// Sections in memory.
+    pub(super) fn held_sections(&self) -> u64 {
+        self.held_sections
+    }
+
+    fn may_drop(&self, id: Id, asker: Asker) -> bool {
+        let State::Here(chunk) = &self.slots[id as usize].state else { return false };
+        let oldest_waiting = self.waiting(id).first();
+        let spared = match asker {
+            Asker::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
+            Asker::Prefetch(_) => oldest_waiting.is_some(),
+        };
+        Arc::strong_count(chunk) == 1 && !spared
+    }
+
+    fn drop_section(&mut self, id: Id) {
+        self.unlink(id);
+        let slot = &mut self.slots[id as usize];
+        slot.state = State::Absent;
+        self.held_bytes -= slot.bytes;
+        self.held_sections -= 1;
+        self.forget_if_unused(id);
+    }
+
+    /// Absent sections of versions that nobody has open are not worth a name.
+    fn forget_if_unused(&mut self, id: Id) {
+        let Slot { key, state, versions, .. } = &self.slots[id as usize];
+        if *versions == 0 && matches!(state, State::Absent) {
+            self.ids.remove(key);
+            self.vacant.push(id);
+        }
+    }
+
+    fn unlink(&mut self, id: Id) {
+        let Slot { older, newer, .. } = self.slots[id as usize];
+        match older {
+            NONE => self.oldest = newer,
+            older => self.slots[older as usize].newer = newer,
+        }
+        match newer {
+            NONE => self.newest = older,
+            newer => self.slots[newer as usize].older = older,
+        }
+    }
+
+    fn link_newest(&mut self, id: Id) {
+        let before = std::mem::replace(&mut self.newest, id);
+        match before {
+            NONE => self.oldest = id,
+            before => self.slots[before as usize].newer = id,
+        }
+        let slot = &mut self.slots[id as usize];
+        (slot.older, slot.newer) = (before, NONE);
+    }
+}

@@ -1,0 +1,156 @@
+//! What of a twin is in the device's memory.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use wildcity::generate::{self, StreetSettings};
+use wildcity::render::gpu::Limits;
+use wildcity::render::{Backend, Frame, RenderError, Target, View};
+use wildcity::scene::chunk::{CellRun, Partition};
+use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
+
+use crate::gpu::{bindings, gpu, gpu_with_limits};
+use crate::images::{look, render};
+use crate::streets::{street, turning_views};
+
+/// Most bytes per resident Gaussian of SH degree 1.
+const BYTES: f64 = 64.0;
+
+/// The demo street as a twin has it, in blocks of 16 m, each at the coarsest level whose error is at most
+/// a pixel in a camera of so many pixels of focal length that stands at the street's start.
+fn demo(focal_px: f32) -> Scene {
+    let street = generate::street(&StreetSettings::default()).unwrap();
+    let (gaussians, eye_m) = (street.gaussians, street.trajectory.at_station(0.0).position_m);
+    let Partition { cells, order } = Partition::new(&gaussians.means_m);
+    let block = |cell: &CellRun, indices: &[u32]| {
+        let mut full = Chunk::new(cell.cell, cell.origin_m, gaussians.sh_degree, indices.len());
+        for &index in indices {
+            full.push(&cell.record(&gaussians, index as usize));
+        }
+        let eye_m = (eye_m - cell.origin_m).as_vec3();
+        let distance_m = full
+            .clusters()
+            .iter()
+            .map(|cluster| eye_m.distance(eye_m.clamp(cluster.min_m, cluster.max_m)));
+        let distance_m = distance_m.fold(f32::INFINITY, f32::min);
+        let levels = lod::levels(&full).into_iter().rev();
+        let coarsest = levels.into_iter().find(|level| focal_px * level.error_m <= distance_m);
+        Arc::new(coarsest.map_or(full, |level| level.chunk))
+    };
+    let chunks = cells.iter().flat_map(|cell| {
+        cell.blocks.iter().map(|(_, run)| block(cell, &order[run.clone()])).collect::<Vec<_>>()
+    });
+    Scene { chunks: chunks.collect() }
+}
+
+fn bytes_per_gaussian(scene: &Scene) -> f64 {
+    let backend = gpu();
+    let view = look([64, 64], 50.0, DVec3::ZERO, DVec3::X, DVec3::Z);
+    render(&backend, scene, &RenderProfile::default(), &[view]);
+    backend.usage().unwrap().mirror_bytes as f64 / scene.gaussians() as f64
+}
+
+#[test]
+fn a_gaussian_of_a_twin_takes_at_most_64_bytes() {
+    // All of it, what a camera of 1440 pixels sees of it, and one of a fifth of that.
+    let [full, sharp, small] = [f32::INFINITY, 1_200.0, 240.0].map(demo);
+    let counts = [&full, &sharp, &small].map(Scene::gaussians);
+    assert!(counts[1] < counts[0] && counts[2] < counts[0] / 2, "{counts:?}");
+    for scene in [full, sharp, small] {
+        let bytes = bytes_per_gaussian(&scene);
+        assert!(bytes <= BYTES, "{bytes} B for each of {}", scene.gaussians());
+    }
+}
+
+#[test]
+fn memory_is_what_is_resident() {
+    let (backend, profile) = (gpu(), RenderProfile::default());
+    let bytes = || backend.usage().unwrap().mirror_bytes;
+    let street_of = |seed| Scene::from_gaussians(&street(40_000, 1, seed));
+    render(&backend, &street_of(16), &profile, &turning_views()[..1]);
+    let one = bytes();
+    assert!(one <= 61 * 40_000, "{one} B for 40,000 Gaussians");
+    for seed in 17..27 {
+        let scene = street_of(seed);
+        render(&backend, &scene, &profile, &turning_views()[..1]);
+        assert!(bytes() <= 3 * one, "{} B after scene {seed}", bytes());
+    }
+}
+
+/// Cells of a route, of which a few are drawn at a time.
+fn route() -> Vec<Scene> {
+    let mut cells: Vec<Gaussians> =
+        (0..8).map(|seed| street(5_000 + 700 * seed as usize, 1, seed)).collect();
+    for (k, cell) in cells.iter_mut().enumerate() {
+        cell.means_m.iter_mut().for_each(|mean_m| mean_m[0] += 64.0 * k as f64);
+    }
+    cells.iter().map(Scene::from_gaussians).collect()
+}
+
+/// A drive to and fro, and jumps, under every limit: the bytes never exceed it, and the images are those
+/// without any.
+#[test]
+fn what_was_not_drawn_for_longest_makes_room() {
+    let (cells, profile) = (route(), RenderProfile::default());
+    let window = |at: usize| {
+        let chunks = cells[at..at + 3].iter().flat_map(|cell| cell.chunks.iter().cloned());
+        Scene { chunks: chunks.collect() }
+    };
+    let view = |at: usize| {
+        let eye_m = DVec3::new(64.0 * (at + 1) as f64, 0.0, 0.0);
+        look([96, 64], 60.0, eye_m, DVec3::new(1.0, 0.1, 0.2), DVec3::Y)
+    };
+    let free = gpu();
+    // Small bindings too, so that a scene lies on many pages.
+    for bound in [Limits::default(), bindings(256 << 10)] {
+        let alone = (0..6).map(|at| {
+            let backend = gpu_with_limits(bound);
+            render(&backend, &window(at), &profile, &[view(at)]);
+            backend.usage().unwrap().mirror_bytes
+        });
+        let largest = alone.max().unwrap();
+        for mirror_bytes in [largest, largest + largest / 10, 2 * largest] {
+            let limited = gpu_with_limits(Limits { mirror_bytes, ..bound });
+            for at in [0, 1, 2, 3, 4, 5, 4, 3, 0, 5, 1, 3, 0, 2, 5] {
+                let expected = render(&free, &window(at), &profile, &[view(at)]);
+                let drawn = render(&limited, &window(at), &profile, &[view(at)]);
+                assert!(drawn == expected, "at {at} within {mirror_bytes} B, {bound:?}");
+                let held = limited.usage().unwrap().mirror_bytes;
+                assert!(held <= mirror_bytes, "{held} B at {at} of {mirror_bytes}, {bound:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
+    let profile = RenderProfile::default();
+    // Every cell fits alone, and all of them do not.
+    let cells = route();
+    let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
+    let (small, large) = (&cells[0], &Scene { chunks: all.collect() });
+    let limited = gpu_with_limits(Limits { mirror_bytes: 1_000_000, ..Limits::default() });
+    let expected = render(&gpu(), small, &profile, &turning_views());
+    for _ in 0..2 {
+        assert!(render(&limited, small, &profile, &turning_views()) == expected);
+        let refused = refusal(&limited, large, &turning_views());
+        let RenderError::DeviceMemory { needed_bytes, limit_bytes: 1_000_000 } = refused else {
+            panic!("{refused}")
+        };
+        let each = needed_bytes as f64 / large.gaussians() as f64;
+        assert!((60.0..62.0).contains(&each), "{needed_bytes}");
+    }
+}
+
+fn refusal(backend: &dyn Backend, scene: &Scene, views: &[View]) -> RenderError {
+    let profile = RenderProfile::default();
+    let mut images: Vec<Vec<u8>> =
+        views.iter().map(|view| vec![7; 3 * view.camera.pixels()]).collect();
+    let mut targets: Vec<Target<'_>> = (images.iter_mut())
+        .map(|image| Target { rgb8: Some(image), ..Target::default() })
+        .collect();
+    let frame = Frame { scene, profile: &profile, views };
+    let refused = backend.render(&frame, &mut targets, &|_, _| {}).unwrap_err();
+    assert!(images.iter().flatten().all(|&byte| byte == 7), "something was written");
+    refused
+}

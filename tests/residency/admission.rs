@@ -1,0 +1,94 @@
+//! Who may open a session, and what it can rely on.
+
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+use std::time::Instant;
+
+use wildcity::residency::{Cache, Lens, ResidencyError};
+
+use crate::scene_files::Random;
+use crate::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
+
+const LENS: Lens = Lens { focal_px: 70.0, radius_m: 1.7 };
+
+#[test]
+fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
+    let worst_bytes = unlimited().open("demo", None).unwrap().worst_bytes(LENS);
+    let limit_bytes = 2 * worst_bytes + 1;
+    let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+    let resident = cache.open("demo", None).unwrap();
+    assert!(limit_bytes < resident.whole_bytes(), "else there is room for everything");
+    let held = [resident.reserve(LENS).unwrap(), resident.reserve(LENS).unwrap()];
+    let refused = resident.reserve(LENS).unwrap_err();
+    match &refused {
+        ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes: limit } => {
+            let said = (twin.as_str(), *needed_bytes, *held_bytes, *limit);
+            assert_eq!(said, ("demo", worst_bytes, 2 * worst_bytes, limit_bytes));
+        }
+        other => panic!("{other}"),
+    }
+    assert!(refused.to_string().contains("--memory-gib"), "{refused}");
+    assert_eq!(cache.stats().reserved_bytes, 2 * worst_bytes);
+    drop(held);
+    assert!(resident.reserve(LENS).is_ok(), "what is given back is there again");
+    assert_eq!(cache.stats().reserved_bytes, 0);
+}
+
+#[test]
+fn a_twin_that_fits_as_a_whole_has_room_for_any_number_of_sessions() {
+    let whole_bytes = unlimited().open("demo", None).unwrap().whole_bytes();
+    let cache = Cache::limited(demo().catalog(), Some(whole_bytes));
+    let resident = cache.open("demo", None).unwrap();
+    let held: Vec<_> = (0..100).map(|_| resident.reserve(LENS).unwrap()).collect();
+    assert_eq!(cache.stats().reserved_bytes, whole_bytes);
+    drop(held);
+}
+
+#[test]
+fn as_many_sessions_as_there_is_room_for_race_without_a_deadlock() {
+    let all = unlimited().open("demo", None).unwrap();
+    let limit_bytes = 3 * all.worst_bytes(LENS);
+    let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+    let resident = cache.open("demo", None).unwrap();
+    race(&resident, 3, true);
+    let stats = cache.stats();
+    assert!(stats.evictions > 0 && stats.held_bytes <= limit_bytes, "{stats:?}");
+}
+
+#[test]
+fn askers_that_nobody_admitted_get_on_one_after_the_other() {
+    // Room for the worst frame, and eight that want another one each.
+    let all = unlimited().open("demo", None).unwrap();
+    let limit_bytes = all.worst_bytes(LENS);
+    let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+    race(&cache.open("demo", None).unwrap(), 8, false);
+    assert!(cache.stats().held_bytes <= limit_bytes);
+}
+
+/// Threads that each draw forty frames in places of their own.
+fn race(resident: &Arc<wildcity::residency::Resident>, threads: u64, admitted: bool) {
+    let (tell, told) = channel();
+    for thread in 0..threads {
+        let (resident, tell) = (resident.clone(), tell.clone());
+        std::thread::spawn(move || {
+            let _reservation = admitted.then(|| resident.reserve(LENS).unwrap());
+            let mut random = Random(thread + 1);
+            for _ in 0..40 {
+                let pose = demo().at(600.0 * random.unit());
+                let scene = resident.scene(&eyes(&views(pose)), &PROFILE).unwrap();
+                let needed = resident.demand(&eyes(&views(pose)), &PROFILE);
+                assert_eq!(scene.chunks.len(), needed.len());
+                let stats = resident.stats();
+                assert!(stats.held_bytes <= stats.limit_bytes, "{stats:?}");
+                let _pixels = (random.unit() < 0.1).then(|| pixels(&scene, pose));
+            }
+            tell.send(thread).unwrap();
+        });
+    }
+    drop(tell);
+    let began = Instant::now();
+    for _ in 0..threads {
+        let left = (3 * PATIENCE).saturating_sub(began.elapsed());
+        told.recv_timeout(left).expect("a frame was never drawn");
+    }
+}

@@ -1,0 +1,125 @@
+//! The set that is drawn is a function of the pose: memory changes when, and never what.
+
+use wildcity::residency::{Cache, Index, Lens, Resident, demand};
+use wildcity::scene::RenderProfile;
+
+use crate::scene_files::Random;
+use crate::{PROFILE, bytes, demo, eyes, need_bytes, pixels, unlimited, views};
+
+/// A frame's pixels, and that nothing is held beyond the limit meanwhile.
+fn drawn(resident: &std::sync::Arc<Resident>, station_m: f64) -> Vec<Vec<u8>> {
+    let pose = demo().at(station_m);
+    let scene = resident.scene(&eyes(&views(pose)), &PROFILE).unwrap();
+    let stats = resident.stats();
+    assert!(stats.held_bytes <= stats.limit_bytes, "{stats:?}");
+    pixels(&scene, pose)
+}
+
+#[test]
+fn a_cache_of_exactly_what_a_frame_needs_draws_it() {
+    let all = unlimited().open("demo", None).unwrap();
+    for station_m in [0.0, 200.0, 410.0] {
+        let limit_bytes = need_bytes(&all, demo().at(station_m));
+        let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+        let resident = cache.open("demo", None).unwrap();
+        assert_eq!(drawn(&resident, station_m), drawn(&all, station_m));
+        let stats = cache.stats();
+        assert_eq!((stats.held_bytes, stats.evictions), (limit_bytes, 0), "to the byte");
+
+        let less = Cache::limited(demo().catalog(), Some(limit_bytes - 1));
+        let resident = less.open("demo", None).unwrap();
+        let views = views(demo().at(station_m));
+        let refused = resident.scene(&eyes(&views), &PROFILE).unwrap_err().to_string();
+        assert!(refused.contains(&limit_bytes.to_string()), "{refused}");
+        assert_eq!(less.stats().loads, 0, "refused before anything is loaded");
+    }
+}
+
+#[test]
+fn two_hundred_teleports_under_random_budgets_draw_what_the_whole_twin_does() {
+    let all = unlimited().open("demo", None).unwrap();
+    let mut random = Random(7);
+    let most = (0..60).map(|i| need_bytes(&all, demo().at(10.0 * f64::from(i)))).max().unwrap();
+    for _ in 0..5 {
+        let limit_bytes = most + (random.unit() * most as f64) as u64;
+        let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+        let resident = cache.open("demo", None).unwrap();
+        for _ in 0..40 {
+            // On a grid, so that what everything in memory draws is drawn once for many.
+            let station_m = 10.0 * (random.unit() * 59.0).floor();
+            assert_eq!(drawn(&resident, station_m), drawn(&all, station_m), "at {station_m} m");
+        }
+        let stats = cache.stats();
+        assert!(stats.evictions > 0 && stats.hits > 0 && stats.misses > 0, "{stats:?}");
+        assert_eq!(stats.loads, stats.misses, "nothing is loaded twice at a time");
+    }
+}
+
+#[test]
+fn the_index_finds_what_looking_at_every_block_finds() {
+    let resident = unlimited().open("demo", None).unwrap();
+    let manifest = &resident.version.manifest;
+    let index = Index::new(manifest);
+    let mut random = Random(3);
+    for reach_m in [None, Some(0.0), Some(30.0), Some(120.0), Some(5_000.0)] {
+        for tau_px in [0.0, 0.5, 4.0] {
+            let profile = RenderProfile { reach_m, tau_px, ..PROFILE };
+            for _ in 0..10 {
+                let mut pose = demo().at(700.0 * random.unit() - 50.0);
+                pose.position_m.y += 400.0 * random.unit() - 200.0;
+                let eyes = eyes(&views(pose));
+                let plain = plain_walk(manifest, &eyes, &profile);
+                assert_eq!(index.demand(manifest, &eyes, &profile), plain);
+                assert_eq!(demand(manifest, &eyes, &profile), plain);
+            }
+        }
+    }
+}
+
+/// The rule without an index.
+fn plain_walk(
+    manifest: &wildcity::scene::Manifest,
+    eyes: &[wildcity::residency::Eye],
+    profile: &RenderProfile,
+) -> Vec<wildcity::residency::Needed> {
+    let focal_px = eyes.iter().map(|eye| eye.focal_px).fold(0.0, f64::max);
+    let mut needed = Vec::new();
+    for (chunk, entry) in manifest.chunks.iter().enumerate() {
+        for (section, full) in entry.sections.iter().enumerate().filter(|(_, s)| s.level == 0) {
+            let bounds = entry.section_bounds(full);
+            let far = |eye: &wildcity::residency::Eye| bounds.distance_m(eye.position_m);
+            let distance_m = eyes.iter().map(far).fold(f64::INFINITY, f64::min);
+            if profile.reach_m.is_some_and(|reach_m| distance_m > reach_m) {
+                continue;
+            }
+            let levels = entry.sections[section..].iter().take_while(|s| s.block == full.block);
+            let drawn = levels
+                .enumerate()
+                .filter(|(_, s)| focal_px * f64::from(s.error_m) <= profile.tau_px * distance_m)
+                .last();
+            let level = drawn.map_or(0, |(level, _)| level);
+            needed.push(wildcity::residency::Needed { chunk, section: section + level });
+        }
+    }
+    needed
+}
+
+#[test]
+fn no_frame_anywhere_needs_more_than_the_worst() {
+    let resident = unlimited().open("demo", None).unwrap();
+    let mut random = Random(11);
+    let lens = Lens { focal_px: 70.0, radius_m: 1.7 };
+    let worst_bytes = resident.worst_bytes(lens);
+    let mut most_bytes = 0;
+    for _ in 0..3_000 {
+        let mut pose = demo().at(650.0 * random.unit() - 25.0);
+        pose.position_m.x += 60.0 * random.unit() - 30.0;
+        pose.position_m.y += 200.0 * random.unit() - 100.0;
+        pose.position_m.z += 50.0 * random.unit() - 10.0;
+        let needed = resident.demand(&eyes(&views(pose)), &PROFILE);
+        most_bytes = most_bytes.max(bytes(&resident, &needed));
+    }
+    assert!(most_bytes <= worst_bytes, "{most_bytes} of {worst_bytes}");
+    assert!(worst_bytes <= 2 * most_bytes, "{worst_bytes} is no bound of {most_bytes} to use");
+    assert!(worst_bytes < resident.whole_bytes());
+}
