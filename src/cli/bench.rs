@@ -1,10 +1,11 @@
 //! `wildcity bench`.
 
 mod gpu;
+mod load;
 mod step;
 mod timed;
 
-/// Time the renderer.
+/// Time the renderer, and reading twins.
 #[derive(Debug, clap::Args)]
 pub(super) struct Bench {
     #[command(subcommand)]
@@ -15,6 +16,7 @@ pub(super) struct Bench {
 enum What {
     Step(step::Step),
     Gpu(gpu::Gpu),
+    Load(load::Load),
 }
 
 impl Bench {
@@ -22,6 +24,7 @@ impl Bench {
         match self.what {
             What::Step(step) => step.run(),
             What::Gpu(gpu) => gpu.run(),
+            What::Load(load) => load.run(),
         }
     }
 }

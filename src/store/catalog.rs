@@ -178,6 +178,11 @@ impl Catalog {
             .map_err(|reason| of_section(self.objects.path(twin, &chunk.object), reason))
     }
 
+    /// Where a chunk's object lies: a path, or a URL.
+    pub fn object_path(&self, version: &Version, chunk: &ChunkEntry) -> PathBuf {
+        self.objects.path(&version.manifest.twin, &chunk.object)
+    }
+
     /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
     ///
     /// # Errors

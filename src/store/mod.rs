@@ -1,12 +1,19 @@
-//! Twins on disk: immutable versions, content-addressed.
+//! Twins on disk or in an object store: immutable versions, content-addressed.
 //!
 //! ```text
-//! <twins>/<name>/log/0000000001         which manifest version 1 is, and since when
+//! <twins>/<name>/log/0000000001         which manifest version 1 is, since when, and how it came about
 //! <twins>/<name>/objects/3f/3f9c...     manifests, their tables and chunks, named by their BLAKE3
+//! <twins>/<name>/leases/...             versions in use, and until when
+//! <twins>/<name>/gc/candidates          objects that no version needs, and since when
+//! <twins>/<name>/gc/collected           versions whose objects were removed
+//!
 //! <twins>/.staging/<name>@<commit>/     objects of a commit in the making, invisible to everyone
 //! <twins>/.staging/<name>@<commit>/lock held by its process as long as it lives
 //! <twins>/.staging/<name>.lock          held while a version is published
 //! ```
+//!
+//! What begins with `.staging` is of directories alone; in an object store, objects are uploaded to
+//! where they stay.
 //!
 //! Objects come first and the log's record last, put only if absent, so that whatever happens in
 //! the middle leaves the old version or the new one.
