@@ -137,6 +137,10 @@ pub const SCENE_JSON_BYTES: u64 = 64 << 20;
 /// Files of one scene: eight per block of a streamed SOG.
 pub const SCENE_PARTS: usize = 100_000;
 
+/// Gaussians that cover the triangles of a mesh, and as many again for those smaller than one's share: a
+/// lorry of 60 m² gets one every 17 mm.
+pub const MESH_GAUSSIANS: u32 = 200_000;
+
 /// Most values beside arrays of a NuRec payload, of 32 bytes each in memory. A log's tracks are
 /// 100,000.
 pub const NUREC_VALUES: usize = 1 << 20;

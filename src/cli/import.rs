@@ -89,6 +89,8 @@ Formats, and the axes that they usually have; files of one extension differ, so 
   streamed SOG        lod-meta.json, or one .zip; the finest level is read  y-down-z-forward
   glTF, GLB           KHR_gaussian_splatting, where its nodes put it; the   '-1 0 0 0 0 1 0 1 0'
                       standard has x left, y up, z to the front
+  glTF, GLB of        triangles, covered with 200,000 flat Gaussians in     the same
+  ordinary meshes     their base colour
   NuRec (.usdz)       NVIDIA; what stands still. Axes are the payload's:    y-down-z-forward
                       what the USD layers around it turn is not looked at
 

@@ -16,6 +16,7 @@ mod damage;
 mod formats;
 mod fuzz;
 mod hostile;
+mod meshes;
 mod real_scenes;
 mod round_trip;
 

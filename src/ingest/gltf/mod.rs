@@ -7,10 +7,13 @@
 //! colour space, projection and sorting are not looked at, as the extension allows: the trainer's
 //! are the render profile's.
 //!
-//! The gltf crate keeps only attributes that glTF itself knows, so the document is our own.
+//! A scene without splats is read as what it is: its triangles are covered with flat Gaussians
+//! (`mesh.rs`). The gltf crate keeps only attributes that glTF itself knows, so the document of splats is
+//! our own.
 
 mod accessor;
 mod document;
+mod mesh;
 mod place;
 
 use std::collections::BTreeMap;
@@ -92,7 +95,7 @@ pub(super) fn read(
     let mut fetched = Vec::new();
     for (index, buffer) in document.buffers.iter().enumerate() {
         fetched.push(match &buffer.uri {
-            Some(uri) => Some(fetch(uri, index, parts)?),
+            Some(uri) => Some(fetch(uri, &format!("buffer {index}"), parts)?),
             None => None,
         });
     }
@@ -108,7 +111,8 @@ pub(super) fn read(
     }
     let mut all = Gaussians::default();
     let mut found = false;
-    for placed in place::meshes(&document)? {
+    let placed = place::meshes(&document)?;
+    for placed in &placed {
         for (index, primitive) in placed.mesh.primitives.iter().enumerate() {
             if !primitive.extensions.contains_key(EXTENSION) {
                 continue;
@@ -122,22 +126,21 @@ pub(super) fn read(
         }
     }
     if !found {
-        return Err(bad("meshes", format!("no primitive of the scene has {EXTENSION}")));
+        all = mesh::read(json, &placed, &buffers, parts)?;
     }
     validate::check(&all, &Field::plain_name)?;
     Ok(all)
 }
 
-/// The bytes of a buffer that is not in the GLB file.
-fn fetch(uri: &str, index: usize, parts: &mut dyn Parts) -> Result<Vec<u8>, IngestError> {
+/// The bytes of what is not in the GLB file.
+fn fetch(uri: &str, place: &str, parts: &mut dyn Parts) -> Result<Vec<u8>, IngestError> {
     if !uri.starts_with("data:") {
         return parts.read(uri, config::SCENE_PART_BYTES);
     }
-    let (_, text) = uri.split_once(";base64,").ok_or_else(|| {
-        bad(&format!("buffer {index}"), "its data URI has no \";base64,\"".into())
-    })?;
-    let decoded = BASE64.decode(text.as_bytes());
-    decoded.map_err(|e| bad(&format!("buffer {index}"), format!("its base64: {e}")))
+    let (_, text) = uri
+        .split_once(";base64,")
+        .ok_or_else(|| bad(place, "its data URI has no \";base64,\"".into()))?;
+    BASE64.decode(text.as_bytes()).map_err(|e| bad(place, format!("its base64: {e}")))
 }
 
 /// Reads one primitive in its own axes.

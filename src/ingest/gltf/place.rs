@@ -11,8 +11,10 @@ use super::document::{Document, Mesh, Node};
 /// A mesh of a node.
 pub(super) struct Placed<'a> {
     pub(super) node: usize,
+    /// Which mesh of the document, and the mesh.
+    pub(super) index: usize,
     pub(super) mesh: &'a Mesh,
-    scene_from_mesh: DMat4,
+    pub(super) scene_from_mesh: DMat4,
 }
 
 /// All meshes of the scene, in the order of its tree.
@@ -31,10 +33,10 @@ pub(super) fn meshes(document: &Document) -> Result<Vec<Placed<'_>>, IngestError
         }
         let scene_from_mesh = scene_from_parent * parent_from_node(node);
         waiting.extend(node.children.iter().rev().map(|&child| (child, scene_from_mesh)));
-        if let Some(mesh) = node.mesh {
-            let mesh = document.meshes.get(mesh);
+        if let Some(own) = node.mesh {
+            let mesh = document.meshes.get(own);
             let mesh = mesh.ok_or_else(|| bad(&place, "its mesh is not there".into()))?;
-            placed.push(Placed { node: index, mesh, scene_from_mesh });
+            placed.push(Placed { node: index, index: own, mesh, scene_from_mesh });
         }
     }
     Ok(placed)
