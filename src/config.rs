@@ -5,6 +5,9 @@ use std::time::Duration;
 /// Where `serve` listens unless told otherwise.
 pub const LISTEN: &str = "127.0.0.1:8080";
 
+/// The server that clients talk to unless told otherwise.
+pub const SERVER_URL: &str = "http://127.0.0.1:8080";
+
 /// Simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
@@ -251,3 +254,83 @@ pub const REMEMBERED_CUTS: usize = 64;
 /// Smallest limit of a binding that the gpu backend is made to live with: one cluster of SH degree 3
 /// takes 34 kB of one.
 pub const BINDING_BYTES_MIN: u64 = 64 << 10;
+
+/// Uploads that a server keeps, finished or not: a city's blocks, each in a file.
+pub const UPLOADS: usize = 1024;
+
+/// Longest name of an upload: what file systems allow.
+pub const UPLOAD_NAME_BYTES: usize = 255;
+
+/// Largest upload: 250 million Gaussians of 236 bytes are 59 GB.
+pub const UPLOAD_BYTES: u64 = 64 << 30;
+
+/// Bytes of all uploads, as announced: two of the largest.
+pub const SPOOL_BYTES: u64 = 2 * UPLOAD_BYTES;
+
+/// How long an upload is kept after its last byte.
+pub const UPLOAD_AGE: Duration = Duration::from_secs(24 * 3600);
+
+/// How long an upload may stand still before its connection is closed; it can go on later.
+pub const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
+
+/// Bytes of an upload that are written at once.
+pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
+
+/// Pushes that wait or run. Each holds its request, and nothing of its files.
+pub const PUSHES: usize = 16;
+
+/// Pushes whose end is remembered: 100,000 cells of a report are 3 MB, most have a hundred.
+pub const PUSHES_REMEMBERED: usize = 64;
+
+/// Files of one push.
+pub const PUSH_FILES: usize = 256;
+
+/// Bad Gaussians that are named of one file; the others are counted.
+pub const BAD_GAUSSIANS: usize = 16;
+
+/// Poses at which a push is compared: 32 small images before, and 32 after.
+pub const GOLDEN_POSES: usize = 32;
+
+/// Poses along the twin's trajectory at which a push is compared, unless it names others.
+pub const GOLDEN_STATIONS: usize = 4;
+
+/// Longest side of the images that are compared, in pixels.
+pub const GOLDEN_SIDE_PX: u32 = 320;
+
+/// Gaussians of a push that is compared: in memory beside it, 92 B each at SH degree 1, 1.8 GB.
+pub const GOLDEN_GAUSSIANS: usize = 20_000_000;
+
+/// How long it may take to compare, and to load what the latest version changes.
+pub const PREFETCH_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Characters of a push's note.
+pub const NOTE_CHARS: usize = 1000;
+
+/// A cell that a push shrinks to less than this share, without naming it, is taken for one that it
+/// only touched: stray Gaussians of a neighbour's margin.
+pub const SHRUNK_SHARE: f64 = 0.1;
+
+/// Largest file of tokens: 200 B each.
+pub const TOKENS_FILE_BYTES: u64 = 1 << 20;
+
+/// How long a client waits for a connection.
+pub const HTTP_CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// How long a client waits for an answer of HTTP: none of them waits for a push or a render.
+pub const HTTP_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Slowest way of an upload, and slowest hashing of it, that a client waits for, in bytes per second.
+pub const UPLOAD_BYTES_PER_S: u64 = 1 << 20;
+
+/// Largest answer of HTTP that a client reads: the report of 100,000 cells is 5 MB.
+pub const HTTP_ANSWER_BYTES: usize = 64 << 20;
+
+/// How often a client tries again without a byte getting through.
+pub const HTTP_TRIES: u32 = 6;
+
+/// How long it waits before the first of those tries; twice as long before each further one, 12 s in
+/// all.
+pub const HTTP_RETRY: Duration = Duration::from_millis(200);
+
+/// How often a client asks how it stands with a push.
+pub const PUSH_POLL: Duration = Duration::from_millis(100);

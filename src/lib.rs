@@ -14,7 +14,7 @@
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
 //! | [`protocol`] | the wire, and only the wire | nothing |
-//! | [`server`] | WebSocket and HTTP | config, geometry, scene, store, residency, render, session, protocol |
+//! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
 //! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, server, client |
 //!

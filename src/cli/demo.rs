@@ -69,6 +69,8 @@ impl Demo {
             twins,
             cache: self.twins.cache(),
             episodes: self.out.join("episodes"),
+            uploads: self.out.join("uploads"),
+            tokens: None,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits::default(),
         };

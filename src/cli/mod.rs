@@ -12,6 +12,7 @@ mod lod;
 mod output;
 mod places;
 mod progress;
+mod push;
 mod render;
 mod replay;
 mod scene_source;
@@ -35,6 +36,7 @@ enum Command {
     Serve(serve::Serve),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
     Render(render::Render),
@@ -52,6 +54,7 @@ pub fn main() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),

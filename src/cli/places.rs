@@ -73,6 +73,28 @@ impl Episodes {
     }
 }
 
+/// `--uploads`, for every command that takes them.
+#[derive(Debug, clap::Args)]
+pub(super) struct Uploads {
+    /// Directory where uploads are kept until they are pushed, one server's at a time [default:
+    /// $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
+    #[arg(long, value_name = "DIR")]
+    uploads: Option<PathBuf>,
+}
+
+impl Uploads {
+    /// The directory given, or the user's own.
+    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+        if let Some(dir) = &self.uploads {
+            return Ok(dir.clone());
+        }
+        match user_dir("XDG_STATE_HOME", ".local/state") {
+            Some(state) => Ok(state.join("wildcity/uploads")),
+            None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --uploads DIR"),
+        }
+    }
+}
+
 /// A directory of the XDG base directory specification: from the environment, or below HOME.
 fn user_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);

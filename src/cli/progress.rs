@@ -12,6 +12,11 @@ pub(super) fn count(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {human_pos}/{human_len} {eta}")
 }
 
+/// A bar whose label says what is counted now.
+pub(super) fn state() -> ProgressBar {
+    bar("waiting", "{msg:12} {wide_bar} {percent} %")
+}
+
 /// Sets how much is done of how much.
 pub(super) fn show(bar: &ProgressBar) -> impl FnMut(u64, u64) {
     |done, total| {

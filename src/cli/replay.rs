@@ -58,14 +58,14 @@ impl Replay {
         }
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
-        let resident = cache.open(&header.twin, Some(header.version))?;
         let backend = self.engine.backend_of(&header.backend)?;
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
         // Pictures that were asked for are all drawn; a yes or no needs none after a no.
         let extent = if self.out.is_some() { Extent::Whole } else { Extent::FirstDifference };
-        let report = recording.replay(&resident, &*backend, extent, &mut |image| {
+        let mut open = |version| cache.open(&header.twin, Some(version));
+        let report = recording.replay(&mut open, &*backend, extent, &mut |image| {
             bar.inc(1);
             match &self.out {
                 Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
@@ -98,7 +98,7 @@ impl Replay {
 }
 
 fn summary(out: &mut impl Write, recording: &Recording) -> io::Result<()> {
-    let Recording { header, frames, end } = recording;
+    let Recording { header, frames, versions, end } = recording;
     let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
@@ -107,6 +107,9 @@ fn summary(out: &mut impl Write, recording: &Recording) -> io::Result<()> {
     writeln!(out, "recorded by {}, backend {}", header.build, header.backend)?;
     writeln!(out, "rig         {}: {}", header.rig.name, cameras.join(", "))?;
     writeln!(out, "frames      {} with {images} images", frames.len())?;
+    for (before, version) in versions {
+        writeln!(out, "switched    to version {} after {before} frames", version.version)?;
+    }
     match end {
         Some(end) => writeln!(
             out,

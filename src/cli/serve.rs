@@ -2,14 +2,17 @@
 
 use std::io::{self, IsTerminal, Write};
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
 use crate::config;
-use crate::server::{self, Limits};
+use crate::ingest;
+use crate::server::{self, Limits, Tokens};
 
-use super::places::{Episodes, Twins};
+use super::places::{Episodes, Twins, Uploads};
 use super::scene_source::Engine;
 
 /// Serve twins to agents over WebSocket.
@@ -25,7 +28,14 @@ pub(super) struct Serve {
     #[command(flatten)]
     episodes: Episodes,
 
-    /// Loopback address and port to listen on; port 0 takes a free one.
+    #[command(flatten)]
+    uploads: Uploads,
+
+    /// JSON file of who may do what (see below); without it the server listens on this machine alone.
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
+
+    /// Address and port to listen on; port 0 takes a free one. Not loopback only with --tokens.
     #[arg(long, value_name = "ADDR", default_value = config::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
@@ -45,7 +55,15 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity serve
   wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
-  curl http://127.0.0.1:8080/v1/twins";
+  wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
+  curl http://127.0.0.1:8080/v1/twins
+
+Tokens file: role is drive (sessions), push (uploads and pushes) or admin (everything). Give a token
+itself, 16 characters and more, or hash: blake3: or sha-256: and its hash in hex. twins is which twins
+it sees; all if it is left out.
+  {\"tokens\": [
+    {\"name\": \"fleet\", \"role\": \"drive\", \"token\": \"u3mR8qkV0aXn2wLc\", \"twins\": [\"street\"]},
+    {\"name\": \"trainer\", \"role\": \"push\", \"hash\": \"sha-256:9f86d081884c7d659a2feaa0c55ad015...\"}]}";
 
 impl Serve {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -66,11 +84,14 @@ impl Serve {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
+        let tokens = self.tokens.as_deref().map(read_tokens).transpose()?;
         let config = server::Config {
             listen: self.listen,
             twins,
             cache: self.twins.cache(),
             episodes: self.episodes.dir()?,
+            uploads: self.uploads.dir()?,
+            tokens,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits {
                 resident_bytes: self.memory_gib.map(|gib| u64::from(gib) << 30),
@@ -79,7 +100,7 @@ impl Serve {
         };
         tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        runtime.block_on(async {
+        let served = runtime.block_on(async {
             // Before anybody is told of the server: they may tell it to stop at once.
             let stop = server::stop_signal()?;
             let running = server::start(config).await?;
@@ -88,8 +109,17 @@ impl Serve {
             tracing::info!("stopping");
             running.stop().await;
             Ok(())
-        })
+        });
+        // A push that still writes is not waited for: killed at any point, it leaves nothing.
+        runtime.shutdown_background();
+        served
     }
+}
+
+fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
+    let cannot = || format!("--tokens {}", path.display());
+    let text = ingest::read_whole(path, config::TOKENS_FILE_BYTES).with_context(cannot)?;
+    Tokens::parse(&text).with_context(cannot)
 }
 
 fn address(text: &str) -> Result<SocketAddr, String> {

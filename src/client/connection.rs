@@ -32,11 +32,17 @@ pub(super) enum Incoming {
 }
 
 impl Connection {
-    pub(super) async fn open(url: &str) -> Result<Self, ClientError> {
+    /// Connects, with a token for a server that has tokens.
+    pub(super) async fn open(url: &str, token: Option<&str>) -> Result<Self, ClientError> {
         let failed = |reason: String| ClientError::Connect { url: url.to_owned(), reason };
         let mut request = url.into_client_request().map_err(|e| failed(e.to_string()))?;
         let subprotocol = HeaderValue::from_static(PROTOCOL);
         request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
+        if let Some(token) = token {
+            let bearer = HeaderValue::try_from(format!("Bearer {token}"));
+            let bearer = bearer.map_err(|_| failed("no header may have that token".to_owned()))?;
+            request.headers_mut().insert("Authorization", bearer);
+        }
         let limits = WebSocketConfig::default()
             .max_message_size(Some(config::OBSERVATION_BYTES))
             .max_frame_size(Some(config::OBSERVATION_BYTES));
@@ -121,6 +127,7 @@ impl Incoming {
             Self::Answer(
                 Answer::Welcome { seq, .. }
                 | Answer::Resumed { seq, .. }
+                | Answer::Switched { seq, .. }
                 | Answer::Closed { seq, .. },
             ) => Some(*seq),
         }

@@ -5,7 +5,9 @@
 
 mod connection;
 mod error;
+mod http;
 mod observation;
+mod upload;
 
 use std::mem;
 use std::time::Duration;
@@ -19,8 +21,12 @@ use crate::protocol::message::{
 
 use connection::{Connection, Incoming};
 
+pub use crate::protocol::http::{
+    All, CellReport, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
+};
 pub use crate::protocol::message::{Open, Pose};
 pub use error::{ClientError, FrameError};
+pub use http::{HttpClient, HttpError};
 pub use observation::{ImageView, Observation};
 
 /// A connection to a server, and the session on it.
@@ -31,6 +37,7 @@ pub use observation::{ImageView, Observation};
 #[derive(Debug)]
 pub struct Client {
     url: String,
+    token: Token,
     name: String,
     connection: Option<Connection>,
     lost_because: String,
@@ -38,6 +45,15 @@ pub struct Client {
     session: Option<String>,
     next_seq: u64,
     answer_timeout: Duration,
+}
+
+/// Says nothing of itself.
+struct Token(Option<String>);
+
+impl std::fmt::Debug for Token {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(if self.0.is_some() { "a token" } else { "none" })
+    }
 }
 
 /// The server's answer to `hello`.
@@ -66,16 +82,40 @@ pub struct Resumed {
     pub time_us: i64,
 }
 
+/// The server's answer to `switch_version`: what is seen from now on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Switched {
+    /// The version.
+    pub version: u64,
+    /// BLAKE3 of its manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of its render profile's JSON, in hex.
+    pub profile_hash: String,
+}
+
 impl Client {
     /// Connects to `ws://host:port/v1/session` and says hello; `name` is for the server's log.
     ///
     /// # Errors
     /// The server cannot be reached in time, speaks another protocol, or refuses.
     pub async fn connect(url: &str, name: &str) -> Result<Self, ClientError> {
-        let mut connection = Connection::open(url).await?;
+        Self::connect_as(url, name, None).await
+    }
+
+    /// The same with a token, for a server that has tokens.
+    ///
+    /// # Errors
+    /// As [`Client::connect`].
+    pub async fn connect_as(
+        url: &str,
+        name: &str,
+        token: Option<String>,
+    ) -> Result<Self, ClientError> {
+        let mut connection = Connection::open(url, token.as_deref()).await?;
         let welcome = hello(&mut connection, name).await?;
         Ok(Self {
             url: url.to_owned(),
+            token: Token(token),
             name: name.to_owned(),
             connection: Some(connection),
             lost_because: String::new(),
@@ -113,7 +153,7 @@ impl Client {
     /// As [`Client::resume`]. After `unknown_session` another session can be opened.
     pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
         self.connection = None;
-        let mut connection = Connection::open(&self.url).await?;
+        let mut connection = Connection::open(&self.url, self.token.0.as_deref()).await?;
         self.welcome = hello(&mut connection, &self.name).await?;
         self.connection = Some(connection);
         let Some(session) = self.session.clone() else {
@@ -187,6 +227,19 @@ impl Client {
         start: Option<Start>,
     ) -> Result<Observation, ClientError> {
         self.observation(&Request::Reset { seq: self.next_seq, seed, start }).await
+    }
+
+    /// Sees another version of the twin from the next step on, or the latest; the episode goes on.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn switch_version(&mut self, version: Option<u64>) -> Result<Switched, ClientError> {
+        match self.exchange(&Request::SwitchVersion { seq: self.next_seq, version }).await? {
+            Incoming::Answer(Answer::Switched { version, version_hash, profile_hash, .. }) => {
+                Ok(Switched { version, version_hash, profile_hash })
+            }
+            other => Err(self.break_off("switched", &other)),
+        }
     }
 
     /// Ends the session; another can be opened on the same connection.

@@ -34,6 +34,7 @@ use crate::scene::Gaussians;
 
 pub use axes::Axes;
 pub use file::{FileError, read_whole};
+pub use validate::{BadGaussian, BadGaussians};
 
 use hashing::Hashing;
 use parts::Folder;
@@ -127,18 +128,9 @@ pub enum IngestError {
         /// How many.
         count: u64,
     },
-    /// A Gaussian that no renderer can draw.
-    #[error("Gaussian {index}: {field} is {value}; {must}")]
-    Value {
-        /// Which one, from 0.
-        index: usize,
-        /// The field, as the file calls it.
-        field: String,
-        /// The refused value.
-        value: String,
-        /// What must hold instead.
-        must: &'static str,
-    },
+    /// Gaussians that no renderer can draw.
+    #[error("{0}")]
+    Values(BadGaussians),
     /// `--axes` or `--scale` cannot be used.
     #[error("{option} {given:?}: {reason}")]
     Frame {

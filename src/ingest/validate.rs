@@ -5,6 +5,7 @@
 
 use rayon::prelude::*;
 
+use crate::config;
 use crate::geometry::Pose;
 use crate::scene::{Gaussians, sh};
 
@@ -62,23 +63,67 @@ impl Field {
     }
 }
 
+/// A Gaussian that no renderer can draw.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("Gaussian {index}: {field} is {value}; {must}")]
+pub struct BadGaussian {
+    /// Which one, from 0.
+    pub index: usize,
+    /// The field, as the file calls it.
+    pub field: String,
+    /// The refused value.
+    pub value: String,
+    /// What must hold instead.
+    pub must: &'static str,
+}
+
+/// All Gaussians of a file that no renderer can draw.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BadGaussians {
+    /// The first of them, one at least and [`config::BAD_GAUSSIANS`] at most.
+    pub first: Vec<BadGaussian>,
+    /// How many there are.
+    pub count: u64,
+    /// Of how many.
+    pub gaussians: u64,
+}
+
 /// Checks all Gaussians; `name` says what the file calls a field.
 ///
 /// # Errors
-/// [`IngestError::Value`] for the first Gaussian that is out of bounds.
+/// [`IngestError::Values`] if one is out of bounds: all of those.
 pub fn check(
     gaussians: &Gaussians,
     name: &(dyn Fn(Field) -> String + Sync),
 ) -> Result<(), IngestError> {
-    let bad = (0..gaussians.len())
+    let first = (0..gaussians.len())
         .into_par_iter()
         .by_uniform_blocks(4096)
-        .find_map_first(|index| first_fault(gaussians, index).map(|fault| (index, fault)));
-    match bad {
-        Some((index, (field, value, must))) => {
-            Err(IngestError::Value { index, field: name(field), value, must })
+        .find_first(|&index| first_fault(gaussians, index).is_some());
+    let Some(first) = first else { return Ok(()) };
+    let (mut bad, mut count) = (Vec::new(), 0);
+    for index in first..gaussians.len() {
+        let Some((field, value, must)) = first_fault(gaussians, index) else { continue };
+        count += 1;
+        if bad.len() < config::BAD_GAUSSIANS {
+            bad.push(BadGaussian { index, field: name(field), value, must });
         }
-        None => Ok(()),
+    }
+    let gaussians = gaussians.len() as u64;
+    Err(IngestError::Values(BadGaussians { first: bad, count, gaussians }))
+}
+
+impl std::fmt::Display for BadGaussians {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(first) = self.first.first() {
+            write!(f, "{first}")?;
+        }
+        if self.count > 1 {
+            let (more, others) = (self.count - 1, self.first.iter().skip(1).map(|bad| bad.index));
+            let named: Vec<String> = others.take(4).map(|index| index.to_string()).collect();
+            write!(f, "; and {more} more, as Gaussian {}", named.join(", "))?;
+        }
+        Ok(())
     }
 }
 

@@ -59,6 +59,24 @@ pub enum Code {
     TimedOut,
     /// The server is shutting down.
     ShuttingDown,
+    /// A token is needed, and none was given that the server knows.
+    Unauthorized,
+    /// The token does not go that far.
+    Forbidden,
+    /// There is no upload of this id.
+    UnknownUpload,
+    /// An upload goes on elsewhere than at the given offset.
+    UploadOffset,
+    /// An upload is not what its digest or size promises.
+    UploadDigest,
+    /// No room for the upload.
+    StorageFull,
+    /// There is no push of this id.
+    UnknownPush,
+    /// The cells were changed by somebody else since the base version.
+    Conflict,
+    /// The pushed Gaussians cannot be used.
+    PushRefused,
     /// A fault of the server.
     Internal,
 }

@@ -65,6 +65,15 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         start: Option<Start>,
     },
+    /// Sees another version of the twin from the next step on; the episode goes on. Answer:
+    /// `switched`.
+    SwitchVersion {
+        /// Number of this request.
+        seq: u64,
+        /// The version; the latest if absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        version: Option<u64>,
+    },
     /// Ends the session. Answer: `closed`.
     Close {
         /// Number of this request.
@@ -279,6 +288,19 @@ pub enum Answer {
         step: u64,
         /// Simulated time, in microseconds.
         time_us: i64,
+    },
+    /// To `switch_version`: what the session sees from now on.
+    Switched {
+        /// Number of the request.
+        seq: u64,
+        /// The version.
+        version: u64,
+        /// BLAKE3 of the version's manifest, in hex.
+        version_hash: String,
+        /// BLAKE3 of the render profile's JSON, in hex.
+        profile_hash: String,
+        /// The render profile: numbers and switches by name.
+        profile: serde_json::Map<String, serde_json::Value>,
     },
     /// To `close`.
     Closed {

@@ -2,9 +2,10 @@
 //!
 //! Text frames are JSON, [`message::Request`] one way and [`message::Answer`] the other, matched by
 //! `seq`. Binary frames are [`observation`]s. The prose is `protocol/README.md`; the JSON schemas
-//! beside it are generated from these types.
+//! beside it are generated from these types. What HTTP carries beside sessions is in [`http`].
 
 pub mod error;
+pub mod http;
 pub mod message;
 pub mod observation;
 mod strict;

@@ -374,6 +374,11 @@ impl CellRun {
     }
 }
 
+/// The grid cell (x, y) of a centre, in metres.
+pub fn cell_at(mean_m: &[f64; 3]) -> [i32; 2] {
+    [cell_of(mean_m[0]), cell_of(mean_m[1])]
+}
+
 /// The cell index along one axis; the gate keeps coordinates below 1e8 m, far inside i32.
 fn cell_of(coordinate_m: f64) -> i32 {
     (coordinate_m / CELL_M).round() as i32

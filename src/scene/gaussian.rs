@@ -45,6 +45,18 @@ impl Gaussians {
         self.means_m.is_empty()
     }
 
+    /// Adds coefficients of zero, which change no colour, up to a degree that is not lower.
+    pub fn raise_sh_degree(&mut self, degree: u8) {
+        let (from, to) = (3 * sh::coefficients(self.sh_degree), 3 * sh::coefficients(degree));
+        if from < to {
+            let mut raised = vec![0.0; self.len() * to];
+            for (new, old) in raised.chunks_exact_mut(to).zip(self.sh.chunks_exact(from)) {
+                new[..from].copy_from_slice(old);
+            }
+            (self.sh, self.sh_degree) = (raised, degree);
+        }
+    }
+
     /// Colour coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);

@@ -12,17 +12,19 @@ use tokio::time::{Instant, sleep_until, timeout};
 use crate::session::{Frame, Outcome, Session, SessionError};
 
 use super::Server;
+use super::auth::Grant;
 use super::convert::{self, Command, Parsed};
 use super::fault::Fault;
 use super::sessions::{Answer, Place};
 use super::socket::{Incoming, Lost, Socket};
 
 /// Serves a client until it leaves or is turned away. An open session is parked then.
-pub(super) async fn serve(server: Arc<Server>, socket: Socket) {
+pub(super) async fn serve(server: Arc<Server>, socket: Socket, grant: Arc<Grant>) {
     let hello_by = Instant::now() + server.limits.hello;
     let mut connection = Connection {
         server,
         socket,
+        grant,
         hello_by,
         greeted: false,
         answered: None,
@@ -36,6 +38,7 @@ pub(super) async fn serve(server: Arc<Server>, socket: Socket) {
 struct Connection {
     server: Arc<Server>,
     socket: Socket,
+    grant: Arc<Grant>,
     /// When `hello` must have come, however much else comes before it.
     hello_by: Instant,
     greeted: bool,
@@ -121,6 +124,9 @@ impl Connection {
             Ok(answer) => answer,
             Err(fault) => return self.refuse(Some(seq), &fault).await,
         };
+        if let Some(place) = &self.place {
+            place.tell();
+        }
         if resumes {
             // From here on the numbers are the session's.
             self.last = self.place.as_ref().and_then(|place| place.last.clone());
@@ -152,9 +158,10 @@ impl Connection {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
             Command::Open { name, opening } => {
+                self.grant.reaches(&opening.twin)?;
                 let name =
                     name.unwrap_or_else(|| format!("s-{}", uuid::Uuid::now_v7().as_simple()));
-                let mut place = self.server.sessions.reserve(name.clone())?;
+                let mut place = self.server.sessions.reserve(name.clone(), &self.grant.name)?;
                 let opened = Session::open(self.server.engine.clone(), name, *opening);
                 let session = timeout(self.server.limits.step, opened)
                     .await
@@ -167,7 +174,8 @@ impl Connection {
             }
             Command::Resume { session, last_seq } => {
                 let patience = self.server.limits.step;
-                let place = self.server.sessions.resume(&session, patience).await?;
+                let place =
+                    self.server.sessions.resume(&session, &self.grant.name, patience).await?;
                 if last_seq > place.answered {
                     let expected = format!("{} is the session's last answer", place.answered);
                     return Err(Fault::SeqOutOfOrder { seq: last_seq, expected });
@@ -180,7 +188,12 @@ impl Connection {
                 Ok(Answer::Text(text.into()))
             }
             Command::Step { pose, terminate } => {
+                let begun = Instant::now();
                 let frame = self.session()?.step(pose, terminate).await?;
+                let metrics = &self.server.metrics;
+                metrics.steps.inc();
+                metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
+                metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
                 self.observation(seq, frame)
             }
             Command::Observe { poses } => {
@@ -190,6 +203,14 @@ impl Connection {
             Command::Reset { seed, start } => {
                 let frame = self.session()?.reset(seed, start).await?;
                 self.observation(seq, frame)
+            }
+            Command::SwitchVersion { version } => {
+                let patience = self.server.limits.step;
+                let switched = timeout(patience, self.session()?.switch_version(version)).await;
+                switched.map_err(|_| SessionError::DeadlineExceeded)??;
+                self.server.metrics.versions_switched.inc();
+                let text = convert::switched(seq, self.session()?)?;
+                Ok(Answer::Text(text.into()))
             }
             Command::Close => {
                 let session = self.place.as_mut().and_then(|place| place.session.take());
@@ -207,7 +228,8 @@ impl Connection {
             return Err(Fault::WrongOrder("hello was said already"));
         }
         let engine = &self.server.engine;
-        let twins = engine.twins().await?;
+        let mut twins = engine.twins().await?;
+        twins.retain(|twin| self.grant.sees(&twin.name));
         let text = convert::welcome(seq, &self.server.limits, engine.backend(), &twins)?;
         tracing::debug!(client, "hello");
         self.greeted = true;
@@ -226,12 +248,17 @@ impl Connection {
     async fn send(&mut self, answer: &Answer) -> Result<(), Lost> {
         match answer {
             Answer::Text(text) => self.socket.send_text(text).await,
-            Answer::Observation(frame) => self.socket.send_binary(frame.buffer.bytes()).await,
+            Answer::Observation(frame) => {
+                let bytes = frame.buffer.bytes();
+                self.server.metrics.observation_bytes.inc_by(bytes.len() as u64);
+                self.socket.send_binary(bytes).await
+            }
         }
     }
 
     async fn refuse(&mut self, seq: Option<u64>, fault: &Fault) -> Result<(), Lost> {
         tracing::debug!(seq, "refused: {fault}");
+        self.server.metrics.refused(&convert::code(fault));
         self.socket.send_text(&convert::refused(seq, fault)).await
     }
 

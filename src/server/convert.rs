@@ -2,11 +2,14 @@
 
 mod answer;
 mod fault;
+mod http;
 mod request;
 
 pub(super) use answer::{
-    closed, observation, opened, refusal_body, refused, resumed, twins, welcome,
+    WireCode, closed, code, observation, opened, refusal_body, refused, resumed, switched, twin,
+    twins, welcome,
 };
+pub(super) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
 pub(super) use request::{Command, Parsed, parse};
 
 /// The WebSocket subprotocol.

@@ -3,6 +3,7 @@
 use crate::geometry::{CameraError, PoseError};
 use crate::scene::rig::RigError;
 use crate::session::SessionError;
+use crate::store::StoreError;
 
 /// Why a request was refused.
 #[derive(Debug, thiserror::Error)]
@@ -118,6 +119,83 @@ pub(super) enum Fault {
     /// Somebody resumed the session elsewhere.
     #[error("the session was resumed by another connection")]
     Replaced,
+    /// No token, or one that is not known.
+    #[error("a token is needed that this server knows: send Authorization: Bearer TOKEN")]
+    Unauthorized,
+    /// The token allows less.
+    #[error("this token may not do that: {reason}")]
+    Forbidden {
+        /// What it lacks.
+        reason: String,
+    },
+    /// Nothing to append to.
+    #[error("there is no upload {id:?}: it was never begun, did not fit its digest, or is too old")]
+    UnknownUpload {
+        /// The id asked for.
+        id: String,
+    },
+    /// Bytes for another place.
+    #[error("the upload has {held} bytes, Upload-Offset is {given}: go on from {held}")]
+    UploadOffset {
+        /// The offset given.
+        given: u64,
+        /// Where it goes on.
+        held: u64,
+    },
+    /// Not what was announced.
+    #[error("{what} is {found}, but {promised} was promised: send it again")]
+    UploadDigest {
+        /// The digest of what, or its size.
+        what: &'static str,
+        /// As announced.
+        promised: String,
+        /// As it came.
+        found: String,
+    },
+    /// No room.
+    #[error("no room for the upload: {reason}")]
+    StorageFull {
+        /// What is full.
+        reason: String,
+    },
+    /// This server keeps none.
+    #[error("this server takes no uploads: {reason}")]
+    NoUploads {
+        /// Why not.
+        reason: String,
+    },
+    /// Nothing to tell.
+    #[error("there is no push {id:?} of twin {twin:?} any more; send it again")]
+    UnknownPush {
+        /// The id asked for.
+        id: String,
+        /// The twin.
+        twin: String,
+    },
+    /// The push's content cannot be accepted.
+    #[error("{reason}")]
+    Content {
+        /// Why not.
+        reason: String,
+        /// The cells at fault, if cells are.
+        cells: Vec<[i32; 2]>,
+    },
+    /// A field of a body is outside its limits.
+    #[error("{field} is {must}")]
+    OutOfRange {
+        /// The field.
+        field: String,
+        /// What it is, and what is accepted.
+        must: String,
+    },
+    /// The disk.
+    #[error("cannot {action} the spool: {cause}")]
+    Spool {
+        /// What was tried.
+        action: &'static str,
+        /// What the operating system says.
+        cause: std::io::Error,
+    },
     /// The server stops.
     #[error("the server is shutting down; resume or start again when it is back")]
     ShuttingDown,
@@ -127,6 +205,12 @@ pub(super) enum Fault {
     /// A defect of the program.
     #[error("internal: {0}")]
     Internal(String),
+}
+
+impl From<StoreError> for Fault {
+    fn from(error: StoreError) -> Self {
+        Self::Session(error.into())
+    }
 }
 
 impl Fault {

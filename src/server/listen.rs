@@ -1,6 +1,6 @@
 //! Accepts connections, a bounded number of them.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use hyper::server::conn::http1;
@@ -9,6 +9,7 @@ use hyper_util::service::TowerToHyperService;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
+use tokio::time::Instant;
 
 use crate::config;
 
@@ -39,24 +40,54 @@ pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
         };
         prepare(&stream);
         // A WebSocket leaves HTTP behind but keeps its place, inside the request.
-        let app = app.clone().layer(axum::Extension(Arc::new(place)));
+        let patience = Arc::new(Patience::new(server.limits.hello + server.limits.send));
+        let app = app
+            .clone()
+            .layer(axum::Extension(Arc::new(place)))
+            .layer(axum::Extension(patience.clone()));
         let connection = http1::Builder::new()
             .timer(TokioTimer::new())
             .header_read_timeout(server.limits.hello)
             .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
             .with_upgrades();
-        // The request and its answer; what becomes a WebSocket is over here by then.
-        let patience = server.limits.hello + server.limits.send;
-        let connection = tokio::time::timeout(patience, connection);
         let server = server.clone();
         tokio::spawn(async move {
             tokio::select! {
                 // The client's fault, and of no interest: it went away, never spoke HTTP, or does
                 // not read.
                 _ = connection => {}
+                () = patience.over() => {}
                 () = server.stopped() => {}
             }
         });
+    }
+}
+
+/// How long a connection may take for its requests and their answers, from the last time that one of
+/// them showed that it goes on; what becomes a WebSocket is over here by then.
+pub(super) struct Patience {
+    until: Mutex<Instant>,
+    period: Duration,
+}
+
+impl Patience {
+    fn new(period: Duration) -> Self {
+        Self { until: Mutex::new(Instant::now() + period), period }
+    }
+
+    /// A request goes on.
+    pub(super) fn extend(&self) {
+        *self.until.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now() + self.period;
+    }
+
+    async fn over(&self) {
+        loop {
+            let until = *self.until.lock().unwrap_or_else(PoisonError::into_inner);
+            if until <= Instant::now() {
+                return;
+            }
+            tokio::time::sleep_until(until).await;
+        }
     }
 }
 

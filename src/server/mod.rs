@@ -3,6 +3,12 @@
 //! ```text
 //! listen      accepts connections, a bounded number
 //! router      HTTP routes, and the upgrade to WebSocket
+//! auth        who may do what
+//! uploads     files on their way in; spool: where they lie
+//! push        new versions of uploaded files; publish: making one; report: what was found
+//! twins       what there is, and rollback
+//! metrics     numbers for Prometheus
+//! refusal     faults as answers of HTTP
 //! socket      WebSocket messages, with a time-out on every wait
 //! connection  one agent, in lock step: read a request, answer it
 //! sessions    who exists, who is connected, who waits to be resumed
@@ -10,14 +16,23 @@
 //! shutdown    stopping without losing what runs
 //! ```
 
+mod auth;
 mod connection;
 mod convert;
 mod fault;
 mod listen;
+mod metrics;
+mod publish;
+mod push;
+mod refusal;
+mod report;
 mod router;
 mod sessions;
 mod shutdown;
 mod socket;
+mod spool;
+mod twins;
+mod uploads;
 
 use std::io;
 use std::net::SocketAddr;
@@ -34,12 +49,16 @@ use crate::residency::Cache;
 use crate::session::{Engine, EngineSettings, SessionError};
 use crate::store::{CacheSettings, Catalog, StoreError};
 
+use spool::Spool;
+
+pub use auth::{Role, Tokens, TokensError};
 pub use shutdown::{Running, stop_signal};
+pub use spool::SpoolLimits;
 
 /// What a server is made of.
 #[derive(Clone)]
 pub struct Config {
-    /// Where to listen; port 0 takes a free one. A loopback address.
+    /// Where to listen; port 0 takes a free one. Without tokens, a loopback address.
     pub listen: SocketAddr,
     /// Directory of twins, or their URL.
     pub twins: PathBuf,
@@ -47,6 +66,10 @@ pub struct Config {
     pub cache: Option<CacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
+    /// Directory where uploads are kept until they are pushed. One server uses it at a time.
+    pub uploads: PathBuf,
+    /// Who may do what; everybody everything if none are said.
+    pub tokens: Option<Tokens>,
     /// What renders.
     pub backend: Arc<dyn Backend>,
     /// How long the server waits, and for how many.
@@ -76,6 +99,8 @@ pub struct Limits {
     /// Bytes of memory that all twins in use may take; if none is said, three quarters of the
     /// machine's.
     pub resident_bytes: Option<u64>,
+    /// How much is kept of uploads.
+    pub spool: SpoolLimits,
 }
 
 /// Why a server did not start.
@@ -83,8 +108,8 @@ pub struct Limits {
 pub enum ServerError {
     /// Anybody in the network could drive, and read the twins.
     #[error(
-        "{address} is not a loopback address: there are no access tokens yet, so that only \
-         127.0.0.1 and [::1] are safe; reach them from elsewhere through an SSH tunnel"
+        "{address} is not a loopback address, and without tokens only 127.0.0.1 and [::1] are \
+         safe: give --tokens FILE, or reach them from elsewhere through an SSH tunnel"
     )]
     PublicAddress {
         /// The refused address.
@@ -117,10 +142,11 @@ pub enum ServerError {
 /// Starts a server within the running tokio runtime and returns once it listens.
 ///
 /// # Errors
-/// The address is not a loopback address or cannot be used, or a directory cannot.
+/// The address is not a loopback address and there are no tokens, or it cannot be used, or a directory
+/// cannot. One for uploads that cannot be used is logged: whoever uploads is told.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, cache, episodes, backend, limits } = config;
-    if !listen.ip().is_loopback() {
+    let Config { listen, twins, cache, episodes, uploads, tokens, backend, limits } = config;
+    if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
     std::fs::create_dir_all(&episodes)
@@ -132,13 +158,22 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     let failed = |cause| ServerError::Listen { address: listen, cause };
     let listener = TcpListener::bind(listen).await.map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
+    let spool = Spool::open(&uploads, limits.spool).map(Arc::new).map_err(|error| {
+        let reason = format!("{}: {error}", uploads.display());
+        tracing::warn!("no uploads are taken: {reason}");
+        reason
+    });
     let (stop, stopping) = tokio::sync::watch::channel(false);
     let server = Arc::new(Server {
+        metrics: metrics::Metrics::new(engine.clone()),
         engine,
         sessions: sessions::Sessions::new(limits.sessions, limits.resume_grace),
         agents: Arc::new(Semaphore::new(limits.connections)),
         stopping,
         limits,
+        tokens,
+        spool,
+        pushes: push::Pushes::new(),
     });
     Ok(Running::new(server, listener, address, stop))
 }
@@ -152,9 +187,19 @@ struct Server {
     /// Becomes true when the server stops.
     stopping: tokio::sync::watch::Receiver<bool>,
     limits: Limits,
+    tokens: Option<Tokens>,
+    /// Or why there is none.
+    spool: Result<Arc<Spool>, String>,
+    pushes: push::Pushes,
+    metrics: metrics::Metrics,
 }
 
 impl Server {
+    /// Where uploads lie.
+    fn spool(&self) -> Result<&Arc<Spool>, fault::Fault> {
+        self.spool.as_ref().map_err(|reason| fault::Fault::NoUploads { reason: reason.clone() })
+    }
+
     /// Returns when the server stops.
     async fn stopped(&self) {
         // An error means that whoever could say so is gone, which says the same.
@@ -174,18 +219,21 @@ impl Default for Limits {
             connections: config::CONNECTIONS,
             sessions: config::SESSIONS,
             resident_bytes: None,
+            spool: SpoolLimits::default(),
         }
     }
 }
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, cache, episodes, backend, limits } = self;
+        let Self { listen, twins, cache, episodes, uploads, tokens, backend, limits } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
             .field("cache", cache)
             .field("episodes", episodes)
+            .field("uploads", uploads)
+            .field("tokens", &tokens.is_some())
             .field("backend", &backend.name())
             .field("limits", limits)
             .finish()

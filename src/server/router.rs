@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use axum::extract::{Request, State};
+use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
+use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use axum::{Extension, Json, Router};
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
@@ -13,49 +14,112 @@ use tokio::net::TcpStream;
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
+use crate::config;
+
+use super::auth::{Grant, Role};
 use super::fault::Fault;
+use super::refusal::{Answered, Refusal};
 use super::socket::Socket;
-use super::{Server, connection, convert};
+use super::{Server, connection, convert, metrics, push, twins, uploads};
 
 /// The routes of a server.
 pub(super) fn router(server: Arc<Server>) -> Router {
+    let json = DefaultBodyLimit::max(config::INBOUND_MESSAGE_BYTES);
     Router::new()
         .route("/v1/session", get(session))
-        .route("/v1/twins", get(twins))
+        .route("/v1/sessions", get(sessions))
+        .route("/v1/twins", get(twins::list))
+        .route("/v1/twins/{twin}", get(twins::look))
+        .route("/v1/twins/{twin}/versions", get(twins::versions))
+        .route("/v1/twins/{twin}/rollback", post(twins::rollback))
+        .route("/v1/twins/{twin}/pushes", post(push::begin))
+        .route("/v1/twins/{twin}/pushes/{id}", get(push::look))
+        .route("/v1/uploads", post(uploads::begin))
+        // An upload is no message: it goes to disk as it comes.
+        .route(
+            "/v1/uploads/{id}",
+            get(uploads::look)
+                .delete(uploads::forget)
+                .patch(uploads::append)
+                .layer(DefaultBodyLimit::disable()),
+        )
+        .route("/metrics", get(metrics::show))
+        // What is above needs a token where there are any; what follows, none.
+        .route_layer(from_fn_with_state(server.clone(), admit))
         .route("/healthz", get(async || "ok\n"))
         .route("/readyz", get(ready))
+        .layer(json)
+        .layer(from_fn_with_state(server.clone(), metrics::count))
         .with_state(server)
+}
+
+/// Lets in who may come in, and tells the routes who it is.
+async fn admit(
+    State(server): State<Arc<Server>>,
+    mut request: Request,
+    next: Next,
+) -> Result<Response, Refusal> {
+    check_origin(request.headers())?;
+    let grant = match &server.tokens {
+        Some(tokens) => {
+            let authorization = request.headers().get(header::AUTHORIZATION);
+            tokens.grant(authorization.map(|value| value.as_bytes()))?
+        }
+        None => Grant::everything(),
+    };
+    request.extensions_mut().insert(grant);
+    Ok(next.run(request).await)
+}
+
+/// Browsers send Origin and cannot leave it out where it matters; agents do not. Any page may try to
+/// reach 127.0.0.1, so only pages that come from there are let in.
+fn check_origin(headers: &HeaderMap) -> Result<(), Fault> {
+    match headers.get(header::ORIGIN) {
+        Some(origin) if !origin.to_str().is_ok_and(is_local) => {
+            let reason = format!("pages from {origin:?} may not come in; loopback origins may");
+            Err(Fault::Forbidden { reason })
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Whether sessions can be opened: the twins can be listed.
 async fn ready(State(server): State<Arc<Server>>) -> Response {
     match server.engine.check_twins().await {
         Ok(()) => "ready\n".into_response(),
-        Err(error) => refuse(StatusCode::SERVICE_UNAVAILABLE, &error.into()),
+        Err(error) => {
+            let body = Json(convert::refusal_body(&error.into()));
+            (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
+        }
     }
 }
 
-async fn twins(State(server): State<Arc<Server>>) -> Response {
-    match server.engine.twins().await {
-        Ok(twins) => Json(convert::twins(&twins)).into_response(),
-        Err(error) => refuse(StatusCode::INTERNAL_SERVER_ERROR, &error.into()),
-    }
+/// `GET /v1/sessions`: what every session sees.
+async fn sessions(
+    State(server): State<Arc<Server>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> Answered {
+    grant.may(Role::Admin)?;
+    let mut sessions = server.sessions.list();
+    sessions.retain(|(_, about, _)| grant.sees(&about.twin));
+    Ok(Json(convert::sessions(&sessions)).into_response())
 }
 
 /// `GET /v1/session`: checks the handshake (RFC 6455, section 4.2) and hands the socket over.
 async fn session(
     State(server): State<Arc<Server>>,
     Extension(place): Extension<Arc<OwnedSemaphorePermit>>,
+    Extension(grant): Extension<Arc<Grant>>,
     mut request: Request,
-) -> Response {
+) -> Answered {
     let accept = match check(request.headers()) {
         Ok(key) => derive_accept_key(key),
-        Err((status, message)) => return (status, format!("{message}\n")).into_response(),
+        Err((status, message)) => return Ok((status, format!("{message}\n")).into_response()),
     };
+    grant.may(Role::Drive)?;
     let Ok(agent) = server.agents.clone().try_acquire_owned() else {
         let limit = server.limits.connections;
-        let fault = Fault::Busy { what: "connections", limit };
-        return refuse(StatusCode::SERVICE_UNAVAILABLE, &fault);
+        return Err(Fault::Busy { what: "connections", limit }.into());
     };
     let upgrade = hyper::upgrade::on(&mut request);
     tokio::spawn(async move {
@@ -64,7 +128,7 @@ async fn session(
         match upgrade.await.map(into_tcp) {
             Ok(Ok((stream, read_ahead))) => {
                 let socket = Socket::new(stream, read_ahead, server.limits.send).await;
-                connection::serve(server, socket).await;
+                connection::serve(server, socket, grant).await;
             }
             Ok(Err(_)) => tracing::error!("a WebSocket upgrade did not give back its socket"),
             Err(error) => tracing::debug!("a client left during its upgrade: {error}"),
@@ -76,7 +140,7 @@ async fn session(
         (header::SEC_WEBSOCKET_ACCEPT, &accept),
         (header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL),
     ];
-    (StatusCode::SWITCHING_PROTOCOLS, headers).into_response()
+    Ok((StatusCode::SWITCHING_PROTOCOLS, headers).into_response())
 }
 
 /// The socket under an upgraded connection, and what was read from it already.
@@ -93,14 +157,6 @@ fn check(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
     };
     let has = |name, wanted: &str| any(name, &|value| value.eq_ignore_ascii_case(wanted));
     let bad = |message: &str| Err((StatusCode::BAD_REQUEST, message.to_owned()));
-    // Browsers send Origin and cannot leave it out; agents do not. Any page may try to reach
-    // 127.0.0.1, so only pages that come from there are let in.
-    if let Some(origin) = headers.get(header::ORIGIN)
-        && !origin.to_str().is_ok_and(is_local)
-    {
-        let message = format!("pages from {origin:?} may not drive; loopback origins may");
-        return Err((StatusCode::FORBIDDEN, message));
-    }
     if !has(header::CONNECTION, "upgrade") || !has(header::UPGRADE, "websocket") {
         let message = "this address speaks WebSocket: send an upgrade".to_owned();
         return Err((StatusCode::UPGRADE_REQUIRED, message));
@@ -132,10 +188,6 @@ fn is_local(origin: &str) -> bool {
         _ => authority,
     };
     ["localhost", "127.0.0.1", "[::1]"].contains(&host)
-}
-
-fn refuse(status: StatusCode, fault: &Fault) -> Response {
-    (status, Json(convert::refusal_body(fault))).into_response()
 }
 
 #[cfg(test)]

@@ -7,6 +7,8 @@ use std::time::Duration;
 use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
+use crate::geometry::Pose;
+use crate::residency::Eye;
 use crate::session::{Frame, Outcome, Session};
 
 use super::fault::Fault;
@@ -20,10 +22,25 @@ pub(super) struct Sessions {
 
 struct Entry {
     seat: Arc<AsyncMutex<Seat>>,
+    /// Name of the token that opened it.
+    owner: String,
+    /// As it was after the last request; none before the first.
+    about: Option<About>,
     /// Asks the connection that holds the seat to give it up.
     leave: Arc<Notify>,
     /// Since when nobody holds the seat, and what that means for the session.
     parked: Option<(Instant, Outcome)>,
+}
+
+/// What others are told of a session.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct About {
+    pub(super) twin: String,
+    pub(super) version: u64,
+    pub(super) step: u64,
+    pub(super) world_from_rig: Pose,
+    /// What its next frame needs, if it stays where it is.
+    pub(super) eyes: Vec<Eye>,
 }
 
 /// A session with what a lost connection must not lose.
@@ -62,8 +79,8 @@ impl Sessions {
         Arc::new(Self { limit, grace, entries: Mutex::default() })
     }
 
-    /// Takes an empty seat under a new name.
-    pub(super) fn reserve(self: &Arc<Self>, name: String) -> Result<Place, Fault> {
+    /// Takes an empty seat under a new name, for whoever a token names.
+    pub(super) fn reserve(self: &Arc<Self>, name: String, owner: &str) -> Result<Place, Fault> {
         let mut entries = self.lock();
         if entries.contains_key(&name) {
             return Err(Fault::SessionExists { name });
@@ -74,7 +91,9 @@ impl Sessions {
         let (seat, leave) = (Arc::new(AsyncMutex::new(Seat::default())), Arc::new(Notify::new()));
         let taken = seat.clone().try_lock_owned();
         let guard = taken.map_err(|_| Fault::Internal("a new seat is taken".to_owned()))?;
-        entries.insert(name.clone(), Entry { seat, leave: leave.clone(), parked: None });
+        let owner = owner.to_owned();
+        let entry = Entry { seat, owner, about: None, leave: leave.clone(), parked: None };
+        entries.insert(name.clone(), entry);
         drop(entries);
         Ok(Place { sessions: self.clone(), name, outcome: Outcome::AgentLost, leave, seat: guard })
     }
@@ -84,6 +103,7 @@ impl Sessions {
     pub(super) async fn resume(
         self: &Arc<Self>,
         name: &str,
+        owner: &str,
         patience: Duration,
     ) -> Result<Place, Fault> {
         let unknown = || Fault::UnknownSession { name: name.to_owned() };
@@ -91,7 +111,9 @@ impl Sessions {
         loop {
             let seat = {
                 let entries = self.lock();
-                let entry = entries.get(name).ok_or_else(unknown)?;
+                // To others than its owner there is no such session.
+                let entry = entries.get(name).filter(|entry| entry.owner == owner);
+                let entry = entry.ok_or_else(unknown)?;
                 if entry.parked.is_none() {
                     entry.leave.notify_one();
                 }
@@ -125,6 +147,14 @@ impl Sessions {
     /// How many there are, connected and parked.
     pub(super) fn count(&self) -> usize {
         self.lock().len()
+    }
+
+    /// All that see something, in order of name, and whether a client is connected to each.
+    pub(super) fn list(&self) -> Vec<(String, About, bool)> {
+        let told = |(name, entry): (&String, &Entry)| {
+            Some((name.clone(), entry.about.clone()?, entry.parked.is_none()))
+        };
+        self.lock().iter().filter_map(told).collect()
     }
 
     /// Ends sessions whose grace is over, until dropped.
@@ -173,6 +203,24 @@ impl Sessions {
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Entry>> {
         // A panic elsewhere leaves nothing half-done behind this lock.
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Place {
+    /// Lets others know how it stands with the session.
+    pub(super) fn tell(&self) {
+        let Some(session) = &self.seat.session else { return };
+        let version = &session.resident().version;
+        let about = About {
+            twin: version.manifest.twin.clone(),
+            version: version.number,
+            step: session.episode().step(),
+            world_from_rig: session.episode().world_from_rig(),
+            eyes: session.eyes(),
+        };
+        if let Some(entry) = self.sessions.lock().get_mut(&self.name) {
+            entry.about = Some(about);
+        }
     }
 }
 

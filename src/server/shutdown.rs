@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -18,6 +19,19 @@ pub struct Running {
     listening: JoinHandle<()>,
 }
 
+/// Throws away uploads that nobody came back for, until dropped.
+async fn reap_uploads(server: &Server) {
+    let Ok(spool) = &server.spool else { return std::future::pending().await };
+    let period = (spool.age() / 4).clamp(Duration::from_millis(10), Duration::from_secs(60));
+    loop {
+        tokio::time::sleep(period).await;
+        let spool = spool.clone();
+        if tokio::task::spawn_blocking(move || spool.reap()).await.is_err() {
+            tracing::error!("old uploads were not thrown away: a task crashed");
+        }
+    }
+}
+
 impl Running {
     pub(super) fn new(
         server: Arc<Server>,
@@ -30,6 +44,7 @@ impl Running {
         tokio::spawn(async move {
             tokio::select! {
                 () = reaping.sessions.reap() => {}
+                () = reap_uploads(&reaping) => {}
                 () = reaping.stopped() => {}
             }
         });

@@ -1,9 +1,10 @@
 //! What all sessions share: the twins in memory, the backend, and one queue for the renderer.
 
+use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
@@ -11,7 +12,8 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Lens, Reservation, Resident, Stats};
+use crate::residency::{Cache, Eye, Lens, Reservation, Resident, Stats};
+use crate::store::Catalog;
 
 use super::SessionError;
 use super::listing::{Listings, TwinSummary};
@@ -42,6 +44,14 @@ pub struct Engine {
     step_timeout: Duration,
     jobs: mpsc::Sender<Job>,
     answers: Answers,
+    /// By twin: the version that counts as its latest, while a newer one is made ready.
+    held: Mutex<BTreeMap<String, u64>>,
+}
+
+/// Keeps what is the latest version of a twin, until dropped.
+pub struct HeldLatest {
+    engine: Arc<Engine>,
+    twin: String,
 }
 
 /// RGB images that are encoded and forgotten: kept between frames, so that no step allocates them.
@@ -79,7 +89,8 @@ impl Engine {
         }
         let listings = Arc::new(Listings::new(cache.catalog().clone()));
         let answers = Answers::default();
-        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers }))
+        let held = Mutex::default();
+        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers, held }))
     }
 
     /// The latest version of every twin, in order of name. A damaged one is logged and left out,
@@ -101,6 +112,41 @@ impl Engine {
         let listings = self.listings.clone();
         let checked = tokio::task::spawn_blocking(move || listings.check());
         Ok(checked.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// The twins that can be opened.
+    pub fn catalog(&self) -> &Catalog {
+        self.cache.catalog()
+    }
+
+    /// Frames that wait for the renderer.
+    pub fn queued(&self) -> usize {
+        self.jobs.max_capacity() - self.jobs.capacity()
+    }
+
+    /// Lets a version be the latest of its twin for whoever opens it, whatever is committed meanwhile.
+    pub fn hold_latest(self: &Arc<Self>, twin: &str, number: u64) -> HeldLatest {
+        lock(&self.held).insert(twin.to_owned(), number);
+        HeldLatest { engine: self.clone(), twin: twin.to_owned() }
+    }
+
+    /// Opens a version and loads what frames of it need, for those who will switch to it where they
+    /// are: they need not wait.
+    ///
+    /// # Errors
+    /// It cannot be opened, or what a frame needs cannot be loaded.
+    pub async fn prepare(
+        self: &Arc<Self>,
+        twin: &str,
+        number: u64,
+        frames: Vec<Vec<Eye>>,
+    ) -> Result<(), SessionError> {
+        let resident = self.resident(twin.to_owned(), Some(number)).await?;
+        let loaded = tokio::task::spawn_blocking(move || {
+            let profile = &resident.version.manifest.profile;
+            frames.iter().try_for_each(|eyes| resident.scene(eyes, profile).map(|_| ()))
+        });
+        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
     }
 
     /// Name of the backend.
@@ -125,6 +171,7 @@ impl Engine {
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
+        let version = version.or_else(|| lock(&self.held).get(&twin).copied());
         let opened = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
         Ok(opened.await.map_err(|_| SessionError::Crashed)??)
     }
@@ -186,6 +233,17 @@ impl Engine {
     }
 }
 
+impl Drop for HeldLatest {
+    fn drop(&mut self) {
+        lock(&self.engine.held).remove(&self.twin);
+    }
+}
+
+/// A panic elsewhere leaves nothing half-done behind these locks.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl std::fmt::Debug for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Engine").field("backend", &self.backend.name()).finish_non_exhaustive()
@@ -240,7 +298,6 @@ impl Drop for Hold {
 mod tests {
     use super::*;
     use crate::render;
-    use crate::store::Catalog;
 
     #[test]
     fn huge_images_are_not_kept() {

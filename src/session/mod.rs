@@ -9,6 +9,7 @@ mod encode;
 mod engine;
 mod episode;
 mod error;
+mod golden;
 mod listing;
 mod observation;
 mod opening;
@@ -30,13 +31,16 @@ use crate::scene::rig::{Rig, RigCamera};
 pub use buffer::Buffer;
 pub use encode::Encoding;
 pub(crate) use encode::{jpeg, png};
-pub use engine::{Engine, EngineSettings};
+pub use engine::{Engine, EngineSettings, HeldLatest};
 pub use episode::{Episode, History, Outcome, Summary};
 pub use error::SessionError;
+pub use golden::{Changed, Golden};
 pub use listing::{TrajectorySummary, TwinSummary};
 pub use observation::{DType, Frame, HEADER_PREFIX_BYTES, Image, Tensor, TensorKind, Timings};
 pub use opening::{Opening, Outputs, RigChoice, Start};
-pub use record::{EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs};
+pub use record::{
+    EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs, RecordedVersion,
+};
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 
 pub(crate) use observation::eyes;
@@ -44,7 +48,7 @@ use observation::{Assembly, Layout};
 use opening::{choose_cameras, resolve_start};
 use record::{Line, Recorder};
 
-/// One agent's session on one version of a twin.
+/// One agent's session on a twin: on one version of it, until the agent asks for another.
 #[derive(Debug)]
 pub struct Session {
     engine: Arc<Engine>,
@@ -158,6 +162,35 @@ impl Session {
         Ok(frame)
     }
 
+    /// Sees another version of the twin from now on, or its latest; the episode goes on.
+    ///
+    /// # Errors
+    /// The version cannot be had: the session stays with its own.
+    pub async fn switch_version(&mut self, version: Option<u64>) -> Result<(), SessionError> {
+        let now = &self.resident().version;
+        let resident = self.engine.resident(now.manifest.twin.clone(), version).await?;
+        if resident.version.number == now.number {
+            return Ok(());
+        }
+        let lens = lens(self.layout.cameras());
+        let reservation = Engine::reserve(resident.clone(), lens).await?;
+        let profile = resident.version.manifest.profile;
+        let profile_hash = record::profile_hash(&profile);
+        // A file that is not begun yet will begin with the new version.
+        if let Some(recorder) = self.recorder.clone() {
+            let switched = RecordedVersion {
+                step: self.episode.step(),
+                version: resident.version.number,
+                version_hash: resident.version.hash.clone(),
+                profile,
+                profile_hash: profile_hash.to_hex().to_string(),
+            };
+            append(recorder, Line::Version(switched)).await?;
+        }
+        (self.reservation, self.profile_hash) = (reservation, profile_hash);
+        Ok(())
+    }
+
     /// Ends the session and tells how its last episode went.
     pub async fn close(mut self, outcome: Outcome) -> Summary {
         self.finish(outcome).await;
@@ -172,6 +205,11 @@ impl Session {
     /// The twin's version.
     pub fn resident(&self) -> &Arc<Resident> {
         self.reservation.resident()
+    }
+
+    /// What its next frame needs, if it stays where it is.
+    pub fn eyes(&self) -> Vec<Eye> {
+        eyes(&View::of_rig(self.layout.cameras(), self.episode.world_from_rig()))
     }
 
     /// The memory that is set aside for its worst frame, in bytes.

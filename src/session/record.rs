@@ -4,6 +4,7 @@
 //! <episodes>/<session>-<n>.jsonl
 //! {"kind":"episode", ...}    what it takes to render the same again
 //! {"kind":"frame", ...}      one per answer with images: request, poses, hashes
+//! {"kind":"version", ...}  what follows was rendered from another version of the twin
 //! {"kind":"end", ...}        how it went; missing if the server was killed
 //! ```
 //!
@@ -95,6 +96,22 @@ pub struct FrameRecord {
     pub images: Vec<String>,
 }
 
+/// Another version of the twin, from here on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedVersion {
+    /// Steps done before it.
+    pub step: u64,
+    /// The version.
+    pub version: u64,
+    /// BLAKE3 of its manifest, in hex.
+    pub version_hash: String,
+    /// How it is rendered.
+    pub profile: RenderProfile,
+    /// BLAKE3 of the profile's JSON, in hex.
+    pub profile_hash: String,
+}
+
 /// Requests that are answered with images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -115,6 +132,8 @@ pub(super) enum Line {
     Episode(Box<EpisodeHeader>),
     /// One per answer with images.
     Frame(FrameRecord),
+    /// Between two frames.
+    Version(RecordedVersion),
     /// The last.
     End(Summary),
 }

@@ -10,7 +10,9 @@ use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
 
-use super::record::{BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, profile_hash};
+use super::record::{
+    BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,
+};
 use super::{Summary, observation};
 
 /// A recorded episode.
@@ -20,6 +22,8 @@ pub struct Recording {
     pub header: EpisodeHeader,
     /// Everything rendered, in order; the first stands in line 2 of the file.
     pub frames: Vec<FrameRecord>,
+    /// Versions that the session switched to, and how many frames were rendered before.
+    pub versions: Vec<(usize, RecordedVersion)>,
     /// How it went; absent if the server was killed or is still running.
     pub end: Option<Summary>,
 }
@@ -115,6 +119,9 @@ pub enum ReplayError {
     /// The recorded cameras cannot be used.
     #[error(transparent)]
     Rig(#[from] RigError),
+    /// The twin cannot be had.
+    #[error(transparent)]
+    Twin(#[from] ResidencyError),
     /// What a frame needs cannot be had.
     #[error("step {step}: {cause}")]
     Residency {
@@ -152,6 +159,7 @@ impl Recording {
         let failed = |cause| ReplayError::Read { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
         let (mut header, mut frames, mut end) = (None, Vec::new(), None);
+        let mut versions = Vec::new();
         for line in 1.. {
             let wrong = |reason: String| ReplayError::Line { path: path.to_owned(), line, reason };
             let mut text = Vec::new();
@@ -186,35 +194,46 @@ impl Recording {
                     }
                     frames.push(frame);
                 }
+                Line::Version(version) if line > 1 => versions.push((frames.len(), version)),
                 Line::End(summary) if line > 1 => end = Some(summary),
                 Line::Episode(_) => return Err(wrong("a second beginning".to_owned())),
-                Line::Frame(_) | Line::End(_) => {
+                Line::Frame(_) | Line::Version(_) | Line::End(_) => {
                     return Err(wrong("the episode's beginning is missing".to_owned()));
                 }
             }
         }
         let empty =
             || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
-        Ok(Self { header: header.ok_or_else(empty)?, frames, end })
+        Ok(Self { header: header.ok_or_else(empty)?, frames, versions, end })
     }
 
-    /// Renders the episode again. Each image is shown to `visit` before it is compared.
+    /// Renders the episode again, from the versions of its twin that `open` gives. Each image is
+    /// shown to `visit` before it is compared.
     ///
     /// # Errors
-    /// The backend refuses a frame, or `visit` fails.
+    /// A version cannot be had, the backend refuses a frame, or `visit` fails.
     pub fn replay(
         &self,
-        resident: &Arc<Resident>,
+        open: &mut dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError>,
         backend: &dyn Backend,
         extent: Extent,
         visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
     ) -> Result<Report, ReplayError> {
+        let mut resident = open(self.header.version)?;
         let mut report =
-            Report { images: 0, changes: self.changes(resident, backend), difference: None };
+            Report { images: 0, changes: self.changes(&resident, backend), difference: None };
+        let mut switches = self.versions.iter().peekable();
+        let mut lines_before = 2;
         let cameras = &self.header.rig.cameras;
         let mut pixels: Vec<Vec<u8>> =
             cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
         for (index, frame) in self.frames.iter().enumerate() {
+            while let Some((_, to)) = switches.next_if(|(before, _)| *before <= index) {
+                resident = open(to.version)?;
+                lines_before += 1;
+                let recorded = (&*to.version_hash, &*to.profile_hash);
+                report.changes.extend(scene_changes(recorded, &resident));
+            }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
                 let (views, step) = (View::of_rig(cameras, *world_from_rig), frame.step);
@@ -238,7 +257,7 @@ impl Recording {
                     let now = hash.to_hex().to_string();
                     if now != *recorded && report.difference.is_none() {
                         report.difference = Some(Difference {
-                            line: index + 2,
+                            line: index + lines_before,
                             request,
                             step,
                             pose,
@@ -258,14 +277,28 @@ impl Recording {
 
     fn changes(&self, resident: &Resident, backend: &dyn Backend) -> Vec<Change> {
         let header = &self.header;
-        let profile = profile_hash(&resident.version.manifest.profile).to_hex().to_string();
-        [
+        let of_build = [
             ("build", &*header.build, BUILD),
             ("backend", &*header.backend, backend.name()),
             ("backend detail", &*header.backend_detail, &*backend.detail()),
-            ("version hash", &*header.version_hash, &*resident.version.hash),
-            ("profile hash", &*header.profile_hash, &*profile),
-        ]
+        ];
+        let mut changes = differing(of_build);
+        changes.extend(scene_changes((&header.version_hash, &header.profile_hash), resident));
+        changes
+    }
+}
+
+/// What is not as it was of a version, whose manifest and profile had these hashes.
+fn scene_changes((version, profile): (&str, &str), resident: &Resident) -> Vec<Change> {
+    let now = profile_hash(&resident.version.manifest.profile).to_hex();
+    differing([
+        ("version hash", version, &*resident.version.hash),
+        ("profile hash", profile, now.as_str()),
+    ])
+}
+
+fn differing<const N: usize>(compared: [(&'static str, &str, &str); N]) -> Vec<Change> {
+    compared
         .into_iter()
         .filter(|(_, recorded, now)| recorded != now)
         .map(|(what, recorded, now)| Change {
@@ -274,7 +307,6 @@ impl Recording {
             now: now.to_owned(),
         })
         .collect()
-    }
 }
 
 impl std::fmt::Display for Difference {

@@ -117,6 +117,7 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
         | Request::Step { seq, .. }
         | Request::Observe { seq, .. }
         | Request::Reset { seq, .. }
+        | Request::SwitchVersion { seq, .. }
         | Request::Close { seq }
         | Request::Resume { seq, .. } => *seq,
     }

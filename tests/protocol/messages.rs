@@ -146,6 +146,8 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("reset", Request::Reset { seq: 2, seed: 7, start: None }),
         ("reset_pose", Request::Reset { seq: 6, seed: 8, start: Some(start) }),
         ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
+        ("switch_version", Request::SwitchVersion { seq: 8, version: Some(4) }),
+        ("switch_latest", Request::SwitchVersion { seq: 8, version: None }),
         ("close", Request::Close { seq: 8 }),
         ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
     ]
@@ -203,6 +205,13 @@ fn answers() -> Vec<(&'static str, Answer)> {
         trajectories: vec![trajectory],
         resident_bytes: 36_000_000,
     };
+    let switched = Answer::Switched {
+        seq: 8,
+        version: 4,
+        version_hash: opened.version_hash.clone(),
+        profile_hash: opened.profile_hash.clone(),
+        profile: opened.profile.clone(),
+    };
     let session = "run-17".to_owned();
     let summary =
         Summary { outcome: Outcome::Completed, steps: 2, time_us: 200_000, distance_m: 1.75 };
@@ -224,6 +233,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("welcome", welcome),
         ("opened", Answer::Opened(Box::new(opened))),
         ("resumed", Answer::Resumed { seq: 1, session, last_seq: 4, step: 2, time_us: 200_000 }),
+        ("switched", switched),
         ("closed", Answer::Closed { seq: 8, summary }),
         ("error", refused),
         ("error_fatal", fatal),

@@ -3,6 +3,7 @@
 use schemars::schema_for;
 use serde::de::DeserializeOwned;
 use wildcity::protocol::error::Code;
+use wildcity::protocol::http;
 use wildcity::protocol::message::{Answer, Request};
 use wildcity::protocol::observation::Observation;
 
@@ -11,22 +12,40 @@ use super::read;
 #[test]
 fn every_json_example_is_a_message() {
     let page = page();
-    let is = |text: &str, kind: &str| match kind {
-        "request" => parses::<Request>(text),
-        "answer" => parses::<Answer>(text),
-        _ => parses::<Observation>(text),
-    };
-    let mut counts = [0; 3];
-    for example in blocks(&page, "json") {
-        let kinds = ["request", "answer", "observation"].map(|kind| is(example, kind));
-        let matches = kinds.iter().filter(|errors| errors.is_none()).count();
-        assert_eq!(matches, 1, "{example}\nas request, answer, observation: {kinds:#?}");
-        for (count, errors) in counts.iter_mut().zip(kinds) {
-            *count += usize::from(errors.is_none());
+    let (page, http) = page.split_once("\n## HTTP\n").expect("a section on HTTP");
+    let kinds: [Kind; 3] = [
+        ("request", parses::<Request>),
+        ("answer", parses::<Answer>),
+        ("observation", parses::<Observation>),
+    ];
+    // Each request but the two of `open` once, each answer once.
+    assert_eq!(counted(page, kinds), [9, 6, 1]);
+    let kinds: [Kind; 6] = [
+        ("new upload", parses::<http::NewUpload>),
+        ("upload", parses::<http::Upload>),
+        ("new push", parses::<http::NewPush>),
+        ("push", parses::<http::Push>),
+        ("rollback", parses::<http::Rollback>),
+        ("refusal", parses::<http::Refusal>),
+    ];
+    assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1]);
+}
+
+/// A kind of message, and what keeps a text from being one.
+type Kind = (&'static str, fn(&str) -> Option<String>);
+
+/// How many examples there are of each kind; every example is of exactly one.
+fn counted<const N: usize>(page: &str, kinds: [Kind; N]) -> [usize; N] {
+    let mut counts = [0; N];
+    for example in blocks(page, "json") {
+        let errors = kinds.map(|(kind, parses)| (kind, parses(example)));
+        let matches = errors.iter().filter(|(_, error)| error.is_none()).count();
+        assert_eq!(matches, 1, "{example}\n{errors:#?}");
+        for (count, (_, error)) in counts.iter_mut().zip(errors) {
+            *count += usize::from(error.is_none());
         }
     }
-    // Each request but the two of `open` once, each answer once.
-    assert_eq!(counts, [8, 5, 1]);
+    counts
 }
 
 #[test]
@@ -80,6 +99,20 @@ fn limits_are_those_of_the_configuration() {
         format!("| resuming | {} s |", seconds(config::RESUME_GRACE)),
         format!("hears nothing for {} s", seconds(config::ANSWER_TIMEOUT)),
         format!("headers up to {} MiB", config::OBSERVATION_HEADER_BYTES >> 20),
+        format!(
+            "| uploads kept, and their bytes | {}, {} GiB |",
+            config::UPLOADS,
+            config::SPOOL_BYTES >> 30
+        ),
+        format!("| one upload | {} GiB |", config::UPLOAD_BYTES >> 30),
+        format!("| silence within an upload | {} s |", seconds(config::UPLOAD_SILENCE)),
+        format!(
+            "| an upload that nobody goes on with | {} h |",
+            seconds(config::UPLOAD_AGE) / 3600
+        ),
+        format!("| pushes that wait or run | {} |", config::PUSHES),
+        format!("| files of a push | {} |", config::PUSH_FILES),
+        format!("| poses compared | {} |", config::GOLDEN_POSES),
         format!("frames up to {} GiB", config::OBSERVATION_BYTES as f64 / f64::from(1 << 30)),
     ] {
         assert!(page.contains(&row), "{row}");

@@ -2,18 +2,30 @@
 
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema, schema_for};
-use wildcity::protocol::{message, observation};
+use wildcity::protocol::{http, message, observation};
 
 use super::check_json;
 
 #[test]
 fn schemas_are_fresh() {
     // The server refuses unknown fields, at any depth; clients ignore them.
-    let mut request = schema_for!(message::Request);
-    RecursiveTransform(closed).transform(&mut request);
-    check_json("schema/request.json", &request);
+    check_closed::<message::Request>("request");
+    check_closed::<http::NewUpload>("new_upload");
+    check_closed::<http::NewPush>("new_push");
+    check_closed::<http::Rollback>("rollback");
     check::<message::Answer>("answer");
     check::<observation::Observation>("observation");
+    check::<http::Upload>("upload");
+    check::<http::Push>("push");
+    check::<http::VersionInfo>("version");
+    check::<http::SessionInfo>("session");
+    check::<http::Refusal>("refusal");
+}
+
+fn check_closed<T: JsonSchema>(name: &str) {
+    let mut schema = schema_for!(T);
+    RecursiveTransform(closed).transform(&mut schema);
+    check_json(&format!("schema/{name}.json"), &schema);
 }
 
 fn check<T: JsonSchema>(name: &str) {

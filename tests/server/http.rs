@@ -107,6 +107,8 @@ async fn public_addresses_are_refused() {
         twins: server.twins.path().to_owned(),
         cache: None,
         episodes: server.episodes.path().to_owned(),
+        uploads: server.twins.path().join(".uploads"),
+        tokens: None,
         backend: server.painter.clone(),
         limits: Limits::default(),
     };

@@ -30,6 +30,8 @@ impl Served {
             .arg(twins.path())
             .arg("--episodes")
             .arg(episodes.path())
+            .arg("--uploads")
+            .arg(twins.path().join(".uploads"))
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();

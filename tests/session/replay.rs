@@ -33,10 +33,9 @@ async fn recorded() -> (TestServer, PathBuf) {
 
 fn replay(server: &TestServer, path: &Path, backend: &dyn Backend) -> Result<Report, ReplayError> {
     let recording = Recording::read(path)?;
-    let resident = Cache::new(Catalog::open(server.twins.path()).unwrap())
-        .open(&recording.header.twin, Some(recording.header.version))
-        .unwrap();
-    recording.replay(&resident, backend, Extent::FirstDifference, &mut |_| Ok(()))
+    let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
+    let mut open = |version| cache.open(&recording.header.twin, Some(version));
+    recording.replay(&mut open, backend, Extent::FirstDifference, &mut |_| Ok(()))
 }
 
 /// Changes one hex digit of the hash of an image, in a line counted from 0.
@@ -135,6 +134,8 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         twins: twins.path().to_owned(),
         cache: None,
         episodes: episodes.path().to_owned(),
+        uploads: twins.path().join(".uploads"),
+        tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         limits: Limits::default(),
     };

@@ -1,5 +1,7 @@
 //! A server with a painted world, and an agent that speaks raw WebSocket.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -169,16 +171,23 @@ impl TestServer {
     }
 
     pub(crate) async fn with(limits: Limits) -> Self {
+        Self::configured(|config| config.limits = limits).await
+    }
+
+    pub(crate) async fn configured(change: impl FnOnce(&mut Config)) -> Self {
         let (twins, painter) = (twins(), Arc::new(Painter::default()));
         let episodes = tempfile::tempdir().expect("a temporary directory");
-        let config = Config {
+        let mut config = Config {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
             twins: twins.path().to_owned(),
             cache: None,
             episodes: episodes.path().to_owned(),
+            uploads: twins.path().join(".uploads"),
+            tokens: None,
             backend: painter.clone(),
-            limits,
+            limits: Limits::default(),
         };
+        change(&mut config);
         let running = server::start(config).await.expect("a server");
         Self { running, painter, twins, episodes }
     }

@@ -10,7 +10,11 @@ use std::path::PathBuf;
 /// Packages that belong to some places alone.
 const PACKAGES: &[(&str, &[&str])] = &[
     ("axum", &["server"]),
-    ("hyper", &["server"]),
+    ("hyper", &["client", "server"]),
+    ("http_body_util", &["client", "server"]),
+    ("bytes", &["client"]),
+    ("prometheus_client", &["server/metrics.rs"]),
+    ("sha2", &["server"]),
     ("tokio_tungstenite", &["client", "server"]),
     ("bincode", &["store/chunk_file.rs"]),
     ("clap", &["cli"]),
@@ -27,11 +31,11 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("flate2", &["ingest"]),
     ("zip", &["ingest/archive.rs"]),
     ("image_webp", &["ingest/sog"]),
-    ("data_encoding", &["ingest/gltf"]),
+    ("data_encoding", &["ingest/gltf", "server/uploads.rs"]),
 ];
 
-/// Who may touch files: those of a twin only `store/local`; the others scenes and settings of
-/// the user, episodes (the server makes their directory), pictures, and how much memory there is.
+/// Who may touch files: those of a twin only `store/local`; the others scenes and settings of the user,
+/// episodes (the server makes their directory), uploads, pictures, and how much memory there is.
 const FILES: &[&str] = &[
     "store/local",
     "residency/budget.rs",
@@ -39,6 +43,8 @@ const FILES: &[&str] = &[
     "session/record.rs",
     "session/replay.rs",
     "server/mod.rs",
+    "server/spool.rs",
+    "client/upload.rs",
     "cli",
 ];
 /// The modules that open files.

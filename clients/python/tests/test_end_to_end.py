@@ -58,7 +58,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
-    serving += ["--episodes", str(folder / "episodes")]
+    serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
         try:
             yield Server(listening_url(process))

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::config;
 use crate::geometry::{Camera, Pose};
+use crate::protocol::http::Refusal;
 use crate::protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
@@ -21,7 +22,7 @@ use crate::session::{
 use crate::store::Version;
 
 use super::SUBPROTOCOL;
-use super::fault::code_and_field;
+use super::fault::{cells, code_and_field};
 
 /// To `hello`.
 pub(in crate::server) fn welcome(
@@ -56,10 +57,7 @@ pub(in crate::server) fn welcome(
 pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
-    let profile = match serde_json::to_value(manifest.profile) {
-        Ok(serde_json::Value::Object(profile)) => profile,
-        other => return Err(Fault::Internal(format!("the profile is no object: {other:?}"))),
-    };
+    let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let (depth, opacity) = session.depth_and_opacity();
     let names = session.cameras().iter().map(|camera| camera.name.clone()).collect();
@@ -99,6 +97,18 @@ pub(in crate::server) fn resumed(
     text(&Answer::Resumed { seq, session: session.name().to_owned(), last_seq, step, time_us })
 }
 
+/// To `switch_version`.
+pub(in crate::server) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
+    let Version { number, hash, .. } = &*session.resident().version;
+    text(&Answer::Switched {
+        seq,
+        version: *number,
+        version_hash: hash.clone(),
+        profile_hash: session.profile_hash().to_hex().to_string(),
+        profile: profile(session)?,
+    })
+}
+
 /// To `close`.
 pub(in crate::server) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
     let Summary { outcome, steps, time_us, distance_m } = *summary;
@@ -121,15 +131,35 @@ pub(in crate::server) fn refused(seq: Option<u64>, fault: &Fault) -> String {
     text(&Answer::Error { seq, code, message, field, fatal }).unwrap_or_default()
 }
 
-/// The body of an HTTP answer that refuses: code and message.
+/// The code of a fault as it stands on the wire.
+#[derive(Clone, Debug)]
+pub(in crate::server) struct WireCode(pub(in crate::server) String);
+
+/// The code of a fault.
+pub(in crate::server) fn code(fault: &Fault) -> WireCode {
+    let code = serde_json::to_value(code_and_field(fault).0);
+    WireCode(code.ok().and_then(|code| code.as_str().map(str::to_owned)).unwrap_or_default())
+}
+
+/// The body of an HTTP answer that refuses.
 pub(in crate::server) fn refusal_body(fault: &Fault) -> serde_json::Value {
-    let (code, _) = code_and_field(fault);
-    serde_json::json!({ "code": code, "message": fault.to_string() })
+    let (code, field) = code_and_field(fault);
+    let offset = match fault {
+        Fault::UploadOffset { held, .. } => Some(*held),
+        _ => None,
+    };
+    let cells = cells(fault).to_vec();
+    serde_json::json!(Refusal { code, message: fault.to_string(), field, cells, offset })
 }
 
 /// The body of `GET /v1/twins`.
 pub(in crate::server) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
     serde_json::json!({ "twins": twins.iter().map(|twin| twin_info(twin)).collect::<Vec<_>>() })
+}
+
+/// The body of `GET /v1/twins/{twin}`.
+pub(in crate::server) fn twin(twin: &TwinSummary) -> serde_json::Value {
+    serde_json::json!(twin_info(twin))
 }
 
 /// Completes an observation: writes the header that says what its bytes are.
@@ -267,6 +297,13 @@ fn twin_info(twin: &TwinSummary) -> TwinInfo {
     }
 }
 
+fn profile(session: &Session) -> Result<serde_json::Map<String, serde_json::Value>, Fault> {
+    match serde_json::to_value(session.resident().version.manifest.profile) {
+        Ok(serde_json::Value::Object(profile)) => Ok(profile),
+        other => Err(Fault::Internal(format!("the profile is no object: {other:?}"))),
+    }
+}
+
 fn trajectory_info(log: TrajectorySummary) -> TrajectoryInfo {
     let TrajectorySummary { name, length_m, keyframes } = log;
     TrajectoryInfo { name, length_m, keyframes }
@@ -286,7 +323,7 @@ fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {
     }
 }
 
-fn pose(pose: &Pose) -> message::Pose {
+pub(super) fn pose(pose: &Pose) -> message::Pose {
     message::Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
 }
 

@@ -46,9 +46,41 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
         Fault::Busy { .. } => (Code::Busy, None),
         Fault::TimedOut(_) => (Code::TimedOut, None),
         Fault::ShuttingDown => (Code::ShuttingDown, None),
+        Fault::Unauthorized => (Code::Unauthorized, None),
+        Fault::Forbidden { .. } => (Code::Forbidden, None),
+        Fault::UnknownUpload { .. } => (Code::UnknownUpload, None),
+        Fault::UploadOffset { .. } => (Code::UploadOffset, field("upload-offset")),
+        Fault::UploadDigest { .. } => (Code::UploadDigest, None),
+        Fault::StorageFull { .. } => (Code::StorageFull, None),
+        Fault::NoUploads { .. } => (Code::Busy, None),
+        Fault::UnknownPush { .. } => (Code::UnknownPush, None),
+        Fault::Content { .. } => (Code::PushRefused, None),
+        Fault::OutOfRange { field, .. } => (Code::OutOfRange, Some(field.clone())),
+        Fault::Spool { .. } => (Code::Internal, None),
         Fault::Internal(_) => (Code::Internal, None),
         Fault::Session(error) => of_session(error),
     }
+}
+
+/// The cells at fault, if cells are.
+pub(super) fn cells(fault: &Fault) -> &[[i32; 2]] {
+    match fault {
+        Fault::Content { cells, .. }
+        | Fault::Session(SessionError::Twin(StoreError::Overlap { cells, .. })) => cells,
+        _ => &[],
+    }
+}
+
+/// Whether a commit was refused for what it holds.
+fn is_content(error: &StoreError) -> bool {
+    matches!(
+        error,
+        StoreError::Gaussians(_)
+            | StoreError::Clamped { .. }
+            | StoreError::Profile(_)
+            | StoreError::Field { .. }
+            | StoreError::ManifestSize { .. }
+    )
 }
 
 fn of_session(error: &SessionError) -> (Code, Option<String>) {
@@ -59,6 +91,10 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
         SessionError::Twin(StoreError::NoVersion { .. }) => {
             (Code::UnknownVersion, field("version"))
         }
+        SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
+            (Code::Conflict, None)
+        }
+        SessionError::Twin(error) if is_content(error) => (Code::PushRefused, None),
         SessionError::Residency(error) => match error {
             ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => {
                 (Code::Busy, field("twin"))

@@ -63,6 +63,11 @@ pub(in crate::server) enum Command {
         /// Its start.
         start: Option<Start>,
     },
+    /// Another version of the twin; the latest if none is said.
+    SwitchVersion {
+        /// The version.
+        version: Option<u64>,
+    },
     /// The end of the session.
     Close,
     /// A session of an earlier connection.
@@ -184,6 +189,7 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             let start = start.map(start_of).transpose();
             (seq, start.map(|start| Command::Reset { seed, start }))
         }
+        Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
             let command =
@@ -255,7 +261,7 @@ fn name_of(field: &str, name: String) -> Result<String, Fault> {
     if is_name(&name) { Ok(name) } else { Err(Fault::InvalidName { field: field.into(), name }) }
 }
 
-fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
+pub(super) fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
     Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
 }
 

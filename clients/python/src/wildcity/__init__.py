@@ -12,6 +12,7 @@ from .errors import (
     ConnectFailed,
     Disconnected,
     ProtocolError,
+    PushFailed,
     Refused,
     TimedOut,
     WildCityError,
@@ -29,10 +30,12 @@ from .protocol import (
     Rig,
     Station,
     Summary,
+    Switched,
     TrajectoryInfo,
     TwinInfo,
     Welcome,
 )
+from .pushing import Push, PushProgress, push, rollback
 from .sync import Client, Session, connect
 
 __version__ = _version("wildcity")
@@ -52,12 +55,16 @@ __all__ = [
     "Outputs",
     "Pose",
     "ProtocolError",
+    "Push",
+    "PushFailed",
+    "PushProgress",
     "Refused",
     "Resumed",
     "Rig",
     "Session",
     "Station",
     "Summary",
+    "Switched",
     "TimedOut",
     "TrajectoryInfo",
     "TwinInfo",
@@ -65,4 +72,6 @@ __all__ = [
     "Welcome",
     "WildCityError",
     "connect",
+    "push",
+    "rollback",
 ]

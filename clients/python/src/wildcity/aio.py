@@ -11,7 +11,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as dial
 from websockets.exceptions import WebSocketException
 
-from .core import DIAL, Conversation, Exchange, Message, keeps_connection, translated
+from .core import DIAL, Conversation, Exchange, Message, headers, keeps_connection, translated
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -23,18 +23,26 @@ from .protocol import (
     Rig,
     Station,
     Summary,
+    Switched,
     Welcome,
 )
 
 T = TypeVar("T")
 
 
-async def connect(url: str, *, name: str = "wildcity-python", timeout: float = 90.0) -> Client:
+async def connect(
+    url: str,
+    *,
+    name: str = "wildcity-python",
+    timeout: float = 90.0,
+    token: str | None = None,
+) -> Client:
     """Connects to `ws://host:port/v1/session` and says hello.
 
     `timeout` is how long an answer may take, in seconds; the server's own limits are shorter.
+    `token` is for a server that has tokens.
     """
-    client = Client(url, name=name, timeout=timeout)
+    client = Client(url, name=name, timeout=timeout, token=token)
     await client._connect()
     return client
 
@@ -45,8 +53,9 @@ class Client:
     welcome: Welcome
     """What the server said to hello: its limits, its twins."""
 
-    def __init__(self, url: str, *, name: str, timeout: float) -> None:
+    def __init__(self, url: str, *, name: str, timeout: float, token: str | None) -> None:
         self.url, self.timeout = url, timeout
+        self._headers = headers(token)
         self._conversation = Conversation(name)
         self._connection: ClientConnection | None = None
 
@@ -99,7 +108,7 @@ class Client:
     async def _connect(self) -> None:
         await self.close()
         try:
-            connection = await dial(self.url, **DIAL)
+            connection = await dial(self.url, additional_headers=self._headers, **DIAL)
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
         self._connection = connection
@@ -172,6 +181,10 @@ class Session:
     async def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
         """Starts a new episode, at the session's start if none is given."""
         return await self._client._run(self._conversation.reset(seed, start))
+
+    async def switch_version(self, version: int | None = None) -> Switched:
+        """Sees another version of the twin from the next step on, or the latest; the episode goes on."""
+        return await self._client._run(self._conversation.switch_version(version))
 
     async def close(self) -> Summary:
         """Ends the session; another can be opened on the same client."""

@@ -29,6 +29,7 @@ from .protocol import (
     Rig,
     Station,
     Summary,
+    Switched,
     Welcome,
     decode_answer,
     encode,
@@ -103,6 +104,11 @@ class Conversation:
             fields["start"] = _start(start)
         return (yield from self._next("reset", Observation, fields))
 
+    def switch_version(self, version: int | None) -> Exchange[Switched]:
+        """Sees another version."""
+        fields = {} if version is None else {"version": version}
+        return (yield from self._next("switch_version", Switched, fields))
+
     def close(self) -> Exchange[Summary]:
         """Ends the session."""
         closed = yield from self._next("close", Closed, {})
@@ -163,6 +169,11 @@ DIAL: dict[str, Any] = {
     "proxy": None,
 }
 """How both clients connect."""
+
+
+def headers(token: str | None) -> dict[str, str]:
+    """What a client sends with its upgrade."""
+    return {} if token is None else {"Authorization": f"Bearer {token}"}
 
 
 def keeps_connection(error: BaseException) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 Code = Literal[
     "malformed_json",
@@ -31,6 +31,15 @@ Code = Literal[
     "deadline_exceeded",
     "timed_out",
     "shutting_down",
+    "unauthorized",
+    "forbidden",
+    "unknown_upload",
+    "upload_offset",
+    "upload_digest",
+    "storage_full",
+    "unknown_push",
+    "conflict",
+    "push_refused",
     "internal",
 ]
 """The closed list of refusals; `protocol/README.md` says what each means and what to do."""
@@ -72,3 +81,24 @@ class Refused(WildCityError):
         self.message = message
         self.field = field
         self.fatal = fatal
+
+
+class PushFailed(WildCityError):
+    """A push was refused, or the server could not do it. Nothing changed.
+
+    `code` is `conflict` if others changed the same `cells`, and `push_refused` if the scene cannot be
+    used; `report` then says what was found.
+    """
+
+    def __init__(
+        self,
+        code: Code,
+        message: str,
+        cells: tuple[tuple[int, int], ...],
+        report: dict[str, Any] | None,
+    ) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+        self.cells = cells
+        self.report = report

@@ -176,6 +176,17 @@ class Resumed:
 
 
 @dataclass(frozen=True)
+class Switched:
+    """Answer to switch_version: what the session sees from now on."""
+
+    seq: int
+    version: int
+    version_hash: str
+    profile_hash: str
+    profile: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class Summary:
     """How an episode went."""
 
@@ -283,6 +294,7 @@ ANSWERS: dict[str, type[Any]] = {
     "welcome": Welcome,
     "opened": Opened,
     "resumed": Resumed,
+    "switched": Switched,
     "closed": Closed,
     "error": Refusal,
 }

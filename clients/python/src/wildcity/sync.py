@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as dial
 
-from .core import DIAL, Conversation, Exchange, Message, keeps_connection, translated
+from .core import DIAL, Conversation, Exchange, Message, headers, keeps_connection, translated
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -25,25 +25,34 @@ from .protocol import (
     Rig,
     Station,
     Summary,
+    Switched,
     Welcome,
 )
 
 T = TypeVar("T")
 
 
-def connect(url: str, *, name: str = "wildcity-python", timeout: float = 90.0) -> Client:
+def connect(
+    url: str,
+    *,
+    name: str = "wildcity-python",
+    timeout: float = 90.0,
+    token: str | None = None,
+) -> Client:
     """Connects to `ws://host:port/v1/session` and says hello.
 
     `timeout` is how long an answer may take, in seconds; the server's own limits are shorter.
+    `token` is for a server that has tokens.
     """
-    return Client(url, name=name, timeout=timeout)
+    return Client(url, name=name, timeout=timeout, token=token)
 
 
 class Client:
     """A connection to a server. Use `connect`, and close it or use it in a `with` block."""
 
-    def __init__(self, url: str, *, name: str, timeout: float) -> None:
+    def __init__(self, url: str, *, name: str, timeout: float, token: str | None) -> None:
         self.url, self.timeout = url, timeout
+        self._headers = headers(token)
         self._conversation = Conversation(name)
         self._connection: ClientConnection | None = None
         self.welcome: Welcome = self._connect()
@@ -103,7 +112,7 @@ class Client:
         self.close()
         try:
             # Entered here and closed in `close`, as it outlives any block.
-            connection = dial(self.url, **DIAL).__enter__()
+            connection = dial(self.url, additional_headers=self._headers, **DIAL).__enter__()
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
         self._connection = connection
@@ -186,6 +195,10 @@ class Session:
     def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
         """Starts a new episode, at the session's start if none is given."""
         return self._client._run(self._conversation.reset(seed, start))
+
+    def switch_version(self, version: int | None = None) -> Switched:
+        """Sees another version of the twin from the next step on, or the latest; the episode goes on."""
+        return self._client._run(self._conversation.switch_version(version))
 
     def close(self) -> Summary:
         """Ends the session; another can be opened on the same client."""

@@ -1,0 +1,226 @@
+//! `wildcity push`.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+
+use crate::client::{
+    All, Cells, Golden, HttpClient, NewPush, Push as Pushed, PushFile, PushReport, PushState,
+};
+use crate::config;
+use crate::ingest;
+
+use super::progress;
+
+/// Push trained scenes to a server, as a new version of a twin.
+///
+/// The files become one. They replace the 64 m cells that their Gaussians lie in, all at once; sessions
+/// that run keep what they see until they ask for the new version. What was cut off goes on where it
+/// stopped: run the same again.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Push {
+    /// The scene files, one file each, of the formats that `wildcity import` reads.
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+
+    /// Name of the twin; a new one is made.
+    #[arg(long, value_name = "NAME")]
+    twin: String,
+
+    #[command(flatten)]
+    server: Server,
+
+    /// Which way the files' axes point, as in `wildcity import`.
+    #[arg(long, default_value = "identity", allow_hyphen_values = true)]
+    axes: String,
+
+    /// Metres per unit of the files.
+    #[arg(long, default_value_t = 1.0)]
+    scale: f64,
+
+    /// `all`, or the cells to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j)
+    /// m. What lies elsewhere is left out [default: those that the Gaussians lie in]
+    #[arg(long, value_name = "CELL", allow_hyphen_values = true)]
+    cells: Vec<String>,
+
+    /// The version that the scenes were trained from: cells that changed since are not overwritten
+    /// [default: the latest]
+    #[arg(long, value_name = "VERSION")]
+    base: Option<u64>,
+
+    /// In how many bits Gaussians are stored, if not as the rest of the twin.
+    #[arg(long)]
+    record: Option<String>,
+
+    /// Makes no levels of detail.
+    #[arg(long)]
+    no_lod: bool,
+
+    /// How it must be rendered where that changes; may be given again.
+    #[arg(long, value_name = "KEY=VALUE")]
+    profile: Vec<String>,
+
+    /// What this version is, for people.
+    #[arg(long)]
+    note: Option<String>,
+
+    /// Refuses the push if a view along the twin's trajectory differs by more, in dB.
+    #[arg(long, value_name = "DB")]
+    min_psnr_db: Option<f64>,
+}
+
+/// `--server` and its token, for every command that talks to one.
+#[derive(Debug, clap::Args)]
+pub(super) struct Server {
+    /// The server, as http://HOST:PORT.
+    #[arg(long, value_name = "URL", default_value = config::SERVER_URL)]
+    server: String,
+
+    /// File that holds the token [default: $WILDCITY_TOKEN, or none]
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity push street.ply --twin street --axes y-down-z-forward
+  wildcity push block7.spz block8.spz --twin city --server http://sim:8080 --token-file token
+  wildcity push block7.ply --twin city --base 12 --cells 3,-1 --cells 4,-1";
+
+impl Push {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let cells = match &self.cells[..] {
+            [] => None,
+            [all] if all == "all" => Some(Cells::All(All::All)),
+            cells => Some(Cells::These(cells.iter().map(|c| cell(c)).collect::<Result<_, _>>()?)),
+        };
+        let client = self.server.client()?;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let pushed = runtime.block_on(self.push(&client, cells))?;
+        let mut out = io::stdout().lock();
+        if let Some(report) = &pushed.report {
+            show(&mut out, report)?;
+        }
+        match (pushed.state, pushed.version, pushed.error) {
+            (PushState::Ready, Some(version), _) => {
+                let hash = pushed.version_hash.unwrap_or_default();
+                writeln!(out, "twin {} version {version} is ready\nblake3 {hash}", pushed.twin)?;
+                Ok(())
+            }
+            (state, _, error) => {
+                let why = error.map_or_else(String::new, |error| error.message);
+                anyhow::bail!("the push was {}: {why}", word(state))
+            }
+        }
+    }
+
+    async fn push(&self, client: &HttpClient, cells: Option<Cells>) -> anyhow::Result<Pushed> {
+        let mut files = Vec::with_capacity(self.files.len());
+        for path in &self.files {
+            let bar = progress::bytes("uploading");
+            let upload = client.upload(path, &mut progress::show(&bar)).await;
+            let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
+            bar.finish_and_clear();
+            let (axes, scale) = (self.axes.clone(), self.scale);
+            files.push(PushFile { upload: upload.id, axes, scale });
+        }
+        let asked = NewPush {
+            // One for this run: if the answer is lost, the same is asked and not another.
+            id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
+            files,
+            base: self.base,
+            cells,
+            record: self.record.clone(),
+            levels: !self.no_lod,
+            profile: self.profile.clone(),
+            note: self.note.clone(),
+            golden: Golden { poses: None, min_psnr_db: self.min_psnr_db },
+        };
+        let begun = client.push(&self.twin, &asked).await?;
+        let bar = progress::state();
+        let seen = &mut |push: &Pushed| {
+            bar.set_message(word(push.state));
+            bar.set_length(push.progress.total);
+            bar.set_position(push.progress.done);
+        };
+        let ended = client.wait(begun, seen).await?;
+        bar.finish_and_clear();
+        Ok(ended)
+    }
+}
+
+impl Server {
+    /// A client of it, with the token.
+    pub(super) fn client(&self) -> anyhow::Result<HttpClient> {
+        let token = match &self.token_file {
+            Some(path) => Some(read_token(path)?),
+            None => std::env::var("WILDCITY_TOKEN").ok().filter(|token| !token.is_empty()),
+        };
+        Ok(HttpClient::new(&self.server, token)?)
+    }
+}
+
+fn read_token(path: &Path) -> anyhow::Result<String> {
+    let cannot = || format!("--token-file {}", path.display());
+    let text = ingest::read_whole(path, config::TOKENS_FILE_BYTES).with_context(cannot)?;
+    Ok(String::from_utf8(text).with_context(cannot)?.trim().to_owned())
+}
+
+fn cell(text: &str) -> anyhow::Result<[i32; 2]> {
+    let parsed = text
+        .split_once(',')
+        .and_then(|(x, y)| Some([x.trim().parse().ok()?, y.trim().parse().ok()?]));
+    parsed.with_context(|| format!("--cells {text:?} is neither all nor a cell, as 3,-1"))
+}
+
+fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
+    for file in &report.files {
+        writeln!(out, "file        {}: {} Gaussians", file.name, file.gaussians)?;
+        for bad in &file.first_bad {
+            let (index, field) = (bad.index, &bad.field);
+            writeln!(out, "bad         Gaussian {index}: {field} is {}; {}", bad.value, bad.must)?;
+        }
+        let unnamed = file.bad - file.first_bad.len() as u64;
+        if unnamed > 0 {
+            writeln!(out, "bad         and {unnamed} more")?;
+        }
+    }
+    if let Some(ranges) = report.ranges {
+        let [low, high] = ranges.mean_m;
+        writeln!(out, "bounds      {low:.1?} to {high:.1?} m")?;
+        let [thin, wide] = ranges.scale_m;
+        writeln!(out, "scales      {thin:.2e} to {wide:.2e} m")?;
+    }
+    if !report.cells.is_empty() {
+        let count = |of: fn(&crate::client::CellReport) -> u64| -> u64 {
+            report.cells.iter().map(of).sum()
+        };
+        let (before, after) = (count(|cell| cell.before), count(|cell| cell.after));
+        let cells = report.cells.len();
+        writeln!(out, "cells       {cells}: {before} Gaussians before, {after} after")?;
+    }
+    if report.left_out > 0 {
+        writeln!(out, "left out    {} Gaussians in other cells", report.left_out)?;
+    }
+    for golden in &report.golden {
+        let [x, y, z] = golden.pose.xyz;
+        let alike = golden.psnr_db.map_or("equal".to_owned(), |db| format!("{db:.1} dB"));
+        writeln!(out, "view        from ({x:.1}, {y:.1}, {z:.1}): {alike}")?;
+    }
+    Ok(())
+}
+
+fn word(state: PushState) -> &'static str {
+    match state {
+        PushState::Queued => "queued",
+        PushState::Ingesting => "ingesting",
+        PushState::Validating => "validating",
+        PushState::Committing => "committing",
+        PushState::Prefetching => "prefetching",
+        PushState::Ready => "ready",
+        PushState::Refused => "refused",
+        PushState::Failed => "stopped by a fault of the server",
+    }
+}

@@ -1,0 +1,328 @@
+//! What a push does: read its files, look at them, write a version, and make it ready.
+//!
+//! Nobody sees anything of it before the version is written whole.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use tokio::time::timeout;
+
+use crate::config;
+use crate::ingest::{self, IngestError};
+use crate::scene::chunk::cell_at;
+use crate::scene::manifest::Provenance;
+use crate::scene::{Gaussians, RenderProfile};
+use crate::session::{Changed, SessionError};
+use crate::store::{Catalog, Change, Kind, Settings, Storage, StoreError, Version};
+
+use super::Server;
+use super::fault::Fault;
+use super::push::{Ask, AskedCells, Push};
+use super::report::{FileReport, Ranges, Report, State, cells};
+use super::spool::Upload;
+use super::uploads::blocking;
+
+/// Carries out a push in its turn, and ends it.
+pub(super) async fn run(server: Arc<Server>, push: Arc<Push>, ask: Ask, uploads: Vec<Arc<Upload>>) {
+    let done = async {
+        let turn = server.pushes.turn.acquire().await;
+        let _turn = turn.map_err(|_| Fault::ShuttingDown)?;
+        publish(&server, &push, Arc::new(ask), uploads).await
+    };
+    let ended = tokio::select! {
+        done = done => done,
+        () = server.stopped() => Err(Fault::ShuttingDown),
+    };
+    let ended = ended.map_err(|fault| {
+        let state = if is_content(&fault) { State::Refused } else { State::Failed };
+        tracing::warn!(?state, "a push ended: {fault}");
+        (state, fault)
+    });
+    let outcome = match &ended {
+        Ok(_) => "ready",
+        Err((State::Refused, _)) => "refused",
+        Err(_) => "failed",
+    };
+    server.metrics.pushed(outcome);
+    push.end(ended);
+}
+
+/// Whether a fault lies in what was pushed: the same again would fail again.
+fn is_content(fault: &Fault) -> bool {
+    match fault {
+        Fault::Content { .. } | Fault::OutOfRange { .. } => true,
+        Fault::Session(SessionError::Twin(error)) => !matches!(
+            error,
+            StoreError::Io { .. }
+                | StoreError::Damaged { .. }
+                | StoreError::Conflict { .. }
+                | StoreError::NotSynced { .. }
+        ),
+        _ => false,
+    }
+}
+
+/// What the files hold, as one.
+struct Scene {
+    gaussians: Arc<Gaussians>,
+    /// BLAKE3 of each source, and how it was read.
+    sources: Vec<String>,
+    options: Vec<String>,
+    report: Report,
+}
+
+async fn publish(
+    server: &Arc<Server>,
+    push: &Arc<Push>,
+    ask: Arc<Ask>,
+    uploads: Vec<Arc<Upload>>,
+) -> Result<(u64, String), Fault> {
+    push.enter(State::Ingesting);
+    let (told, asked) = (push.clone(), ask.clone());
+    let scene = blocking(move || read(&told, &asked, &uploads)).await?;
+
+    push.enter(State::Validating);
+    let (catalog, asked) = (server.engine.catalog().clone(), ask.clone());
+    let base = blocking(move || find_base(&catalog, &asked)).await?.map(Arc::new);
+    let scene = Arc::new(validate(server, push, &ask, scene, base.as_ref()).await?);
+
+    push.enter(State::Committing);
+    let latest = base.as_ref().map(|base| base.number);
+    let (catalog, told) = (server.engine.catalog().clone(), push.clone());
+    // Until it is ready, who opens the latest gets the one before.
+    let latest = ask.base.map_or(Ok(latest), |_| latest_of(&catalog, &ask.twin).map(Some))?;
+    let held = latest.map(|number| server.engine.hold_latest(&ask.twin, number));
+    let asked = ask.clone();
+    let version =
+        blocking(move || commit(&catalog, &told, &asked, &scene, base.as_deref())).await?;
+    tracing::info!(twin = ask.twin, version = version.number, "pushed");
+
+    push.enter(State::Prefetching);
+    // Where sessions drive on that twin now, whoever switches need not wait.
+    let driving = server.sessions.list().into_iter().filter(|(_, about, _)| about.twin == ask.twin);
+    let frames = driving.map(|(_, about, _)| about.eyes).collect();
+    let prepared = server.engine.prepare(&ask.twin, version.number, frames);
+    match timeout(config::PREFETCH_TIMEOUT, prepared).await {
+        Ok(Ok(())) => {}
+        // It is committed and sound: whoever opens it waits, or is told why it does not fit.
+        Ok(Err(error)) => tracing::warn!(twin = ask.twin, "not loaded ahead: {error}"),
+        Err(_) => tracing::warn!(twin = ask.twin, "not loaded ahead in time"),
+    }
+    drop(held);
+    Ok((version.number, version.hash))
+}
+
+/// Reads the files, turns them into the twin's axes, and joins them.
+fn read(push: &Push, ask: &Ask, uploads: &[Arc<Upload>]) -> Result<Scene, Fault> {
+    let total: u64 = uploads.iter().map(|upload| upload.announced().size).sum();
+    let (mut report, mut joined) = (Report::default(), Gaussians::default());
+    let (mut sources, mut options) = (Vec::new(), Vec::new());
+    let mut before = 0;
+    for (file, upload) in ask.files.iter().zip(uploads) {
+        let name = upload.announced().name.clone();
+        let progress = &mut |done: u64, _| push.progress(before + done, total);
+        let refused = |error: IngestError| Fault::Content {
+            reason: format!("{name}: {error}"),
+            cells: Vec::new(),
+        };
+        let (mut gaussians, hash) = match ingest::read_hashed(&upload.path(), progress) {
+            Ok(read) => read,
+            Err(IngestError::Values(bad)) => {
+                report.gaussians += bad.gaussians;
+                report.files.push(FileReport {
+                    name: name.clone(),
+                    gaussians: bad.gaussians,
+                    bad: bad.count,
+                    first_bad: bad.first.clone(),
+                });
+                push.tell(report);
+                return Err(refused(IngestError::Values(bad)));
+            }
+            Err(IngestError::File(cause)) => {
+                return Err(Fault::Internal(format!("{name}: {cause}")));
+            }
+            Err(error) => return Err(refused(error)),
+        };
+        file.axes.apply(&mut gaussians);
+        let (count, first_bad) = (gaussians.len() as u64, Vec::new());
+        report.files.push(FileReport { name: name.clone(), gaussians: count, bad: 0, first_bad });
+        joined = join(joined, gaussians);
+        report.gaussians = joined.len() as u64;
+        if report.gaussians > config::IMPORT_GAUSSIANS {
+            return Err(refused(IngestError::TooMany { count: report.gaussians }));
+        }
+        sources.push(hash);
+        options.extend(file.options.clone());
+        before += upload.announced().size;
+    }
+    report.sh_degree = joined.sh_degree;
+    report.ranges = Ranges::of(&joined);
+    push.tell(report.clone());
+    if joined.is_empty() {
+        let reason = "the files hold no Gaussians: nothing to push".to_owned();
+        return Err(Fault::Content { reason, cells: Vec::new() });
+    }
+    Ok(Scene { gaussians: Arc::new(joined), sources, options, report })
+}
+
+/// One scene after the other; the lower SH degree gets zeros.
+fn join(mut first: Gaussians, mut second: Gaussians) -> Gaussians {
+    if first.is_empty() {
+        return second;
+    }
+    let degree = first.sh_degree.max(second.sh_degree);
+    first.raise_sh_degree(degree);
+    second.raise_sh_degree(degree);
+    first.means_m.append(&mut second.means_m);
+    first.quats_wxyz.append(&mut second.quats_wxyz);
+    first.ln_scales.append(&mut second.ln_scales);
+    first.logit_opacities.append(&mut second.logit_opacities);
+    first.sh.append(&mut second.sh);
+    first
+}
+
+/// The version that a push is made from; none if it makes a new twin.
+fn find_base(catalog: &Catalog, ask: &Ask) -> Result<Option<Version>, Fault> {
+    match catalog.version(&ask.twin, ask.base) {
+        Ok(version) => Ok(Some(version)),
+        Err(StoreError::NoTwin { .. }) if ask.base.is_none() => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn latest_of(catalog: &Catalog, twin: &str) -> Result<u64, Fault> {
+    Ok(catalog.versions(twin)?.last().map_or(0, |entry| entry.number))
+}
+
+/// Looks at what would change, and at how it looks.
+async fn validate(
+    server: &Arc<Server>,
+    push: &Arc<Push>,
+    ask: &Ask,
+    scene: Scene,
+    base: Option<&Arc<Version>>,
+) -> Result<Scene, Fault> {
+    let Scene { mut gaussians, sources, options, mut report } = scene;
+    // What is stored of a twin has one SH degree; a lower one gets zeros.
+    if let Some(base) = base
+        && base.manifest.sh_degree > gaussians.sh_degree
+        && ask.cells != AskedCells::All
+    {
+        Arc::make_mut(&mut gaussians).raise_sh_degree(base.manifest.sh_degree);
+    }
+    let mut after = BTreeMap::new();
+    for mean_m in &gaussians.means_m {
+        *after.entry(cell_at(mean_m)).or_insert(0) += 1;
+    }
+    let found = cells(&ask.cells, base.map(|base| &base.manifest), &after);
+    let (replaced, left_out) = found.inspect_err(|_| push.tell(report.clone()))?;
+    (report.cells, report.left_out) = (replaced, left_out);
+    push.tell(report.clone());
+
+    let fits = gaussians.len() <= config::GOLDEN_GAUSSIANS;
+    let wants = ask.poses.is_some() || ask.min_psnr_db.is_some();
+    if wants && !fits {
+        let most = config::GOLDEN_GAUSSIANS;
+        let must = format!("set, for {} Gaussians; at most {most} are compared", gaussians.len());
+        return Err(Fault::OutOfRange { field: "golden".to_owned(), must });
+    }
+    if let Some(base) = base.filter(|base| fits && base.manifest.sh_degree == gaussians.sh_degree) {
+        let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
+        let changed = Changed {
+            before: base.clone(),
+            gaussians: inside(&gaussians, &changed, left_out),
+            cells: changed,
+            profile: profile(ask, base.manifest.profile)?,
+        };
+        let progress = |done, total| push.progress(done, total);
+        report.golden = server.engine.compare(changed, ask.poses.clone(), &progress).await?;
+        push.tell(report.clone());
+    }
+    let least_db = ask.min_psnr_db.unwrap_or(f64::NEG_INFINITY);
+    let worst = report.golden.iter().enumerate().find(|(_, golden)| golden.psnr_db < least_db);
+    if let Some((index, golden)) = worst {
+        let [x, y, z] = golden.world_from_rig.position_m.to_array();
+        let reason = format!(
+            "pose {index} at ({x:.1}, {y:.1}, {z:.1}) differs from what was there: {:.1} dB, \
+             min_psnr_db is {least_db}",
+            golden.psnr_db
+        );
+        return Err(Fault::Content { reason, cells: Vec::new() });
+    }
+    Ok(Scene { gaussians, sources, options, report })
+}
+
+/// The Gaussians within some cells.
+fn inside(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64) -> Arc<Gaussians> {
+    if left_out == 0 {
+        return gaussians.clone();
+    }
+    let mut kept = Gaussians::with_capacity(gaussians.sh_degree, gaussians.len());
+    for (index, mean_m) in gaussians.means_m.iter().enumerate() {
+        if cells.contains(&cell_at(mean_m)) {
+            kept.means_m.push(*mean_m);
+            kept.quats_wxyz.push(gaussians.quats_wxyz[index]);
+            kept.ln_scales.push(gaussians.ln_scales[index]);
+            kept.logit_opacities.push(gaussians.logit_opacities[index]);
+            kept.sh.extend(gaussians.sh_of(index));
+        }
+    }
+    Arc::new(kept)
+}
+
+fn profile(ask: &Ask, mut profile: RenderProfile) -> Result<RenderProfile, Fault> {
+    for setting in &ask.profile {
+        profile.set(setting).map_err(StoreError::from)?;
+    }
+    Ok(profile)
+}
+
+/// Writes the version: all of its cells, or none.
+fn commit(
+    catalog: &Catalog,
+    push: &Push,
+    ask: &Ask,
+    scene: &Scene,
+    base: Option<&Version>,
+) -> Result<Version, Fault> {
+    let was = base.map(|base| &base.manifest);
+    let record = ask.record.or(was.map(|was| was.record)).unwrap_or_default();
+    let storage = Storage { record, levels: ask.levels };
+    let mut commit = catalog.begin(&ask.twin, Kind::Push, storage)?;
+    let only = match &ask.cells {
+        AskedCells::These(cells) => Some(cells),
+        AskedCells::Touched | AskedCells::All => None,
+    };
+    commit.put(&scene.gaussians, only, &mut |done, total| push.progress(done, total))?;
+    let provenance = provenance(ask, scene);
+    let new_profile = profile(ask, was.map(|was| was.profile).unwrap_or_default())?;
+    Ok(match base {
+        Some(base) if ask.cells != AskedCells::All => {
+            let profile = (!ask.profile.is_empty()).then_some(new_profile);
+            let change = Change { profile, rig: None, trajectories: None, provenance };
+            commit.change(base.number, change)?
+        }
+        _ => commit.replace(Settings {
+            profile: new_profile,
+            rig: was.and_then(|was| was.rig.clone()),
+            trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),
+            provenance,
+        })?,
+    })
+}
+
+/// No clock in it, nor who pushed: the same content is the same version.
+fn provenance(ask: &Ask, scene: &Scene) -> Provenance {
+    let source = match &scene.sources[..] {
+        [one] => one.clone(),
+        several => blake3::hash(several.join("\n").as_bytes()).to_hex().to_string(),
+    };
+    let mut options = scene.options.clone();
+    options.extend((!ask.levels).then(|| "lod=off".to_owned()));
+    options.extend(ask.note.as_ref().map(|note| format!("note={note}")));
+    Provenance {
+        source: format!("blake3:{source}"),
+        builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
+        options,
+    }
+}

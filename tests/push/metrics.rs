@@ -1,0 +1,47 @@
+//! `/metrics` counts what happened, each server for itself.
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+
+use crate::support::TestServer;
+use crate::{get, in_cell, push};
+
+async fn scrape(server: &TestServer) -> String {
+    let mut stream = TcpStream::connect(server.address()).await.unwrap();
+    let request = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
+    stream.write_all(request).await.unwrap();
+    let mut text = String::new();
+    stream.read_to_string(&mut text).await.unwrap();
+    text
+}
+
+#[tokio::test]
+async fn what_happened_is_counted() {
+    let (server, idle) = (TestServer::start().await, TestServer::start().await);
+    let mut driver = server.driver("a").await;
+    for x in 1..=3 {
+        driver.step(f64::from(x)).await;
+    }
+    get(&server, "/v1/uploads/nothing").await.refused(404, "unknown_upload");
+    push(&server, &in_cell([0, 0], 40, 1), |_| {}).await;
+    push(&server, &in_cell([1, 0], 1, 1), |_| {}).await;
+    let text = scrape(&server).await;
+    for line in [
+        "wildcity_steps_total 3",
+        "wildcity_step_seconds_count 3",
+        "wildcity_sessions 1",
+        "wildcity_connections 1",
+        "wildcity_uploads_begun_total 2",
+        "wildcity_uploads 2",
+        "wildcity_pushes_open 0",
+        "wildcity_frames_queued 0",
+        "wildcity_refusals_total{code=\"unknown_upload\"} 1",
+        "wildcity_pushes_total{outcome=\"ready\"} 1",
+        "wildcity_pushes_total{outcome=\"refused\"} 1",
+        "# EOF",
+    ] {
+        assert!(text.lines().any(|found| found == line), "no {line:?} in\n{text}");
+    }
+    assert!(text.contains("application/openmetrics-text"), "{text}");
+    assert!(scrape(&idle).await.lines().any(|line| line == "wildcity_steps_total 0"));
+}

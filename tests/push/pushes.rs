@@ -1,0 +1,199 @@
+//! Pushes: atomic, over all their cells; refused with everything that is wrong; the same again is the
+//! same.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use serde_json::json;
+use wildcity::client::{Cells, PushState};
+use wildcity::protocol::error::Code;
+use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::store::Catalog;
+
+use crate::support::TestServer;
+use crate::{client, get, in_cell, post, push, push_of, write};
+
+#[tokio::test]
+async fn a_push_replaces_the_cells_that_it_touches() {
+    let server = TestServer::start().await;
+    let mut gaussians = in_cell([0, 0], 40, 1);
+    let far = in_cell([3, -1], 10, 2);
+    gaussians.means_m.extend(&far.means_m);
+    gaussians.quats_wxyz.extend(&far.quats_wxyz);
+    gaussians.ln_scales.extend(&far.ln_scales);
+    gaussians.logit_opacities.extend(&far.logit_opacities);
+    gaussians.sh.extend(&far.sh);
+    let pushed = push(&server, &gaussians, |_| {}).await;
+    assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(2)), "{pushed:?}");
+    let report = pushed.report.unwrap();
+    let cells: Vec<_> = report.cells.iter().map(|c| (c.cell, c.before, c.after)).collect();
+    assert_eq!(cells, [([3, -1], 0, 10), ([0, 0], 32, 40)]);
+    assert_eq!((report.gaussians, report.left_out, report.files.len()), (50, 0, 1));
+    assert_eq!(report.golden.len(), 4, "a few poses along the trajectory");
+
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let version = catalog.version("test", None).unwrap();
+    let counts: Vec<_> = version.manifest.chunks.iter().map(|c| (c.cell, c.count)).collect();
+    assert_eq!(counts, [([3, -1], 10), ([0, 0], 40), ([1, 0], 32)]);
+    assert_eq!(version.manifest.trajectories.len(), 1, "the rest of the twin stays");
+    let listed = get(&server, "/v1/twins/test").await.body;
+    assert_eq!((&listed["version"], &listed["gaussians"]), (&json!(2), &json!(82)));
+    let versions = get(&server, "/v1/twins/test/versions").await.body["versions"].clone();
+    assert_eq!(versions.as_array().unwrap().len(), 2);
+    assert_eq!((&versions[1]["kind"], &versions[1]["parent"]), (&json!("push"), &json!(1)));
+
+    let back = post(&server, "/v1/twins/test/rollback", &json!({ "version": 1 })).await;
+    assert_eq!((back.status, &back.body["version"]), (200, &json!(3)), "{back:?}");
+    assert_eq!(back.body["version_hash"], versions[0]["version_hash"]);
+    post(&server, "/v1/twins/test/rollback", &json!({ "version": 9 }))
+        .await
+        .refused(404, "unknown_version");
+}
+
+#[tokio::test]
+async fn a_push_makes_a_new_twin() {
+    let server = TestServer::start().await;
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), "a.ply", &in_cell([0, 0], 20, 1));
+    let client = client(&server);
+    let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
+    let begun = client.push("fresh", &push_of(&[&upload.id])).await.unwrap();
+    let pushed = client.wait(begun, &mut |_| {}).await.unwrap();
+    assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(1)), "{pushed:?}");
+    assert_eq!(get(&server, "/v1/twins/fresh").await.body["gaussians"], 20);
+}
+
+#[tokio::test]
+async fn the_same_push_again_is_the_same_answer() {
+    let server = TestServer::start().await;
+    let gaussians = in_cell([0, 0], 40, 1);
+    let first = push(&server, &gaussians, |push| push.id = Some("one".to_owned())).await;
+    let again = push(&server, &gaussians, |push| push.id = Some("one".to_owned())).await;
+    assert_eq!(first, again);
+    let other = push(&server, &gaussians, |_| {}).await;
+    assert_eq!(other.version, Some(2), "the same content as the latest version's is that version");
+    // After a rollback, the same content is wanted again.
+    post(&server, "/v1/twins/test/rollback", &json!({ "version": 1 })).await;
+    assert_eq!(push(&server, &gaussians, |_| {}).await.version, Some(4));
+    let taken = json!({ "id": "one", "files": [{ "upload": "blake3-0" }], "note": "another" });
+    post(&server, "/v1/twins/test/pushes", &taken).await.refused(400, "out_of_range");
+}
+
+#[tokio::test]
+async fn every_bad_gaussian_is_named() {
+    let server = TestServer::start().await;
+    let mut gaussians = in_cell([0, 0], 5000, 1);
+    gaussians.means_m[17][1] = f64::NAN;
+    gaussians.quats_wxyz[18] = [0.0; 4];
+    for index in 100..140 {
+        gaussians.ln_scales[index][2] = 11.0;
+    }
+    let pushed = push(&server, &gaussians, |_| {}).await;
+    assert_eq!((pushed.state, pushed.version), (PushState::Refused, None));
+    let error = pushed.error.unwrap();
+    assert_eq!(error.code, Code::PushRefused);
+    assert!(error.message.starts_with("scene.ply: Gaussian 17: y is NaN"), "{}", error.message);
+    let report = pushed.report.unwrap();
+    let file = &report.files[0];
+    assert_eq!((file.gaussians, file.bad, file.first_bad.len()), (5000, 42, 16));
+    let named: Vec<_> = file.first_bad.iter().map(|bad| (bad.index, &*bad.field)).collect();
+    assert_eq!(named[0], (17, "y"));
+    assert_eq!(named[1].0, 18);
+    assert_eq!(named[2], (100, "scale_2"));
+    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
+    server.still_serves().await;
+}
+
+/// A few Gaussians that stray into a neighbour's cell must not wipe it.
+#[tokio::test]
+async fn a_margin_does_not_wipe_the_neighbour() {
+    let server = TestServer::start().await;
+    let mut gaussians = in_cell([0, 0], 40, 1);
+    for mean in gaussians.means_m.iter_mut().take(3) {
+        mean[0] = 33.0;
+    }
+    let refused = push(&server, &gaussians, |_| {}).await;
+    let error = refused.error.unwrap();
+    assert_eq!((refused.state, error.cells), (PushState::Refused, vec![[1, 0]]));
+    assert!(error.message.contains("3 Gaussians in place of 32"), "{}", error.message);
+    let named = |cells: &[[i32; 2]]| Some(Cells::These(cells.to_vec()));
+    let pushed = push(&server, &gaussians, |push| push.cells = named(&[[0, 0]])).await;
+    assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
+    assert_eq!(pushed.report.unwrap().left_out, 3);
+    assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 37 + 32);
+    // Named, it is meant.
+    let pushed = push(&server, &gaussians, |push| push.cells = named(&[[0, 0], [1, 0]])).await;
+    assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
+    assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 40);
+    let empty = push(&server, &gaussians, |push| push.cells = named(&[[0, 0], [7, 7]])).await;
+    assert_eq!(empty.error.unwrap().cells, [[7, 7]]);
+}
+
+#[tokio::test]
+async fn what_others_changed_is_not_overwritten() {
+    let server = TestServer::start().await;
+    let changed = push(&server, &in_cell([0, 0], 40, 1), |push| push.base = Some(1)).await;
+    assert_eq!(changed.version, Some(2), "{changed:?}");
+    // Other cells go on top.
+    let apart = push(&server, &in_cell([1, 0], 50, 2), |push| push.base = Some(1)).await;
+    assert_eq!(apart.version, Some(3), "{apart:?}");
+    assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 90);
+    // The same cell does not: known at once where cells are named, else once the files are read.
+    let late = push(&server, &in_cell([0, 0], 60, 3), |push| push.base = Some(1)).await;
+    let error = late.error.unwrap();
+    assert_eq!((late.state, error.code), (PushState::Refused, Code::Conflict));
+    assert_eq!(error.cells, [[0, 0]]);
+    let ask = json!({ "files": [{ "upload": "x" }], "base": 1, "cells": [[0, 0], [5, 5]] });
+    let refused = post(&server, "/v1/twins/test/pushes", &ask).await;
+    refused.refused(409, "conflict");
+    assert_eq!(refused.body["cells"], json!([[0, 0]]));
+    let ask = json!({ "files": [{ "upload": "x" }], "base": 9 });
+    post(&server, "/v1/twins/test/pushes", &ask).await.refused(404, "unknown_version");
+    // All of the twin, from an old version.
+    let ask = json!({ "files": [{ "upload": "x" }], "base": 2, "cells": "all" });
+    let refused = post(&server, "/v1/twins/test/pushes", &ask).await;
+    assert_eq!((refused.status, &refused.body["cells"]), (409, &json!([[1, 0]])));
+    let whole = in_cell([2, 2], 7, 4);
+    let all = push(&server, &whole, |push| {
+        push.cells = Some(Cells::All(wildcity::client::All::All));
+        push.base = Some(3);
+    });
+    assert_eq!(all.await.version, Some(4));
+    assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 7);
+}
+
+#[tokio::test]
+async fn views_before_and_after_are_compared() {
+    let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
+    let server = TestServer::configured(|config| config.backend = cpu).await;
+    let gaussians = in_cell([0, 0], 400, 1);
+    let refused = push(&server, &gaussians, |push| push.golden.min_psnr_db = Some(90.0)).await;
+    assert_eq!(refused.state, PushState::Refused);
+    assert!(refused.error.unwrap().message.contains("min_psnr_db is 90"));
+    let golden = refused.report.unwrap().golden;
+    assert_eq!(golden.len(), 4);
+    assert!(golden.iter().all(|golden| golden.psnr_db.is_some_and(|db| db < 90.0)), "{golden:?}");
+    let pushed = push(&server, &gaussians, |push| push.golden.min_psnr_db = Some(1.0)).await;
+    assert_eq!(pushed.version, Some(2), "{pushed:?}");
+    // The same again looks the same, within what the record rounds.
+    let again = push(&server, &gaussians, |push| {
+        push.golden.min_psnr_db = Some(40.0);
+        push.note = Some("once more".to_owned());
+    });
+    let again = again.await;
+    assert_eq!(again.state, PushState::Ready, "{again:?}");
+}
+
+/// A session's frame that crashes the renderer, or a comparison that does, ends that alone.
+#[tokio::test]
+async fn a_crash_while_comparing_fails_the_push_and_nothing_else() {
+    let server = TestServer::start().await;
+    server.painter.crash.store(true, Ordering::SeqCst);
+    let failed = push(&server, &in_cell([0, 0], 40, 1), |push| push.id = Some("p".into())).await;
+    assert_eq!((failed.state, failed.version), (PushState::Failed, None), "{failed:?}");
+    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
+    // What failed is tried again.
+    let again = push(&server, &in_cell([0, 0], 40, 1), |push| push.id = Some("p".into())).await;
+    assert_eq!((again.state, again.version), (PushState::Ready, Some(2)), "{again:?}");
+    server.still_serves().await;
+}

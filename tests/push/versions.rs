@@ -1,0 +1,161 @@
+//! Sessions and versions: each keeps its own until its agent asks for another.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde_json::json;
+use wildcity::client::PushState;
+use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::residency::Cache;
+use wildcity::session::{Extent, Recording};
+use wildcity::store::Catalog;
+
+use crate::support::{Agent, Seen, TestServer, pose, refused};
+use crate::{get, in_cell, push};
+
+/// Versions that are pushed while agents drive.
+const VERSIONS: u64 = 50;
+
+/// What an agent saw: the version, where it stood, and the frame's hash.
+type Sight = (u64, u64, String);
+
+fn sight(seen: &Seen) -> Sight {
+    let version = seen.meta["version"].as_u64().unwrap();
+    let x_m = seen.meta["ego"]["pose"]["xyz"][0].as_f64().unwrap();
+    (version, x_m.to_bits(), seen.frame_hash().to_owned())
+}
+
+/// A server that renders, and another on the same twins.
+async fn rendering(twins: Option<&Path>) -> TestServer {
+    let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
+    TestServer::configured(|config| {
+        config.backend = cpu;
+        if let Some(twins) = twins {
+            config.twins = twins.to_owned();
+        }
+    })
+    .await
+}
+
+async fn driver(server: &TestServer, name: &str) -> Agent {
+    let mut agent = server.agent().await;
+    let start = json!({ "pose": pose(0.0) });
+    agent.open(json!({ "session": name, "start": start, "outputs": { "encoding": "raw" } })).await;
+    agent
+}
+
+#[tokio::test]
+async fn agents_drive_while_versions_are_pushed() {
+    let server = Arc::new(rendering(None).await);
+    let (mut pinned, mut switching) =
+        (driver(&server, "pinned").await, driver(&server, "switching").await);
+    let over = Arc::new(AtomicBool::new(false));
+    let pushing = async {
+        for number in 0..VERSIONS {
+            let pushed = push(&server, &in_cell([0, 0], 60, 1000 + number), |_| {}).await;
+            assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(number + 2)));
+        }
+        over.store(true, Ordering::SeqCst);
+    };
+    let places = |step: usize| (step % 5) as f64;
+    let staying = async {
+        let (mut sights, mut step) = (Vec::new(), 0);
+        while !over.load(Ordering::SeqCst) {
+            sights.push(sight(&pinned.step(places(step)).await));
+            step += 1;
+        }
+        sights
+    };
+    let following = async {
+        let (mut sights, mut step, mut version) = (Vec::new(), 0, 1);
+        while !over.load(Ordering::SeqCst) {
+            if step % 3 == 2 {
+                let switched = switching.ask(json!({ "type": "switch_version" })).await;
+                assert_eq!(switched["type"], "switched", "{switched}");
+                let now = switched["version"].as_u64().unwrap();
+                assert!(now >= version, "back from {version} to {now}");
+                version = now;
+            }
+            let seen = switching.step(places(step)).await;
+            assert_eq!(seen.meta["version"], version, "it switches when told, and not before");
+            sights.push(sight(&seen));
+            step += 1;
+        }
+        sights
+    };
+    let ((), pinned_sights, mut sights) = tokio::join!(pushing, staying, following);
+    assert!(pinned_sights.iter().all(|(version, ..)| *version == 1), "the pinned one changed");
+    let versions: std::collections::BTreeSet<_> = sights.iter().map(|sight| sight.0).collect();
+    assert!(versions.len() > 3, "only {versions:?} were seen");
+
+    // Every observation is the picture of its version, whole: as another server draws it.
+    sights.extend(pinned_sights);
+    let mut seen: BTreeMap<(u64, u64), String> = BTreeMap::new();
+    for (version, x_m, hash) in sights {
+        let same = seen.entry((version, x_m)).or_insert_with(|| hash.clone());
+        assert_eq!(*same, hash, "two pictures of version {version}");
+    }
+    let fresh = rendering(Some(server.twins.path())).await;
+    for ((version, x_m), hash) in &seen {
+        let mut agent = fresh.agent().await;
+        agent.open(json!({ "version": version, "outputs": { "encoding": "raw" } })).await;
+        let poses = [pose(f64::from_bits(*x_m))];
+        let drawn = agent.look(json!({ "type": "observe", "poses": poses })).await;
+        assert_eq!(drawn.frame_hash(), hash, "version {version}");
+    }
+    let distinct: std::collections::BTreeSet<_> = seen.values().collect();
+    assert!(distinct.len() > 3, "the versions look alike");
+}
+
+#[tokio::test]
+async fn a_session_switches_between_steps_and_its_episode_goes_on() {
+    let server = rendering(None).await;
+    let mut agent = driver(&server, "a").await;
+    let before = agent.step(1.0).await;
+    let pushed = push(&server, &in_cell([0, 0], 60, 1), |_| {}).await;
+    assert_eq!(pushed.version, Some(2), "{pushed:?}");
+    assert_eq!(agent.step(1.0).await.frame_hash(), before.frame_hash(), "it was not asked to");
+    let switched = agent.ask(json!({ "type": "switch_version", "version": 2 })).await;
+    assert_eq!(switched["version_hash"], *pushed.version_hash.as_ref().unwrap());
+    assert!(switched["profile_hash"].is_string() && switched["profile"].is_object(), "{switched}");
+    let after = agent.step(1.0).await;
+    assert_ne!(after.frame_hash(), before.frame_hash());
+    assert_eq!((&after.meta["version"], &after.meta["step"]), (&json!(2), &json!(3)));
+    assert_eq!(after.meta["version_hash"], switched["version_hash"]);
+    let sessions = get(&server, "/v1/sessions").await.body["sessions"].clone();
+    assert_eq!((&sessions[0]["session"], &sessions[0]["version"]), (&json!("a"), &json!(2)));
+    assert_eq!((&sessions[0]["step"], &sessions[0]["connected"]), (&json!(3), &json!(true)));
+    refused(&agent.ask(json!({ "type": "switch_version", "version": 7 })).await, "unknown_version");
+    assert_eq!(agent.step(1.0).await.frame_hash(), after.frame_hash(), "nothing changed");
+    let back = agent.ask(json!({ "type": "switch_version", "version": 1 })).await;
+    assert_eq!(back["version"], 1);
+    assert_eq!(agent.step(1.0).await.frame_hash(), before.frame_hash());
+    let closed = agent.ask(json!({ "type": "close" })).await;
+    assert_eq!(closed["summary"]["steps"], 5, "{closed}");
+
+    // What was recorded follows.
+    let recording = Recording::read(&server.recorded()[0]).unwrap();
+    let switches: Vec<_> = recording.versions.iter().map(|(at, v)| (*at, v.version)).collect();
+    assert_eq!(switches, [(2, 2), (4, 1)]);
+    let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
+    let cpu = Cpu::new(2, Simd::Best).unwrap();
+    let replay = |recording: &Recording| {
+        let mut open = |version| cache.open("test", Some(version));
+        recording.replay(&mut open, &cpu, Extent::Whole, &mut |_| Ok(())).unwrap()
+    };
+    let report = replay(&recording);
+    assert_eq!((report.difference, report.images, report.changes), (None, 10, vec![]));
+    let mut forgetful = recording.clone();
+    forgetful.versions.clear();
+    let difference = replay(&forgetful).difference.expect("the wrong version is noticed");
+    assert_eq!(difference.line, 4);
+}
+
+#[tokio::test]
+async fn without_a_session_there_is_nothing_to_switch() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    refused(&agent.ask(json!({ "type": "switch_version" })).await, "session_state");
+}
