@@ -1,5 +1,6 @@
 //! `wildcity bench`.
 
+mod drive;
 mod gpu;
 mod load;
 mod step;
@@ -16,6 +17,7 @@ pub(super) struct Bench {
 enum What {
     Step(step::Step),
     Gpu(gpu::Gpu),
+    Drive(Box<drive::Drive>),
     Load(load::Load),
 }
 
@@ -24,6 +26,7 @@ impl Bench {
         match self.what {
             What::Step(step) => step.run(),
             What::Gpu(gpu) => gpu.run(),
+            What::Drive(drive) => drive.run(),
             What::Load(load) => load.run(),
         }
     }

@@ -193,15 +193,21 @@ fn read_rig(path: &Path) -> anyhow::Result<Rig> {
 fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
     let mut read: Vec<Trajectory> = Vec::with_capacity(paths.len());
     for path in paths {
-        let trajectory: Trajectory = read_json(path)?;
-        let cannot = || format!("{}", path.display());
-        trajectory.check().with_context(cannot)?;
+        let trajectory = read_trajectory(path)?;
         if read.iter().any(|before| before.name == trajectory.name) {
-            return Err(StoreError::TrajectoryName { name: trajectory.name }).with_context(cannot);
+            return Err(StoreError::TrajectoryName { name: trajectory.name })
+                .with_context(|| format!("{}", path.display()));
         }
         read.push(trajectory);
     }
     Ok(read)
+}
+
+/// Reads a recorded drive from its JSON, and checks it.
+pub(super) fn read_trajectory(path: &Path) -> anyhow::Result<Trajectory> {
+    let trajectory: Trajectory = read_json(path)?;
+    trajectory.check().with_context(|| format!("{}", path.display()))?;
+    Ok(trajectory)
 }
 
 fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {

@@ -15,6 +15,7 @@ mod progress;
 mod push;
 mod render;
 mod replay;
+mod route;
 mod scene_source;
 mod serve;
 mod time;
@@ -41,6 +42,7 @@ enum Command {
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
+    Route(route::Route),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
     Devices(devices::Devices),
@@ -59,6 +61,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
         Command::Devices(command) => command.run(),

@@ -226,7 +226,8 @@ fn threads(text: &str) -> Result<usize, String> {
     }
 }
 
-fn gib(text: &str) -> Result<f64, String> {
+/// A number of GiB on the command line.
+pub(super) fn gib(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
         _ => Err("expected a number above 0, to 65536".to_owned()),

@@ -3,6 +3,7 @@
 mod diff;
 mod fsck;
 mod gc;
+mod generate;
 mod list;
 mod log;
 mod rollback;
@@ -17,6 +18,7 @@ pub(super) struct Twin {
 #[derive(Debug, clap::Subcommand)]
 enum What {
     List(list::List),
+    Generate(generate::Generate),
     Log(log::Log),
     Diff(diff::Diff),
     Rollback(rollback::Rollback),
@@ -28,6 +30,7 @@ impl Twin {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.what {
             What::List(list) => list.run(),
+            What::Generate(generate) => generate.run(),
             What::Log(log) => log.run(),
             What::Diff(diff) => diff.run(),
             What::Rollback(rollback) => rollback.run(),

@@ -26,7 +26,7 @@ const LAND_FROM_M: f64 = 27.0;
 
 /// Paints all of it around the middle of the street.
 pub(super) fn paint(painter: &mut Painter, route: &Route, seed: u64) {
-    let middle_m = route.at(0.5 * route.length_m).point_m;
+    let middle_m = route.at(0.5 * route.driven_m[1]).point_m;
     sky(painter, middle_m, seed);
     skyline(painter, middle_m, seed);
     land(painter, route, middle_m, seed);
@@ -112,7 +112,7 @@ fn land(painter: &mut Painter, route: &Route, middle_m: DVec3, seed: u64) {
             let center_m = middle_m + (radius_m + 0.5 * step_m) * away - 0.35 * DVec3::Z;
             let edge_m = step_m.max(turn * radius_m);
             let (s_m, t_m) = route.project(center_m);
-            let on_street = (-130.0..route.length_m + 130.0).contains(&s_m);
+            let on_street = (-130.0..route.driven_m[1] + 130.0).contains(&s_m);
             if on_street && t_m.abs() < LAND_FROM_M + 1.5 * edge_m {
                 continue;
             }

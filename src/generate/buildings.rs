@@ -6,7 +6,7 @@ use super::facade::{self, GroundFloor, Style, Wall};
 use super::light::Occluder;
 use super::random::{Random, noise};
 use super::road::{FRONT_M, SIDE_FRONT_M, SIDE_REACH_M};
-use super::route::{BEYOND_M, Route};
+use super::route::Route;
 use super::surface::{Paint, Painter};
 
 /// Depth of a house behind its front, in metres.
@@ -70,7 +70,7 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
         }
     };
 
-    let ends_m = [-BEYOND_M, route.length_m + BEYOND_M];
+    let ends_m = route.ends_m;
     let gap_m = [cross_s_m - SIDE_FRONT_M, cross_s_m + SIDE_FRONT_M];
     // Seen from the street, the left row runs along s and the right row against it.
     let left = |s_m: f64| route.at(s_m).beside(FRONT_M, 0.0);
@@ -96,10 +96,14 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
     row("end of the side street, left", [-13.0, 13.0], &across, [false; 2]);
     let across = |d_m: f64| side_point(-SIDE_REACH_M, -d_m);
     row("end of the side street, right", [-13.0, 13.0], &across, [false; 2]);
-    let across = |t_m: f64| route.at(ends_m[1]).beside(-t_m, 0.0);
-    row("end of the street, ahead", [-22.0, 22.0], &across, [false; 2]);
-    let across = |t_m: f64| route.at(ends_m[0]).beside(t_m, 0.0);
-    row("end of the street, behind", [-22.0, 22.0], &across, [false; 2]);
+    if route.closed[1] {
+        let across = |t_m: f64| route.at(ends_m[1]).beside(-t_m, 0.0);
+        row("end of the street, ahead", [-22.0, 22.0], &across, [false; 2]);
+    }
+    if route.closed[0] {
+        let across = |t_m: f64| route.at(ends_m[0]).beside(t_m, 0.0);
+        row("end of the street, behind", [-22.0, 22.0], &across, [false; 2]);
+    }
     buildings
 }
 

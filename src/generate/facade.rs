@@ -163,11 +163,15 @@ impl Facade<'_, '_, '_> {
             // Stains run down, splashes from the pavement darken the foot.
             let seed = (at_m.x * 16.0) as i64 as u64;
             let stain = 0.030 * noise(seed, 1.3 * u_m, 0.25 * v_m)
-                + 0.025 * noise(seed + 1, 0.3 * u_m, 0.3 * v_m);
+                + 0.025 * noise(seed.wrapping_add(1), 0.3 * u_m, 0.3 * v_m);
             let grain = if style.brick {
-                0.06 * noise(seed + 2, 3.1 * u_m + (v_m * 8.0).floor() * 0.5, (v_m * 8.0).floor())
+                0.06 * noise(
+                    seed.wrapping_add(2),
+                    3.1 * u_m + (v_m * 8.0).floor() * 0.5,
+                    (v_m * 8.0).floor(),
+                )
             } else {
-                0.012 * noise(seed + 2, 5.0 * u_m, 5.0 * v_m)
+                0.012 * noise(seed.wrapping_add(2), 5.0 * u_m, 5.0 * v_m)
             };
             let foot = 0.72 + 0.28 * smooth(v_m / 1.2);
             let eaves = 0.75 + 0.25 * smooth((style.height_m() - v_m) / 1.2);

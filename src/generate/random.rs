@@ -12,10 +12,15 @@ impl Random {
         Self(mix(named ^ mix(index as u64)))
     }
 
+    /// A seed of other streams.
+    pub(super) fn seed(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(GOLDEN);
+        mix(self.0)
+    }
+
     /// Uniform in [0, 1), with 53 random bits.
     pub(super) fn unit(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(GOLDEN);
-        to_unit(mix(self.0))
+        to_unit(self.seed())
     }
 
     /// Uniform in `[low, high)`.

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::random::{Random, noise, smooth};
-use super::route::{BEYOND_M, Route, Station};
+use super::route::{Route, Station};
 use super::surface::{Paint, Painter};
 
 /// Half width of the two lanes together, in metres: twice 3.6 m.
@@ -41,11 +41,17 @@ const STRIPE_M: f64 = 0.48;
 /// Pavement slabs are squares of this side, in metres.
 const SLAB_M: f64 = 0.90;
 
-/// Paints all ground along the street; `cross_s_m` is the middle of the crossing.
-pub(super) fn paint(painter: &mut Painter, route: &Route, cross_s_m: f64, seed: u64) {
-    let ground = Ground { route, cross_s_m, seed };
+/// Paints all ground along the street; `cross_s_m` is the middle of the crossing. `seed` is that of
+/// the grain, `covers_seed` that of what lies on the road.
+pub(super) fn paint(
+    painter: &mut Painter,
+    route: &Route,
+    cross_s_m: f64,
+    [seed, covers_seed]: [u64; 2],
+) {
+    let ground = Ground { route, cross_s_m, seed, covers_seed };
     ground.covers().for_each(|(s_m, t_m)| ground.cover(painter, s_m, t_m));
-    let drive = [0.0, route.length_m];
+    let drive = route.driven_m;
     let [approach, leave] = [-1.0, 1.0].map(|side| {
         let (near, far) = (cross_s_m + side * ZEBRA_M[0], cross_s_m + side * STOP_M[1]);
         [near.min(far), near.max(far)]
@@ -61,7 +67,8 @@ pub(super) fn paint(painter: &mut Painter, route: &Route, cross_s_m: f64, seed: 
         ground.side_street(painter, side);
     }
     painter.coarser(2.2, |painter| {
-        for [from_m, to_m] in [[-BEYOND_M, drive[0]], [drive[1], drive[1] + BEYOND_M]] {
+        let beyond = [[route.ends_m[0], drive[0]], [drive[1], route.ends_m[1]]];
+        for [from_m, to_m] in beyond.into_iter().filter(|[from_m, to_m]| from_m < to_m) {
             ground.lanes(painter, from_m, to_m);
             for side in [-1.0, 1.0] {
                 ground.verge(painter, side, from_m, to_m);
@@ -74,6 +81,7 @@ struct Ground<'a> {
     route: &'a Route,
     cross_s_m: f64,
     seed: u64,
+    covers_seed: u64,
 }
 
 impl Ground<'_> {
@@ -111,10 +119,11 @@ impl Ground<'_> {
 
     /// Where manholes are: one in 31 m, off the wheel tracks of one lane or the other.
     fn covers(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
-        let (seed, cross_s_m) = (self.seed, self.cross_s_m);
-        (0..(self.route.length_m / 31.0) as usize).filter_map(move |index| {
+        let (seed, cross_s_m, [from_m, to_m]) =
+            (self.covers_seed, self.cross_s_m, self.route.driven_m);
+        (0..((to_m - from_m) / 31.0) as usize).filter_map(move |index| {
             let mut random = Random::new(seed, "manhole", index);
-            let s_m = 31.0 * (index as f64 + random.range(0.2, 0.8));
+            let s_m = from_m + 31.0 * (index as f64 + random.range(0.2, 0.8));
             let t_m = random.pick(&[-1.0, 1.0]) * random.range(1.5, 2.0);
             ((s_m - cross_s_m).abs() > JUNCTION_M + 1.0).then_some((s_m, t_m))
         })

@@ -1,5 +1,7 @@
 //! The street's centre line, and the drive along it.
 
+use std::f64::consts::TAU;
+
 use glam::{DQuat, DVec3};
 
 use crate::geometry::Pose;
@@ -11,8 +13,12 @@ pub(super) const BEYOND_M: f64 = 80.0;
 
 /// Distance between keyframes, in metres.
 const KEYFRAME_M: f64 = 0.5;
-/// Time between keyframes: 0.5 m at 10 m/s, in microseconds.
-const KEYFRAME_US: i64 = 50_000;
+/// How fast the recorded drive of a street is, in m/s.
+const SPEED_M_S: f64 = 10.0;
+/// How far from both ends of the driven part the drive stays, in metres.
+const INDENT_M: f64 = 8.0;
+/// How far the table of the centre line goes beyond the houses, in metres.
+const SLACK_M: f64 = 40.0;
 /// Arc length between nodes of the table, in metres.
 const NODE_M: f64 = 0.25;
 /// The street swings this far to both sides of east, in radians (17°) ...
@@ -21,15 +27,37 @@ const SWING_RAD: f64 = 0.30;
 /// which hides both ends of the street from nearly everywhere on it.
 const SWING_PERIOD_M: f64 = 260.0;
 
-/// An S of constant width in the plane z = 0, by arc length `s` in metres.
-///
-/// The heading is `0.30 sin(2π s / 260)` rad from east; the position is its integral.
+/// A street of constant width in the plane z = 0, by arc length `s` in metres.
 #[derive(Clone, Debug)]
 pub(super) struct Route {
-    /// Length of the part that is driven, in metres.
-    pub(super) length_m: f64,
+    /// From where to where it is driven, in metres.
+    pub(super) driven_m: [f64; 2],
+    /// From where to where houses stand, in metres: as far as is driven, or beyond.
+    pub(super) ends_m: [f64; 2],
+    /// Whether a house across the street closes the view at either end.
+    pub(super) closed: [bool; 2],
+    bends: Bends,
     first_s_m: f64,
     nodes_m: Vec<DVec3>,
+}
+
+/// How a street bends. Its heading is `0.30 sin(2π s / 260)` rad from east, and what is added to
+/// that; its position is the integral.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Bends {
+    /// Waves of the heading beside the street's own.
+    pub(super) wide: [Wave; 2],
+}
+
+/// A wave of the heading.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Wave {
+    /// How far it swings to both sides, in radians.
+    pub(super) swing_rad: f64,
+    /// After how long it is back, in metres.
+    pub(super) period_m: f64,
+    /// Where in its period it is at s = 0, in radians.
+    pub(super) phase_rad: f64,
 }
 
 /// A point of the centre line with its directions.
@@ -51,21 +79,29 @@ impl Station {
 }
 
 impl Route {
-    /// The centre line of a street on which `length_m` are driven.
+    /// The centre line of a street on which `length_m` are driven, from the origin to the east.
     pub(super) fn new(length_m: f64) -> Self {
+        let ends_m = [-BEYOND_M, length_m + BEYOND_M];
+        let line = Self::line(Bends::default(), ends_m, 0.0, DVec3::ZERO);
+        Self { driven_m: [0.0, length_m], closed: [true; 2], ..line }
+    }
+
+    /// The centre line from station to station, both multiples of 0.25 m, all of it driven and open at
+    /// both ends; at station `at_s_m`, a multiple too, it passes `at_m`.
+    pub(super) fn line(bends: Bends, ends_m: [f64; 2], at_s_m: f64, at_m: DVec3) -> Self {
         // Midpoint rule; one segment of slack on either side for `at` beyond the ends.
-        let first_s_m = -(BEYOND_M + 40.0);
-        let count = ((length_m - 2.0 * first_s_m) / NODE_M) as usize;
+        let first_s_m = ends_m[0] - SLACK_M;
+        let count = ((ends_m[1] + SLACK_M - first_s_m) / NODE_M) as usize;
         let mut nodes_m = vec![DVec3::ZERO; count + 1];
         for i in 0..count {
             let middle_m = first_s_m + (i as f64 + 0.5) * NODE_M;
-            nodes_m[i + 1] = nodes_m[i] + NODE_M * direction(middle_m);
+            nodes_m[i + 1] = nodes_m[i] + NODE_M * bends.direction(middle_m);
         }
-        let origin_m = nodes_m[(-first_s_m / NODE_M) as usize];
+        let offset_m = nodes_m[((at_s_m - first_s_m) / NODE_M) as usize];
         for node_m in &mut nodes_m {
-            *node_m -= origin_m;
+            *node_m = *node_m - offset_m + at_m;
         }
-        Self { length_m, first_s_m, nodes_m }
+        Self { driven_m: ends_m, ends_m, closed: [false; 2], bends, first_s_m, nodes_m }
     }
 
     /// The centre line at arc length `s_m`, clamped to the table.
@@ -74,14 +110,15 @@ impl Route {
         let node = ((s_m - self.first_s_m) / NODE_M).floor().clamp(0.0, last);
         let node_s_m = self.first_s_m + node * NODE_M;
         let rest_m = s_m - node_s_m;
-        let point_m = self.nodes_m[node as usize] + rest_m * direction(node_s_m + 0.5 * rest_m);
-        let forward = direction(s_m);
+        let point_m =
+            self.nodes_m[node as usize] + rest_m * self.bends.direction(node_s_m + 0.5 * rest_m);
+        let forward = self.bends.direction(s_m);
         Station { point_m, forward, left: DVec3::new(-forward.y, forward.x, 0.0) }
     }
 
     /// How far beyond the driven part a station lies, in metres; 0 on it.
     pub(super) fn beyond_m(&self, s_m: f64) -> f64 {
-        (s_m - s_m.clamp(0.0, self.length_m)).abs()
+        (s_m - s_m.clamp(self.driven_m[0], self.driven_m[1])).abs()
     }
 
     /// The arc length whose cross-section holds a point, and how far left of the centre line the
@@ -97,48 +134,84 @@ impl Route {
         for _ in 0..3 {
             let station = self.at(s_m);
             let offset_m = point_m - station.point_m;
-            let shrink = 1.0 - curvature_per_m(s_m) * offset_m.dot(station.left);
+            let shrink = 1.0 - self.bends.curvature_per_m(s_m) * offset_m.dot(station.left);
             s_m += offset_m.dot(station.forward) / shrink.max(0.3);
         }
         (s_m, (point_m - self.at(s_m).point_m).dot(self.at(s_m).left))
     }
 
-    /// Drives the lane `t_m` to the left of the centre line at 10 m/s, from `start_s_m` to as far
-    /// before the route's end.
-    pub(super) fn drive(&self, name: &str, t_m: f64, start_s_m: f64) -> Trajectory {
-        let mut keyframes = Vec::new();
-        let mut s_m = start_s_m;
-        while s_m <= self.length_m - start_s_m {
-            let station = self.at(s_m);
-            keyframes.push(Keyframe {
-                time_us: KEYFRAME_US * keyframes.len() as i64,
-                world_from_rig: Pose {
-                    position_m: station.beside(t_m, 0.0),
-                    rotation: DQuat::from_rotation_z(heading_rad(s_m)),
-                },
+    /// Drives the lane `t_m` to the left of the centre line at 10 m/s, from 8 m after the start to as
+    /// far before the end.
+    pub(super) fn drive(&self, name: &str, t_m: f64) -> Trajectory {
+        let mut station_m = self.driven_m[0] + INDENT_M;
+        let poses = self.poses(t_m, &mut station_m, self.driven_m[1] - INDENT_M);
+        Trajectory { name: name.into(), keyframes: keyframes(poses, SPEED_M_S) }
+    }
+
+    /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from a station to another
+    /// one, both in metres. Leaves the station of the pose after the last.
+    pub(super) fn poses(&self, t_m: f64, station_m: &mut f64, to_s_m: f64) -> Vec<Pose> {
+        let mut poses = Vec::new();
+        while *station_m <= to_s_m {
+            let s_m = *station_m;
+            poses.push(Pose {
+                position_m: self.at(s_m).beside(t_m, 0.0),
+                rotation: DQuat::from_rotation_z(self.bends.heading_rad(s_m)),
             });
             // A lane t to the left of a line of curvature k is (1 - k t) as long as the line.
             let half_m = 0.5 * KEYFRAME_M;
-            s_m += KEYFRAME_M / (1.0 - curvature_per_m(s_m + half_m) * t_m);
+            *station_m += KEYFRAME_M / (1.0 - self.bends.curvature_per_m(s_m + half_m) * t_m);
         }
-        Trajectory { name: name.into(), keyframes }
+        poses
     }
 }
 
-/// Angle from east at arc length `s_m`, counter-clockwise.
-fn heading_rad(s_m: f64) -> f64 {
-    SWING_RAD * (std::f64::consts::TAU * s_m / SWING_PERIOD_M).sin()
+/// Poses that lie 0.5 m apart, at the times of a constant speed, in m/s.
+pub(super) fn keyframes(poses: Vec<Pose>, speed_m_s: f64) -> Vec<Keyframe> {
+    let step_us = 1e6 * KEYFRAME_M / speed_m_s;
+    let at = |(i, world_from_rig)| Keyframe {
+        time_us: (i as f64 * step_us).round() as i64,
+        world_from_rig,
+    };
+    poses.into_iter().enumerate().map(at).collect()
 }
 
-/// Derivative of the heading; positive turns left.
-fn curvature_per_m(s_m: f64) -> f64 {
-    let rate_per_m = std::f64::consts::TAU / SWING_PERIOD_M;
-    SWING_RAD * rate_per_m * (rate_per_m * s_m).cos()
+impl Bends {
+    /// Angle from east at arc length `s_m`, counter-clockwise.
+    fn heading_rad(&self, s_m: f64) -> f64 {
+        let street_rad = SWING_RAD * (TAU * s_m / SWING_PERIOD_M).sin();
+        self.wide.iter().fold(street_rad, |sum_rad, wave| sum_rad + wave.heading_rad(s_m))
+    }
+
+    /// Derivative of the heading; positive turns left.
+    fn curvature_per_m(&self, s_m: f64) -> f64 {
+        let rate_per_m = TAU / SWING_PERIOD_M;
+        let street_per_m = SWING_RAD * rate_per_m * (rate_per_m * s_m).cos();
+        self.wide.iter().fold(street_per_m, |sum_per_m, wave| sum_per_m + wave.curvature_per_m(s_m))
+    }
+
+    fn direction(&self, s_m: f64) -> DVec3 {
+        let (sin, cos) = self.heading_rad(s_m).sin_cos();
+        DVec3::new(cos, sin, 0.0)
+    }
 }
 
-fn direction(s_m: f64) -> DVec3 {
-    let (sin, cos) = heading_rad(s_m).sin_cos();
-    DVec3::new(cos, sin, 0.0)
+impl Wave {
+    fn heading_rad(&self, s_m: f64) -> f64 {
+        self.swing_rad * (TAU * s_m / self.period_m + self.phase_rad).sin()
+    }
+
+    fn curvature_per_m(&self, s_m: f64) -> f64 {
+        let rate_per_m = TAU / self.period_m;
+        self.swing_rad * rate_per_m * (rate_per_m * s_m + self.phase_rad).cos()
+    }
+}
+
+impl Default for Wave {
+    /// Straight on.
+    fn default() -> Self {
+        Self { swing_rad: 0.0, period_m: 1.0, phase_rad: 0.0 }
+    }
 }
 
 #[cfg(test)]
@@ -169,7 +242,7 @@ mod tests {
 
     #[test]
     fn the_drive_has_even_keyframes_that_face_ahead() {
-        let drive = Route::new(300.0).drive("log", -1.75, 8.0);
+        let drive = Route::new(300.0).drive("log", -1.75);
         assert!(drive.length_m() > 250.0, "{} m", drive.length_m());
         assert_eq!(drive.check(), Ok(()));
         for pair in drive.keyframes.windows(2) {

@@ -3,11 +3,11 @@
 use super::buildings::{self, Building};
 use super::cars::Car;
 use super::furniture;
-use super::light::Light;
+use super::light::{Light, Occluder};
 use super::plants::Tree;
 use super::random::Random;
 use super::road::{self, FRONT_M, KERB_M, LANE_T_M, PAVEMENT_M};
-use super::route::{BEYOND_M, Route};
+use super::route::Route;
 use super::surface::Painter;
 use super::{Street, StreetSettings, backdrop};
 
@@ -24,42 +24,73 @@ const TREE_M: f64 = 17.0;
 
 pub(super) fn build(settings: &StreetSettings) -> Street {
     let StreetSettings { seed, length_m, crossing_m, density } = *settings;
-    let route = Route::new(length_m);
-    let buildings = buildings::plan(&route, crossing_m, seed);
-    let (cars, trees) = (park(&route, settings), plant(&route, settings));
-
-    let mut occluders: Vec<_> = buildings.iter().map(Building::occluder).collect();
-    occluders.extend(cars.iter().flat_map(Car::occluders));
-    occluders.extend(trees.iter().map(Tree::occluder));
-    let light = Light::new(occluders);
-
+    let plan = Plan::new(Route::new(length_m), crossing_m, [seed; 2]);
+    let light = Light::new(plan.occluders().collect());
     let mut painter = Painter::new(&light, density);
-    road::paint(&mut painter, &route, crossing_m, seed);
-    for building in &buildings {
-        building.paint(&mut painter);
-    }
-    for car in &cars {
-        car.paint(&mut painter);
-    }
-    for tree in &trees {
-        tree.paint(&mut painter);
-    }
-    furnish(&mut painter, &route, settings);
-    backdrop::paint(&mut painter, &route, seed);
-    let trajectory = route.drive("log", LANE_T_M, 8.0);
+    plan.paint(&mut painter);
+    backdrop::paint(&mut painter, &plan.route, seed);
+    let trajectory = plan.route.drive("log", LANE_T_M);
     Street { gaussians: painter.gaussians, trajectory }
 }
 
+/// What stands where.
+#[derive(Debug)]
+pub(super) struct Plan {
+    pub(super) route: Route,
+    crossing_m: f64,
+    seed: u64,
+    grain_seed: u64,
+    buildings: Vec<Building>,
+    cars: Vec<Car>,
+    trees: Vec<Tree>,
+}
+
+impl Plan {
+    /// The street along `route` with a side street at station `crossing_m`. One seed is that of all
+    /// things, the other that of the ground's grain, which goes on where one street meets the next.
+    pub(super) fn new(route: Route, crossing_m: f64, [seed, grain_seed]: [u64; 2]) -> Self {
+        Self {
+            buildings: buildings::plan(&route, crossing_m, seed),
+            cars: park(&route, crossing_m, seed),
+            trees: plant(&route, crossing_m, seed),
+            route,
+            crossing_m,
+            seed,
+            grain_seed,
+        }
+    }
+
+    /// What throws shadows.
+    pub(super) fn occluders(&self) -> impl Iterator<Item = Occluder> + '_ {
+        let buildings = self.buildings.iter().map(Building::occluder);
+        let cars = self.cars.iter().flat_map(Car::occluders);
+        buildings.chain(cars).chain(self.trees.iter().map(Tree::occluder))
+    }
+
+    pub(super) fn paint(&self, painter: &mut Painter) {
+        road::paint(painter, &self.route, self.crossing_m, [self.grain_seed, self.seed]);
+        for building in &self.buildings {
+            building.paint(painter);
+        }
+        for car in &self.cars {
+            car.paint(painter);
+        }
+        for tree in &self.trees {
+            tree.paint(painter);
+        }
+        furnish(painter, &self.route, self.crossing_m, self.seed);
+    }
+}
+
 /// Cars in two of three bays, looking the way their side drives.
-fn park(route: &Route, settings: &StreetSettings) -> Vec<Car> {
+fn park(route: &Route, crossing_m: f64, seed: u64) -> Vec<Car> {
     let mut cars = Vec::new();
     for (side, name) in [(-1.0, "car, right"), (1.0, "car, left")] {
         for (index, s_m) in along(route, BAY_M).enumerate() {
             let beyond_m = route.beyond_m(s_m);
-            let mut random = Random::new(settings.seed, name, index);
-            let free = random.chance(0.34)
-                || beyond_m > 45.0
-                || (s_m - settings.crossing_m).abs() < CLEAR_M + 2.0;
+            let mut random = Random::new(seed, name, index);
+            let free =
+                random.chance(0.34) || beyond_m > 45.0 || (s_m - crossing_m).abs() < CLEAR_M + 2.0;
             if free {
                 continue;
             }
@@ -74,13 +105,13 @@ fn park(route: &Route, settings: &StreetSettings) -> Vec<Car> {
 }
 
 /// Trees at even distances on both pavements.
-fn plant(route: &Route, settings: &StreetSettings) -> Vec<Tree> {
+fn plant(route: &Route, crossing_m: f64, seed: u64) -> Vec<Tree> {
     let mut trees = Vec::new();
     for (side, name) in [(-1.0, "tree, right"), (1.0, "tree, left")] {
         for (index, s_m) in along(route, TREE_M).enumerate() {
             let s_m = s_m + if side < 0.0 { 0.0 } else { 6.0 };
-            let mut random = Random::new(settings.seed, name, index);
-            let free = random.chance(0.12) || (s_m - settings.crossing_m).abs() < CLEAR_M;
+            let mut random = Random::new(seed, name, index);
+            let free = random.chance(0.12) || (s_m - crossing_m).abs() < CLEAR_M;
             if free {
                 continue;
             }
@@ -92,15 +123,15 @@ fn plant(route: &Route, settings: &StreetSettings) -> Vec<Tree> {
 }
 
 /// Lamps, signs, bins, planters along both sides; lights and bollards at the crossing.
-fn furnish(painter: &mut Painter, route: &Route, settings: &StreetSettings) {
+fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
     for side in [-1.0, 1.0] {
         let name = if side < 0.0 { "furniture, right" } else { "furniture, left" };
         for (index, s_m) in along(route, TREE_M).enumerate() {
             let s_m = s_m + 0.5 * TREE_M + if side < 0.0 { 0.0 } else { 6.0 };
-            if (s_m - settings.crossing_m).abs() < CLEAR_M {
+            if (s_m - crossing_m).abs() < CLEAR_M {
                 continue;
             }
-            let mut random = Random::new(settings.seed, name, index);
+            let mut random = Random::new(seed, name, index);
             let station = route.at(s_m);
             let foot_m = station.beside(side * FURNITURE_T_M, PAVEMENT_M);
             match index % 2 {
@@ -118,7 +149,7 @@ fn furnish(painter: &mut Painter, route: &Route, settings: &StreetSettings) {
         }
     }
     for (ahead, side) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
-        let station = |away_m: f64| route.at(settings.crossing_m + ahead * away_m);
+        let station = |away_m: f64| route.at(crossing_m + ahead * away_m);
         let at = |away_m: f64, t_m: f64| station(away_m).beside(side * t_m, PAVEMENT_M);
         // Each lane's light stands on its own side before the zebra; the others look at the
         // side street.
@@ -133,9 +164,13 @@ fn furnish(painter: &mut Painter, route: &Route, settings: &StreetSettings) {
     }
 }
 
-/// Stations along the whole street, `step_m` apart.
+/// Stations along the whole street, `step_m` apart: clear of the houses that close its ends, and as
+/// far from open ends as the next street's are.
 fn along(route: &Route, step_m: f64) -> impl Iterator<Item = f64> + use<> {
-    let from_m = -BEYOND_M + 14.0;
-    let count = ((route.length_m + 2.0 * BEYOND_M - 24.0) / step_m) as usize;
+    let [clear, ends] = [[14.0, 10.0], route.ends_m];
+    let clear_m = |end: usize| if route.closed[end] { clear[end] } else { 0.5 * step_m };
+    let (from_m, to_m) = (ends[0] + clear_m(0), ends[1] - clear_m(1));
+    let count = ((to_m - from_m) / step_m) as usize;
+    let count = if route.closed[1] { count } else { count + 1 };
     (0..count).map(move |i| from_m + step_m * i as f64)
 }

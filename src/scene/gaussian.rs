@@ -35,6 +35,24 @@ impl Gaussians {
         }
     }
 
+    /// Makes room for `n` more, and no further.
+    pub fn reserve_exact(&mut self, n: usize) {
+        self.means_m.reserve_exact(n);
+        self.quats_wxyz.reserve_exact(n);
+        self.ln_scales.reserve_exact(n);
+        self.logit_opacities.reserve_exact(n);
+        self.sh.reserve_exact(n * 3 * sh::coefficients(self.sh_degree));
+    }
+
+    /// Adds one of others, which have the same SH degree.
+    pub fn push_from(&mut self, others: &Self, index: usize) {
+        self.means_m.push(others.means_m[index]);
+        self.quats_wxyz.push(others.quats_wxyz[index]);
+        self.ln_scales.push(others.ln_scales[index]);
+        self.logit_opacities.push(others.logit_opacities[index]);
+        self.sh.extend_from_slice(others.sh_of(index));
+    }
+
     /// How many.
     pub fn len(&self) -> usize {
         self.means_m.len()

@@ -7,6 +7,7 @@ pub mod manifest;
 pub mod profile;
 pub mod record;
 pub mod rig;
+pub mod route;
 pub mod sh;
 pub mod trajectory;
 

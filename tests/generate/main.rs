@@ -1,11 +1,12 @@
-//! The demo street: the same every time, within the bounds of a twin, drivable, and closed.
+//! The demo street, and cities: the same every time, within the bounds of a twin, drivable, and closed.
 
+mod city;
 mod drive;
 mod pictures;
 
 use std::sync::LazyLock;
 
-use wildcity::generate::{Street, StreetError, StreetSettings, street};
+use wildcity::generate::{GenerateError, Street, StreetSettings, street};
 use wildcity::scene::Gaussians;
 
 /// The street of `scenes/demo.json`, made once for all tests.
@@ -66,7 +67,7 @@ fn every_value_is_within_the_bounds_of_a_twin() {
 fn settings_out_of_range_are_named() {
     let good = StreetSettings::default();
     let refused = |settings: StreetSettings| match street(&settings) {
-        Err(StreetError::Setting { field, .. }) => field,
+        Err(GenerateError::Setting { field, .. }) => field,
         Ok(_) => "none",
     };
     assert_eq!(refused(StreetSettings { length_m: f64::NAN, ..good.clone() }), "length_m");

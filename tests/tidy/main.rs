@@ -22,7 +22,10 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("indicatif", &["cli"]),
     ("fearless_simd", &["render/cpu"]),
     ("wgpu", &["render/gpu"]),
-    ("rayon", &["render", "scene/chunk.rs", "ingest/validate.rs", "store/pack.rs"]),
+    (
+        "rayon",
+        &["render", "scene/chunk.rs", "generate/city.rs", "ingest/validate.rs", "store/pack.rs"],
+    ),
     ("tokio", &["server", "client", "session", "cli", "store/remote"]),
     // The catalog is made from one that is open.
     ("object_store", &["store/remote", "store/catalog.rs"]),

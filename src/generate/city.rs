@@ -1,0 +1,246 @@
+//! A city: streets end to start along one route of any length, made cell by cell.
+//!
+//! The route runs east and swings up to 47° to both sides, so it never meets itself, and a line of
+//! constant x sweeps over it: a cell that lies west of everything to come is done. What is in memory
+//! is two or three streets, however long the route.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::geometry::Pose;
+use crate::scene::chunk::{self, CELL_M};
+use crate::scene::{Gaussians, Trajectory};
+
+use super::light::Light;
+use super::random::Random;
+use super::road::LANE_T_M;
+use super::route::{self, BEYOND_M, Bends, Route, Wave};
+use super::street::Plan;
+use super::surface::Painter;
+use super::{CitySettings, GenerateError};
+
+/// Shortest and longest street but for the last two, in metres: room for side streets that do not
+/// meet behind the houses where the route bends.
+const STREET_M: [f64; 2] = [150.0, 220.0];
+/// How far from its centre line a street reaches, in metres: the side street's 82, the house at its
+/// end, 13, and eaves.
+const ASIDE_M: f64 = 110.0;
+/// Streets that are painted at once, at most: each is 115 MB at 5 million Gaussians per km.
+const PAINTED_AT_ONCE: usize = 4;
+/// How far from both ends of the route the drive stays, in metres.
+const INDENT_M: f64 = 8.0;
+
+/// The Gaussians of one cell, all of them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cell {
+    /// Grid cell (x, y), as in [`crate::scene::Chunk::cell`].
+    pub cell: [i32; 2],
+    /// Raw Gaussians of SH degree 1, in world axes.
+    pub gaussians: Gaussians,
+}
+
+/// A city in the making: its cells, each once, from west to east. The same settings give the same
+/// cells, on any number of threads.
+#[derive(Debug)]
+pub struct City {
+    settings: CitySettings,
+    streets: Streets,
+    /// Streets that stand and are not painted; before the first, the one that was painted last.
+    planned: VecDeque<Plan>,
+    painted_any: bool,
+    /// Gaussians of cells that more may come to.
+    open: BTreeMap<[i32; 2], Gaussians>,
+    done: VecDeque<Cell>,
+}
+
+/// Begins a city.
+///
+/// # Errors
+/// Names the first setting out of range.
+pub fn city(settings: &CitySettings) -> Result<City, GenerateError> {
+    settings.check()?;
+    Ok(City {
+        streets: Streets::new(settings),
+        settings: settings.clone(),
+        planned: VecDeque::new(),
+        painted_any: false,
+        open: BTreeMap::new(),
+        done: VecDeque::new(),
+    })
+}
+
+/// The recorded drive through a city, from end to end in the right lane: a keyframe every 0.5 m at a
+/// constant speed.
+///
+/// # Errors
+/// Names the first setting out of range.
+pub fn city_drive(settings: &CitySettings) -> Result<Trajectory, GenerateError> {
+    settings.check()?;
+    let mut station_m = INDENT_M;
+    let mut poses: Vec<Pose> = Vec::new();
+    for Site { route, .. } in Streets::new(settings) {
+        let to_s_m = route.driven_m[1].min(settings.length_m - INDENT_M);
+        poses.extend(route.poses(LANE_T_M, &mut station_m, to_s_m));
+    }
+    Ok(Trajectory { name: "log".into(), keyframes: route::keyframes(poses, settings.speed_m_s) })
+}
+
+impl Iterator for City {
+    type Item = Cell;
+
+    fn next(&mut self) -> Option<Cell> {
+        while self.done.is_empty() && self.paint() {}
+        self.done.pop_front()
+    }
+}
+
+impl City {
+    /// Paints the next streets, and puts aside the cells that nothing further can touch. Whether there
+    /// was any street left.
+    fn paint(&mut self) -> bool {
+        let count = rayon::current_num_threads().min(PAINTED_AT_ONCE);
+        let first = usize::from(self.painted_any);
+        // A street's houses throw their shadows on the next one, and the other way round.
+        while self.planned.len() < first + count + 1
+            && let Some(site) = self.streets.next()
+        {
+            self.planned.push_back(site.plan(self.settings.seed));
+        }
+        let last = self.planned.len().min(first + count);
+        if first == last {
+            return false;
+        }
+        let density = self.settings.spacing_density();
+        let planned = self.planned.make_contiguous();
+        let painted: Vec<Gaussians> =
+            (first..last).into_par_iter().map(|at| paint(planned, at, density)).collect();
+        for gaussians in painted {
+            self.file(&gaussians);
+        }
+        self.planned.drain(..last - 1);
+        self.painted_any = true;
+        let to_come_m =
+            self.planned.get(1).map(|next| next.route.at(next.route.ends_m[0]).point_m.x);
+        self.close(to_come_m.map_or(f64::INFINITY, |x_m| x_m - ASIDE_M));
+        true
+    }
+
+    /// Adds Gaussians to their cells.
+    fn file(&mut self, gaussians: &Gaussians) {
+        let mut counts: BTreeMap<[i32; 2], usize> = BTreeMap::new();
+        for mean_m in &gaussians.means_m {
+            *counts.entry(chunk::cell_at(mean_m)).or_default() += 1;
+        }
+        for (cell, count) in counts {
+            let empty = || Gaussians::with_capacity(gaussians.sh_degree, count);
+            self.open.entry(cell).or_insert_with(empty).reserve_exact(count);
+        }
+        for (index, mean_m) in gaussians.means_m.iter().enumerate() {
+            if let Some(cell) = self.open.get_mut(&chunk::cell_at(mean_m)) {
+                cell.push_from(gaussians, index);
+            }
+        }
+    }
+
+    /// Puts the cells west of `x_m` aside.
+    fn close(&mut self, x_m: f64) {
+        let open = std::mem::take(&mut self.open).into_iter();
+        let is_done = |cell: &[i32; 2]| CELL_M * (f64::from(cell[0]) + 0.5) < x_m;
+        let (done, open): (BTreeMap<_, _>, _) = open.partition(|(cell, _)| is_done(cell));
+        self.open = open;
+        self.done.extend(done.into_iter().map(|(cell, gaussians)| Cell { cell, gaussians }));
+    }
+}
+
+/// Paints one of the planned streets in the light that its neighbours leave.
+fn paint(planned: &[Plan], at: usize, density: f64) -> Gaussians {
+    let near = &planned[at.saturating_sub(1)..planned.len().min(at + 2)];
+    let light = Light::new(near.iter().flat_map(Plan::occluders).collect());
+    let mut painter = Painter::new(&light, density);
+    planned[at].paint(&mut painter);
+    painter.gaussians
+}
+
+/// Where a street of the city lies.
+#[derive(Debug)]
+struct Site {
+    route: Route,
+    index: usize,
+}
+
+impl Site {
+    fn plan(self, seed: u64) -> Plan {
+        let mut random = Random::new(seed, "street", self.index);
+        let [from_m, to_m] = self.route.driven_m;
+        let middle_m = 0.5 * (from_m + to_m);
+        // A street of 100 m, the shortest, leaves 40 m on either side.
+        let crossing_m = middle_m + 0.1 * (to_m - from_m) * random.range(-1.0, 1.0);
+        Plan::new(self.route, crossing_m, [random.seed(), seed])
+    }
+}
+
+/// The streets of a city, from its start to its end.
+#[derive(Clone, Debug)]
+struct Streets {
+    seed: u64,
+    length_m: f64,
+    bends: Bends,
+    station_m: f64,
+    point_m: DVec3,
+    index: usize,
+}
+
+impl Streets {
+    /// Bends of a city, and no streets yet.
+    ///
+    /// Together with the streets' own 0.30 rad the heading stays within 0.82 rad of east; the curvature
+    /// within `2π (0.30 / 260 + 0.40 / 3100 + 0.12 / 1100)` = 0.0088 1/m, a radius of 114 m.
+    fn new(settings: &CitySettings) -> Self {
+        let mut random = Random::new(settings.seed, "bends", 0);
+        let wide = [(0.40, 3100.0), (0.12, 1100.0)].map(|(swing_rad, period_m)| {
+            let phase_rad = random.range(0.0, std::f64::consts::TAU);
+            Wave { swing_rad, period_m, phase_rad }
+        });
+        Self {
+            seed: settings.seed,
+            length_m: settings.length_m,
+            bends: Bends { wide },
+            station_m: 0.0,
+            point_m: DVec3::ZERO,
+            index: 0,
+        }
+    }
+}
+
+impl Iterator for Streets {
+    type Item = Site;
+
+    fn next(&mut self) -> Option<Site> {
+        let [shortest_m, longest_m] = STREET_M;
+        let left_m = self.length_m - self.station_m;
+        if left_m <= 0.0 {
+            return None;
+        }
+        // Whole metres, so that streets meet on the nodes of their centre lines.
+        let long_m = if left_m <= longest_m {
+            left_m
+        } else if left_m <= 2.0 * shortest_m {
+            (0.5 * left_m).floor()
+        } else {
+            let mut random = Random::new(self.seed, "length", self.index);
+            random.range(shortest_m, longest_m).min(left_m - shortest_m).floor()
+        };
+        let driven_m = [self.station_m, self.station_m + long_m];
+        let closed = [self.index == 0, driven_m[1] >= self.length_m];
+        let beyond_m = closed.map(|closed| if closed { BEYOND_M } else { 0.0 });
+        let ends_m = [driven_m[0] - beyond_m[0], driven_m[1] + beyond_m[1]];
+        let mut route = Route::line(self.bends, ends_m, self.station_m, self.point_m);
+        (route.driven_m, route.closed) = (driven_m, closed);
+        self.station_m = driven_m[1];
+        self.point_m = route.at(self.station_m).point_m;
+        self.index += 1;
+        Some(Site { route, index: self.index - 1 })
+    }
+}

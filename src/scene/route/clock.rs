@@ -1,0 +1,102 @@
+//! Two clocks: which times belong together, and poses at other times than the log's.
+
+use super::{Route, RouteError, between};
+use crate::geometry::Pose;
+
+/// Times of one clock with those of another one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Association {
+    /// What belongs together, in order of time.
+    pub pairs: Vec<Pair>,
+    /// Places of the first clock's times that found nothing.
+    pub alone: Vec<usize>,
+}
+
+/// Two times that belong together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pair {
+    /// Place among the first clock's times.
+    pub first: usize,
+    /// Place among the second clock's times.
+    pub second: usize,
+    /// Second minus first, in microseconds.
+    pub residual_us: i64,
+}
+
+/// Pairs the times of two clocks, both strictly increasing, in microseconds: two times belong
+/// together if each is the other's nearest and they are at most `tolerance_us` apart. So nothing is
+/// used twice, and nothing crosses. Of two equally near ones the earlier counts.
+///
+/// # Errors
+/// [`RouteError::Order`] names the first time that is out of order; [`RouteError::Value`] if the
+/// tolerance is negative.
+pub fn associate(
+    first_us: &[i64],
+    second_us: &[i64],
+    tolerance_us: i64,
+) -> Result<Association, RouteError> {
+    check_order("first", first_us)?;
+    check_order("second", second_us)?;
+    if tolerance_us < 0 {
+        let (field, value) = ("tolerance_us", tolerance_us as f64);
+        return Err(RouteError::Value { field, value, must: "a tolerance is 0 µs or more" });
+    }
+    let (mut pairs, mut alone) = (Vec::new(), Vec::new());
+    for (first, &time_us) in first_us.iter().enumerate() {
+        let mutual = nearest(second_us, time_us)
+            .filter(|&second| nearest(first_us, second_us[second]) == Some(first))
+            .filter(|&second| time_us.abs_diff(second_us[second]) <= tolerance_us.unsigned_abs());
+        match mutual {
+            Some(second) => {
+                // Within the tolerance, hence within i64.
+                let residual_us = second_us[second].saturating_sub(time_us);
+                pairs.push(Pair { first, second, residual_us });
+            }
+            None => alone.push(first),
+        }
+    }
+    Ok(Association { pairs, alone })
+}
+
+impl Route<'_> {
+    /// Where the drive was at a time, in microseconds of its clock: position linear, rotation
+    /// spherical, between the keyframes before and after.
+    ///
+    /// # Errors
+    /// [`RouteError::Outside`] before the first keyframe or after the last one.
+    pub fn pose_at(&self, time_us: i64) -> Result<Pose, RouteError> {
+        let keyframes = &self.trajectory.keyframes;
+        let (from_us, to_us) = (keyframes[0].time_us, keyframes[keyframes.len() - 1].time_us);
+        if !(from_us..=to_us).contains(&time_us) {
+            let name = self.trajectory.name.clone();
+            return Err(RouteError::Outside { name, time_us, from_us, to_us });
+        }
+        let after = keyframes.partition_point(|keyframe| keyframe.time_us < time_us);
+        let to = &keyframes[after];
+        let Some(from) = after.checked_sub(1).map(|before| &keyframes[before]) else {
+            return Ok(to.world_from_rig);
+        };
+        let since_us = |earlier_us: i64, later_us: i64| later_us.abs_diff(earlier_us) as f64;
+        let t = since_us(from.time_us, time_us) / since_us(from.time_us, to.time_us);
+        Ok(between(from, to, t).world_from_rig)
+    }
+}
+
+/// The place of the time that is nearest, the earlier of two.
+fn nearest(times_us: &[i64], time_us: i64) -> Option<usize> {
+    let after = times_us.partition_point(|&other_us| other_us < time_us);
+    let candidates = [after.checked_sub(1), (after < times_us.len()).then_some(after)];
+    candidates.into_iter().flatten().min_by_key(|&place| times_us[place].abs_diff(time_us))
+}
+
+fn check_order(clock: &'static str, times_us: &[i64]) -> Result<(), RouteError> {
+    match times_us.windows(2).position(|pair| pair[1] <= pair[0]) {
+        Some(before) => Err(RouteError::Order {
+            clock,
+            index: before + 1,
+            time_us: times_us[before + 1],
+            before_us: times_us[before],
+        }),
+        None => Ok(()),
+    }
+}
