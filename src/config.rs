@@ -300,7 +300,8 @@ pub const GOLDEN_SIDE_PX: u32 = 320;
 /// Gaussians of a push that is compared: in memory beside it, 92 B each at SH degree 1, 1.8 GB.
 pub const GOLDEN_GAUSSIANS: usize = 20_000_000;
 
-/// How long it may take to compare, and to load what the latest version changes.
+/// How long a push may load what its version changes where sessions drive, before it is ready all the
+/// same.
 pub const PREFETCH_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Characters of a push's note.
