@@ -170,6 +170,37 @@ pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 /// one of those who try succeeds, so that 32 may try at once.
 pub const PUBLISH_TRIES: u32 = 32;
 
+/// Largest lease or list of candidates for garbage collection: 20,000 hashes of 70 bytes are 1.4 MB.
+pub const NOTE_BYTES: u64 = 16 << 20;
+
+/// How long one request to an object store may take: a cell of 300 MB at 5 MB/s.
+pub const REMOTE_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How often such a request is made, at most.
+pub const REMOTE_TRIES: u32 = 5;
+
+/// How long to wait before the second try, twice as long before each further one: 0.1 + 0.2 + 0.4 +
+/// 0.8 = 1.5 s in all, after which a step still has time to fail by [`STEP_TIMEOUT`].
+pub const REMOTE_BACKOFF: Duration = Duration::from_millis(100);
+
+/// How often an object is read whose bytes are not those of its hash: damaged on the way, or there.
+pub const SOUND_TRIES: u32 = 3;
+
+/// Threads that wait for an object store's answers.
+pub const REMOTE_THREADS: usize = 2;
+
+/// Objects of one commit that are uploaded at once, each held in memory: cells of 10 MB.
+pub const UPLOADS_AT_ONCE: usize = 8;
+
+/// What is kept on disk of twins from elsewhere, in GiB, unless told otherwise: half of a log's 32 GB.
+pub const CACHE_GIB: u32 = 16;
+
+/// Versions that garbage collection keeps, unless told otherwise: a day of hourly pushes, twice.
+pub const GC_KEEP: u32 = 50;
+
+/// How long garbage stays, unless told otherwise: longer than any commit is in preparation.
+pub const GC_GRACE: &str = "24h";
+
 /// Largest rig or trajectory file: what fits a manifest.
 pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
 
@@ -200,6 +231,37 @@ pub const ROOM_POLL: Duration = Duration::from_secs(1);
 /// Sections in the queue beyond which nothing more is prefetched: 40 B each, so 10 MB; a frame of
 /// 300 m around is some thousands.
 pub const QUEUED_SECTIONS: usize = 1 << 18;
+
+/// How far ahead is loaded: three times what all but one of a hundred loads take, within these. A
+/// disk's 1 s at 30 m/s are 30 m; 5 s cover a remote store on a bad day.
+pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(5));
+
+/// Steps whose own places are looked at: a second at 10 Hz.
+pub const IMMINENT_STEPS: usize = 10;
+
+/// Distance of places beyond those, in metres: a level of detail changes every 16 m and more where it
+/// is not on the next steps' way.
+pub const PREFETCH_SPACING_M: f64 = 8.0;
+
+/// Places that are looked at after a step, and as many of a hint: 512 m, 0.2 ms each in a city.
+pub const PREFETCH_PLACES: usize = 64;
+
+/// Poses of one `prefetch` request: 2 km of a polyline.
+pub const PREFETCH_POSES: usize = 256;
+
+/// Distance from a recorded drive within which the ego is taken to follow it, in metres: the other
+/// side of a wide road.
+pub const ROUTE_NEAR_M: f64 = 15.0;
+
+/// A step that is shorter is none, in metres.
+pub const STANDING_M: f64 = 0.01;
+
+/// What is loaded ahead of an ego that stands on a recorded drive, in metres: five seconds of a town's
+/// speed.
+pub const STANDING_AHEAD_M: f64 = 50.0;
+
+/// Steps ahead at most, however much faster than the clock they come.
+pub const STEPS_AHEAD: usize = 256;
 
 /// Squares that the search for a twin's worst place looks at. A square cell of 64 m of 20 km of road is
 /// one of 320 in a row, and twice as many lie above them.

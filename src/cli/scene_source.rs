@@ -22,7 +22,6 @@ use crate::render::{Backend, View};
 use crate::residency::{Cache, Pinned, Resident};
 use crate::scene::{RenderProfile, Scene};
 use crate::session;
-use crate::store::Catalog;
 
 use super::places::{TwinVersion, Twins};
 use super::progress;
@@ -198,8 +197,10 @@ impl Machine {
     }
 
     fn limits(&self) -> Limits {
-        let bytes = |gib: f64| (gib * f64::from(1 << 30)) as u64;
-        Limits { mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes), ..Limits::default() }
+        Limits {
+            mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
+            ..Limits::default()
+        }
     }
 }
 
@@ -233,6 +234,11 @@ pub(super) fn gib(text: &str) -> Result<f64, String> {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
         _ => Err("expected a number above 0, to 65536".to_owned()),
     }
+}
+
+/// Bytes of so many GiB.
+pub(super) fn bytes_of_gib(gib: f64) -> u64 {
+    (gib * f64::from(1 << 30)) as u64
 }
 
 /// What a rendering command draws.
@@ -332,7 +338,7 @@ impl SceneSource {
             return Ok((Source::File(scene), RenderProfile::default()));
         }
         let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
-        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let cache = Cache::new(self.twins.catalog()?);
         let resident = cache.open(&named.name, named.number).with_context(|| {
             format!("{:?} is no file, and as the name of a twin it fails", self.scene)
         })?;

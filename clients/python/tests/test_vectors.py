@@ -50,6 +50,7 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
+    "prefetch": lambda c: c.prefetch([HERE, ABOVE]),
     "reset": lambda c: c.reset(7, None),
     "reset_pose": lambda c: c.reset(8, HERE),
     "reset_station": lambda c: c.reset(9, LOG),
