@@ -422,10 +422,16 @@ mod tests {
         let rail = triangle([[0.0; 3], [5.0, 0.0, 0.0], [5.0, 0.01, 0.0]]);
         let area_m2 = rail.area_m2();
         let parts = rail.halved(0.1);
-        assert_eq!(parts.len(), 64);
+        // Of its two long edges one is halved first, and then both halves' edges in turn.
+        assert!((100..=1 << HALVINGS).contains(&parts.len()), "{}", parts.len());
         let sum_m2: f64 = parts.iter().map(Triangle::area_m2).sum();
         assert!((sum_m2 / area_m2 - 1.0).abs() < 1e-12);
-        assert!(parts.iter().all(|part| part.corners_m[0].distance(part.corners_m[1]) <= 0.1));
+        let longest_m = parts.iter().flat_map(|part| {
+            let [a, b, c] = part.corners_m;
+            [a.distance(b), b.distance(c), c.distance(a)]
+        });
+        let longest_m = longest_m.fold(0.0, f64::max);
+        assert!(longest_m <= 0.1, "{longest_m}");
         // However long, and however thin; and what is not thin stays whole.
         let line = triangle([[0.0; 3], [1e9, 0.0, 0.0], [2e9, 0.0, 0.0]]);
         assert_eq!(line.halved(1e-3).len(), 1 << HALVINGS);
