@@ -27,8 +27,9 @@ const WIDER: f64 = 1.7;
 /// Longest edge of what becomes one Gaussian, in edges of a square share: what is longer and narrow would
 /// stand out beyond its ends.
 const LONGEST: f64 = 4.0;
-/// Halvings of one triangle at most: 256 parts, as of a rail of 15 m on a lorry.
-const HALVINGS: u32 = 8;
+/// Halvings of one triangle at most, every second of which halves its length: a rail of 4 m becomes
+/// pieces of 6 cm.
+const HALVINGS: u32 = 12;
 /// Thickness per width.
 const FLATNESS: f64 = 0.02;
 /// Opacity of what is not see-through.
@@ -71,7 +72,21 @@ pub(super) fn read(
     }
     let share_m2 = area_m2 / f64::from(config::MESH_GAUSSIANS);
     let longest_m = LONGEST * share_m2.sqrt();
-    let halved = triangles.into_iter().flat_map(|triangle| triangle.halved(longest_m));
+    // What has no area is not seen, however long it is.
+    let seen = triangles.into_iter().filter(|triangle| triangle.area_m2() > 0.0);
+    let mut parts_left = config::MESH_PARTS;
+    let halved = seen.flat_map(|triangle| {
+        let whole = vec![triangle.clone()];
+        let halved = triangle.halved(longest_m);
+        // What is left whole stands out beyond its ends, and takes no memory.
+        match parts_left.checked_sub(halved.len()) {
+            Some(left) => {
+                parts_left = left;
+                halved
+            }
+            None => whole,
+        }
+    });
     let triangles: Vec<Triangle> = halved.collect();
     let count: u128 = triangles.iter().map(|t| u128::from(t.cuts(share_m2)).pow(2)).sum();
     parts.budget().unpack(FORMAT, "meshes", 56 * count)?;
