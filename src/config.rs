@@ -201,6 +201,37 @@ pub const ROOM_POLL: Duration = Duration::from_secs(1);
 /// 300 m around is some thousands.
 pub const QUEUED_SECTIONS: usize = 1 << 18;
 
+/// How far ahead is loaded: three times what all but one of a hundred loads take, within these. A
+/// disk's 1 s at 30 m/s are 30 m; 5 s cover a remote store on a bad day.
+pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(5));
+
+/// Steps whose own places are looked at: a second at 10 Hz.
+pub const IMMINENT_STEPS: usize = 10;
+
+/// Distance of places beyond those, in metres: a level of detail changes every 16 m and more where it
+/// is not on the next steps' way.
+pub const PREFETCH_SPACING_M: f64 = 8.0;
+
+/// Places that are looked at after a step, and as many of a hint: 512 m, 0.2 ms each in a city.
+pub const PREFETCH_PLACES: usize = 64;
+
+/// Poses of one `prefetch` request: 2 km of a polyline.
+pub const PREFETCH_POSES: usize = 256;
+
+/// Distance from a recorded drive within which the ego is taken to follow it, in metres: the other
+/// side of a wide road.
+pub const ROUTE_NEAR_M: f64 = 15.0;
+
+/// A step that is shorter is none, in metres.
+pub const STANDING_M: f64 = 0.01;
+
+/// What is loaded ahead of an ego that stands on a recorded drive, in metres: five seconds of a town's
+/// speed.
+pub const STANDING_AHEAD_M: f64 = 50.0;
+
+/// Steps ahead at most, however much faster than the clock they come.
+pub const STEPS_AHEAD: usize = 256;
+
 /// Squares that the search for a twin's worst place looks at. A square cell of 64 m of 20 km of road is
 /// one of 320 in a row, and twice as many lie above them.
 pub const WORST_PLACES: usize = 4096;
@@ -269,7 +300,8 @@ pub const GOLDEN_SIDE_PX: u32 = 320;
 /// Gaussians of a push that is compared: in memory beside it, 92 B each at SH degree 1, 1.8 GB.
 pub const GOLDEN_GAUSSIANS: usize = 20_000_000;
 
-/// How long it may take to compare, and to load what the latest version changes.
+/// How long a push may load what its version changes where sessions drive, before it is ready all the
+/// same.
 pub const PREFETCH_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Characters of a push's note.

@@ -198,8 +198,10 @@ impl Machine {
     }
 
     fn limits(&self) -> Limits {
-        let bytes = |gib: f64| (gib * f64::from(1 << 30)) as u64;
-        Limits { mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes), ..Limits::default() }
+        Limits {
+            mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
+            ..Limits::default()
+        }
     }
 }
 
@@ -233,6 +235,11 @@ pub(super) fn gib(text: &str) -> Result<f64, String> {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
         _ => Err("expected a number above 0, to 65536".to_owned()),
     }
+}
+
+/// Bytes of so many GiB.
+pub(super) fn bytes_of_gib(gib: f64) -> u64 {
+    (gib * f64::from(1 << 30)) as u64
 }
 
 /// What a rendering command draws.

@@ -14,7 +14,7 @@ use crate::server::{self, Limits, Tokens};
 use crate::store::Catalog;
 
 use super::places::{Episodes, Twins, Uploads};
-use super::scene_source::Engine;
+use super::scene_source::{Engine, bytes_of_gib, gib};
 
 /// Serve twins to agents over WebSocket.
 ///
@@ -40,9 +40,11 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ADDR", default_value = config::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Memory that all twins in use may take, in GiB [default: three quarters of the machine's]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65_536))]
-    memory_gib: Option<u32>,
+    /// Memory that the Gaussians of all twins may take, in GiB, as 2 or 0.5 [default: three quarters of
+    /// the machine's]. A session is refused if its largest frame does not fit beside those of others;
+    /// whatever else fits is kept for the frames to come.
+    #[arg(long, value_name = "N", value_parser = gib)]
+    memory_gib: Option<f64>,
 
     #[command(flatten)]
     engine: Engine,
@@ -55,6 +57,7 @@ pub(super) struct Serve {
 const EXAMPLES: &str = "\
 Examples:
   wildcity serve
+  wildcity serve --memory-gib 2
   wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
   wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
   curl http://127.0.0.1:8080/v1/twins
@@ -94,7 +97,7 @@ impl Serve {
             tokens,
             backend: Arc::from(self.engine.backend()?),
             limits: Limits {
-                resident_bytes: self.memory_gib.map(|gib| u64::from(gib) << 30),
+                resident_bytes: self.memory_gib.map(bytes_of_gib),
                 ..Limits::default()
             },
         };

@@ -127,6 +127,7 @@ impl Incoming {
             Self::Answer(
                 Answer::Welcome { seq, .. }
                 | Answer::Resumed { seq, .. }
+                | Answer::Ok { seq }
                 | Answer::Switched { seq, .. }
                 | Answer::Closed { seq, .. },
             ) => Some(*seq),

@@ -217,6 +217,19 @@ impl Client {
         self.observation(&Request::Observe { seq: self.next_seq, poses: poses.to_vec() }).await
     }
 
+    /// Has loaded what is seen from poses (`world_from_rig`) and from between them, where the agent may
+    /// go next; does not wait for it.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn prefetch(&mut self, poses: &[Pose]) -> Result<(), ClientError> {
+        let request = Request::Prefetch { seq: self.next_seq, poses: poses.to_vec() };
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Ok { .. }) => Ok(()),
+            other => Err(self.break_off("ok", &other)),
+        }
+    }
+
     /// Starts a new episode, at the session's start if `start` is absent.
     ///
     /// # Errors

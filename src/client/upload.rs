@@ -3,7 +3,7 @@
 
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -43,9 +43,10 @@ impl HttpClient {
                 Err(error) => return Err(error),
             };
             // Anything that got through gives hope.
-            let offset = match self.json(Method::POST, "/v1/uploads", Some(&announced)).await {
-                Ok(Upload { complete: true, offset, .. }) => offset,
-                Ok(Upload { offset, .. }) => offset,
+            let known: Result<Upload, _> =
+                self.json(Method::POST, "/v1/uploads", Some(&announced)).await;
+            let offset = match known {
+                Ok(upload) => upload.offset,
                 Err(error) if is_passing(&error) => furthest,
                 Err(error) => return Err(error),
             };
@@ -154,5 +155,5 @@ fn read_some(mut file: File, rest: u64) -> io::Result<(File, Bytes)> {
 }
 
 fn unreadable(path: &Path, cause: io::Error) -> HttpError {
-    HttpError::File { path: PathBuf::from(path).display().to_string(), cause }
+    HttpError::File { path: path.display().to_string(), cause }
 }

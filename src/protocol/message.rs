@@ -54,6 +54,14 @@ pub enum Request {
         /// `world_from_rig` each; 1 to `limits.observe_poses`.
         poses: Vec<Pose>,
     },
+    /// Loads what is seen from where the ego may go next. Answer: `ok`, before it is loaded.
+    Prefetch {
+        /// Number of this request.
+        seq: u64,
+        /// `world_from_rig` each, in the order of the way; what lies straight between them counts. In
+        /// place of those of the request before.
+        poses: Vec<Pose>,
+    },
     /// Starts a new episode in the same session. Answer: an observation.
     Reset {
         /// Number of this request.
@@ -289,6 +297,11 @@ pub enum Answer {
         /// Simulated time, in microseconds.
         time_us: i64,
     },
+    /// To `prefetch`.
+    Ok {
+        /// Number of the request.
+        seq: u64,
+    },
     /// To `switch_version`: what the session sees from now on.
     Switched {
         /// Number of the request.
@@ -415,8 +428,8 @@ pub struct Opened {
     pub outputs: Outputs,
     /// The twin's recorded trajectories.
     pub trajectories: Vec<TrajectoryInfo>,
-    /// Memory that the twin holds in the server, in bytes, shared by all its sessions.
-    pub resident_bytes: u64,
+    /// Memory of the server that is set aside for the session's largest frame, in bytes.
+    pub reserved_bytes: u64,
 }
 
 /// How an episode went.

@@ -48,6 +48,8 @@ pub struct Observation {
     pub images: Vec<Image>,
     /// What it cost.
     pub timings: Timings,
+    /// What of it had to be loaded.
+    pub residency: Residency,
 }
 
 /// The ego vehicle at one time.
@@ -108,6 +110,19 @@ pub struct Timings {
     pub encode_ms: f64,
     /// Wall time of each render stage.
     pub stages_ms: Vec<Stage>,
+}
+
+/// Memory of the server behind an observation. What is in memory never changes what is drawn.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Residency {
+    /// Bytes of Gaussians in memory, of all twins.
+    pub held_bytes: u64,
+    /// Bytes that there may be.
+    pub limit_bytes: u64,
+    /// Sections of the twin that were not in memory when the request came.
+    pub waited_for: u64,
+    /// How long the request waited until they were, in microseconds of wall time.
+    pub waited_us: u64,
 }
 
 /// Wall time of a render stage.

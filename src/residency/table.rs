@@ -263,3 +263,176 @@ impl Table {
         (slot.older, slot.newer) = (before, NONE);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    impl Table {
+        /// What must hold at any time; `pinned` is what frames hold.
+        fn check(&self, pinned: &[(Id, Arc<Chunk>)]) {
+            let taken = |slot: &&Slot| !matches!(slot.state, State::Absent);
+            let bytes: u64 = self.slots.iter().filter(taken).map(|slot| slot.bytes).sum();
+            assert_eq!(bytes, self.held_bytes);
+            assert!(bytes <= self.limit_bytes, "{bytes} of {}", self.limit_bytes);
+            let (mut listed, mut next, mut before) = (Vec::new(), self.oldest, NONE);
+            while next != NONE {
+                let slot = &self.slots[next as usize];
+                assert_eq!(slot.older, before);
+                listed.push(next);
+                (before, next) = (next, slot.newer);
+            }
+            assert_eq!(before, self.newest);
+            listed.sort_unstable();
+            let here = |id: &Id| matches!(self.slots[*id as usize].state, State::Here(_));
+            let held: Vec<Id> = (0..self.slots.len() as Id).filter(here).collect();
+            assert_eq!(listed, held, "the list is of what is here");
+            assert_eq!(held.len() as u64, self.held_sections);
+            for (id, chunk) in pinned {
+                let same = self.get(*id).is_some_and(|here| Arc::ptr_eq(here, chunk));
+                assert!(same, "section {id} was dropped while a frame held it");
+            }
+            for (key, id) in self.ids.iter().collect::<BTreeMap<_, _>>() {
+                assert_eq!(self.slots[*id as usize].key, *key);
+            }
+            assert_eq!(self.ids.len() + self.vacant.len(), self.slots.len());
+        }
+    }
+
+    /// Numbers that look random: Knuth's MMIX generator.
+    struct Random(u64);
+
+    impl Random {
+        fn below(&mut self, limit: usize) -> usize {
+            self.0 = self
+                .0
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            (self.0 >> 33) as usize % limit
+        }
+    }
+
+    fn key(number: usize) -> Key {
+        let mut key = [0; 16];
+        key[..8].copy_from_slice(&(number as u64).to_le_bytes());
+        Key(key)
+    }
+
+    fn chunk() -> Arc<Chunk> {
+        Arc::new(Chunk::new([0, 0], DVec3::ZERO, 0, 0))
+    }
+
+    #[test]
+    fn whatever_happens_the_books_are_right_and_what_is_held_stays() {
+        for seed in 1..=50 {
+            let mut random = Random(seed);
+            let sizes: Vec<u64> = (0..40).map(|_| 1 + random.below(50) as u64).collect();
+            let mut table = Table::new(200 + random.below(300) as u64);
+            let names = |table: &mut Table| -> Vec<Id> {
+                let all = sizes.iter().enumerate();
+                all.map(|(number, &bytes)| table.register(key(number), bytes)).collect()
+            };
+            let mut versions = vec![names(&mut table)];
+            let mut pinned: Vec<(Id, Arc<Chunk>)> = Vec::new();
+            let mut loading: Vec<Id> = Vec::new();
+            let mut evicted = 0;
+            for now in 1..=2_000_u64 {
+                let id = versions[0][random.below(sizes.len())];
+                match random.below(8) {
+                    0 => table.want(id, now),
+                    1..=3 if table.is_absent(id) => {
+                        let asker = match random.below(2) {
+                            0 => Asker::Frame(now),
+                            _ => Asker::Prefetch(now.saturating_sub(random.below(500) as u64)),
+                        };
+                        table.want(id, now);
+                        let before = table.held_bytes();
+                        match table.reserve(id, asker) {
+                            Some(dropped) => {
+                                evicted += dropped.len();
+                                loading.push(id);
+                            }
+                            None => assert_eq!(table.held_bytes(), before, "nothing was dropped"),
+                        }
+                    }
+                    4 | 5 if !loading.is_empty() => {
+                        let id = loading.swap_remove(random.below(loading.len()));
+                        if random.below(4) > 0 { table.fill(id, chunk()) } else { table.fail(id) }
+                    }
+                    6 => {
+                        if let Some(chunk) = table.get(id).cloned() {
+                            pinned.push((id, chunk));
+                        }
+                        if pinned.len() > 4 {
+                            pinned.swap_remove(random.below(pinned.len()));
+                        }
+                    }
+                    7 if random.below(20) == 0 => {
+                        // Another version with the same sections, and one of them is closed.
+                        versions.push(names(&mut table));
+                        let closed = versions.remove(random.below(2));
+                        closed.into_iter().for_each(|id| table.unregister(id));
+                    }
+                    _ => {}
+                }
+                table.check(&pinned);
+            }
+            assert!(evicted > 20, "{evicted}");
+        }
+    }
+
+    /// A table with room for three sections of 10 bytes, all here, and a fourth.
+    fn full() -> (Table, [Id; 4]) {
+        let mut table = Table::new(30);
+        let ids = [0, 1, 2, 3].map(|number| table.register(key(number), 10));
+        for (stamp, &id) in (1..).zip(&ids[..3]) {
+            table.want(id, stamp);
+            assert_eq!(table.reserve(id, Asker::Frame(stamp)), Some(vec![]));
+            table.fill(id, chunk());
+        }
+        (table, ids)
+    }
+
+    #[test]
+    fn what_was_wanted_longest_ago_goes_first() {
+        let (mut table, ids) = full();
+        table.want(ids[0], 4);
+        assert_eq!(table.reserve(ids[3], Asker::Frame(5)), Some(vec![ids[1]]));
+    }
+
+    #[test]
+    fn a_prefetch_pushes_out_nothing_that_was_wanted_lately() {
+        let (mut table, ids) = full();
+        assert_eq!(table.reserve(ids[3], Asker::Prefetch(1)), None);
+        assert_eq!(table.reserve(ids[3], Asker::Prefetch(2)), Some(vec![ids[0]]));
+    }
+
+    #[test]
+    fn what_a_frame_waits_for_is_spared_by_all_but_older_frames() {
+        let (mut table, ids) = full();
+        ids[..3].iter().for_each(|&id| table.wait(id, 7));
+        assert_eq!(table.reserve(ids[3], Asker::Prefetch(100)), None);
+        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), None);
+        assert_eq!(table.reserve(ids[3], Asker::Frame(7)), None, "not even by itself");
+        table.unwait(ids[2], 7);
+        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), Some(vec![ids[2]]));
+        table.fail(ids[3]);
+        assert_eq!(table.reserve(ids[3], Asker::Frame(6)), Some(vec![]), "there is room now");
+        assert_eq!(table.reserve(ids[2], Asker::Frame(6)), Some(vec![ids[0]]));
+    }
+
+    #[test]
+    fn sections_that_no_version_has_and_nobody_holds_lose_their_names() {
+        let (mut table, ids) = full();
+        ids.into_iter().for_each(|id| table.unregister(id));
+        assert_eq!((table.ids.len(), table.held_sections()), (3, 3), "memory stays for the next");
+        let again = table.register(key(1), 10);
+        assert_eq!(again, ids[1]);
+        let new = table.register(key(9), 30);
+        assert_eq!(table.reserve(new, Asker::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
+        table.unregister(again);
+        assert_eq!(table.ids.len(), 1);
+        table.check(&[]);
+    }
+}

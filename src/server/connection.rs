@@ -200,6 +200,10 @@ impl Connection {
                 let frame = self.session()?.observe(poses).await?;
                 self.observation(seq, frame)
             }
+            Command::Prefetch { poses } => {
+                self.session()?.prefetch(poses)?;
+                Ok(Answer::Text(convert::ok(seq)?.into()))
+            }
             Command::Reset { seed, start } => {
                 let frame = self.session()?.reset(seed, start).await?;
                 self.observation(seq, frame)

@@ -6,8 +6,8 @@ mod http;
 mod request;
 
 pub(super) use answer::{
-    WireCode, closed, code, observation, opened, refusal_body, refused, resumed, switched, twin,
-    twins, welcome,
+    WireCode, closed, code, observation, ok, opened, refusal_body, refused, resumed, switched,
+    twin, twins, welcome,
 };
 pub(super) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
 pub(super) use request::{Command, Parsed, parse};

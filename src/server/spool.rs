@@ -10,9 +10,9 @@
 //! The id is the digest: the same content is the same upload. Half an upload survives a restart, and
 //! goes on where it stopped.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read as _, Seek as _, Write as _};
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -218,8 +218,7 @@ impl Spool {
             let known = ["json", "part", "data"].contains(&kind);
             Digest::of_id(id).filter(|_| known).map(|_| id.to_owned())
         };
-        let ids: std::collections::BTreeSet<String> =
-            names.iter().filter_map(|name| is_ours(name)).collect();
+        let ids: BTreeSet<String> = names.iter().filter_map(|name| is_ours(name)).collect();
         for id in ids {
             let path = |kind: &str| self.dir.join(format!("{id}.{kind}"));
             let announced = fs::read(path("json")).ok();
@@ -451,25 +450,16 @@ impl Algorithm {
 
     fn of_file(self, path: &Path) -> io::Result<Digest> {
         let mut file = File::open(path)?;
-        file.rewind()?;
         let (mut blake3, mut sha256) = (blake3::Hasher::new(), Sha256::new());
-        let mut buffer = vec![0; config::UPLOAD_WRITE_BYTES];
-        loop {
-            let read = file.read(&mut buffer)?;
-            if read == 0 {
-                break;
-            }
-            match self {
-                Self::Blake3 => blake3.update(&buffer[..read]),
-                Self::Sha256 => {
-                    sha256.update(&buffer[..read]);
-                    continue;
-                }
-            };
-        }
         let hash = match self {
-            Self::Blake3 => *blake3.finalize().as_bytes(),
-            Self::Sha256 => sha256.finalize().into(),
+            Self::Blake3 => {
+                io::copy(&mut file, &mut blake3)?;
+                *blake3.finalize().as_bytes()
+            }
+            Self::Sha256 => {
+                io::copy(&mut file, &mut sha256)?;
+                sha256.finalize().into()
+            }
         };
         Ok(Digest { algorithm: self, hash })
     }

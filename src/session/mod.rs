@@ -4,6 +4,7 @@
 //! renders, is recorded, and only then changes the session: whatever fails on the way, nothing has
 //! happened, and the request can be sent again.
 
+mod ahead;
 mod buffer;
 mod encode;
 mod engine;
@@ -25,7 +26,7 @@ use tokio::time::{Instant, timeout_at};
 use crate::config;
 use crate::geometry::Pose;
 use crate::render::View;
-use crate::residency::{Eye, Lens, Pinned, Reservation, Resident};
+use crate::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
 use crate::scene::rig::{Rig, RigCamera};
 
 pub use buffer::Buffer;
@@ -36,13 +37,16 @@ pub use episode::{Episode, History, Outcome, Summary};
 pub use error::SessionError;
 pub use golden::{Changed, Golden};
 pub use listing::{TrajectorySummary, TwinSummary};
-pub use observation::{DType, Frame, HEADER_PREFIX_BYTES, Image, Tensor, TensorKind, Timings};
+pub use observation::{
+    DType, Frame, HEADER_PREFIX_BYTES, Image, Residency, Tensor, TensorKind, Timings,
+};
 pub use opening::{Opening, Outputs, RigChoice, Start};
 pub use record::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs, RecordedVersion,
 };
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 
+use ahead::{Ahead, Route};
 pub(crate) use observation::eyes;
 use observation::{Assembly, Layout};
 use opening::{choose_cameras, resolve_start};
@@ -64,6 +68,12 @@ pub struct Session {
     /// Number of the current episode's file, and the file once something was rendered.
     episode_number: u64,
     recorder: Option<Recorder>,
+    /// The recorded drive that the agent may follow, and where it says that it goes.
+    route: Option<Arc<Route>>,
+    hint: Vec<Pose>,
+    /// When the last frame was ready, and how long after the one before.
+    last_frame: Instant,
+    frame_took: Duration,
 }
 
 impl Session {
@@ -98,8 +108,15 @@ impl Session {
             Some(start) => resolve_start(&resident, start)?,
             None => manifest.trajectories.first().map_or(Pose::IDENTITY, |log| log.at_station(0.0)),
         };
+        let named = match &opening.start {
+            Some(Start::Station { trajectory, .. }) => Some(trajectory),
+            _ => None,
+        };
+        let mut logs = manifest.trajectories.iter();
+        let route = logs.find(|log| named.is_none_or(|name| log.name == *name));
+        let route = route.map(|log| Arc::new(Route::new(log)));
         let reservation = Engine::reserve(resident.clone(), lens).await?;
-        Ok(Self {
+        let session = Self {
             profile_hash: record::profile_hash(&manifest.profile),
             rig_name,
             layout: Arc::new(layout),
@@ -112,7 +129,15 @@ impl Session {
             engine,
             reservation,
             name,
-        })
+            route,
+            hint: Vec::new(),
+            last_frame: Instant::now(),
+            // As fast as the clock, until it is known.
+            frame_took: Duration::from_micros(dt_us.unsigned_abs()),
+        };
+        // The first look is likely to be at the start: it is loaded while the agent thinks.
+        session.expect(vec![(Urgency::Imminent, start)]);
+        Ok(session)
     }
 
     /// Moves the ego to its next pose (`world_from_rig`), lets `dt_us` pass and renders.
@@ -125,6 +150,7 @@ impl Session {
         let frame = self.draw(&next, vec![pose]).await?;
         self.record(FrameRequest::Step, &next, &[pose], &frame).await?;
         self.episode = next;
+        self.look_ahead();
         Ok(frame)
     }
 
@@ -159,7 +185,24 @@ impl Session {
         self.finish(Outcome::Completed).await;
         (self.recorder, self.episode_number) = (Some(recorder), number);
         self.episode = next;
+        self.hint.clear();
+        self.look_ahead();
         Ok(frame)
+    }
+
+    /// Loads what is seen from 1 to `config::PREFETCH_POSES` poses (`world_from_rig`), and between
+    /// them, as far as there is room: where the agent may go next, in order. Does not wait for it.
+    ///
+    /// # Errors
+    /// There are too many poses, or none.
+    pub fn prefetch(&mut self, poses: Vec<Pose>) -> Result<(), SessionError> {
+        if !(1..=config::PREFETCH_POSES).contains(&poses.len()) {
+            let must = format!("{}; 1 to {} are accepted", poses.len(), config::PREFETCH_POSES);
+            return Err(SessionError::OutOfRange { field: "poses", must });
+        }
+        self.hint = poses;
+        self.expect(self.ahead().places());
+        Ok(())
     }
 
     /// Sees another version of the twin from now on, or its latest; the episode goes on.
@@ -188,6 +231,9 @@ impl Session {
             append(recorder, Line::Version(switched)).await?;
         }
         (self.reservation, self.profile_hash) = (reservation, profile_hash);
+        let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
+        places.extend(self.ahead().places());
+        self.expect(places);
         Ok(())
     }
 
@@ -271,6 +317,7 @@ impl Session {
             let views = View::of_rig(self.layout.cameras(), world_from_rig);
             // Before the job is queued: no render thread waits for a disk.
             let pinned = self.pin(deadline, eyes(&views)).await?;
+            let (waited_for, waited) = (pinned.waited_for, pinned.waited);
             let profile = self.resident().version.manifest.profile;
             let (drawn, queued) = self
                 .engine
@@ -280,8 +327,44 @@ impl Session {
                 .await?;
             assembly = drawn?;
             assembly.add_queue_time(queued);
+            assembly.add_waiting(waited_for, waited);
         }
-        assembly.finish()
+        let stats = self.resident().stats();
+        assembly.finish(stats.held_bytes, stats.limit_bytes)
+    }
+
+    /// Loads what the next steps will need, while the agent thinks.
+    fn look_ahead(&mut self) {
+        self.frame_took = self.last_frame.elapsed();
+        self.last_frame = Instant::now();
+        self.hint = ahead::rest(&self.hint, self.episode.world_from_rig()).to_vec();
+        self.expect(self.ahead().places());
+    }
+
+    /// What is known of where the ego goes.
+    fn ahead(&self) -> Ahead<'_> {
+        let (least, most) = config::PREFETCH_AHEAD;
+        let ahead = (3 * self.resident().stats().load_p99).clamp(least, most);
+        let steps = ahead.as_secs_f64() / self.frame_took.as_secs_f64().max(1e-3);
+        Ahead {
+            now: self.episode.world_from_rig(),
+            last_step_m: self.episode.velocity_m_s() * (self.dt_us as f64 * 1e-6),
+            steps: (steps.ceil() as usize).min(config::STEPS_AHEAD),
+            route: self.route.as_deref(),
+            hint: &self.hint,
+        }
+    }
+
+    /// Has what is seen from some places loaded by others.
+    fn expect(&self, places: Vec<(Urgency, Pose)>) {
+        let (reservation, layout) = (self.reservation.clone(), self.layout.clone());
+        // Nobody waits for it, and a defect in it is logged where it happens.
+        drop(tokio::task::spawn_blocking(move || {
+            let eyes_at = |(urgency, pose)| (urgency, eyes(&View::of_rig(layout.cameras(), pose)));
+            let places: Vec<_> = places.into_iter().map(eyes_at).collect();
+            let profile = &reservation.resident().version.manifest.profile;
+            reservation.prefetch(&places, profile);
+        }));
     }
 
     /// Waits until everything that a frame needs is in memory, all at once.

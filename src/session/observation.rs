@@ -68,6 +68,21 @@ pub struct Frame {
     pub history_count: usize,
     /// What it cost.
     pub timings: Timings,
+    /// What of it had to be loaded.
+    pub residency: Residency,
+}
+
+/// Memory behind an observation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Residency {
+    /// Bytes of Gaussians in memory, of all twins.
+    pub held_bytes: u64,
+    /// Bytes that there may be.
+    pub limit_bytes: u64,
+    /// Sections that were not in memory when it was asked for.
+    pub waited_for: usize,
+    /// How long it took until they were.
+    pub waited: Duration,
 }
 
 /// One image of a [`Frame`].
@@ -140,6 +155,7 @@ pub(super) struct Assembly {
     poses: usize,
     drawn: Vec<Drawn>,
     timings: Timings,
+    residency: Residency,
 }
 
 impl Layout {
@@ -225,6 +241,7 @@ impl Assembly {
             poses,
             drawn: Vec::with_capacity(images),
             timings: Timings::default(),
+            residency: Residency::default(),
         })
     }
 
@@ -304,8 +321,17 @@ impl Assembly {
         self.timings.queue += queued;
     }
 
+    pub(super) fn add_waiting(&mut self, waited_for: usize, waited: Duration) {
+        self.residency.waited_for += waited_for;
+        self.residency.waited += waited;
+    }
+
     /// Appends what was encoded and names every tensor.
-    pub(super) fn finish(mut self) -> Result<Frame, SessionError> {
+    pub(super) fn finish(
+        mut self,
+        held_bytes: u64,
+        limit_bytes: u64,
+    ) -> Result<Frame, SessionError> {
         let layout = self.layout;
         let files: Vec<&[u8]> = self.drawn.iter().map(|drawn| &drawn.file[..]).collect();
         self.buffer.append(&self.answers, &files)?;
@@ -342,6 +368,7 @@ impl Assembly {
             frame_hash,
             history_count: self.history_count,
             timings: self.timings,
+            residency: Residency { held_bytes, limit_bytes, ..self.residency },
         })
     }
 }

@@ -116,6 +116,7 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
         Request::Hello { seq, .. }
         | Request::Step { seq, .. }
         | Request::Observe { seq, .. }
+        | Request::Prefetch { seq, .. }
         | Request::Reset { seq, .. }
         | Request::SwitchVersion { seq, .. }
         | Request::Close { seq }

@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value, json};
 use wildcity::protocol::message::{Encoding, Pose, RigCamera};
-use wildcity::protocol::observation::{Ego, Image, Observation, Stage, Timings};
+use wildcity::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
 
 use super::messages::{front, rear};
 
@@ -231,6 +231,12 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> Observation 
                 Stage { name: "project".into(), ms: 2.0 },
                 Stage { name: "rasterize".into(), ms: 9.75 },
             ],
+        },
+        residency: Residency {
+            held_bytes: 30_000_000,
+            limit_bytes: 64_000_000,
+            waited_for: 2,
+            waited_us: 1_500,
         },
     }
 }

@@ -143,6 +143,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("step", Request::Step { seq: 3, pose: there, terminate: false }),
         ("step_terminate", Request::Step { seq: 4, pose: there, terminate: true }),
         ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
+        ("prefetch", Request::Prefetch { seq: 6, poses: vec![there, above] }),
         ("reset", Request::Reset { seq: 2, seed: 7, start: None }),
         ("reset_pose", Request::Reset { seq: 6, seed: 8, start: Some(start) }),
         ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
@@ -203,7 +204,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
             ..Outputs::default()
         },
         trajectories: vec![trajectory],
-        resident_bytes: 36_000_000,
+        reserved_bytes: 36_000_000,
     };
     let switched = Answer::Switched {
         seq: 8,
@@ -233,6 +234,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("welcome", welcome),
         ("opened", Answer::Opened(Box::new(opened))),
         ("resumed", Answer::Resumed { seq: 1, session, last_seq: 4, step: 2, time_us: 200_000 }),
+        ("ok", Answer::Ok { seq: 6 }),
         ("switched", switched),
         ("closed", Answer::Closed { seq: 8, summary }),
         ("error", refused),

@@ -33,9 +33,9 @@ fn seqs(requests: &[Request]) -> Vec<u64> {
 
 #[tokio::test]
 async fn a_whole_conversation() {
-    let closed = Reply::Golden("closed");
+    let (ok, closed) = (Reply::Golden("ok"), Reply::Golden("closed"));
     let (server, mut client) =
-        opened(vec![vec![HELLO, OPEN, SEEN, SEEN, SEEN, SEEN, closed]]).await;
+        opened(vec![vec![HELLO, OPEN, SEEN, SEEN, SEEN, SEEN, ok, closed]]).await;
     assert_eq!(client.welcome().twins[0].name, "street");
     assert_eq!(client.reset(7, None).await.unwrap().metadata().seq, 2);
     let seen = client.step(HERE).await.unwrap();
@@ -43,11 +43,12 @@ async fn a_whole_conversation() {
     assert!(seen.camera("left").is_none());
     client.last_step(HERE).await.unwrap();
     client.observe(&[HERE, HERE]).await.unwrap();
+    client.prefetch(&[HERE]).await.unwrap();
     assert_eq!(client.close().await.unwrap().outcome, Outcome::Completed);
     drop(client);
 
     let requests = server.requests().await.remove(0);
-    assert_eq!(seqs(&requests), [0, 1, 2, 3, 4, 5, 6]);
+    assert_eq!(seqs(&requests), [0, 1, 2, 3, 4, 5, 6, 7]);
     assert!(matches!(requests[3], Request::Step { pose: HERE, terminate: false, .. }));
     assert!(matches!(requests[4], Request::Step { terminate: true, .. }));
 }

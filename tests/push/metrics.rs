@@ -6,7 +6,8 @@ use tokio::net::TcpStream;
 use crate::support::TestServer;
 use crate::{get, in_cell, push};
 
-async fn scrape(server: &TestServer) -> String {
+/// The text of `/metrics`, its header included.
+pub(crate) async fn scrape(server: &TestServer) -> String {
     let mut stream = TcpStream::connect(server.address()).await.unwrap();
     let request = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
     stream.write_all(request).await.unwrap();
@@ -38,10 +39,18 @@ async fn what_happened_is_counted() {
         "wildcity_refusals_total{code=\"unknown_upload\"} 1",
         "wildcity_pushes_total{outcome=\"ready\"} 1",
         "wildcity_pushes_total{outcome=\"refused\"} 1",
+        "wildcity_residency_failed_damaged_total 0",
         "# EOF",
     ] {
         assert!(text.lines().any(|found| found == line), "no {line:?} in\n{text}");
     }
     assert!(text.contains("application/openmetrics-text"), "{text}");
+    let number = |name: &str| {
+        let line = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+        line.unwrap_or_else(|| panic!("no {name} in\n{text}")).parse::<f64>().unwrap()
+    };
+    assert!(number("wildcity_residency_loads_total") >= 1.0);
+    assert!(number("wildcity_residency_held_sections") >= 1.0);
+    assert!(number("wildcity_residency_limit_bytes") > 1e6);
     assert!(scrape(&idle).await.lines().any(|line| line == "wildcity_steps_total 0"));
 }

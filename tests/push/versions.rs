@@ -9,10 +9,13 @@ use serde_json::json;
 use wildcity::client::PushState;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
-use wildcity::session::{Extent, Recording};
+use wildcity::session::{
+    Encoding, Engine, EngineSettings, Extent, Opening, Outputs, Recording, Session,
+};
 use wildcity::store::Catalog;
 
-use crate::support::{Agent, Seen, TestServer, pose, refused};
+use crate::metrics::scrape;
+use crate::support::{Agent, PATIENCE, Seen, TestServer, pose, refused};
 use crate::{get, in_cell, push};
 
 /// Versions that are pushed while agents drive.
@@ -151,6 +154,65 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     forgetful.versions.clear();
     let difference = replay(&forgetful).difference.expect("the wrong version is noticed");
     assert_eq!(difference.line, 4);
+}
+
+/// While a new version is made ready, who opens the latest gets the one before.
+#[tokio::test]
+async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
+    let server = TestServer::start().await;
+    push(&server, &in_cell([0, 0], 60, 1), |_| {}).await;
+    let episodes = tempfile::tempdir().unwrap();
+    let engine = Engine::start(EngineSettings {
+        cache: Cache::new(Catalog::open(server.twins.path()).unwrap()),
+        episodes: episodes.path().to_owned(),
+        backend: server.painter.clone(),
+        step_timeout: PATIENCE,
+    });
+    let engine = engine.unwrap();
+    let latest = async || {
+        let opening = Opening {
+            twin: "test".to_owned(),
+            version: None,
+            seed: 0,
+            start: None,
+            rig: None,
+            outputs: Outputs {
+                cameras: None,
+                encoding: Encoding::Raw,
+                depth: false,
+                opacity: false,
+            },
+            dt_us: None,
+            deadline: None,
+        };
+        let session = Session::open(engine.clone(), "a".to_owned(), opening).await.unwrap();
+        session.resident().version.number
+    };
+    assert_eq!(latest().await, 2);
+    let held = engine.hold_latest("test", 1);
+    assert_eq!(latest().await, 1);
+    drop(held);
+    assert_eq!(latest().await, 2);
+}
+
+/// What a session needs of a new version is in memory when the push is ready.
+#[tokio::test]
+async fn a_ready_version_does_not_keep_its_sessions_waiting() {
+    let server = rendering(None).await;
+    let mut agent = driver(&server, "a").await;
+    agent.step(1.0).await;
+    push(&server, &in_cell([0, 0], 60, 1), |_| {}).await;
+    let waits = async || {
+        let text = scrape(&server).await;
+        let line =
+            text.lines().find_map(|line| line.strip_prefix("wildcity_residency_waits_total "));
+        line.expect("a count of waits").parse::<u64>().unwrap()
+    };
+    let before = waits().await;
+    let switched = agent.ask(json!({ "type": "switch_version" })).await;
+    assert_eq!(switched["version"], 2, "{switched}");
+    agent.step(1.0).await;
+    assert_eq!(waits().await, before);
 }
 
 #[tokio::test]

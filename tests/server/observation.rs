@@ -50,8 +50,24 @@ async fn nothing_of_what_was_opened_is_implicit() {
         "depth": false, "opacity": false,
     });
     assert_eq!(opened["outputs"], outputs);
-    assert!(opened["resident_bytes"].as_u64().unwrap() > 64 * 11 * 4);
+    assert!(opened["reserved_bytes"].as_u64().unwrap() > 64 * 11 * 4);
     assert_eq!(agent.ask(json!({ "type": "close" })).await["summary"]["steps"], 0);
+}
+
+#[tokio::test]
+async fn observations_tell_what_they_waited_for_and_hints_are_taken() {
+    let server = TestServer::start().await;
+    let mut agent = open(&server, json!({})).await;
+    assert_eq!(agent.ask(json!({ "type": "prefetch", "poses": [pose(1.0)] })).await["type"], "ok");
+    let first = agent.step(0.0).await.meta["residency"].clone();
+    assert!(first["held_bytes"].as_u64().unwrap() > 0);
+    assert!(first["held_bytes"].as_u64() <= first["limit_bytes"].as_u64());
+    // Everything is near everything here, so that the second frame finds it.
+    let second = agent.step(1.0).await.meta["residency"].clone();
+    assert_eq!((&second["waited_for"], &second["waited_us"]), (&json!(0), &json!(0)));
+    let answer = agent.ask(json!({ "type": "prefetch", "poses": [] })).await;
+    crate::support::refused(&answer, "out_of_range");
+    assert_eq!(answer["field"], "poses");
 }
 
 #[tokio::test]

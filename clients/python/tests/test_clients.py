@@ -40,7 +40,7 @@ def seqs(requests: list[dict[str, Any]]) -> list[int]:
 
 
 def test_a_whole_conversation(connect: Connect) -> None:
-    script: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, SEEN, "closed"]
+    script: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, SEEN, "ok", "closed"]
     with FakeServer(script) as server:
         with connect(server.url) as client, client.open("street") as session:
             assert client.welcome.twins[0].name == "street"
@@ -50,9 +50,10 @@ def test_a_whole_conversation(connect: Connect) -> None:
             assert seen.images["front"].shape == (3, 4, 3)
             assert np.isfinite(seen.depth["rear"]).all()
             session.observe([HERE, HERE])
+            session.prefetch([HERE])
     types = [request["type"] for request in server.requests[0]]
-    assert types == ["hello", "open", "reset", "step", "observe", "close"]
-    assert seqs(server.requests[0]) == [0, 1, 2, 3, 4, 5]
+    assert types == ["hello", "open", "reset", "step", "observe", "prefetch", "close"]
+    assert seqs(server.requests[0]) == [0, 1, 2, 3, 4, 5, 6]
 
 
 def test_a_session_closed_by_hand_is_not_closed_again(connect: Connect) -> None:

@@ -50,9 +50,12 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
+    "prefetch": lambda c: c.prefetch([HERE, ABOVE]),
     "reset": lambda c: c.reset(7, None),
     "reset_pose": lambda c: c.reset(8, HERE),
     "reset_station": lambda c: c.reset(9, LOG),
+    "switch_version": lambda c: c.switch_version(4),
+    "switch_latest": lambda c: c.switch_version(None),
     "close": lambda c: c.close(),
     "resume": lambda c: c.resume("run-17", 4),
 }

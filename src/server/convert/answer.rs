@@ -11,7 +11,7 @@ use crate::protocol::http::Refusal;
 use crate::protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use crate::protocol::observation::{Ego, Image, Observation, Stage, Timings};
+use crate::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
 use crate::scene::Rig;
 use crate::server::Limits as ServerLimits;
 use crate::server::fault::Fault;
@@ -82,7 +82,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
             .map(TrajectorySummary::of)
             .map(trajectory_info)
             .collect(),
-        resident_bytes: session.reserved_bytes(),
+        reserved_bytes: session.reserved_bytes(),
     })))
 }
 
@@ -95,6 +95,11 @@ pub(in crate::server) fn resumed(
     let episode = session.episode();
     let (step, time_us) = (episode.step(), episode.time_us());
     text(&Answer::Resumed { seq, session: session.name().to_owned(), last_seq, step, time_us })
+}
+
+/// To `prefetch`.
+pub(in crate::server) fn ok(seq: u64) -> Result<String, Fault> {
+    text(&Answer::Ok { seq })
 }
 
 /// To `switch_version`.
@@ -282,6 +287,12 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             render_ms: ms(timings.render),
             encode_ms: ms(timings.encode),
             stages_ms: timings.stages_ms.iter().map(stage).collect(),
+        },
+        residency: Residency {
+            held_bytes: frame.residency.held_bytes,
+            limit_bytes: frame.residency.limit_bytes,
+            waited_for: frame.residency.waited_for as u64,
+            waited_us: frame.residency.waited.as_micros() as u64,
         },
     }
 }

@@ -56,6 +56,11 @@ pub(in crate::server) enum Command {
         /// `world_from_rig` each.
         poses: Vec<Pose>,
     },
+    /// To have loaded what is seen from poses.
+    Prefetch {
+        /// `world_from_rig` each.
+        poses: Vec<Pose>,
+    },
     /// A new episode.
     Reset {
         /// Its seed.
@@ -176,14 +181,12 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, command)
         }
         Request::Observe { seq, poses } => {
-            let poses: Result<_, _> = poses
-                .iter()
-                // One more than is accepted tells the session that there are too many.
-                .take(config::OBSERVE_POSES + 1)
-                .enumerate()
-                .map(|(index, pose)| pose_of(&format!("poses[{index}]"), pose))
-                .collect();
+            let poses = poses_of(&poses, config::OBSERVE_POSES);
             (seq, poses.map(|poses| Command::Observe { poses }))
+        }
+        Request::Prefetch { seq, poses } => {
+            let poses = poses_of(&poses, config::PREFETCH_POSES);
+            (seq, poses.map(|poses| Command::Prefetch { poses }))
         }
         Request::Reset { seq, seed, start } => {
             let start = start.map(start_of).transpose();
@@ -263,6 +266,13 @@ fn name_of(field: &str, name: String) -> Result<String, Fault> {
 
 pub(super) fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
     Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
+}
+
+/// The poses of a request that may have so many.
+fn poses_of(poses: &[message::Pose], most: usize) -> Result<Vec<Pose>, Fault> {
+    // One more than is accepted tells the session that there are too many.
+    let poses = poses.iter().take(most + 1).enumerate();
+    poses.map(|(index, pose)| pose_of(&format!("poses[{index}]"), pose)).collect()
 }
 
 /// The number of something that has one but is no request.

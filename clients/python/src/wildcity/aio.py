@@ -178,6 +178,10 @@ class Session:
         """What would be seen from poses, without moving: one view for each."""
         return await self._client._run(self._conversation.observe(poses))
 
+    async def prefetch(self, poses: Sequence[Pose]) -> None:
+        """Has loaded what is seen from poses, in the order of the way. Does not wait for it."""
+        return await self._client._run(self._conversation.prefetch(poses))
+
     async def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
         """Starts a new episode, at the session's start if none is given."""
         return await self._client._run(self._conversation.reset(seed, start))

@@ -21,6 +21,7 @@ from .protocol import (
     OBSERVATION_BYTES,
     PROTOCOL,
     Closed,
+    Ok,
     Opened,
     Outputs,
     Pose,
@@ -96,6 +97,10 @@ class Conversation:
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
         """Looks."""
         return (yield from self._next("observe", Observation, {"poses": encode(poses)}))
+
+    def prefetch(self, poses: Sequence[Pose]) -> Exchange[None]:
+        """Says where it may go."""
+        yield from self._next("prefetch", Ok, {"poses": encode(poses)})
 
     def reset(self, seed: int, start: Pose | Station | None) -> Exchange[Observation]:
         """Begins an episode."""

@@ -161,7 +161,7 @@ class Opened:
     cameras: tuple[Camera, ...]
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
-    resident_bytes: int
+    reserved_bytes: int
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,13 @@ class Summary:
     steps: int
     time_us: int
     distance_m: float
+
+
+@dataclass(frozen=True)
+class Ok:
+    """Answer to prefetch."""
+
+    seq: int
 
 
 @dataclass(frozen=True)
@@ -270,6 +277,16 @@ class Timings:
 
 
 @dataclass(frozen=True)
+class Residency:
+    """The server's memory: what Gaussians take in it and may take, and what had to be waited for."""
+
+    held_bytes: int
+    limit_bytes: int
+    waited_for: int
+    waited_us: int
+
+
+@dataclass(frozen=True)
 class Metadata:
     """What an observation says beside its tensors."""
 
@@ -288,12 +305,14 @@ class Metadata:
     ego: Ego
     images: tuple[ImageInfo, ...]
     timings: Timings
+    residency: Residency
 
 
 ANSWERS: dict[str, type[Any]] = {
     "welcome": Welcome,
     "opened": Opened,
     "resumed": Resumed,
+    "ok": Ok,
     "switched": Switched,
     "closed": Closed,
     "error": Refusal,

@@ -192,6 +192,10 @@ class Session:
         """What would be seen from poses, without moving: one view for each."""
         return self._client._run(self._conversation.observe(poses))
 
+    def prefetch(self, poses: Sequence[Pose]) -> None:
+        """Has loaded what is seen from poses, in the order of the way. Does not wait for it."""
+        return self._client._run(self._conversation.prefetch(poses))
+
     def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
         """Starts a new episode, at the session's start if none is given."""
         return self._client._run(self._conversation.reset(seed, start))

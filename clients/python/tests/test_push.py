@@ -1,0 +1,189 @@
+"""Pushing to a real server: uploads resumed, refusals typed, versions switched."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import select
+import socket
+import struct
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import wildcity
+from wildcity import Camera, Pose, PushFailed, PushProgress, Refused, Rig
+
+RIG = Rig("one", (Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0, Pose((-15, 0, 1.5), (0.5, -0.5, 0.5, -0.5))),))
+TOKEN = "pusher-pusher-pusher"
+PLY = """ply
+format binary_little_endian 1.0
+element vertex {count}
+property float x
+property float y
+property float z
+property float f_dc_0
+property float f_dc_1
+property float f_dc_2
+property float opacity
+property float scale_0
+property float scale_1
+property float scale_2
+property float rot_0
+property float rot_1
+property float rot_2
+property float rot_3
+end_header
+"""
+
+
+def write_ply(path: Path, x: float, seed: int, count: int = 2000) -> Path:
+    """Gaussians about a place on the x axis."""
+    numbers = random.Random(seed)
+    with path.open("wb") as file:
+        file.write(PLY.format(count=count).encode())
+        for _ in range(count):
+            mean = [x + numbers.uniform(-9, 9), numbers.uniform(-9, 9), numbers.uniform(0, 3)]
+            colour = [numbers.uniform(-1, 1) for _ in range(3)]
+            file.write(struct.pack("<14f", *mean, *colour, 2, -2, -2, -2, 1, 0, 0, 0))
+    return path
+
+
+@contextlib.contextmanager
+def serving(folder: Path, *more: str) -> Iterator[str]:
+    """A server of its own; gives its http address."""
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    command = [binary, "serve", "--backend", "cpu", "--listen", "127.0.0.1:0", *more]
+    for name in ("twins", "episodes", "uploads"):
+        command += [f"--{name}", str(folder / name)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            yield line.strip().replace("listening on ws://", "http://").removesuffix("/v1/session")
+        finally:
+            process.terminate()
+            assert process.wait(timeout=20) == 0, "the server did not stop cleanly"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(tmp_path_factory.mktemp("push")) as address:
+        yield address
+
+
+def test_a_scene_becomes_a_twin_and_then_another_version(server: str, tmp_path: Path) -> None:
+    seen: list[PushProgress] = []
+    path = write_ply(tmp_path / "a.ply", 0.0, 1)
+    first = wildcity.push(path, twin="street", server=server, progress=seen.append)
+    assert (first.version, first.report["gaussians"]) == (1, 2000)
+    assert seen[0].state == "uploading" and seen[-1].state == "ready"
+    uploaded = [step.done for step in seen if step.state == "uploading"]
+    assert uploaded == sorted(uploaded) and uploaded[-1] == path.stat().st_size
+
+    url = server.replace("http://", "ws://") + "/v1/session"
+    with wildcity.connect(url) as client, client.open("street", rig=RIG) as session:
+        before = session.reset()
+        files = [write_ply(tmp_path / "b.ply", 64.0, 2), write_ply(tmp_path / "c.ply", 0.0, 3)]
+        second = wildcity.push(files, twin="street", server=server, base=1, note="two blocks")
+        assert second.version == 2
+        assert [cell["cell"] for cell in second.report["cells"]] == [[0, 0], [1, 0]]
+        assert session.reset().metadata.frame_hash == before.metadata.frame_hash
+        switched = session.switch_version()
+        assert (switched.version, switched.version_hash) == (2, second.version_hash)
+        after = session.reset()
+        assert after.metadata.version == 2
+        assert after.metadata.frame_hash != before.metadata.frame_hash
+    assert wildcity.rollback("street", 1, server=server) == 3
+
+
+def test_refusals_have_types(server: str, tmp_path: Path) -> None:
+    wildcity.push(write_ply(tmp_path / "a.ply", 0.0, 1), twin="road", server=server)
+    wildcity.push(write_ply(tmp_path / "b.ply", 0.0, 2), twin="road", server=server)
+    late = write_ply(tmp_path / "c.ply", 0.0, 3)
+    with pytest.raises(PushFailed) as conflict:
+        wildcity.push(late, twin="road", server=server, base=1)
+    assert (conflict.value.code, conflict.value.cells) == ("conflict", ((0, 0),))
+    with pytest.raises(Refused) as named:
+        wildcity.push(late, twin="road", server=server, base=1, cells=[(0, 0)])
+    assert named.value.code == "conflict"
+
+    bad = write_ply(tmp_path / "bad.ply", 0.0, 4)
+    with bad.open("r+b") as file:
+        file.seek(len(PLY.format(count=2000)) + 7 * 14 * 4 + 8)
+        file.write(struct.pack("<f", float("nan")))
+    with pytest.raises(PushFailed, match=r"Gaussian 7: z is NaN") as refused:
+        wildcity.push(bad, twin="road", server=server)
+    assert refused.value.code == "push_refused" and refused.value.report is not None
+    assert refused.value.report["files"][0]["bad"] == 1
+    with pytest.raises(ValueError, match="http"):
+        wildcity.push(bad, twin="road", server="localhost:8080")
+    with pytest.raises(wildcity.ConnectFailed):
+        wildcity.rollback("road", 1, server="http://127.0.0.1:1")
+
+
+def test_a_cut_upload_goes_on(server: str, tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "large.ply", 0.0, 5, count=60_000)
+    with Cutting(server, after_bytes=1_500_000) as address:
+        pushed = wildcity.push(path, twin="cut", server=address)
+    assert pushed.report["gaussians"] == 60_000
+
+
+class Cutting:
+    """A way to a server on which the first connection that carries much is cut."""
+
+    def __init__(self, server: str, after_bytes: int) -> None:
+        host, port = server.removeprefix("http://").split(":")
+        self.target, self.after_bytes, self.has_cut = (host, int(port)), after_bytes, False
+        self.listener = socket.create_server(("127.0.0.1", 0))
+
+    def __enter__(self) -> str:
+        threading.Thread(target=self.accept, daemon=True).start()
+        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
+
+    def __exit__(self, *_: object) -> None:
+        self.listener.close()
+        assert self.has_cut, "nothing was cut"
+
+    def accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near = self.listener.accept()[0]
+                far = socket.create_connection(self.target)
+                threading.Thread(target=self.carry, args=(near, far), daemon=True).start()
+
+    def carry(self, near: socket.socket, far: socket.socket) -> None:
+        """Both ways, until one side is done or the way is cut."""
+        carried = 0
+        with near, far, contextlib.suppress(OSError):
+            while True:
+                for one in select.select([near, far], [], [])[0]:
+                    if not (data := one.recv(65536)):
+                        return
+                    (far if one is near else near).sendall(data)
+                    carried += len(data)
+                    if not self.has_cut and carried > self.after_bytes:
+                        self.has_cut = True
+                        return
+
+
+def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens = tmp_path / "tokens.json"
+    tokens.write_text(f'{{"tokens": [{{"name": "ci", "role": "push", "token": "{TOKEN}"}}]}}')
+    path = write_ply(tmp_path / "a.ply", 0.0, 1)
+    with serving(tmp_path, "--tokens", str(tokens)) as address:
+        with pytest.raises(Refused) as nobody:
+            wildcity.push(path, twin="street", server=address)
+        assert nobody.value.code == "unauthorized"
+        assert wildcity.push(path, twin="street", server=address, token=TOKEN).version == 1
+        monkeypatch.setenv("WILDCITY_TOKEN", TOKEN)
+        with pytest.raises(Refused) as role:
+            wildcity.rollback("street", 1, server=address)
+        assert role.value.code == "forbidden"
+        url = address.replace("http://", "ws://") + "/v1/session"
+        with pytest.raises(wildcity.ConnectFailed, match="403"):
+            wildcity.connect(url, token=TOKEN)

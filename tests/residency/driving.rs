@@ -1,0 +1,216 @@
+//! Sessions that drive: through the engine, with a small budget, and over what breaks.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::{DQuat, DVec3};
+use wildcity::config;
+use wildcity::geometry::Pose;
+use wildcity::residency::{Cache, Needed, ResidencyError};
+use wildcity::scene::rig::{Rig, RigCamera};
+use wildcity::session::{
+    Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
+};
+
+use crate::source::{Fault, Faulty, Place};
+use crate::{PROFILE, demo, eyes, unlimited, views};
+
+/// An engine with its own room for episodes.
+struct Bench {
+    engine: Arc<Engine>,
+    _episodes: tempfile::TempDir,
+}
+
+fn bench(cache: Cache) -> Bench {
+    let episodes = tempfile::tempdir().unwrap();
+    let engine = Engine::start(EngineSettings {
+        cache,
+        episodes: episodes.path().to_owned(),
+        backend: Arc::new(crate::images::cpu()),
+        step_timeout: config::STEP_TIMEOUT,
+    });
+    Bench { engine: engine.unwrap(), _episodes: episodes }
+}
+
+/// The two cameras of the other tests, as a rig.
+fn rig() -> Rig {
+    let cameras = views(Pose::IDENTITY).into_iter().zip(["front", "left"]);
+    let camera = |(view, name): (wildcity::render::View, &str)| RigCamera {
+        name: name.to_owned(),
+        camera: view.camera,
+        rig_from_camera: view.world_from_camera,
+    };
+    Rig { name: "pair".to_owned(), cameras: cameras.map(camera).collect() }
+}
+
+impl Bench {
+    async fn session(
+        &self,
+        name: &str,
+        deadline: Option<Duration>,
+    ) -> Result<Session, SessionError> {
+        let outputs =
+            Outputs { cameras: None, encoding: Encoding::Raw, depth: false, opacity: false };
+        let opening = Opening {
+            twin: "demo".to_owned(),
+            version: None,
+            seed: 0,
+            start: Some(wildcity::session::Start::Pose(demo().at(0.0))),
+            rig: Some(RigChoice::Full(rig())),
+            outputs,
+            dt_us: None,
+            deadline,
+        };
+        Session::open(self.engine.clone(), name.to_owned(), opening).await
+    }
+}
+
+/// Hashes of a frame's images.
+fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
+    frame.images.iter().map(|image| image.hash).collect()
+}
+
+/// A section that frames from 250 m on need, and earlier ones do not.
+fn later_section() -> Place {
+    let resident = unlimited().open("demo", None).unwrap();
+    let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
+    let early: Vec<Needed> = (0..25).flat_map(|k| at(10.0 * f64::from(k))).collect();
+    let only_late: Vec<_> = at(250.0).into_iter().filter(|n| !early.contains(n)).collect();
+    let Needed { chunk, section } = only_late[0];
+    let chunk = &resident.version.manifest.chunks[chunk];
+    (chunk.cell, chunk.sections[section].block, chunk.sections[section].level)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn thirty_metres_a_second_wait_for_nothing_once_under_way() {
+    let all = unlimited().open("demo", None).unwrap();
+    let lens = wildcity::residency::Lens { focal_px: 70.0, radius_m: 1.7 };
+    let limit_bytes = all.worst_bytes(lens) * 3 / 2;
+    assert!(limit_bytes < all.whole_bytes() / 2, "else all of it fits");
+    let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
+    let mut session = bench.session("a", None).await.unwrap();
+    let mut waited = Vec::new();
+    for step in 0..180 {
+        // What an agent thinks: a quarter of what it may, so that it drives at 120 m/s.
+        tokio::time::sleep(Duration::from_millis(25)).await;
+        let frame = session.step(demo().at(3.0 * f64::from(step)), false).await.unwrap();
+        assert!(frame.residency.held_bytes <= limit_bytes);
+        assert_eq!(frame.residency.limit_bytes, limit_bytes);
+        waited.push(frame.residency.waited_for);
+    }
+    assert!(waited[20..].iter().all(|&sections| sections == 0), "{waited:?}");
+    let stats = bench.engine.residency();
+    assert!(stats.evictions > 0, "{stats:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hint_is_loaded_before_it_is_driven() {
+    let bench = bench(unlimited());
+    let mut session = bench.session("a", None).await.unwrap();
+    session.reset(0, None).await.unwrap();
+    let there = demo().at(400.0);
+    session.prefetch(vec![there]).unwrap();
+    let began = std::time::Instant::now();
+    let resident = session.resident().clone();
+    // Until it stops loading: then a jump there finds everything.
+    let mut before = u64::MAX;
+    while before != resident.stats().loads || before == 0 {
+        assert!(began.elapsed() < crate::PATIENCE);
+        before = resident.stats().loads;
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    let frame = session.step(there, false).await.unwrap();
+    assert_eq!(frame.residency.waited_for, 0);
+    let frame = session.step(demo().at(550.0), false).await.unwrap();
+    assert!(frame.residency.waited_for > 0 && !frame.residency.waited.is_zero());
+    let far = Pose { position_m: DVec3::ZERO, rotation: DQuat::IDENTITY };
+    for count in [0, config::PREFETCH_POSES + 1] {
+        let refused = session.prefetch(vec![far; count]).unwrap_err();
+        assert!(matches!(refused, SessionError::OutOfRange { field: "poses", .. }), "{refused}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on() {
+    let truth = bench(unlimited());
+    let mut healthy = truth.session("healthy", None).await.unwrap();
+    for fault in [Fault::Damaged, Fault::Hangs] {
+        let source = Arc::new(Faulty::new(demo().catalog()));
+        source.break_section(later_section(), fault);
+        let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
+        let deadline = Some(Duration::from_millis(600));
+        let mut driver = bench.session("driver", deadline).await.unwrap();
+        let mut other = bench.session("other", deadline).await.unwrap();
+        let mut stopped_at = None;
+        for step in 0..40_u32 {
+            let pose = demo().at(10.0 * f64::from(step));
+            match driver.step(pose, false).await {
+                Ok(frame) => {
+                    let wanted = healthy.observe(vec![pose]).await.unwrap();
+                    assert_eq!(hashes(&frame), hashes(&wanted), "step {step}");
+                }
+                Err(error) => {
+                    match (fault, error) {
+                        (Fault::Damaged, SessionError::Residency(error)) => {
+                            assert!(matches!(error, ResidencyError::Load { .. }), "{error}");
+                        }
+                        (_, SessionError::Residency(error)) => {
+                            assert!(matches!(error, ResidencyError::Late { .. }), "{error}");
+                        }
+                        (_, error) => panic!("{error}"),
+                    }
+                    stopped_at = Some(step);
+                    break;
+                }
+            }
+        }
+        // Nothing has happened to the session, and others drive.
+        let stopped_at = stopped_at.expect("the section was never needed");
+        assert_eq!(driver.episode().step(), u64::from(stopped_at));
+        other.step(demo().at(0.0), false).await.unwrap();
+        source.heal();
+        for step in stopped_at..40 {
+            let pose = demo().at(10.0 * f64::from(step));
+            let frame = driver.step(pose, false).await.unwrap();
+            let wanted = healthy.observe(vec![pose]).await.unwrap();
+            assert_eq!(hashes(&frame), hashes(&wanted), "step {step}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frame_that_waits_for_a_disk_holds_up_nobody_elses() {
+    let source = Arc::new(Faulty::new(demo().catalog()));
+    let place = later_section();
+    source.break_section(place, Fault::Hangs);
+    let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
+    let mut waiting = bench.session("waiting", None).await.unwrap();
+    let mut other = bench.session("other", None).await.unwrap();
+    let stuck = tokio::spawn(async move { waiting.step(demo().at(250.0), false).await.map(drop) });
+    tokio::task::block_in_place(|| source.await_read(place));
+    for step in 0..5 {
+        other.step(demo().at(f64::from(step)), false).await.unwrap();
+    }
+    assert!(!stuck.is_finished());
+    source.heal();
+    stuck.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_that_does_not_fit_is_refused_and_one_that_closes_makes_room() {
+    let all = unlimited().open("demo", None).unwrap();
+    let probe = bench(unlimited());
+    let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
+    assert!(2 * reserved_bytes < all.whole_bytes());
+    let bench = bench(Cache::limited(demo().catalog(), Some(2 * reserved_bytes - 1)));
+    let first = bench.session("first", None).await.unwrap();
+    let refused = bench.session("second", None).await.unwrap_err();
+    assert!(refused.to_string().contains(&reserved_bytes.to_string()), "{refused}");
+    first.close(wildcity::session::Outcome::Completed).await;
+    // Its last look ahead may hold it for a moment.
+    let began = std::time::Instant::now();
+    while bench.session("second", None).await.is_err() {
+        assert!(began.elapsed() < crate::PATIENCE);
+        tokio::task::yield_now().await;
+    }
+}
