@@ -170,6 +170,37 @@ pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 /// one of those who try succeeds, so that 32 may try at once.
 pub const PUBLISH_TRIES: u32 = 32;
 
+/// Largest lease or list of candidates for garbage collection: 20,000 hashes of 70 bytes are 1.4 MB.
+pub const NOTE_BYTES: u64 = 16 << 20;
+
+/// How long one request to an object store may take: a cell of 300 MB at 5 MB/s.
+pub const REMOTE_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How often such a request is made, at most.
+pub const REMOTE_TRIES: u32 = 5;
+
+/// How long to wait before the second try, twice as long before each further one: 0.1 + 0.2 + 0.4 +
+/// 0.8 = 1.5 s in all, after which a step still has time to fail by [`STEP_TIMEOUT`].
+pub const REMOTE_BACKOFF: Duration = Duration::from_millis(100);
+
+/// How often an object is read whose bytes are not those of its hash: damaged on the way, or there.
+pub const SOUND_TRIES: u32 = 3;
+
+/// Threads that wait for an object store's answers.
+pub const REMOTE_THREADS: usize = 2;
+
+/// Objects of one commit that are uploaded at once, each held in memory: cells of 10 MB.
+pub const UPLOADS_AT_ONCE: usize = 8;
+
+/// What is kept on disk of twins from elsewhere, in GiB, unless told otherwise: half of a log's 32 GB.
+pub const CACHE_GIB: u32 = 16;
+
+/// Versions that garbage collection keeps, unless told otherwise: a day of hourly pushes, twice.
+pub const GC_KEEP: u32 = 50;
+
+/// How long garbage stays, unless told otherwise: longer than any commit is in preparation.
+pub const GC_GRACE: &str = "24h";
+
 /// Largest rig or trajectory file: what fits a manifest.
 pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
 

@@ -9,7 +9,7 @@
 //! | [`scene`] | what a city twin is, its records and levels of detail | geometry |
 //! | [`generate`] | the procedural demo twin | geometry, scene |
 //! | [`ingest`] | one file per outside format | config, geometry, scene |
-//! | [`store`] | twins on disk, versioned, content-addressed | config, geometry, scene, ingest |
+//! | [`store`] | twins on disk or in an object store, versioned, content-addressed | config, geometry, scene, ingest |
 //! | [`residency`] | what is in memory now, what a frame draws | config, geometry, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
@@ -24,7 +24,8 @@
 //! # Invariants
 //!
 //! 1. `protocol` is a leaf; only `server` and `client` name it, `server` in `convert.rs`.
-//! 2. Only `store/objects.rs` opens files of a twin; only `server` names axum; only `render/gpu` wgpu.
+//! 2. Only `store/local` opens files of a twin, only `store/remote` talks to object stores; only `server`
+//!    names axum; only `render/gpu` wgpu.
 //! 3. `render` and `scene` are pure: the same input, the same bytes, whatever the thread count.
 //! 4. Scene data is checked once, at import. Poses and cameras are checked once, at the wire.
 //! 5. An image is a function of (scene version, render profile, poses, cameras).

@@ -2,10 +2,11 @@
 
 mod drive;
 mod gpu;
+mod load;
 mod step;
 mod timed;
 
-/// Time the renderer.
+/// Time the renderer, and reading twins.
 #[derive(Debug, clap::Args)]
 pub(super) struct Bench {
     #[command(subcommand)]
@@ -17,6 +18,7 @@ enum What {
     Step(step::Step),
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
+    Load(load::Load),
 }
 
 impl Bench {
@@ -25,6 +27,7 @@ impl Bench {
             What::Step(step) => step.run(),
             What::Gpu(gpu) => gpu.run(),
             What::Drive(drive) => drive.run(),
+            What::Load(load) => load.run(),
         }
     }
 }

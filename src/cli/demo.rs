@@ -67,6 +67,7 @@ impl Demo {
         let config = server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             twins,
+            cache: self.twins.cache(),
             episodes: self.out.join("episodes"),
             uploads: self.out.join("uploads"),
             tokens: None,

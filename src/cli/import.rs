@@ -11,7 +11,7 @@ use crate::ingest::{self, Axes};
 use crate::scene::manifest::Provenance;
 use crate::scene::rig::is_name;
 use crate::scene::{Record, RenderProfile, Rig, Trajectory};
-use crate::store::{Catalog, NewVersion, Storage, StoreError};
+use crate::store::{NewVersion, Storage, StoreError};
 
 use super::places::Twins;
 use super::progress;
@@ -124,7 +124,7 @@ impl Import {
         }
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
 
         let cannot = || format!("cannot import {}", self.source.display());
         let bar = progress::bytes("reading");

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::geometry::Bounds;
 use crate::scene::Manifest;
-use crate::store::{Catalog, Version};
+use crate::store::Version;
 
 use super::places::{TwinVersion, Twins};
 use super::time::utc;
@@ -32,7 +32,7 @@ Examples:
 
 impl Inspect {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         let mut out = io::stdout().lock();
         if self.json {

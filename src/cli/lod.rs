@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use crate::scene::Manifest;
-use crate::store::{Catalog, Version};
+use crate::store::Version;
 
 use super::places::{TwinVersion, Twins};
 use super::scene_source::Engine;
@@ -50,7 +50,7 @@ Examples:
 
 impl Lod {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         table(&mut io::stdout().lock(), &version)?;
         match &self.out {

@@ -20,7 +20,6 @@ mod scene_source;
 mod serve;
 mod time;
 mod twin;
-mod verify;
 
 use clap::{Parser, Subcommand};
 
@@ -40,7 +39,6 @@ enum Command {
     Inspect(inspect::Inspect),
     Push(push::Push),
     Lod(lod::Lod),
-    Verify(verify::Verify),
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
@@ -60,7 +58,6 @@ pub fn main() -> ExitCode {
         Command::Inspect(command) => command.run(),
         Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
-        Command::Verify(command) => command.run(),
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),

@@ -3,17 +3,43 @@
 use std::env;
 use std::path::PathBuf;
 
+use crate::config;
+use crate::store::{CacheSettings, Catalog};
+
 /// `--twins`, for every command that has it.
 #[derive(Debug, clap::Args)]
 pub(super) struct Twins {
-    /// Directory of the twins [default: $XDG_DATA_HOME/wildcity/twins, or
+    /// Directory of the twins, or s3://BUCKET/FOLDER, gs://.. or az://.., with credentials from the
+    /// environment (AWS_*, GOOGLE_*, AZURE_*) [default: $XDG_DATA_HOME/wildcity/twins, or
     /// ~/.local/share/wildcity/twins]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "PLACE")]
     twins: Option<PathBuf>,
+
+    /// Directory that keeps parts of twins from elsewhere [default: $XDG_CACHE_HOME/wildcity, or
+    /// ~/.cache/wildcity]
+    #[arg(long, value_name = "DIR")]
+    cache_dir: Option<PathBuf>,
+
+    /// How much it keeps, in GiB; 0 for nothing.
+    #[arg(long, value_name = "N", default_value_t = config::CACHE_GIB)]
+    cache_gib: u32,
 }
 
 impl Twins {
-    /// The directory given, or the user's own.
+    /// The twins there.
+    pub(super) fn catalog(&self) -> anyhow::Result<Catalog> {
+        Ok(Catalog::open_cached(&self.dir()?, self.cache().as_ref())?)
+    }
+
+    /// Where parts of remote twins are kept: nowhere without a home.
+    pub(super) fn cache(&self) -> Option<CacheSettings> {
+        let limit_bytes = u64::from(self.cache_gib) << 30;
+        let own = || Some(user_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
+        let dir = self.cache_dir.clone().or_else(own)?;
+        (limit_bytes > 0).then_some(CacheSettings { dir, limit_bytes })
+    }
+
+    /// The place given, or the user's own directory.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
         if let Some(dir) = &self.twins {
             return Ok(dir.clone());

@@ -7,7 +7,6 @@ use anyhow::Context;
 
 use crate::residency::Cache;
 use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
-use crate::store::Catalog;
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -57,7 +56,7 @@ impl Replay {
         if let Some(dir) = &self.out {
             output::make_dir(dir)?;
         }
-        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
         let backend = self.engine.backend_of(&header.backend)?;
 

@@ -22,7 +22,6 @@ use crate::render::{Backend, View};
 use crate::residency::{Cache, Pinned, Resident};
 use crate::scene::{RenderProfile, Scene};
 use crate::session;
-use crate::store::Catalog;
 
 use super::places::{TwinVersion, Twins};
 use super::progress;
@@ -339,7 +338,7 @@ impl SceneSource {
             return Ok((Source::File(scene), RenderProfile::default()));
         }
         let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
-        let cache = Cache::new(Catalog::open(&self.twins.dir()?)?);
+        let cache = Cache::new(self.twins.catalog()?);
         let resident = cache.open(&named.name, named.number).with_context(|| {
             format!("{:?} is no file, and as the name of a twin it fails", self.scene)
         })?;

@@ -11,7 +11,6 @@ use tracing_subscriber::EnvFilter;
 use crate::config;
 use crate::ingest;
 use crate::server::{self, Limits, Tokens};
-use crate::store::Catalog;
 
 use super::places::{Episodes, Twins, Uploads};
 use super::scene_source::{Engine, bytes_of_gib, gib};
@@ -84,7 +83,7 @@ impl Serve {
             "--twins {} is not a directory",
             twins.display()
         );
-        if Catalog::open(&twins)?.twins()?.is_empty() {
+        if self.twins.catalog()?.twins()?.is_empty() {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
@@ -92,6 +91,7 @@ impl Serve {
         let config = server::Config {
             listen: self.listen,
             twins,
+            cache: self.twins.cache(),
             episodes: self.episodes.dir()?,
             uploads: self.uploads.dir()?,
             tokens,

@@ -1,6 +1,8 @@
 //! `wildcity twin`.
 
 mod diff;
+mod fsck;
+mod gc;
 mod generate;
 mod list;
 mod log;
@@ -20,6 +22,8 @@ enum What {
     Log(log::Log),
     Diff(diff::Diff),
     Rollback(rollback::Rollback),
+    Gc(gc::Gc),
+    Fsck(fsck::Fsck),
 }
 
 impl Twin {
@@ -30,6 +34,8 @@ impl Twin {
             What::Log(log) => log.run(),
             What::Diff(diff) => diff.run(),
             What::Rollback(rollback) => rollback.run(),
+            What::Gc(gc) => gc.run(),
+            What::Fsck(fsck) => fsck.run(),
         }
     }
 }

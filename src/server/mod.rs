@@ -47,7 +47,7 @@ use crate::config;
 use crate::render::Backend;
 use crate::residency::Cache;
 use crate::session::{Engine, EngineSettings, SessionError};
-use crate::store::{Catalog, StoreError};
+use crate::store::{CacheSettings, Catalog, StoreError};
 
 use spool::Spool;
 
@@ -60,8 +60,10 @@ pub use spool::SpoolLimits;
 pub struct Config {
     /// Where to listen; port 0 takes a free one. Without tokens, a loopback address.
     pub listen: SocketAddr,
-    /// Directory of twins.
+    /// Directory of twins, or their URL.
     pub twins: PathBuf,
+    /// Where parts of twins at a URL are kept on disk.
+    pub cache: Option<CacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.
@@ -143,13 +145,14 @@ pub enum ServerError {
 /// The address is not a loopback address and there are no tokens, or it cannot be used, or a directory
 /// cannot. One for uploads that cannot be used is logged: whoever uploads is told.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, episodes, uploads, tokens, backend, limits } = config;
+    let Config { listen, twins, cache, episodes, uploads, tokens, backend, limits } = config;
     if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
     std::fs::create_dir_all(&episodes)
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
-    let cache = Cache::limited(Catalog::open(&twins)?, limits.resident_bytes);
+    let cache =
+        Cache::limited(Catalog::open_cached(&twins, cache.as_ref())?, limits.resident_bytes);
     let settings = EngineSettings { cache, episodes, backend, step_timeout: limits.step };
     let engine = Engine::start(settings)?;
     let failed = |cause| ServerError::Listen { address: listen, cause };
@@ -223,10 +226,11 @@ impl Default for Limits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, episodes, uploads, tokens, backend, limits } = self;
+        let Self { listen, twins, cache, episodes, uploads, tokens, backend, limits } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
+            .field("cache", cache)
             .field("episodes", episodes)
             .field("uploads", uploads)
             .field("tokens", &tokens.is_some())

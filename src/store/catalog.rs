@@ -1,7 +1,7 @@
 //! The twins of a directory and their versions.
 
-use std::io::Read as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::Deserialize;
 
@@ -10,14 +10,27 @@ use crate::scene::manifest::{ChunkEntry, Section};
 use crate::scene::rig::is_name;
 use crate::scene::{Chunk, Manifest, sh};
 
+use super::local::Local;
+use super::local::disk_cache::DiskCache;
 use super::log::LogRecord;
-use super::objects::{ObjectReader, Objects};
+use super::objects::{Objects, is_hash};
+use super::remote::{Patience, Remote, Traffic};
 use super::{StoreError, chunk_file, recover};
 
-/// A directory of twins.
+/// Twins in a directory or an object store.
 #[derive(Clone, Debug)]
 pub struct Catalog {
-    pub(super) objects: Objects,
+    pub(super) objects: Arc<dyn Objects>,
+    remote: Option<Remote>,
+}
+
+/// Where parts of remote twins are kept on disk.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CacheSettings {
+    /// The directory, made if need be; processes may share it.
+    pub dir: PathBuf,
+    /// How much it may hold, in bytes.
+    pub limit_bytes: u64,
 }
 
 /// One line of a listing: a twin and its latest version.
@@ -45,17 +58,57 @@ pub struct Version {
 }
 
 impl Catalog {
-    /// Opens a directory of twins, which need not exist yet, and cleans up after killed imports.
+    /// Opens a directory of twins, which need not exist yet, and cleans up after killed commits; or
+    /// the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
+    /// credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed, or the rest of a killed import cannot be removed.
+    /// The directory cannot be listed, or the rest of a killed commit cannot be removed;
+    /// [`StoreError::Url`].
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
-        let catalog = Self { objects: Objects::new(dir) };
+        Self::open_cached(dir, None)
+    }
+
+    /// As [`Catalog::open`], and keeps parts of remote twins on disk; local ones need none of that.
+    ///
+    /// # Errors
+    /// As [`Catalog::open`]; the cache's directory cannot be made.
+    pub fn open_cached(place: &Path, cache: Option<&CacheSettings>) -> Result<Self, StoreError> {
+        let url = place.to_str().filter(|place| place.contains("://"));
+        let catalog = match (url, url.and_then(|url| url.strip_prefix("file://"))) {
+            (_, Some(dir)) => Self { objects: Arc::new(Local::new(Path::new(dir))), remote: None },
+            (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
+            (None, None) => Self { objects: Arc::new(Local::new(place)), remote: None },
+        };
         recover::clean(&catalog)?;
         Ok(catalog)
     }
 
-    /// The directory.
+    /// Twins within an object store that is open already, all keys beginning with `prefix`; `url` is
+    /// what messages call it.
+    ///
+    /// # Errors
+    /// The prefix is none, or the cache's directory cannot be made.
+    pub fn over(
+        store: Arc<dyn object_store::ObjectStore>,
+        url: &str,
+        prefix: &str,
+        cache: Option<&CacheSettings>,
+        patience: Patience,
+    ) -> Result<Self, StoreError> {
+        Remote::over(store, url, prefix, open_cache(cache)?, patience).map(Self::remote)
+    }
+
+    fn remote(remote: Remote) -> Self {
+        Self { objects: Arc::new(remote.clone()), remote: Some(remote) }
+    }
+
+    /// What was asked of the object store since it was opened; none for a directory.
+    pub fn traffic(&self) -> Option<Traffic> {
+        self.remote.as_ref().map(Remote::traffic)
+    }
+
+    /// The directory, or the URL.
     pub fn dir(&self) -> &Path {
         self.objects.root()
     }
@@ -78,7 +131,8 @@ impl Catalog {
     /// Reads one version of a twin, or the latest, and checks it against its hash.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`] or [`StoreError::NoVersion`] for what was asked;
+    /// [`StoreError::Name`], [`StoreError::NoTwin`], [`StoreError::NoVersion`] or
+    /// [`StoreError::Collected`] for what was asked;
     /// [`StoreError::Damaged`] or [`StoreError::Format`] for what was found.
     pub fn version(&self, name: &str, number: Option<u64>) -> Result<Version, StoreError> {
         let numbers = self.numbers(name)?;
@@ -86,6 +140,9 @@ impl Catalog {
         let number = number.unwrap_or(latest);
         if !numbers.contains(&number) {
             return Err(StoreError::NoVersion { name: name.to_owned(), number, latest });
+        }
+        if self.collected(name)?.contains(&number) {
+            return Err(StoreError::Collected { name: name.to_owned(), number });
         }
         let LogRecord { manifest: hash, created_us, .. } = self.record(name, number)?;
         let mut manifest = self.manifest(name, &hash)?;
@@ -106,17 +163,24 @@ impl Catalog {
     ) -> Result<Chunk, StoreError> {
         let Manifest { twin, sh_degree, record, .. } = &version.manifest;
         let end = section.offset_bytes.saturating_add(section.bytes.into());
-        let bytes = self.objects.read_range(twin, &chunk.object, section.offset_bytes..end)?;
-        let damaged = |reason: String| {
-            let path = self.objects.path(twin, &chunk.object);
+        let of_section = |path, reason| {
             let Section { block, level, .. } = section;
             StoreError::Damaged { path, reason: format!("block {block}, level {level}: {reason}") }
         };
-        let found = blake3::hash(&bytes);
-        if found != section.hash {
-            return Err(damaged(format!("its bytes hash to {}", found.to_hex())));
-        }
-        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record).map_err(damaged)
+        let bytes = self
+            .objects
+            .part(twin, &chunk.object, section.offset_bytes..end, &section.hash)
+            .map_err(|error| match error {
+                StoreError::Damaged { path, reason } => of_section(path, reason),
+                error => error,
+            })?;
+        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record)
+            .map_err(|reason| of_section(self.objects.path(twin, &chunk.object), reason))
+    }
+
+    /// Where a chunk's object lies: a path, or a URL.
+    pub fn object_path(&self, version: &Version, chunk: &ChunkEntry) -> PathBuf {
+        self.objects.path(&version.manifest.twin, &chunk.object)
     }
 
     /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
@@ -124,14 +188,10 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
-        let mut reader = self.objects.open(name, &chunk.object)?;
-        let path = reader.path().to_owned();
-        let mut start = Vec::new();
         let most = config::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
-        let read = (&mut reader).take(most as u64).read_to_end(&mut start);
-        read.map_err(StoreError::io("read", &path))?;
-        // The hash says more than what its first wrong byte led to.
-        reader.finish()?;
+        // The hash says more than what its first wrong byte led to, and is compared first.
+        let start = self.objects.start(name, &chunk.object, most)?;
+        let path = self.objects.path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)
             .map_err(|reason| StoreError::Damaged { path, reason })
     }
@@ -170,9 +230,9 @@ impl Catalog {
 
     /// Reads the sections of a manifest's chunks from its table.
     pub(super) fn fill(&self, manifest: &mut Manifest) -> Result<(), StoreError> {
-        let reader = self.objects.open(&manifest.twin, &manifest.table.object)?;
-        let path = reader.path().to_owned();
-        let table = read_whole(reader, "table", config::TABLE_BYTES)?;
+        let (twin, table) = (&manifest.twin, &manifest.table.object);
+        let path = self.objects.path(twin, table);
+        let table = self.objects.whole(twin, table, config::TABLE_BYTES)?;
         let Manifest { chunks, sh_degree, record, .. } = manifest;
         chunk_file::fill(chunks, *sh_degree, *record, &table)
             .map_err(|reason| StoreError::Damaged { path, reason })
@@ -180,9 +240,8 @@ impl Catalog {
 
     /// Reads a manifest without the sections of its chunks.
     pub(super) fn manifest(&self, name: &str, hash: &str) -> Result<Manifest, StoreError> {
-        let reader = self.objects.open(name, hash)?;
-        let path = reader.path().to_owned();
-        let bytes = read_whole(reader, "manifest", config::MANIFEST_BYTES)?;
+        let path = self.objects.path(name, hash);
+        let bytes = self.objects.whole(name, hash, config::MANIFEST_BYTES)?;
         let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
         // The format first: of a later one, nothing else is known.
         let Format { format } =
@@ -211,26 +270,6 @@ struct Format {
     format: u32,
 }
 
-fn read_whole(
-    mut reader: ObjectReader,
-    what: &str,
-    limit_bytes: u64,
-) -> Result<Vec<u8>, StoreError> {
-    let (path, bytes) = (reader.path().to_owned(), reader.size_bytes());
-    if bytes > limit_bytes {
-        let reason = format!("a {what} of {bytes} bytes is above {limit_bytes}");
-        return Err(StoreError::Damaged { path, reason });
-    }
-    let mut whole = Vec::with_capacity(bytes as usize);
-    (&mut reader)
-        .take(limit_bytes)
-        .read_to_end(&mut whole)
-        .map_err(StoreError::io("read", &path))?;
-    reader.finish()?;
-    Ok(whole)
-}
-
-/// Whether a text is 64 lower-case hex digits: it becomes a file name.
-fn is_hash(text: &str) -> bool {
-    text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
+fn open_cache(cache: Option<&CacheSettings>) -> Result<Option<DiskCache>, StoreError> {
+    cache.map(|CacheSettings { dir, limit_bytes }| DiskCache::open(dir, *limit_bytes)).transpose()
 }

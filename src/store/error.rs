@@ -11,7 +11,7 @@ use crate::scene::rig::RigError;
 use crate::scene::trajectory::TrajectoryError;
 
 /// Why a twin could not be read or written. A failed commit leaves nothing behind, except
-/// [`StoreError::NotSynced`].
+/// [`StoreError::NotSynced`] and [`StoreError::Unsettled`].
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The operating system refused.
@@ -49,6 +49,16 @@ pub enum StoreError {
         number: u64,
         /// The newest one.
         latest: u64,
+    },
+    /// The version's objects were removed.
+    #[error(
+        "version {number} of twin {name:?} was removed by `wildcity twin gc`: take a later one"
+    )]
+    Collected {
+        /// The twin.
+        name: String,
+        /// The version asked for.
+        number: u64,
     },
     /// Bytes on disk are not what was committed.
     #[error("{} is damaged: {reason}; import the twin again", path.display())]
@@ -134,6 +144,27 @@ pub enum StoreError {
         number: u64,
         /// What failed.
         cause: Box<StoreError>,
+    },
+    /// The answer to the last step of a commit was lost, and cannot be asked for.
+    #[error(
+        "whether version {number} of twin {name:?} is in place is not known ({cause}): look with \
+         `wildcity twin log`, and try again if it is not"
+    )]
+    Unsettled {
+        /// The twin.
+        name: String,
+        /// The version.
+        number: u64,
+        /// What failed.
+        cause: io::Error,
+    },
+    /// A URL of twins cannot be used.
+    #[error("cannot use {url} for twins: {reason}")]
+    Url {
+        /// The URL.
+        url: String,
+        /// What is wrong with it, or with the credentials.
+        reason: String,
     },
     /// The Gaussians of a commit cannot be used.
     #[error(transparent)]

@@ -64,8 +64,7 @@ pub(super) struct LogRecord {
 impl LogRecord {
     /// A record of now.
     pub(super) fn new(manifest: String, commit: &str, parent: Option<u64>, kind: Kind) -> Self {
-        let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let created_us = i64::try_from(since.as_micros()).unwrap_or(i64::MAX);
+        let created_us = now_us();
         Self { manifest, created_us, commit: Some(commit.to_owned()), parent, kind }
     }
 }
@@ -100,4 +99,10 @@ impl Catalog {
         }
         self.begin(name, Kind::Rollback, Storage::default())?.restore(old)
     }
+}
+
+/// Microseconds since 1970.
+pub(super) fn now_us() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_micros()).unwrap_or(i64::MAX)
 }

@@ -1,12 +1,19 @@
-//! Twins on disk: immutable versions, content-addressed.
+//! Twins on disk or in an object store: immutable versions, content-addressed.
 //!
 //! ```text
-//! <twins>/<name>/log/0000000001         which manifest version 1 is, and since when
+//! <twins>/<name>/log/0000000001         which manifest version 1 is, since when, and how it came about
 //! <twins>/<name>/objects/3f/3f9c...     manifests, their tables and chunks, named by their BLAKE3
+//! <twins>/<name>/leases/...             versions in use, and until when
+//! <twins>/<name>/gc/candidates          objects that no version needs, and since when
+//! <twins>/<name>/gc/collected           versions whose objects were removed
+//!
 //! <twins>/.staging/<name>@<commit>/     objects of a commit in the making, invisible to everyone
 //! <twins>/.staging/<name>@<commit>/lock held by its process as long as it lives
 //! <twins>/.staging/<name>.lock          held while a version is published
 //! ```
+//!
+//! What begins with `.staging` is of directories alone; in an object store, objects are uploaded to
+//! where they stay.
 //!
 //! Objects come first and the log's record last, put only if absent, so that whatever happens in
 //! the middle leaves the old version or the new one.
@@ -16,17 +23,24 @@ mod chunk_file;
 mod commit;
 mod diff;
 mod error;
+mod fsck;
+mod gc;
+mod lease;
+mod local;
 mod log;
 mod objects;
 mod pack;
 mod recover;
-mod verify;
+mod remote;
 mod whole;
 
-pub use catalog::{Catalog, Listing, Version};
+pub use catalog::{CacheSettings, Catalog, Listing, Version};
 pub use commit::{Change, Commit, Settings, Storage, Stored};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
+pub use fsck::{Checked, Damage, Verified};
+pub use gc::{Collected, Keep, Sum};
+pub use lease::Lease;
 pub use log::{Kind, LogEntry};
-pub use verify::{Damage, Verified};
+pub use remote::{Patience, Traffic};
 pub use whole::NewVersion;

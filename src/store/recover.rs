@@ -11,7 +11,7 @@ use super::{Catalog, StoreError};
 pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
     for name in catalog.objects.begun()? {
         // With a damaged version nobody knows what it named, so every object stays.
-        match catalog.objects.sweep(&name, || named(catalog, &name).ok()) {
+        match catalog.objects.sweep(&name, &|| named(catalog, &name).ok()) {
             Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
             cleaned => cleaned?,
         }
@@ -25,13 +25,11 @@ fn is_read_only(error: &io::Error) -> bool {
 
 /// Hashes of all objects that any version of a twin names.
 fn named(catalog: &Catalog, name: &str) -> Result<BTreeSet<String>, StoreError> {
-    let mut named = BTreeSet::new();
+    let (collected, mut named) = (catalog.collected(name)?, BTreeSet::new());
     for number in catalog.objects.numbers(name)? {
-        let hash = catalog.record(name, number)?.manifest;
-        let manifest = catalog.manifest(name, &hash)?;
-        named.extend(manifest.chunks.into_iter().map(|chunk| chunk.object));
-        named.insert(manifest.table.object);
-        named.insert(hash);
+        if !collected.contains(&number) {
+            named.extend(catalog.named_by(name, &catalog.record(name, number)?.manifest)?);
+        }
     }
     Ok(named)
 }

@@ -105,6 +105,7 @@ async fn public_addresses_are_refused() {
     let config = Config {
         listen: "0.0.0.0:0".parse().unwrap(),
         twins: server.twins.path().to_owned(),
+        cache: None,
         episodes: server.episodes.path().to_owned(),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,

@@ -132,6 +132,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let config = Config {
         listen: "127.0.0.1:0".parse().unwrap(),
         twins: twins.path().to_owned(),
+        cache: None,
         episodes: episodes.path().to_owned(),
         uploads: twins.path().join(".uploads"),
         tokens: None,

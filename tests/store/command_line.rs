@@ -95,7 +95,8 @@ fn import_inspect_and_verify_tell_what_is_there() {
     }
 
     let twins = dir.path().join("twins");
-    let verify = wildcity().args(["verify", "street", "--twins"]).arg(twins).output().unwrap();
+    let verify =
+        wildcity().args(["twin", "fsck", "street", "--twins"]).arg(twins).output().unwrap();
     let said = stdout(&verify);
     assert!(said.starts_with(&format!("twin street: {} objects, ", chunks.len() + 2)), "{said}");
     assert!(said.ends_with("all sound\n"));
@@ -234,10 +235,12 @@ fn help_teaches_with_examples() {
         ("import", "Memory: twice what the scene takes uncompressed"),
         ("import", "streamed SOG        lod-meta.json, or one .zip"),
         ("inspect", "wildcity inspect street@2"),
-        ("verify", "wildcity verify street"),
+        ("twin fsck", "wildcity twin fsck street"),
+        ("twin gc", "wildcity twin gc street --keep 20 --dry-run"),
     ] {
-        let said = stdout(&wildcity().args([command, "--help"]).output().unwrap());
-        assert!(said.contains(wanted) && said.contains("--twins <DIR>"), "{said}");
+        let command = command.split(' ');
+        let said = stdout(&wildcity().args(command).arg("--help").output().unwrap());
+        assert!(said.contains(wanted) && said.contains("--twins <PLACE>"), "{said}");
     }
 }
 

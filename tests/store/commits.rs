@@ -290,7 +290,7 @@ fn a_version_that_lost_an_object_does_not_come_back() {
     let path = dir.path().join("street/objects").join(&lost[..2]).join(lost);
     std::fs::remove_file(&path).unwrap();
     let said = catalog.rollback("street", 1).unwrap_err().to_string();
-    assert!(said.contains("cannot find") && said.contains(lost), "{said}");
+    assert!(said.contains("cannot open") && said.contains(lost), "{said}");
     std::fs::write(&path, "short").unwrap();
     let error = catalog.rollback("street", 1).unwrap_err();
     assert!(matches!(error, StoreError::Damaged { .. }), "{error}");

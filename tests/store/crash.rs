@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use wildcity::store::Catalog;
+use wildcity::store::{Catalog, Sum};
 
 use crate::scene_files::{gaussians, inria_columns, ply};
 use crate::{commit, files, street, wildcity};
@@ -94,6 +94,49 @@ fn a_killed_import_leaves_the_old_version_or_the_new_one() {
         killed_on_the_way >= 6,
         "only {killed_on_the_way} of 12 imports were killed on the way"
     );
+}
+
+/// Wherever it is killed: the points are spread over the time that an import takes.
+#[test]
+fn killed_at_a_hundred_points_nothing_is_lost() {
+    const POINTS: u32 = 100;
+    let dir = tempfile::tempdir().unwrap();
+    let twins = dir.path().join("twins");
+    let source = dir.path().join("new.ply");
+    write_ply(&source, 3_000, 1);
+    let import = || {
+        let mut import = wildcity();
+        import.arg("import").arg(&source).args(["--twin", "street", "--twins"]).arg(&twins);
+        import.stdout(Stdio::null());
+        import
+    };
+    let old = commit(&twins, street(&gaussians(1_000, 0, 220.0, 2))).unwrap();
+    let began = Instant::now();
+    assert!(import().status().unwrap().success());
+    let takes = began.elapsed();
+    let new = Catalog::open(&twins).unwrap().version("street", None).unwrap();
+    Catalog::open(&twins).unwrap().rollback("street", old.number).unwrap();
+    let (mut killed, mut left) = (0, 0);
+    for point in 0..POINTS {
+        let mut running = import().spawn().unwrap();
+        // Not to wait for anything: this is where it is killed.
+        std::thread::sleep(takes * point / POINTS);
+        killed += u32::from(running.try_wait().unwrap().is_none());
+        running.kill().unwrap();
+        running.wait().unwrap();
+        left += unfinished(&twins).len();
+        let catalog = Catalog::open(&twins).unwrap();
+        let now = catalog.version("street", None).unwrap();
+        assert!([&old.hash, &new.hash].contains(&&now.hash), "killed at {point}");
+        let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+        assert!(checked.is_sound() && !checked.staging, "killed at {point}: {checked:?}");
+        assert_eq!(checked.unreferenced, Sum::default(), "killed at {point}");
+        if now.hash == new.hash {
+            catalog.rollback("street", old.number).unwrap();
+        }
+    }
+    assert!(killed > POINTS / 4, "only {killed} of {POINTS} were killed on the way");
+    assert!(left > 0, "none was killed while it wrote");
 }
 
 #[test]

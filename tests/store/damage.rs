@@ -45,7 +45,7 @@ impl Twin {
         assert_eq!(named, [hash]);
 
         let mut verify = wildcity();
-        verify.args(["verify", "street", "--twins"]).arg(self.dir.path());
+        verify.args(["twin", "fsck", "street", "--twins"]).arg(self.dir.path());
         let output = verify.output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         let said = String::from_utf8(output.stdout).unwrap();

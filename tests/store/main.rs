@@ -2,6 +2,8 @@
 
 #[path = "../support/data.rs"]
 mod data;
+#[path = "../support/s3.rs"]
+mod s3;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
@@ -10,7 +12,10 @@ mod commits;
 mod crash;
 mod damage;
 mod demo;
+mod garbage;
+mod places;
 mod real_scenes;
+mod remote;
 mod round_trip;
 
 use std::path::{Path, PathBuf};

@@ -180,6 +180,7 @@ impl TestServer {
         let mut config = Config {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
             twins: twins.path().to_owned(),
+            cache: None,
             episodes: episodes.path().to_owned(),
             uploads: twins.path().join(".uploads"),
             tokens: None,

@@ -18,7 +18,6 @@ use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
 use crate::scene::{Manifest, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
-use crate::store::Catalog;
 
 use report::{Report, Row};
 
@@ -99,7 +98,7 @@ struct Step {
 
 impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         let limit_bytes = self.memory_gib.map(scene_source::bytes_of_gib);
         let scratch = Scratch::new()?;

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use crate::cli::places::Twins;
-use crate::store::{Catalog, CellDiff, CellSize, Diff as Differences};
+use crate::store::{CellDiff, CellSize, Diff as Differences};
 
 /// Show which cells differ between two versions of a twin: Gaussians and bytes, before and after.
 #[derive(Debug, clap::Args)]
@@ -27,7 +27,7 @@ pub(super) struct Diff {
 
 impl Diff {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = Catalog::open(&self.twins.dir()?)?;
+        let catalog = self.twins.catalog()?;
         let Differences { cells, kept, settings } =
             catalog.diff(&self.twin, self.before, self.after)?;
         let mut out = io::stdout().lock();

@@ -3,7 +3,6 @@
 use std::io::{self, Write};
 
 use crate::cli::places::Twins;
-use crate::store::Catalog;
 
 /// List all twins with their latest versions.
 #[derive(Debug, clap::Args)]
@@ -19,7 +18,7 @@ pub(super) struct List {
 impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
-        for twin in Catalog::open(&self.twins.dir()?)?.twins()? {
+        for twin in self.twins.catalog()?.twins()? {
             let (name, number, hash) = (&twin.name, twin.number, &twin.hash);
             if self.json {
                 let line = serde_json::json!({ "name": name, "number": number, "hash": hash });

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::places::Twins;
 use crate::cli::time::utc;
-use crate::store::{Catalog, LogEntry};
+use crate::store::LogEntry;
 
 /// Show all versions of a twin, from the first on: when, how, and made from which.
 #[derive(Debug, clap::Args)]
@@ -24,7 +24,7 @@ pub(super) struct Log {
 impl Log {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
-        for entry in Catalog::open(&self.twins.dir()?)?.versions(&self.twin)? {
+        for entry in self.twins.catalog()?.versions(&self.twin)? {
             let LogEntry { number, hash, created_us, commit, parent, kind } = entry;
             if self.json {
                 let line = serde_json::json!({

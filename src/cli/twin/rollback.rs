@@ -3,7 +3,6 @@
 use std::io::{self, Write};
 
 use crate::cli::places::Twins;
-use crate::store::Catalog;
 
 /// Make an old version of a twin the latest, under a new number.
 ///
@@ -26,7 +25,7 @@ pub(super) struct Rollback {
 
 impl Rollback {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let version = Catalog::open(&self.twins.dir()?)?.rollback(&self.twin, self.number)?;
+        let version = self.twins.catalog()?.rollback(&self.twin, self.number)?;
         let (name, number, hash) = (self.twin, version.number, version.hash);
         writeln!(io::stdout(), "twin {name} version {number} is version {}: {hash}", self.number)?;
         Ok(())

@@ -1,0 +1,100 @@
+//! `wildcity twin fsck`.
+
+use std::io::{self, Write};
+
+use crate::cli::places::Twins;
+use crate::cli::progress;
+use crate::store::Checked;
+
+/// Read every object of every version of a twin again and compare it with its hash; and look for what
+/// the log lost, and what no version names.
+///
+/// Exit code 0 if all is what was committed; otherwise 1, and what is not is named. Importing the same
+/// source again with the same options heals objects. What no version names is no loss: `gc` removes it.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "Example:\n  wildcity twin fsck street && wildcity serve")]
+pub(super) struct Fsck {
+    /// The twin's name.
+    #[arg(value_name = "TWIN")]
+    twin: String,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// Print what was found as one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Fsck {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let bar = progress::bytes("checking");
+        let checked = catalog.fsck(&self.twin, &mut progress::show(&bar))?;
+        bar.finish_and_clear();
+        let mut out = io::stdout().lock();
+        if self.json {
+            writeln!(out, "{}", json(&checked))?;
+        } else {
+            self.tell(&mut out, &checked)?;
+        }
+        let (damaged, objects) = (checked.verified.damaged.len(), checked.verified.objects);
+        anyhow::ensure!(damaged == 0, "{damaged} of {objects} objects are damaged");
+        anyhow::ensure!(checked.is_sound(), "the log of twin {} is damaged", self.twin);
+        Ok(())
+    }
+
+    fn tell(&self, out: &mut impl Write, checked: &Checked) -> io::Result<()> {
+        for damage in &checked.verified.damaged {
+            writeln!(out, "damaged {}: {}", damage.object, damage.error)?;
+        }
+        for gap in &checked.gaps {
+            writeln!(out, "lost version {gap}: the log has later ones, but not it")?;
+        }
+        for (number, error) in &checked.records {
+            writeln!(out, "lost version {number}: {error}")?;
+        }
+        if !checked.collected.is_empty() {
+            writeln!(out, "{} old versions were removed by gc", checked.collected.len())?;
+        }
+        let garbage = checked.unreferenced;
+        if garbage.objects > 0 {
+            let (objects, bytes) = (garbage.objects, garbage.bytes);
+            writeln!(out, "{objects} objects of {bytes} bytes belong to no version")?;
+        }
+        if checked.staging {
+            writeln!(out, "a commit is being made, or was killed: the next start cleans up")?;
+        }
+        if checked.is_sound() {
+            let (objects, bytes) = (checked.verified.objects, checked.verified.bytes);
+            writeln!(
+                out,
+                "twin {}: {objects} objects, {bytes} bytes of chunks, all sound",
+                self.twin
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn json(checked: &Checked) -> serde_json::Value {
+    let damaged = checked.verified.damaged.iter().map(
+        |damage| serde_json::json!({ "object": damage.object, "error": damage.error.to_string() }),
+    );
+    let records = checked
+        .records
+        .iter()
+        .map(|(number, error)| serde_json::json!({ "number": number, "error": error.to_string() }));
+    serde_json::json!({
+        "sound": checked.is_sound(),
+        "objects": checked.verified.objects,
+        "chunk_bytes": checked.verified.bytes,
+        "damaged": damaged.collect::<Vec<_>>(),
+        "gaps": checked.gaps,
+        "records": records.collect::<Vec<_>>(),
+        "collected": checked.collected,
+        "unreferenced_objects": checked.unreferenced.objects,
+        "unreferenced_bytes": checked.unreferenced.bytes,
+        "staging": checked.staging,
+    })
+}

@@ -1,0 +1,89 @@
+//! `wildcity twin gc`.
+
+use std::io::{self, Write};
+use std::time::Duration;
+
+use crate::cli::places::Twins;
+use crate::config;
+use crate::store::Keep;
+
+/// Remove objects of a twin that no version to be kept names.
+///
+/// In two steps: the first run notes what is garbage, and one after the grace period removes it. So run
+/// it every day. Versions that running servers use are kept, however old.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity twin gc street --keep 20 --dry-run
+  wildcity twin gc street --keep 20 --grace 24h")]
+pub(super) struct Gc {
+    /// The twin's name.
+    #[arg(value_name = "TWIN")]
+    twin: String,
+
+    /// How many of the latest versions are kept.
+    #[arg(long, value_name = "N", default_value_t = config::GC_KEEP,
+          value_parser = clap::value_parser!(u32).range(1..))]
+    keep: u32,
+
+    /// How long an object stays after it was found to be garbage, as 90s, 30m, 24h or 7d.
+    #[arg(long, value_name = "TIME", default_value = config::GC_GRACE, value_parser = duration)]
+    grace: Duration,
+
+    /// Only says what would be done.
+    #[arg(long)]
+    dry_run: bool,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+impl Gc {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let keep = Keep { versions: self.keep as usize, grace: self.grace };
+        let found = catalog.collect(&self.twin, keep, self.dry_run)?;
+        let kept: Vec<_> = found.kept.iter().map(u64::to_string).collect();
+        let removed = if self.dry_run { "would be removed" } else { "removed" };
+        writeln!(
+            io::stdout(),
+            "kept versions {}\n{removed} {} objects, {} bytes\nnoted {} objects, {} bytes",
+            kept.join(" "),
+            found.removed.objects,
+            found.removed.bytes,
+            found.noted.objects,
+            found.noted.bytes,
+        )?;
+        Ok(())
+    }
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    let wrong = || "expected a whole number and s, m, h or d, as 24h".to_owned();
+    let unit = text.chars().last().ok_or_else(wrong)?;
+    let seconds = match unit {
+        's' => 1,
+        'm' => 60,
+        'h' => 3_600,
+        'd' => 86_400,
+        _ => return Err(wrong()),
+    };
+    let number: u64 = text[..text.len() - 1].parse().map_err(|_| wrong())?;
+    number.checked_mul(seconds).map(Duration::from_secs).ok_or_else(wrong)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_have_a_unit() {
+        for (text, seconds) in [("0s", 0), ("90s", 90), ("30m", 1_800), ("24h", 86_400)] {
+            assert_eq!(duration(text).unwrap().as_secs(), seconds);
+        }
+        assert_eq!(duration("7d").unwrap().as_secs(), 7 * 86_400);
+        for text in ["", "24", "h", "-1h", "1.5h", "99999999999999999999d", "1 h", "1µ"] {
+            assert!(duration(text).unwrap_err().contains("as 24h"), "{text}");
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Parts of remote twins on the local disk, by hash, shared by all processes of a user.
+//!
+//! ```text
+//! <cache>/3f/3f9c...          sections, manifests and tables, named by the BLAKE3 of their bytes
+//! <cache>/~<process>.<n>      one that is being written
+//! <cache>/lock                held by the process that makes room
+//! ```
+//!
+//! Every part is compared with its hash when it is read, which costs less than decoding it. So nothing
+//! needs to be synced: what a power cut tore is fetched again. A part's time of modification is when
+//! it was last of use.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime};
+
+use crate::store::StoreError;
+use crate::store::objects::{check_hash, is_hash};
+
+use super::{WRITING, create_dirs, entries};
+
+/// A part whose time is older than this gets a new one when it is used.
+const TOUCH_AFTER: Duration = Duration::from_secs(60);
+/// How old a part is that its writer left behind, at least.
+const LEFT_AFTER: Duration = Duration::from_secs(3600);
+/// Room is made once this share of the limit was written since the last time, so that several
+/// processes together stay close to it.
+const SLACK: u64 = 16;
+
+/// A directory of parts.
+#[derive(Clone, Debug)]
+pub(in crate::store) struct DiskCache {
+    dir: PathBuf,
+    limit_bytes: u64,
+    counts: Arc<Counts>,
+}
+
+#[derive(Debug, Default)]
+struct Counts {
+    hits: AtomicU64,
+    misses: AtomicU64,
+    /// Files that were begun, for their names.
+    begun: AtomicU64,
+    /// Bytes written since room was made.
+    written: AtomicU64,
+}
+
+impl DiskCache {
+    /// Uses a directory, made if need be, for at most so many bytes.
+    ///
+    /// # Errors
+    /// It cannot be made or listed.
+    pub(in crate::store) fn open(dir: &Path, limit_bytes: u64) -> Result<Self, StoreError> {
+        create_dirs(dir)?;
+        let cache = Self { dir: dir.to_owned(), limit_bytes, counts: Arc::default() };
+        cache.make_room()?;
+        Ok(cache)
+    }
+
+    /// A part, if it is there and sound.
+    pub(in crate::store) fn get(&self, hash: &str) -> Option<Vec<u8>> {
+        let path = self.path(hash);
+        let bytes = fs::read(&path).ok();
+        let sound = bytes.filter(|bytes| {
+            let sound = check_hash(bytes, hash).is_ok();
+            if !sound {
+                // Fetched again, and put again: nobody needs to know.
+                let _ = fs::remove_file(&path);
+            }
+            sound
+        });
+        let counted = if sound.is_some() { &self.counts.hits } else { &self.counts.misses };
+        counted.fetch_add(1, Ordering::Relaxed);
+        if sound.is_some() {
+            touch(&path);
+        }
+        sound
+    }
+
+    /// Keeps a part that has this hash. A disk that is full or gone makes reading slow, not wrong, so
+    /// there is nothing to report.
+    pub(in crate::store) fn put(&self, hash: &str, bytes: &[u8]) {
+        let size = bytes.len() as u64;
+        if size > self.limit_bytes / SLACK {
+            return;
+        }
+        let begun = self.counts.begun.fetch_add(1, Ordering::Relaxed);
+        let writing = self.dir.join(format!("{WRITING}{}.{begun}", std::process::id()));
+        let path = self.path(hash);
+        let kept = fs::create_dir_all(self.dir.join(&hash[..2]))
+            .and_then(|()| fs::write(&writing, bytes))
+            .and_then(|()| fs::rename(&writing, &path));
+        if kept.is_err() {
+            let _ = fs::remove_file(&writing);
+        }
+        let written = self.counts.written.fetch_add(size, Ordering::Relaxed) + size;
+        if written > self.limit_bytes / SLACK {
+            self.counts.written.store(0, Ordering::Relaxed);
+            let _ = self.make_room();
+        }
+    }
+
+    pub(in crate::store) fn hits_and_misses(&self) -> (u64, u64) {
+        let load = |count: &AtomicU64| count.load(Ordering::Relaxed);
+        (load(&self.counts.hits), load(&self.counts.misses))
+    }
+
+    fn path(&self, hash: &str) -> PathBuf {
+        self.dir.join(&hash[..2]).join(hash)
+    }
+
+    /// Removes what was of no use for longest, until there is room for what is written before this
+    /// is done again. One process at a time; who comes meanwhile leaves it to that.
+    fn make_room(&self) -> Result<(), StoreError> {
+        let path = self.dir.join("lock");
+        let lock = File::options().create(true).append(true).open(&path);
+        let lock = lock.map_err(StoreError::io("create", &path))?;
+        if lock.try_lock().is_err() {
+            return Ok(());
+        }
+        let mut parts = Vec::new();
+        for folder in entries(&self.dir)? {
+            let path = self.dir.join(&folder);
+            if folder.starts_with(WRITING) {
+                if age(&path).is_some_and(|age| age > LEFT_AFTER) {
+                    let _ = fs::remove_file(&path);
+                }
+                continue;
+            }
+            for part in entries(&path)?.into_iter().filter(|part| is_hash(part)) {
+                let path = path.join(part);
+                // Another process may have removed it: it was damaged.
+                if let Ok(found) = fs::metadata(&path)
+                    && let Ok(used) = found.modified()
+                {
+                    parts.push((used, path, found.len()));
+                }
+            }
+        }
+        parts.sort_unstable();
+        let mut bytes: u64 = parts.iter().map(|(_, _, bytes)| bytes).sum();
+        for (_, path, size) in parts {
+            if bytes <= self.limit_bytes - self.limit_bytes / SLACK {
+                break;
+            }
+            fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
+            bytes -= size;
+        }
+        Ok(())
+    }
+}
+
+/// Notes that a part was of use. If that cannot be had, it is removed earlier than it should be.
+fn touch(path: &Path) {
+    if age(path).is_some_and(|age| age > TOUCH_AFTER)
+        && let Ok(file) = File::options().append(true).open(path)
+    {
+        let _ = file.set_modified(SystemTime::now());
+    }
+}
+
+fn age(path: &Path) -> Option<Duration> {
+    fs::metadata(path).and_then(|found| found.modified()).ok()?.elapsed().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hash(bytes: &[u8]) -> String {
+        blake3::hash(bytes).to_hex().to_string()
+    }
+
+    fn part(number: u8) -> Vec<u8> {
+        vec![number; 1_000]
+    }
+
+    fn sizes(dir: &Path) -> u64 {
+        let folders = fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path());
+        let files = folders.filter(|path| path.is_dir()).flat_map(|dir| fs::read_dir(dir).unwrap());
+        files.map(|entry| entry.unwrap().metadata().unwrap().len()).sum()
+    }
+
+    #[test]
+    fn what_is_put_is_there_for_everybody_until_there_is_no_room() {
+        let dir = tempfile::tempdir().unwrap();
+        let [one, two] = [(); 2].map(|()| DiskCache::open(dir.path(), 32_000).unwrap());
+        for number in 0..100 {
+            one.put(&hash(&part(number)), &part(number));
+            // The first one stays of use.
+            let path = one.path(&hash(&part(0)));
+            let old = SystemTime::now() - 2 * TOUCH_AFTER;
+            File::options().append(true).open(&path).unwrap().set_modified(old).unwrap();
+            assert_eq!(two.get(&hash(&part(0))), Some(part(0)), "after {number}");
+            assert!(sizes(dir.path()) <= 32_000 + 2_000, "{} after {number}", sizes(dir.path()));
+        }
+        assert!(sizes(dir.path()) > 20_000);
+        assert_eq!(two.get(&hash(&part(99))), Some(part(99)));
+        assert_eq!(two.get(&hash(&part(1))), None);
+        assert_eq!(two.hits_and_misses(), (101, 1));
+        // Larger than all that is kept together should be.
+        one.put(&hash(&[7; 3_000]), &[7; 3_000]);
+        assert_eq!(one.get(&hash(&[7; 3_000])), None);
+    }
+
+    #[test]
+    fn what_is_damaged_is_not_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let cache = DiskCache::open(dir.path(), 1 << 20).unwrap();
+        let name = hash(&part(1));
+        cache.put(&name, &part(1));
+        for torn in [&part(1)[..500], &[]] {
+            fs::write(cache.path(&name), torn).unwrap();
+            assert_eq!(cache.get(&name), None);
+            assert!(!cache.path(&name).exists());
+            cache.put(&name, &part(1));
+            assert_eq!(cache.get(&name), Some(part(1)));
+        }
+        // What a killed process was writing goes, after a while.
+        let [old, new] = ["~1.0", "~1.1"].map(|name| dir.path().join(name));
+        for path in [&old, &new] {
+            fs::write(path, "half").unwrap();
+        }
+        let long_ago = SystemTime::now() - 2 * LEFT_AFTER;
+        File::options().append(true).open(&old).unwrap().set_modified(long_ago).unwrap();
+        DiskCache::open(dir.path(), 1 << 20).unwrap();
+        assert!(!old.exists() && new.exists());
+    }
+}

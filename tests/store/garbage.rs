@@ -1,0 +1,182 @@
+//! Garbage collection and fsck, in a directory and in an object store.
+
+use std::time::Duration;
+
+use wildcity::store::{Catalog, Keep, StoreError, Sum};
+
+use crate::places::{Place, cells_alone, change, commit, everywhere};
+use crate::scene_files::gaussians;
+use crate::wildcity;
+
+const NOW: Duration = Duration::ZERO;
+const DAY: Duration = Duration::from_secs(86_400);
+
+/// A twin of `versions` versions, each of which changed cell (3, 3).
+fn twin(place: &Place, versions: u64) -> Catalog {
+    let catalog = place.catalog();
+    commit(&catalog, &gaussians(1_000, 0, 40.0, 1));
+    for number in 2..=versions {
+        let version = change(&catalog, [3, 3], number).change(number - 1, cells_alone()).unwrap();
+        assert_eq!(version.number, number);
+    }
+    catalog
+}
+
+/// What a version consists of that no other does: its manifest, table and chunk of (3, 3).
+const OWN: u64 = 3;
+
+#[test]
+fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
+    everywhere(|place| {
+        let catalog = twin(place, 5);
+        let before = place.objects();
+        let keep = |versions, grace| Keep { versions, grace };
+        // Seen, but nothing done.
+        let dry = catalog.collect("street", keep(2, NOW), true).unwrap();
+        assert_eq!((&dry.kept[..], dry.removed), (&[4, 5][..], Sum::default()));
+        // Of the first version, which had no cell (3, 3), the manifest and the table.
+        assert_eq!(dry.noted.objects, 2 + 2 * OWN);
+        assert_eq!(catalog.collect("street", keep(2, NOW), true).unwrap(), dry);
+
+        let first = catalog.collect("street", keep(2, NOW), false).unwrap();
+        assert_eq!(first, dry);
+        assert_eq!(place.objects(), before);
+        // Not old enough.
+        let second = catalog.collect("street", keep(2, DAY), false).unwrap();
+        assert_eq!((second.removed, second.noted), (Sum::default(), dry.noted));
+        assert_eq!(place.objects(), before);
+        let third = catalog.collect("street", keep(2, NOW), false).unwrap();
+        assert_eq!((third.removed, third.noted), (dry.noted, Sum::default()));
+        assert_eq!(place.objects().len() as u64, before.len() as u64 - dry.noted.objects);
+
+        for number in [4, 5] {
+            let version = catalog.version("street", Some(number)).unwrap();
+            for chunk in &version.manifest.chunks {
+                catalog.section(&version, chunk, &chunk.sections[0]).unwrap();
+            }
+        }
+        let error = catalog.version("street", Some(2)).unwrap_err();
+        assert!(matches!(error, StoreError::Collected { number: 2, .. }), "{error}");
+        let error = catalog.rollback("street", 3).unwrap_err();
+        assert!(matches!(error, StoreError::Collected { number: 3, .. }), "{error}");
+        let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+        assert!(checked.is_sound(), "{checked:?}");
+        assert_eq!(
+            (&checked.collected[..], checked.unreferenced),
+            (&[1, 2, 3][..], Sum::default())
+        );
+        // And a killed commit's rest can still be told from it.
+        assert_eq!(change(&catalog, [9, 9], 1).change(5, cells_alone()).unwrap().number, 6);
+        let listed = catalog.versions("street").unwrap();
+        assert_eq!(listed.len(), 6, "the log stays");
+    });
+}
+
+#[test]
+fn a_version_in_use_stays_however_old() {
+    everywhere(|place| {
+        let catalog = twin(place, 4);
+        let keep = Keep { versions: 1, grace: NOW };
+        let error = catalog.lease("street", 9, "nobody", DAY).unwrap_err();
+        assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
+        let mut lease = catalog.lease("street", 2, "a test", DAY).unwrap();
+        // One that ended without being dropped.
+        std::mem::forget(catalog.lease("street", 3, "killed", Duration::ZERO).unwrap());
+        lease.renew().unwrap();
+        for _ in 0..2 {
+            let found = place.catalog().collect("street", keep, false).unwrap();
+            assert_eq!(found.kept, [2, 4]);
+        }
+        let version = catalog.version("street", Some(2)).unwrap();
+        let cell = version.manifest.chunks.iter().find(|chunk| chunk.cell == [3, 3]).unwrap();
+        catalog.section(&version, cell, &cell.sections[0]).unwrap();
+        let error = catalog.version("street", Some(3)).unwrap_err();
+        assert!(matches!(error, StoreError::Collected { .. }), "{error}");
+        drop(lease);
+        let found = catalog.collect("street", keep, false).unwrap();
+        assert_eq!((&found.kept[..], found.noted.objects), (&[4][..], OWN));
+    });
+}
+
+#[test]
+fn an_object_that_is_put_again_is_no_garbage_any_more() {
+    everywhere(|place| {
+        let catalog = twin(place, 3);
+        let keep = Keep { versions: 1, grace: NOW };
+        catalog.collect("street", keep, false).unwrap();
+        // The cell of version 2 comes again, and its object with it.
+        let again = change(&catalog, [3, 3], 2).change(3, cells_alone()).unwrap();
+        assert_eq!(again.number, 4);
+        catalog.collect("street", keep, false).unwrap();
+        assert!(catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
+        let version = catalog.version("street", None).unwrap();
+        for chunk in &version.manifest.chunks {
+            catalog.section(&version, chunk, &chunk.sections[0]).unwrap();
+        }
+    });
+}
+
+#[test]
+fn a_commit_in_preparation_is_not_disturbed() {
+    everywhere(|place| {
+        let catalog = twin(place, 3);
+        let running = change(&catalog, [5, 5], 7);
+        let keep = Keep { versions: 1, grace: DAY };
+        for _ in 0..3 {
+            place.catalog().collect("street", keep, false).unwrap();
+        }
+        running.change(3, cells_alone()).unwrap();
+        assert!(catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
+    });
+}
+
+#[test]
+fn fsck_names_what_the_log_lost() {
+    everywhere(|place| {
+        let catalog = twin(place, 4);
+        let log = place.twins().join("street/log");
+        std::fs::remove_file(log.join("0000000002")).unwrap();
+        std::fs::write(log.join("0000000003"), "{").unwrap();
+        let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+        assert!(!checked.is_sound());
+        assert_eq!(checked.gaps, [2]);
+        assert_eq!(checked.records.iter().map(|(number, _)| *number).collect::<Vec<_>>(), [3]);
+        assert_eq!(checked.verified.damaged.len(), 0);
+        assert_eq!(checked.unreferenced.objects, 2 * OWN);
+    });
+}
+
+#[test]
+fn commands_say_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let place = Place::Directory(dir);
+    twin(&place, 3);
+    let run = |arguments: &[&str]| {
+        let mut command = wildcity();
+        command.arg("twin").args(arguments).arg("--twins").arg(place.twins());
+        let output = command.output().unwrap();
+        (output.status.code(), String::from_utf8(output.stdout).unwrap())
+    };
+    let gc = ["gc", "street", "--keep", "1", "--grace", "0s"];
+    let (code, said) = run(&gc);
+    assert_eq!(code, Some(0));
+    assert!(said.starts_with("kept versions 3\nremoved 0 objects"), "{said}");
+    let (_, said) = run(&[&gc[..], &["--dry-run"]].concat());
+    assert!(said.contains("would be removed 5 objects"), "{said}");
+    let (_, said) = run(&gc);
+    assert!(said.contains("removed 5 objects") && said.contains("noted 0 objects"), "{said}");
+    let (code, said) = run(&["fsck", "street", "--json"]);
+    let found: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((code, &found["sound"]), (Some(0), &true.into()), "{said}");
+    assert_eq!(found["collected"], serde_json::json!([1, 2]));
+    let (_, said) = run(&["list"]);
+    assert!(said.starts_with("street ") && said.contains("version 3"), "{said}");
+    let (_, said) = run(&["log", "street", "--json"]);
+    assert_eq!(said.lines().count(), 3);
+    let (_, said) = run(&["log", "street"]);
+    assert!(said.contains("push of 2"), "{said}");
+    std::fs::remove_file(place.twins().join("street/log/0000000001")).unwrap();
+    let (code, said) = run(&["fsck", "street"]);
+    assert_eq!(code, Some(1));
+    assert!(said.contains("lost version 1: the log has later ones"), "{said}");
+}

@@ -1,0 +1,240 @@
+//! An object store that fails: waited for, asked again, and told from one that has lost something.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use wildcity::scene::Gaussians;
+use wildcity::store::{CacheSettings, Catalog, NewVersion, Storage, StoreError, Version};
+
+use crate::places::{cells_alone, change};
+use crate::s3::{Fault, S3, keys, quick};
+use crate::scene_files::{gaussians, inria_columns, ply};
+use crate::{street, wildcity};
+
+fn commit(catalog: &Catalog, scene: &Gaussians) -> Result<Version, StoreError> {
+    let new = NewVersion { storage: Storage::default(), ..street(scene) };
+    catalog.commit(new, &mut |_, _| {})
+}
+
+fn numbers(catalog: &Catalog) -> Vec<u64> {
+    catalog.versions("street").unwrap().iter().map(|entry| entry.number).collect()
+}
+
+#[test]
+fn a_commit_whose_answer_is_lost_is_one() {
+    let s3 = S3::start();
+    let catalog = s3.catalog();
+    commit(&catalog, &gaussians(200, 0, 20.0, 1)).unwrap();
+    // However it is lost: the connection breaks, or something on the way says what is not so. A change
+    // of cells that somebody else changed since would be refused, and here that was itself.
+    let faults = [Fault::AnswerLost, Fault::Denied(500), Fault::Denied(409), Fault::Denied(412)];
+    for (base, fault) in (1..).zip(faults) {
+        s3.fail("PUT", "street/log/", 1, fault);
+        let version = change(&catalog, [3, 3], base).change(base, cells_alone()).unwrap();
+        assert_eq!((version.number, s3.to_fail()), (base + 1, 0), "{fault:?}");
+    }
+    assert_eq!(numbers(&catalog), [1, 2, 3, 4, 5]);
+}
+
+#[test]
+fn a_commit_that_was_not_done_is_done_again() {
+    let s3 = S3::start();
+    let catalog = s3.catalog();
+    // 409: somebody else puts the same right now; who wins is not said, and here nobody did.
+    for (number, status) in (1..).zip([500, 503, 409, 412]) {
+        s3.fail("PUT", "street/log/", 2, Fault::Status(status));
+        let version = commit(&catalog, &gaussians(200, 0, 20.0, number)).unwrap();
+        assert_eq!((version.number, s3.to_fail()), (number, 0), "{status}");
+    }
+    s3.fail("PUT", "street/log/", 1, Fault::Silence);
+    assert_eq!(commit(&catalog, &gaussians(200, 0, 20.0, 9)).unwrap().number, 5);
+    assert_eq!(numbers(&catalog), [1, 2, 3, 4, 5]);
+}
+
+#[test]
+fn a_record_that_nobody_can_ask_for_is_said_to_be_unknown() {
+    let s3 = S3::start();
+    let catalog = s3.catalog();
+    commit(&catalog, &gaussians(200, 0, 20.0, 1)).unwrap();
+    s3.fail("PUT", "street/log/", 1, Fault::AnswerLost);
+    s3.fail("GET", "street/log/0000000002", 3, Fault::Status(500));
+    let error = commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap_err();
+    assert!(matches!(error, StoreError::Unsettled { number: 2, .. }), "{error}");
+    // As it happens, it is there, and the same again is the same.
+    assert_eq!(commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap().number, 2);
+}
+
+#[test]
+fn an_object_that_cannot_be_put_fails_the_commit_and_nobody_sees_any_of_it() {
+    let s3 = S3::start();
+    let catalog = s3.catalog();
+    let first = commit(&catalog, &gaussians(2_000, 0, 150.0, 1)).unwrap();
+    s3.fail("PUT", "/objects/", 2, Fault::Status(500));
+    s3.fail("PUT", "/objects/", 1, Fault::AnswerLost);
+    let second = commit(&catalog, &gaussians(2_000, 0, 150.0, 2)).unwrap();
+    assert_eq!((second.number, s3.to_fail()), (2, 0), "failed, put again, and all are there");
+    assert_eq!(catalog.verify("street", &mut |_, _| {}).unwrap().damaged.len(), 0);
+
+    s3.fail("PUT", "/objects/", 1_000, Fault::Status(500));
+    let error = commit(&catalog, &gaussians(2_000, 0, 150.0, 3)).unwrap_err();
+    let said = error.to_string();
+    assert!(said.starts_with("cannot write s3://bucket/twins/street/objects/"), "{said}");
+    assert!(s3.to_fail() > 900, "not for ever");
+    assert_eq!(numbers(&catalog), [1, 2]);
+    assert_eq!(catalog.version("street", Some(1)).unwrap(), first);
+    assert!(catalog.traffic().unwrap().failures > 0);
+}
+
+#[test]
+fn what_is_damaged_on_the_way_is_read_again() {
+    let s3 = S3::start();
+    let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
+    let catalog = s3.catalog();
+    let chunk = &version.manifest.chunks[0];
+    let read = || catalog.section(&version, chunk, &chunk.sections[0]);
+    let sound = read().unwrap().len();
+    for fault in [
+        Fault::Short,
+        Fault::Flipped,
+        Fault::Status(500),
+        Fault::Status(503),
+        Fault::AnswerLost,
+        Fault::Silence,
+    ] {
+        let before = catalog.traffic().unwrap();
+        s3.fail("GET", "/objects/", 1, fault);
+        assert_eq!(read().unwrap().len(), sound, "{fault:?}");
+        let after = catalog.traffic().unwrap();
+        assert_eq!((after.retries - before.retries, s3.to_fail()), (1, 0), "{fault:?}");
+        assert_eq!(after.failures, before.failures, "{fault:?}");
+    }
+    // Not for ever: each kind becomes the error that it is.
+    s3.fail("GET", "/objects/", 3, Fault::Flipped);
+    let error = read().unwrap_err();
+    assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
+    assert!(error.to_string().contains("block"), "{error}");
+    s3.fail("GET", "/objects/", 3, Fault::Status(500));
+    let error = read().unwrap_err();
+    assert!(error.to_string().starts_with("cannot read s3://bucket/twins/street/objects/"));
+    assert_eq!(s3.to_fail(), 0);
+    let began = Instant::now();
+    s3.fail("GET", "/objects/", 3, Fault::Silence);
+    let error = read().unwrap_err();
+    let StoreError::Io { cause, .. } = &error else { panic!("{error}") };
+    assert_eq!(cause.kind(), std::io::ErrorKind::TimedOut, "{error}");
+    assert!(began.elapsed() < 3 * quick().timeout + Duration::from_secs(5));
+    // 403 is not asked again.
+    let before = catalog.traffic().unwrap().requests;
+    s3.fail("GET", "/objects/", 1, Fault::Status(403));
+    let error = read().unwrap_err();
+    let StoreError::Io { cause, .. } = &error else { panic!("{error}") };
+    assert_eq!(cause.kind(), std::io::ErrorKind::PermissionDenied, "{error}");
+    assert_eq!(catalog.traffic().unwrap().requests, before + 1);
+    // And then it is as if nothing had been.
+    assert_eq!(read().unwrap().len(), sound);
+}
+
+#[test]
+fn what_the_disk_has_is_not_asked_for() {
+    let s3 = S3::start();
+    let dir = tempfile::tempdir().unwrap();
+    let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
+    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let read_all = |catalog: &Catalog| {
+        let version = catalog.version("street", None).unwrap();
+        for chunk in &version.manifest.chunks {
+            for section in &chunk.sections {
+                catalog.section(&version, chunk, section).unwrap();
+            }
+        }
+        version
+    };
+    assert_eq!(read_all(&s3.cached(Some(&cache)).unwrap()), version);
+    // Another process, as it were: only the log is asked for.
+    s3.fail("GET", "/objects/", 1_000, Fault::Status(500));
+    let again = s3.cached(Some(&cache)).unwrap();
+    assert_eq!(read_all(&again), version);
+    let traffic = again.traffic().unwrap();
+    assert_eq!((traffic.cache_misses, traffic.failures, s3.to_fail()), (0, 0, 1_000));
+    assert_eq!(traffic.cache_hits, 2 + sections(&version) as u64);
+}
+
+fn sections(version: &Version) -> usize {
+    version.manifest.chunks.iter().map(|chunk| chunk.sections.len()).sum()
+}
+
+#[test]
+fn from_within_a_runtime_it_is_as_from_without() {
+    let s3 = S3::start();
+    let catalog = s3.catalog();
+    commit(&catalog, &gaussians(100, 0, 10.0, 1)).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    // The catalog is dropped there, too.
+    let number = runtime.block_on(async move { catalog.version("street", None).unwrap().number });
+    assert_eq!(number, 1);
+}
+
+#[test]
+fn commands_take_a_url() {
+    let s3 = S3::start();
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("street.ply");
+    std::fs::write(&source, ply(&gaussians(500, 0, 50.0, 1), &inria_columns(0, false))).unwrap();
+    let run = |arguments: &[&str]| {
+        let mut command = wildcity();
+        command.args(arguments).args(["--twins", &S3::url()]).env("XDG_CACHE_HOME", dir.path());
+        let output = s3.environment(&mut command).output().unwrap();
+        let said = |bytes: &[u8]| String::from_utf8(bytes.to_owned()).unwrap();
+        (output.status.code(), said(&output.stdout), said(&output.stderr))
+    };
+    let (code, out, error) = run(&["import", source.to_str().unwrap(), "--twin", "street"]);
+    assert_eq!(code, Some(0), "{error}");
+    assert!(out.contains("s3://bucket/twins/street"), "{out}");
+    let (code, out, error) = run(&["inspect", "street"]);
+    assert_eq!(code, Some(0), "{error}");
+    assert!(out.contains("gaussians   500"), "{out}");
+    let (code, out, _) = run(&["twin", "log", "street"]);
+    assert!(code == Some(0) && out.contains("import"), "{out}");
+    let mut command = wildcity();
+    let output = command.args(["inspect", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("cannot use ftp://bucket/x for twins: one of s3://"), "{said}");
+}
+
+#[test]
+fn a_killed_import_leaves_the_old_version_or_the_new_one() {
+    let s3 = S3::start();
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("new.ply");
+    std::fs::write(&source, ply(&gaussians(20_000, 0, 220.0, 1), &inria_columns(0, false)))
+        .unwrap();
+    let catalog = s3.catalog();
+    let old = commit(&catalog, &gaussians(1_000, 0, 220.0, 2)).unwrap();
+    let puts = keys(&s3.twins()).len();
+    let mut killed_on_the_way = 0;
+    for more in [0, 1, 3, 8, 15, 25, 40] {
+        let mut import = import(&s3, &source).spawn().unwrap();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while keys(&s3.twins()).len() <= puts + more && import.try_wait().unwrap().is_none() {
+            assert!(Instant::now() < deadline, "the import hangs");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        killed_on_the_way += usize::from(import.try_wait().unwrap().is_none());
+        import.kill().unwrap();
+        import.wait().unwrap();
+        let now = catalog.version("street", None).unwrap();
+        assert!(now == old || now.manifest.gaussians() == 20_000, "after {more}");
+        assert_eq!(catalog.verify("street", &mut |_, _| {}).unwrap().damaged.len(), 0);
+    }
+    assert!(killed_on_the_way >= 2, "only {killed_on_the_way} were killed on the way");
+    assert!(import(&s3, &source).status().unwrap().success());
+    assert_eq!(catalog.version("street", None).unwrap().manifest.gaussians(), 20_000);
+}
+
+fn import(s3: &S3, source: &Path) -> Command {
+    let mut import = wildcity();
+    s3.environment(&mut import).arg("import").arg(source);
+    import.args(["--twin", "street", "--twins", &S3::url()]).stdout(Stdio::null());
+    import
+}
