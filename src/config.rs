@@ -173,8 +173,12 @@ pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 /// one of those who try succeeds, so that 32 may try at once.
 pub const PUBLISH_TRIES: u32 = 32;
 
-/// Largest lease or list of candidates for garbage collection: 20,000 hashes of 70 bytes are 1.4 MB.
+/// Largest lease or list of candidates for garbage collection: 20,000 hashes of 85 bytes are 1.7 MB.
 pub const NOTE_BYTES: u64 = 16 << 20;
+
+/// Objects that one garbage collection notes; what is beyond is noted by the next. Each takes 67 bytes
+/// and a time of at most 20.
+pub const GC_CANDIDATES: usize = (NOTE_BYTES / 88) as usize;
 
 /// How long one request to an object store may take: a cell of 300 MB at 5 MB/s.
 pub const REMOTE_TIMEOUT: Duration = Duration::from_secs(60);
@@ -183,8 +187,24 @@ pub const REMOTE_TIMEOUT: Duration = Duration::from_secs(60);
 pub const REMOTE_TRIES: u32 = 5;
 
 /// How long to wait before the second try, twice as long before each further one: 0.1 + 0.2 + 0.4 +
-/// 0.8 = 1.5 s in all, after which a step still has time to fail by [`STEP_TIMEOUT`].
+/// 0.8 = 1.5 s in all.
 pub const REMOTE_BACKOFF: Duration = Duration::from_millis(100);
+
+/// How long one request for a section may take, which steps wait for: 2 MB at 0.4 MB/s.
+pub const SECTION_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How often such a request is made, at most.
+pub const SECTION_TRIES: u32 = 3;
+
+// Whoever waits for a section that a store never answers for is told so before the step's time is over:
+// 3 attempts of 3 x 5 s + 0.1 s + 0.2 s, and 0.25 s between them, are 46.2 s.
+const _: () = {
+    let pauses = (1 << (SECTION_TRIES - 1)) - 1;
+    let attempt_ms =
+        SECTION_TIMEOUT.as_millis() * SECTION_TRIES as u128 + REMOTE_BACKOFF.as_millis() * pauses;
+    let between_ms = 5 * LOAD_BACKOFF.as_millis();
+    assert!(LOAD_ATTEMPTS as u128 * attempt_ms + between_ms < STEP_TIMEOUT.as_millis());
+};
 
 /// How often an object is read whose bytes are not those of its hash: damaged on the way, or there.
 pub const SOUND_TRIES: u32 = 3;

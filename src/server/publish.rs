@@ -302,12 +302,15 @@ fn commit(
             let change = Change { profile, rig: None, trajectories: None, provenance };
             commit.change(base.number, change)?
         }
-        _ => commit.replace(Settings {
-            profile: new_profile,
-            rig: was.and_then(|was| was.rig.clone()),
-            trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),
-            provenance,
-        })?,
+        _ => {
+            let settings = Settings {
+                profile: new_profile,
+                rig: was.and_then(|was| was.rig.clone()),
+                trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),
+                provenance,
+            };
+            commit.replace(ask.base, settings)?
+        }
     })
 }
 

@@ -103,6 +103,11 @@ impl Catalog {
         Self { objects: Arc::new(remote.clone()), remote: Some(remote) }
     }
 
+    /// The same twins, read from where they are and not from the disk cache.
+    pub(super) fn uncached(&self) -> Self {
+        self.remote.as_ref().map_or_else(|| self.clone(), |remote| Self::remote(remote.uncached()))
+    }
+
     /// What was asked of the object store since it was opened; none for a directory.
     pub fn traffic(&self) -> Option<Traffic> {
         self.remote.as_ref().map(Remote::traffic)
@@ -128,6 +133,16 @@ impl Catalog {
         Ok(twins)
     }
 
+    /// Number of a twin's latest version, from the names of the log's records alone: none of them is
+    /// read, and one that is damaged is in nobody's way.
+    ///
+    /// # Errors
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed.
+    pub fn latest(&self, name: &str) -> Result<u64, StoreError> {
+        let numbers = self.numbers(name)?;
+        Ok(numbers[numbers.len() - 1])
+    }
+
     /// Reads one version of a twin, or the latest, and checks it against its hash.
     ///
     /// # Errors
@@ -141,9 +156,7 @@ impl Catalog {
         if !numbers.contains(&number) {
             return Err(StoreError::NoVersion { name: name.to_owned(), number, latest });
         }
-        if self.collected(name)?.contains(&number) {
-            return Err(StoreError::Collected { name: name.to_owned(), number });
-        }
+        self.check_not_collected(name, number)?;
         let LogRecord { manifest: hash, created_us, .. } = self.record(name, number)?;
         let mut manifest = self.manifest(name, &hash)?;
         self.fill(&mut manifest)?;
@@ -178,9 +191,13 @@ impl Catalog {
             .map_err(|reason| of_section(self.objects.path(twin, &chunk.object), reason))
     }
 
-    /// Where a chunk's object lies: a path, or a URL.
-    pub fn object_path(&self, version: &Version, chunk: &ChunkEntry) -> PathBuf {
-        self.objects.path(&version.manifest.twin, &chunk.object)
+    /// Reads a chunk's object to its end, looks at none of it, and keeps nothing: how fast bytes come.
+    /// Returns how many there are.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn skim(&self, version: &Version, chunk: &ChunkEntry) -> Result<u64, StoreError> {
+        self.objects.skim(&version.manifest.twin, &chunk.object)
     }
 
     /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
@@ -198,9 +215,7 @@ impl Catalog {
 
     /// Numbers of a twin's versions, rising; at least one.
     pub(super) fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
-        if !is_name(name) {
-            return Err(StoreError::Name { name: name.to_owned() });
-        }
+        check_name(name)?;
         let numbers = self.objects.numbers(name)?;
         if numbers.is_empty() {
             let (dir, known) = (self.dir().to_owned(), self.objects.names()?);
@@ -268,6 +283,11 @@ impl Catalog {
 #[derive(Deserialize)]
 struct Format {
     format: u32,
+}
+
+/// Whether a name can be a twin's, and part of a path.
+pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
+    if is_name(name) { Ok(()) } else { Err(StoreError::Name { name: name.to_owned() }) }
 }
 
 fn open_cache(cache: Option<&CacheSettings>) -> Result<Option<DiskCache>, StoreError> {

@@ -6,9 +6,9 @@ use crate::config;
 use crate::ingest::validate::{self, Field};
 use crate::scene::manifest::{ChunkEntry, ObjectRef, Provenance};
 use crate::scene::record::Clamped;
-use crate::scene::rig::is_name;
 use crate::scene::{Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory};
 
+use super::catalog::check_name;
 use super::diff::Diff;
 use super::log::{Kind, LogRecord};
 use super::objects::Staging;
@@ -90,9 +90,7 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::Name`]; what killed commits left cannot be removed, or nothing can be written.
     pub fn begin(&self, name: &str, kind: Kind, storage: Storage) -> Result<Commit, StoreError> {
-        if !is_name(name) {
-            return Err(StoreError::Name { name: name.to_owned() });
-        }
+        check_name(name)?;
         recover::clean(self)?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         Ok(Commit {
@@ -148,18 +146,23 @@ impl Commit {
     /// Makes the latest version exactly what was put, all or nothing. The same content as the latest
     /// version's is that version: no new one is made.
     ///
+    /// With a `base`, nothing is replaced that others committed since that version; with none, whatever
+    /// is there is.
+    ///
     /// # Errors
-    /// What cannot be accepted, or could not be written, and then nothing of it is left.
+    /// [`StoreError::Overlap`] if others changed since `base` what this would be in place of; what
+    /// cannot be accepted, or could not be written, and then nothing of it is left.
     /// [`StoreError::NotSynced`] alone means that the version is there, but might not be after a
     /// power cut.
-    pub fn replace(self, settings: Settings) -> Result<Version, StoreError> {
+    pub fn replace(self, base: Option<u64>, settings: Settings) -> Result<Version, StoreError> {
         settings.check()?;
         self.check_clamped()?;
-        self.publish(None, |commit, _| {
+        let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
+        self.publish(base.as_ref().map(|base| base.number), |commit, latest| {
             let Settings { profile, rig, trajectories, provenance } = settings.clone();
             let chunks: Vec<_> = commit.chunks.values().cloned().collect();
             let (sh_degree, record) = (commit.sh_degree.unwrap_or(0), commit.storage.record);
-            commit.complete(Manifest {
+            let manifest = Manifest {
                 format: Manifest::FORMAT,
                 twin: commit.name.clone(),
                 profile,
@@ -170,7 +173,14 @@ impl Commit {
                 rig,
                 trajectories,
                 provenance,
-            })
+            };
+            if let (Some(base), Some(latest)) = (&base, latest)
+                && latest != base.number
+            {
+                let latest = commit.catalog.version(&commit.name, Some(latest))?;
+                commit.check_apart(base, &latest, &manifest)?;
+            }
+            commit.complete(manifest)
         })
     }
 
@@ -188,21 +198,33 @@ impl Commit {
         self.publish(Some(base.number), |commit, latest| match latest {
             Some(latest) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
-                commit.check_apart(&base, &latest, &change)?;
-                commit.merge(latest.manifest, &change)
+                let merged = commit.merge(latest.manifest.clone(), &change)?;
+                commit.check_apart(&base, &latest, &merged)?;
+                commit.complete(merged)
             }
-            _ => commit.merge(base.manifest.clone(), &change),
+            _ => {
+                let merged = commit.merge(base.manifest.clone(), &change)?;
+                commit.complete(merged)
+            }
         })
     }
 
-    /// Makes the latest version an old one.
-    pub(super) fn restore(self, old: Version) -> Result<Version, StoreError> {
-        let Version { number, hash, manifest, .. } = old;
-        self.publish(Some(number), |_, _| Ok((manifest.clone(), hash.clone())))
+    /// Makes the latest version an old one, if all of it is there.
+    pub(super) fn restore(self, number: u64) -> Result<Version, StoreError> {
+        self.publish(Some(number), |commit, _| {
+            // Whoever removed objects while this waited for its turn is done, and has said so; and what
+            // the disk cache keeps of them is not there.
+            let there = commit.catalog.uncached();
+            let Version { hash, manifest, .. } = there.version(&commit.name, Some(number))?;
+            for chunk in &manifest.chunks {
+                there.objects.check_present(&commit.name, &chunk.object, chunk.bytes)?;
+            }
+            Ok((manifest, hash))
+        })
     }
 
-    /// A version with the cells that were put in place of its own.
-    fn merge(&mut self, mut manifest: Manifest, change: &Change) -> Result<Hashed, StoreError> {
+    /// A version with the cells that were put in place of its own, and the table that it had.
+    fn merge(&self, mut manifest: Manifest, change: &Change) -> Result<Manifest, StoreError> {
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
         let Change { profile, rig, trajectories, provenance } = change.clone();
@@ -214,26 +236,24 @@ impl Commit {
         let mut chunks: BTreeMap<_, _> = own.collect();
         chunks.extend(self.chunks.clone());
         manifest.chunks = chunks.into_values().collect();
-        self.complete(manifest)
+        Ok(manifest)
     }
 
-    /// Whether what changes here is nothing that others changed since the base.
+    /// Whether nothing that others changed from the base to the latest becomes something else by what
+    /// is `new`. What they made the same is no loss, and may have been this commit's own first try.
     fn check_apart(
         &self,
         base: &Version,
         latest: &Version,
-        change: &Change,
+        new: &Manifest,
     ) -> Result<(), StoreError> {
-        let Diff { cells, settings, .. } = Diff::between(&base.manifest, &latest.manifest);
-        let cells = cells.iter().map(|differs| differs.cell);
-        let cells: Vec<_> = cells.filter(|&[x, y]| self.chunks.contains_key(&[y, x])).collect();
-        let changes = |field: &&str| match *field {
-            "profile" => change.profile.is_some(),
-            "rig" => change.rig.is_some(),
-            "trajectories" => change.trajectories.is_some(),
-            _ => false,
-        };
-        let settings: Vec<_> = settings.into_iter().filter(changes).collect();
+        let theirs = Diff::between(&base.manifest, &latest.manifest);
+        let ours = Diff::between(&latest.manifest, new);
+        let changed: BTreeSet<_> = ours.cells.iter().map(|differs| differs.cell).collect();
+        let cells = theirs.cells.iter().map(|differs| differs.cell);
+        let cells: Vec<_> = cells.filter(|cell| changed.contains(cell)).collect();
+        let mut settings = theirs.settings;
+        settings.retain(|field| ours.settings.contains(field));
         if cells.is_empty() && settings.is_empty() {
             return Ok(());
         }

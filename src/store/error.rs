@@ -60,6 +60,16 @@ pub enum StoreError {
         /// The version asked for.
         number: u64,
     },
+    /// A version came into use in the moment in which its objects were to be removed.
+    #[error(
+        "version {number} of twin {name:?} came into use just now: nothing was removed; try again"
+    )]
+    Leased {
+        /// The twin.
+        name: String,
+        /// The version.
+        number: u64,
+    },
     /// Bytes on disk are not what was committed.
     #[error("{} is damaged: {reason}; import the twin again", path.display())]
     Damaged {
@@ -129,8 +139,22 @@ pub enum StoreError {
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// Of `profile`, `rig`, `trajectories`, what both changed.
+        /// Of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, what both changed.
         settings: Vec<&'static str>,
+    },
+    /// What is written beside the versions is too large to be read again.
+    #[error(
+        "{} would take {bytes} bytes; at most {limit} are read: give a lease a shorter holder, or \
+         import a twin of so many versions anew",
+        path.display()
+    )]
+    NoteSize {
+        /// Where it would lie.
+        path: PathBuf,
+        /// Its size.
+        bytes: u64,
+        /// The largest that is read.
+        limit: u64,
     },
     /// A version is committed and visible, but the disk refused to say that it will stay.
     #[error(

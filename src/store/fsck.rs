@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::catalog::check_name;
 use super::gc::Sum;
 use super::{Catalog, StoreError};
 
@@ -61,6 +62,7 @@ impl Catalog {
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Checked, StoreError> {
+        check_name(name)?;
         // Listed first, so that what is committed meanwhile is not taken for left over.
         let listed = self.objects.list(name)?;
         let numbers = self.numbers(name)?;
@@ -95,12 +97,13 @@ impl Catalog {
     /// and bytes in all.
     ///
     /// # Errors
-    /// The log cannot be read. Damage is no error: it is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error: it is the answer.
     pub fn verify(
         &self,
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Verified, StoreError> {
+        check_name(name)?;
         let collected = self.collected(name)?;
         let mut numbers = self.numbers(name)?;
         numbers.retain(|number| !collected.contains(number));
@@ -115,20 +118,22 @@ impl Catalog {
         numbers: &[u64],
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<(Verified, BTreeSet<String>), StoreError> {
+        // What the disk cache keeps may be lost where the twin is.
+        let there = self.uncached();
         let mut damaged = Vec::new();
         // By hash: versions share objects, and are often alike.
         let (mut named, mut chunks) = (BTreeSet::new(), BTreeMap::new());
         for &number in numbers {
-            let hash = self.record(name, number)?.manifest;
+            let hash = there.record(name, number)?.manifest;
             if !named.insert(hash.clone()) {
                 continue;
             }
-            match self.manifest(name, &hash) {
+            match there.manifest(name, &hash) {
                 Ok(mut manifest) => {
                     let table = manifest.table.object.clone();
                     named.insert(table.clone());
                     // Without their table, chunks are still compared with their own hashes.
-                    if let Err(error) = self.fill(&mut manifest) {
+                    if let Err(error) = there.fill(&mut manifest) {
                         damaged.push(Damage { object: table, error });
                     }
                     chunks.extend(manifest.chunks.into_iter().map(|c| (c.object.clone(), c)));
@@ -141,9 +146,9 @@ impl Catalog {
         let mut done = 0;
         for (object, chunk) in chunks {
             let checked = if chunk.sections.is_empty() {
-                self.objects.start(name, &object, 0).map(|_| ())
+                there.objects.start(name, &object, 0).map(|_| ())
             } else {
-                self.check_chunk(name, &chunk)
+                there.check_chunk(name, &chunk)
             };
             if let Err(error) = checked {
                 damaged.push(Damage { object: object.clone(), error });

@@ -11,6 +11,10 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
+use crate::config;
+
+use super::catalog::check_name;
+use super::lease::Terms;
 use super::log::now_us;
 use super::{Catalog, StoreError};
 
@@ -66,25 +70,23 @@ impl Catalog {
     /// removed and nothing noted.
     ///
     /// # Errors
-    /// A version that is to be kept cannot be read: then nobody knows what it names, and nothing is
-    /// removed.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read: then
+    /// nobody knows what it names, and nothing is removed.
     pub fn collect(&self, name: &str, keep: Keep, dry_run: bool) -> Result<Collected, StoreError> {
+        check_name(name)?;
         let now_us = now_us();
         let before: Candidates = self.read_note(name, CANDIDATES)?;
-        let plan = self.plan(name, keep, &before, now_us)?;
+        let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
             return Ok(plan.collected);
         }
         if !plan.remove.is_empty() {
-            // Said before it is so: a version that lost an object without it would be damaged.
-            let mut gone: BTreeSet<u64> = self.collected(name)?;
-            gone.extend(&plan.gone);
-            self.objects.put_note(name, COLLECTED, &self.encode(&gone)?)?;
-            // Somebody may have published since: looked at again when nobody can, or just before.
-            self.objects.remove(name, &|| {
-                let again = self.plan(name, keep, &before, now_us)?;
-                let still: BTreeSet<_> = again.remove.iter().collect();
-                Ok(plan.remove.iter().filter(|hash| still.contains(hash)).cloned().collect())
+            self.objects.remove(name, &mut || {
+                // Somebody may have published or leased since: looked at when nobody can publish, or just
+                // before.
+                plan = self.plan(name, keep, &before, now_us)?;
+                self.give_up(name, &plan.gone, now_us)?;
+                Ok(plan.remove.clone())
             })?;
         }
         self.objects.put_note(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
@@ -92,6 +94,23 @@ impl Catalog {
             lease.remove(self, name)?;
         }
         Ok(plan.collected)
+    }
+
+    /// Says that versions are no more, before it is so: one that lost an object without it would be
+    /// damaged.
+    ///
+    /// # Errors
+    /// [`StoreError::Leased`] if somebody leased one in this moment. Who leases writes and then looks
+    /// here, and this writes and then looks there, so that one of the two sees the other.
+    fn give_up(&self, name: &str, gone: &BTreeSet<u64>, now_us: i64) -> Result<(), StoreError> {
+        let before = self.collected(name)?;
+        let after: BTreeSet<u64> = before.union(gone).copied().collect();
+        self.objects.put_note(name, COLLECTED, &self.encode(&after)?)?;
+        let leases = self.leases(name)?;
+        let leased = |lease: &&Terms| lease.is_live(now_us) && gone.contains(&lease.version);
+        let Some(lease) = leases.iter().find(leased) else { return Ok(()) };
+        self.objects.put_note(name, COLLECTED, &self.encode(&before)?)?;
+        Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
     }
 
     /// Versions whose objects were removed.
@@ -129,7 +148,7 @@ impl Catalog {
             if noted_us.is_some_and(is_old) && is_old(object.written_us) {
                 plan.collected.removed.add(object.bytes);
                 plan.remove.push(object.hash);
-            } else {
+            } else if plan.candidates.len() < config::GC_CANDIDATES {
                 plan.collected.noted.add(object.bytes);
                 plan.candidates.insert(object.hash, noted_us.unwrap_or(now_us));
             }

@@ -49,9 +49,18 @@ impl Catalog {
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let terms = Terms { version, holder: holder.to_owned(), id, until_us: 0 };
         let (catalog, name) = (self.clone(), name.to_owned());
+        catalog.check_not_collected(&name, version)?;
         let mut lease = Lease { catalog, name, duration, terms };
         lease.renew()?;
         Ok(lease)
+    }
+
+    /// Whether a version's objects are not known to be removed.
+    pub(super) fn check_not_collected(&self, name: &str, number: u64) -> Result<(), StoreError> {
+        if self.collected(name)?.contains(&number) {
+            return Err(StoreError::Collected { name: name.to_owned(), number });
+        }
+        Ok(())
     }
 
     /// All leases of a twin, live or not.
@@ -71,12 +80,16 @@ impl Lease {
     /// Begins the duration again.
     ///
     /// # Errors
-    /// It cannot be written; it holds as long as it held before.
+    /// It cannot be written; it holds as long as it held before. [`StoreError::Collected`] if it had
+    /// ended, and the version's objects were removed.
     pub fn renew(&mut self) -> Result<(), StoreError> {
         let for_us = i64::try_from(self.duration.as_micros()).unwrap_or(i64::MAX);
         self.terms.until_us = now_us().saturating_add(for_us);
         let terms = self.catalog.encode(&self.terms)?;
-        self.catalog.objects.put_note(&self.name, &self.terms.note(), &terms)
+        self.catalog.objects.put_note(&self.name, &self.terms.note(), &terms)?;
+        // Garbage collection says what it removes and looks for leases then; here it is the other way
+        // around, so that one of the two sees the other.
+        self.catalog.check_not_collected(&self.name, self.terms.version)
     }
 }
 

@@ -93,11 +93,9 @@ impl Catalog {
     /// As [`Catalog::version`]; the version can still be read in full, or it is not restored. What
     /// could not be written leaves nothing behind, except for [`StoreError::NotSynced`].
     pub fn rollback(&self, name: &str, number: u64) -> Result<Version, StoreError> {
-        let old = self.version(name, Some(number))?;
-        for chunk in &old.manifest.chunks {
-            self.objects.check_present(name, &chunk.object, chunk.bytes)?;
-        }
-        self.begin(name, Kind::Rollback, Storage::default())?.restore(old)
+        // Before anything is written for what cannot be; restoring it looks again, and closer.
+        self.version(name, Some(number))?;
+        self.begin(name, Kind::Rollback, Storage::default())?.restore(number)
     }
 }
 

@@ -6,6 +6,8 @@ use std::io::{self, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use crate::config;
+
 use super::StoreError;
 use super::local::staging::Staging as LocalStaging;
 use super::remote::staging::Staging as RemoteStaging;
@@ -46,6 +48,9 @@ pub(super) trait Objects: Debug + Send + Sync {
         hash: &[u8; 32],
     ) -> Result<Vec<u8>, StoreError>;
 
+    /// Reads an object to its end and keeps none of it. Returns how many bytes it has.
+    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError>;
+
     /// Whether an object is there, and as long as it should be; its bytes are not looked at.
     ///
     /// # Errors
@@ -74,16 +79,19 @@ pub(super) trait Objects: Debug + Send + Sync {
     fn remove(
         &self,
         name: &str,
-        which: &dyn Fn() -> Result<Vec<String>, StoreError>,
+        which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError>;
 
     /// Names of a twin's notes in a folder: what is not part of any version, as leases.
     fn notes(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;
 
-    /// Reads a note; none if there is none.
+    /// Reads a note of at most [`config::NOTE_BYTES`]; none if there is none.
     fn note(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError>;
 
     /// Writes a note, in place of one of that name.
+    ///
+    /// # Errors
+    /// [`StoreError::NoteSize`] for one that could not be read again.
     fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError>;
 
     /// Removes a note, if it is there.
@@ -208,6 +216,15 @@ pub(super) fn log_numbers(names: impl IntoIterator<Item = String>) -> Vec<u64> {
 /// Whether a text is 64 lower-case hex digits: it becomes a file name.
 pub(super) fn is_hash(text: &str) -> bool {
     text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
+}
+
+/// Whether a note can be read again.
+///
+/// # Errors
+/// [`StoreError::NoteSize`].
+pub(super) fn check_note(path: PathBuf, bytes: &[u8]) -> Result<(), StoreError> {
+    let (bytes, limit) = (bytes.len() as u64, config::NOTE_BYTES);
+    if bytes > limit { Err(StoreError::NoteSize { path, bytes, limit }) } else { Ok(()) }
 }
 
 /// Whether bytes are those of a hash.

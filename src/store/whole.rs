@@ -2,9 +2,9 @@
 
 use crate::ingest::validate::{self, Field};
 use crate::scene::manifest::Provenance;
-use crate::scene::rig::is_name;
 use crate::scene::{Gaussians, RenderProfile, Rig, Trajectory};
 
+use super::catalog::check_name;
 use super::{Catalog, Kind, Settings, Storage, StoreError, Version};
 
 /// What a new version of a twin consists of.
@@ -39,14 +39,12 @@ impl Catalog {
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
         let NewVersion { name, gaussians, profile, rig, trajectories, provenance, storage } = new;
-        if !is_name(name) {
-            return Err(StoreError::Name { name: name.to_owned() });
-        }
+        check_name(name)?;
         validate::check(gaussians, &Field::twin_name)?;
         let settings = Settings { profile, rig, trajectories, provenance };
         settings.check()?;
         let mut commit = self.begin(name, Kind::Import, storage)?;
         commit.put(gaussians, None, progress)?;
-        commit.replace(settings)
+        commit.replace(None, settings)
     }
 }

@@ -43,7 +43,7 @@ fn city() -> &'static City {
                 options: Vec::new(),
             },
         };
-        commit.replace(settings).unwrap();
+        commit.replace(None, settings).unwrap();
         City { dir, drive }
     })
 }

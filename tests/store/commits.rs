@@ -9,7 +9,7 @@ use wildcity::store::{
 };
 
 use crate::scene_files::gaussians;
-use crate::{commit, files, street};
+use crate::{commit, files, street, turn};
 
 const EXACT: Storage = Storage { record: Record::F32, levels: false };
 
@@ -57,7 +57,7 @@ fn three(dir: &tempfile::TempDir) -> (Catalog, Version) {
     for x in 0..3 {
         put(&mut commit, &cell([x, 0], 1));
     }
-    let version = commit.replace(settings()).unwrap();
+    let version = commit.replace(None, settings()).unwrap();
     (catalog, version)
 }
 
@@ -97,7 +97,7 @@ fn part_by_part_is_the_same_version_as_at_once() {
         left_out += stored.left_out;
     }
     assert_eq!(left_out, 5_000 * (cells.len().div_ceil(4) as u64 - 1));
-    let version = parts.replace(settings()).unwrap();
+    let version = parts.replace(None, settings()).unwrap();
     assert_eq!((version.hash, version.manifest), (whole.hash, whole.manifest));
 }
 
@@ -140,7 +140,10 @@ fn a_change_keeps_every_other_cell() {
         put(&mut whole, &cell(at, seed));
     }
     let provenance = change("push").provenance;
-    assert_eq!(whole.replace(Settings { provenance, ..settings() }).unwrap().hash, second.hash);
+    assert_eq!(
+        whole.replace(None, Settings { provenance, ..settings() }).unwrap().hash,
+        second.hash
+    );
 
     let mut profile = RenderProfile::default();
     profile.set("near=0.3").unwrap();
@@ -154,8 +157,8 @@ fn a_change_keeps_every_other_cell() {
 fn changes_of_other_cells_are_both_in_and_of_the_same_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, _) = three(&dir);
-    let [one, two, late] = [[[0, 0], [7, 7]], [[1, 0], [1, 1]], [[1, 0], [2, 0]]]
-        .map(|cells| changed(&catalog, &cells, 2));
+    let [one, two] = [[[0, 0], [7, 7]], [[1, 0], [1, 1]]].map(|cells| changed(&catalog, &cells, 2));
+    let late = changed(&catalog, &[[1, 0], [2, 0]], 3);
     let late_id = late.id().to_owned();
     assert_eq!(one.change(1, change("one")).unwrap().number, 2);
     let both = two.change(1, change("two")).unwrap();
@@ -177,6 +180,107 @@ fn changes_of_other_cells_are_both_in_and_of_the_same_are_refused() {
     // Made again from the latest, it is one.
     let fourth = changed(&catalog, &[[1, 0], [2, 0]], 4).change(3, change("late")).unwrap();
     assert_eq!(fourth.number, 4);
+}
+
+/// A twin in preparation, whole: cells (0, 0) and (1, 0), and of another profile if told so.
+fn whole(catalog: &Catalog, near: Option<&str>) -> (Commit, Settings) {
+    let mut commit = catalog.begin("street", Kind::Push, EXACT).unwrap();
+    for x in 0..2 {
+        put(&mut commit, &cell([x, 0], 1));
+    }
+    let mut settings = settings();
+    settings.provenance.source = "whole".to_owned();
+    near.iter().for_each(|near| settings.profile.set(near).unwrap());
+    (commit, settings)
+}
+
+#[test]
+fn a_whole_replaces_nothing_that_came_since_its_base() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    let [(late, settings), (unaware, same)] = [(); 2].map(|()| whole(&catalog, None));
+    let mut near = RenderProfile::default();
+    near.set("near=0.3").unwrap();
+    let since = Change { profile: Some(near), ..change("since") };
+    changed(&catalog, &[[1, 0], [8, 8]], 2).change(1, since).unwrap();
+
+    let before = files(dir.path());
+    let error = late.replace(Some(1), settings).unwrap_err();
+    let StoreError::Overlap { base: 1, latest: 2, cells, settings, .. } = &error else {
+        panic!("{error}")
+    };
+    assert_eq!((&cells[..], &settings[..]), (&[[1, 0], [8, 8]][..], &["profile"][..]));
+    assert_eq!(files(dir.path()).len(), before.len() - STAGED_OF_ONE);
+    // What came back to what it was is what the base was.
+    assert_eq!(catalog.rollback("street", 1).unwrap().hash, first.hash);
+    assert_eq!(unaware.replace(Some(1), same).unwrap().number, 4);
+    // Without a base, whatever is there goes; with the latest, too.
+    let (commit, settings) = whole(&catalog, Some("near=0.4"));
+    assert_eq!(commit.replace(None, settings).unwrap().number, 5);
+    let (commit, settings) = whole(&catalog, Some("near=0.5"));
+    let sixth = commit.replace(Some(5), settings).unwrap();
+    assert_eq!((sixth.number, catalog.versions("street").unwrap()[5].parent), (6, Some(5)));
+    let (commit, settings) = whole(&catalog, None);
+    let error = commit.replace(Some(9), settings).unwrap_err();
+    assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
+}
+
+/// What `whole` has staged: two cells and its lock.
+const STAGED_OF_ONE: usize = 3;
+
+#[test]
+fn the_same_again_from_the_same_base_is_what_was_made_of_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    let mut near = RenderProfile::default();
+    near.set("near=0.3").unwrap();
+    let again = || Change { profile: Some(near), ..change("one") };
+    let second = changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap();
+    assert_eq!(changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap(), second);
+    // Others came since, in other cells; in the same cell it is refused.
+    changed(&catalog, &[[2, 0]], 3).change(2, change("other")).unwrap();
+    let fourth = changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap();
+    assert_eq!(catalog.diff("street", 3, 4).unwrap().cells, []);
+    assert_eq!(fourth.number, 4);
+    let error = changed(&catalog, &[[1, 0], [7, 7]], 3).change(1, again()).unwrap_err();
+    let StoreError::Overlap { cells, settings, .. } = &error else { panic!("{error}") };
+    assert_eq!((&cells[..], settings.len()), (&[[1, 0], [7, 7]][..], 0));
+
+    let (commit, settings) = whole(&catalog, None);
+    let fifth = commit.replace(Some(4), settings).unwrap();
+    let (commit, settings) = whole(&catalog, None);
+    assert_eq!(commit.replace(Some(4), settings).unwrap(), fifth);
+}
+
+#[test]
+fn the_latest_number_is_known_whatever_became_of_the_records() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    changed(&catalog, &[[0, 0]], 2).change(1, change("two")).unwrap();
+    std::fs::write(dir.path().join("street/log/0000000001"), "{").unwrap();
+    assert!(matches!(catalog.versions("street").unwrap_err(), StoreError::Damaged { .. }));
+    assert_eq!(catalog.latest("street").unwrap(), 2);
+    assert!(matches!(catalog.latest("avenue").unwrap_err(), StoreError::NoTwin { .. }));
+    assert!(matches!(catalog.latest("../street").unwrap_err(), StoreError::Name { .. }));
+}
+
+#[test]
+fn what_is_removed_while_a_rollback_waits_for_its_turn_does_not_come_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    changed(&catalog, &[[0, 0]], 2).change(1, change("push")).unwrap();
+    let turn = turn(dir.path());
+    let lost = object(&first.manifest, [0, 0]);
+    let error = std::thread::scope(|scope| {
+        let waits = scope.spawn(|| catalog.rollback("street", 1));
+        std::thread::sleep(std::time::Duration::from_millis(300));
+        let path = dir.path().join("street/objects").join(&lost[..2]).join(lost);
+        std::fs::remove_file(path).unwrap();
+        drop(turn);
+        waits.join().unwrap().unwrap_err()
+    });
+    assert!(error.to_string().contains(lost), "{error}");
+    assert_eq!(catalog.version("street", None).unwrap().number, 2);
 }
 
 #[test]
@@ -291,6 +395,7 @@ fn a_version_that_lost_an_object_does_not_come_back() {
     std::fs::remove_file(&path).unwrap();
     let said = catalog.rollback("street", 1).unwrap_err().to_string();
     assert!(said.contains("cannot open") && said.contains(lost), "{said}");
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     std::fs::write(&path, "short").unwrap();
     let error = catalog.rollback("street", 1).unwrap_err();
     assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
@@ -307,7 +412,7 @@ fn a_diff_names_cells_and_sizes() {
     put(&mut whole, &cell([3, 0], 1));
     let mut settings = settings();
     settings.profile.set("near=0.3").unwrap();
-    let second = whole.replace(settings).unwrap();
+    let second = whole.replace(None, settings).unwrap();
     let size = |version: &Version, cell| {
         let chunk = version.manifest.chunks.iter().find(|chunk| chunk.cell == cell)?;
         assert_eq!(chunk.count, 200);

@@ -6,7 +6,7 @@ use wildcity::store::{Catalog, Keep, StoreError, Sum};
 
 use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
-use crate::wildcity;
+use crate::{turn, wildcity};
 
 const NOW: Duration = Duration::ZERO;
 const DAY: Duration = Duration::from_secs(86_400);
@@ -116,17 +116,92 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
+/// In a directory; elsewhere, only the grace period keeps what no version names yet.
 #[test]
 fn a_commit_in_preparation_is_not_disturbed() {
+    let place = Place::Directory(tempfile::tempdir().unwrap());
+    let catalog = twin(&place, 3);
+    // One of a new object, and one of an object that goes meanwhile.
+    let (new, old) = (change(&catalog, [5, 5], 7), change(&catalog, [3, 3], 2));
+    let keep = Keep { versions: 1, grace: NOW };
+    let removed: u64 = (0..3)
+        .map(|_| place.catalog().collect("street", keep, false).unwrap().removed.objects)
+        .sum();
+    assert_eq!(removed, 2 + OWN);
+    assert_eq!(new.change(3, cells_alone()).unwrap().number, 4);
+    assert_eq!(old.change(4, cells_alone()).unwrap().number, 5);
+    let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+    assert!(checked.is_sound() && !checked.staging, "{checked:?}");
+}
+
+#[test]
+fn a_version_that_is_leased_while_garbage_waits_to_be_removed_stays() {
+    let place = Place::Directory(tempfile::tempdir().unwrap());
+    let catalog = twin(&place, 4);
+    let keep = Keep { versions: 1, grace: NOW };
+    catalog.collect("street", keep, false).unwrap();
+    let turn = turn(&place.twins());
+    let (found, lease) = std::thread::scope(|scope| {
+        let waits = scope.spawn(|| catalog.collect("street", keep, false).unwrap());
+        std::thread::sleep(Duration::from_millis(300));
+        let lease = catalog.lease("street", 2, "a test", DAY).unwrap();
+        drop(turn);
+        (waits.join().unwrap(), lease)
+    });
+    assert_eq!(found.kept, [2, 4]);
+    let version = catalog.version("street", Some(2)).unwrap();
+    for chunk in &version.manifest.chunks {
+        catalog.section(&version, chunk, &chunk.sections[0]).unwrap();
+    }
+    let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+    assert!(checked.is_sound(), "{checked:?}");
+    assert_eq!(checked.collected, [1, 3]);
+    drop(lease);
+}
+
+#[test]
+fn a_version_that_is_no_more_is_not_leased() {
     everywhere(|place| {
         let catalog = twin(place, 3);
-        let running = change(&catalog, [5, 5], 7);
-        let keep = Keep { versions: 1, grace: DAY };
-        for _ in 0..3 {
-            place.catalog().collect("street", keep, false).unwrap();
+        let mut ended = catalog.lease("street", 2, "late", Duration::ZERO).unwrap();
+        for _ in 0..2 {
+            catalog.collect("street", Keep { versions: 1, grace: NOW }, false).unwrap();
         }
-        running.change(3, cells_alone()).unwrap();
-        assert!(catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
+        let error = catalog.lease("street", 1, "a test", DAY).unwrap_err();
+        assert!(matches!(error, StoreError::Collected { number: 1, .. }), "{error}");
+        let error = ended.renew().unwrap_err();
+        assert!(matches!(error, StoreError::Collected { number: 2, .. }), "{error}");
+    });
+}
+
+#[test]
+fn what_is_no_name_is_not_looked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
+    // Beside the twins, and neither a note nor an object.
+    let outside = dir.path().join("outside");
+    std::fs::create_dir_all(outside.join("gc/collected")).unwrap();
+    std::fs::create_dir_all(outside.join("gc/candidates")).unwrap();
+    std::fs::create_dir_all(outside.join("objects/ab")).unwrap();
+    std::os::unix::fs::symlink("nowhere", outside.join("objects/ab/cd")).unwrap();
+    let name = "../outside";
+    let errors = [
+        catalog.collect(name, Keep { versions: 1, grace: NOW }, false).unwrap_err(),
+        catalog.fsck(name, &mut |_, _| {}).unwrap_err(),
+        catalog.verify(name, &mut |_, _| {}).unwrap_err(),
+    ];
+    for error in errors {
+        assert!(matches!(error, StoreError::Name { .. }), "{error}");
+    }
+}
+
+#[test]
+fn a_note_that_could_not_be_read_again_is_not_written() {
+    everywhere(|place| {
+        let catalog = twin(place, 1);
+        let holder = "x".repeat(16 << 20);
+        let error = catalog.lease("street", 1, &holder, DAY).unwrap_err();
+        assert!(matches!(error, StoreError::NoteSize { .. }), "{error}");
     });
 }
 

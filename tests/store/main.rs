@@ -60,6 +60,14 @@ fn files(dir: &Path) -> Vec<PathBuf> {
     found
 }
 
+/// The turn to publish versions of twin "street" in a directory, until it is dropped.
+fn turn(dir: &Path) -> std::fs::File {
+    let turn =
+        std::fs::File::options().append(true).open(dir.join(".staging/street.lock")).unwrap();
+    turn.lock().unwrap();
+    turn
+}
+
 /// The command that users run.
 fn wildcity() -> std::process::Command {
     std::process::Command::new(env!("CARGO_BIN_EXE_wildcity"))

@@ -208,7 +208,8 @@ fn settings_are_replaced_whole() {
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
-        let version = commit.replace(Settings { profile, rig, trajectories, provenance }).unwrap();
+        let version =
+            commit.replace(None, Settings { profile, rig, trajectories, provenance }).unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));
     });

@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use wildcity::scene::Gaussians;
-use wildcity::store::{CacheSettings, Catalog, NewVersion, Storage, StoreError, Version};
+use wildcity::store::{CacheSettings, Catalog, NewVersion, Patience, Storage, StoreError, Version};
 
 use crate::places::{cells_alone, change};
 use crate::s3::{Fault, S3, keys, quick};
@@ -160,6 +160,45 @@ fn what_the_disk_has_is_not_asked_for() {
     assert_eq!(traffic.cache_hits, 2 + sections(&version) as u64);
 }
 
+#[test]
+fn what_only_the_disk_has_is_lost() {
+    let s3 = S3::start();
+    let dir = tempfile::tempdir().unwrap();
+    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let catalog = s3.cached(Some(&cache)).unwrap();
+    let first = commit(&catalog, &gaussians(500, 0, 50.0, 1)).unwrap();
+    commit(&catalog, &gaussians(500, 0, 50.0, 2)).unwrap();
+    assert_eq!(catalog.version("street", Some(1)).unwrap(), first);
+    let path = |hash: &str| s3.twins().join("street/objects").join(&hash[..2]).join(hash);
+    for hash in [&first.manifest.table.object, &first.hash] {
+        std::fs::remove_file(path(hash)).unwrap();
+        assert_eq!(catalog.version("street", Some(1)).unwrap(), first, "as the disk has it");
+        let found = catalog.verify("street", &mut |_, _| {}).unwrap().damaged;
+        assert_eq!(found.iter().map(|damage| &damage.object).collect::<Vec<_>>(), [hash]);
+        assert!(!catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
+        let error = catalog.rollback("street", 1).unwrap_err();
+        assert!(error.to_string().contains(hash), "{error}");
+    }
+    assert_eq!(numbers(&catalog), [1, 2]);
+}
+
+#[test]
+fn a_section_is_not_waited_for_as_long_as_a_cell() {
+    let s3 = S3::start();
+    let version = commit(&s3.catalog(), &gaussians(500, 0, 50.0, 1)).unwrap();
+    let (section_timeout, section_tries) = (Duration::from_millis(200), 2);
+    let patience = Patience { section_timeout, section_tries, ..Patience::default() };
+    let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, patience).unwrap();
+    let chunk = &version.manifest.chunks[0];
+    assert_eq!(catalog.skim(&version, chunk).unwrap(), chunk.bytes);
+    s3.fail("GET", "/objects/", 2, Fault::Silence);
+    let began = Instant::now();
+    let error = catalog.section(&version, chunk, &chunk.sections[0]).unwrap_err();
+    let StoreError::Io { cause, .. } = &error else { panic!("{error}") };
+    assert_eq!((cause.kind(), s3.to_fail()), (std::io::ErrorKind::TimedOut, 0), "{error}");
+    assert!(began.elapsed() < Duration::from_secs(20), "{:?}", began.elapsed());
+}
+
 fn sections(version: &Version) -> usize {
     version.manifest.chunks.iter().map(|chunk| chunk.sections.len()).sum()
 }
@@ -196,6 +235,8 @@ fn commands_take_a_url() {
     assert!(out.contains("gaussians   500"), "{out}");
     let (code, out, _) = run(&["twin", "log", "street"]);
     assert!(code == Some(0) && out.contains("import"), "{out}");
+    let (code, out, error) = run(&["bench", "load", "street", "--repeat", "1"]);
+    assert!(code == Some(0) && out.contains("bare bytes"), "{out}{error}");
     let mut command = wildcity();
     let output = command.args(["inspect", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();

@@ -129,7 +129,8 @@ impl S3 {
 
 /// The patience of tests.
 pub(crate) fn quick() -> Patience {
-    Patience { timeout: Duration::from_secs(3), tries: 3, backoff: Duration::from_millis(10) }
+    let (timeout, backoff) = (Duration::from_secs(3), Duration::from_millis(10));
+    Patience { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
 }
 
 /// All files below a folder that are objects of the server: it keeps notes of its own beside them.

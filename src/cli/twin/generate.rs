@@ -11,7 +11,7 @@ use crate::cli::progress;
 use crate::generate::{self, CitySettings};
 use crate::scene::manifest::Provenance;
 use crate::scene::{RenderProfile, Rig};
-use crate::store::{Catalog, Kind, Settings, Storage};
+use crate::store::{Kind, Settings, Storage};
 
 /// Make a twin of a procedural city: a route of any length between houses, cars and trees.
 ///
@@ -75,10 +75,12 @@ impl Generate {
             speed_m_s: self.speed_m_s,
         };
         let city = generate::city(&settings)?;
-        let dir = self.twins.dir()?;
-        let catalog = Catalog::open(&dir)?;
+        let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
-        check_room(&dir, gaussians)?;
+        let in_directory = catalog.traffic().is_none();
+        if in_directory {
+            check_room(catalog.dir(), gaussians)?;
+        }
 
         let begun = Instant::now();
         let mut commit = catalog.begin(&self.twin, Kind::Import, Storage::default())?;
@@ -88,7 +90,7 @@ impl Generate {
             commit.put(&cell.gaussians, None, &mut |_, _| {})?;
             bar.inc(cell.gaussians.len() as u64);
         }
-        let version = commit.replace(Settings {
+        let parts = Settings {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
             trajectories: vec![generate::city_drive(&settings)?],
@@ -101,7 +103,8 @@ impl Generate {
                 builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).into(),
                 options: Vec::new(),
             },
-        })?;
+        };
+        let version = commit.replace(None, parts)?;
         bar.finish_and_clear();
 
         let (manifest, seconds) = (&version.manifest, begun.elapsed().as_secs_f64());

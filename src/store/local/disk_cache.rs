@@ -11,6 +11,7 @@
 //! it was last of use.
 
 use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -145,8 +146,13 @@ impl DiskCache {
             if bytes <= self.limit_bytes - self.limit_bytes / SLACK {
                 break;
             }
-            fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
-            bytes -= size;
+            match fs::remove_file(&path) {
+                // Another process was faster.
+                Err(error) if error.kind() != ErrorKind::NotFound => {
+                    return Err(StoreError::io("remove", &path)(error));
+                }
+                _ => bytes -= size,
+            }
         }
         Ok(())
     }

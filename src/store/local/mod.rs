@@ -112,6 +112,17 @@ impl Objects for Local {
         Err(StoreError::Damaged { path, reason: format!("its bytes hash to {}", found.to_hex()) })
     }
 
+    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
+        let (path, mut file, _) = self.open(name, hash)?;
+        let (mut buffer, mut bytes) = (vec![0; BUFFER_BYTES], 0);
+        loop {
+            match file.read(&mut buffer).map_err(StoreError::io("read", &path))? {
+                0 => return Ok(bytes),
+                read => bytes += read as u64,
+            }
+        }
+    }
+
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {
         let (path, _, found) = self.open(name, hash)?;
         if found == bytes {
@@ -193,7 +204,7 @@ impl Objects for Local {
     fn remove(
         &self,
         name: &str,
-        which: &dyn Fn() -> Result<Vec<String>, StoreError>,
+        which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
         let _turn = self.turn(name)?;
         for hash in which()? {
@@ -212,17 +223,28 @@ impl Objects for Local {
 
     fn note(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let path = self.root.join(name).join(note);
-        match fs::read(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            read => read.map(Some).map_err(StoreError::io("read", &path)),
+        let file = match File::open(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            opened => opened.map_err(StoreError::io("open", &path))?,
+        };
+        let mut bytes = Vec::new();
+        file.take(config::NOTE_BYTES + 1)
+            .read_to_end(&mut bytes)
+            .map_err(StoreError::io("read", &path))?;
+        if bytes.len() as u64 > config::NOTE_BYTES {
+            let reason = format!("it is above {} bytes", config::NOTE_BYTES);
+            return Err(StoreError::Damaged { path, reason });
         }
+        Ok(Some(bytes))
     }
 
     fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
         let path = self.root.join(name).join(note);
+        objects::check_note(path.clone(), bytes)?;
         create_parent(&path)?;
-        let written = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let writing = path.with_file_name(format!("{WRITING}{}.{written}", std::process::id()));
+        // A name of its own: threads of one process may write the same note.
+        let id = uuid::Uuid::now_v7().as_simple().to_string();
+        let writing = path.with_file_name(format!("{WRITING}{id}"));
         let mut file = File::create(&writing).map_err(StoreError::io("write", &writing))?;
         file.write_all(bytes)
             .and_then(|()| file.sync_all())
@@ -287,16 +309,15 @@ impl Local {
         Ok(())
     }
 
-    /// Removes the empty directories of a twin: all, if it never had a version. Whoever calls has
+    /// Removes the empty directories of a twin: all, if it never had a version, and then nobody noted
+    /// anything of it. Notes are written without a turn, so their directories stay. Whoever calls has
     /// the turn.
     fn remove_empty(&self, name: &str) {
         let twin = self.root.join(name);
         for prefix in entries(&twin.join("objects")).unwrap_or_default() {
             let _ = fs::remove_dir(twin.join("objects").join(prefix));
         }
-        for dir in
-            [twin.join("objects"), twin.join("log"), twin.join("leases"), twin.join("gc"), twin]
-        {
+        for dir in [twin.join("objects"), twin.join("log"), twin] {
             let _ = fs::remove_dir(dir);
         }
     }

@@ -129,6 +129,22 @@ impl Objects for Remote {
         Ok(part)
     }
 
+    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
+        let key = object_key(name, hash);
+        let (store, at) = (self.store.clone(), self.key(&key));
+        self.run("read", &key, move || {
+            let (store, at) = (store.clone(), at.clone());
+            async move {
+                let mut stream = store.get(&at).await?.into_stream();
+                let mut bytes = 0;
+                while let Some(more) = stream.next().await.transpose()? {
+                    bytes += more.len() as u64;
+                }
+                Ok(bytes)
+            }
+        })
+    }
+
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {
         let key = object_key(name, hash);
         let found = self.head(&key)?.size;
@@ -174,7 +190,7 @@ impl Objects for Remote {
     fn remove(
         &self,
         name: &str,
-        which: &dyn Fn() -> Result<Vec<String>, StoreError>,
+        which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
         which()?.iter().try_for_each(|hash| self.delete(&object_key(name, hash)))
     }
@@ -201,6 +217,7 @@ impl Objects for Remote {
 
     fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
         let key = format!("{name}/{note}");
+        objects::check_note(self.root.join(&key), bytes)?;
         let (store, at, payload) =
             (self.store.clone(), self.key(&key), PutPayload::from(bytes.to_vec()));
         self.run("write", &key, move || {
@@ -239,6 +256,11 @@ impl Remote {
         Ok(Self { root, prefix, store, runner: Arc::new(runner), cache })
     }
 
+    /// The same place without the disk cache.
+    pub(super) fn uncached(&self) -> Self {
+        Self { cache: None, ..self.clone() }
+    }
+
     /// What was asked of the store so far, and how it went.
     pub(super) fn traffic(&self) -> Traffic {
         let mut traffic = self.runner.traffic();
@@ -272,7 +294,8 @@ impl Remote {
     /// Reads a part of an object. A part that is shorter than asked for is said to be so.
     fn range(&self, key: &str, bytes: Range<u64>) -> Result<Vec<u8>, StoreError> {
         let (store, at, wanted) = (self.store.clone(), self.key(key), bytes.clone());
-        let read = self.run("read", key, move || {
+        let patience = self.runner.patience().of_sections();
+        let request = move || {
             let (store, at) = (store.clone(), at.clone());
             let range = Some(GetRange::Bounded(wanted.clone()));
             async move {
@@ -280,7 +303,9 @@ impl Remote {
                 let found = store.get_opts(&at, options).await?;
                 found.bytes().await.map(Vec::from)
             }
-        });
+        };
+        let read = self.runner.start(patience, request).wait();
+        let read = read.map_err(StoreError::io("read", &self.root.join(key)));
         let short = match &read {
             Ok(part) => (part.len() as u64) < bytes.end - bytes.start,
             Err(StoreError::Io { cause, .. }) => cause.kind() == ErrorKind::Other,
@@ -319,10 +344,13 @@ impl Remote {
 
     fn head(&self, key: &str) -> Result<ObjectMeta, StoreError> {
         let (store, at) = (self.store.clone(), self.key(key));
-        self.run("find", key, move || {
+        let patience = self.runner.patience().of_sections();
+        let request = move || {
             let (store, at) = (store.clone(), at.clone());
             async move { store.head(&at).await }
-        })
+        };
+        let found = self.runner.start(patience, request).wait();
+        found.map_err(StoreError::io("find", &self.root.join(key)))
     }
 
     fn delete(&self, key: &str) -> Result<(), StoreError> {

@@ -21,6 +21,17 @@ pub struct Patience {
     pub tries: u32,
     /// How long to wait before the second try; twice as long before each further one.
     pub backoff: Duration,
+    /// How long one request for a section may take, which a step waits for.
+    pub section_timeout: Duration,
+    /// How often such a request is made, at most.
+    pub section_tries: u32,
+}
+
+impl Patience {
+    /// With what a step waits for, and with what tells how large something is.
+    pub(super) fn of_sections(self) -> Self {
+        Self { timeout: self.section_timeout, tries: self.section_tries, ..self }
+    }
 }
 
 impl Default for Patience {
@@ -29,6 +40,8 @@ impl Default for Patience {
             timeout: config::REMOTE_TIMEOUT,
             tries: config::REMOTE_TRIES,
             backoff: config::REMOTE_BACKOFF,
+            section_timeout: config::SECTION_TIMEOUT,
+            section_tries: config::SECTION_TRIES,
         }
     }
 }
@@ -100,16 +113,20 @@ impl Runner {
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send,
     {
-        self.start(request).wait()
+        self.start(self.patience, request).wait()
     }
 
-    /// As [`Runner::run`], without waiting for it.
-    pub(super) fn start<T, F>(&self, request: impl Fn() -> F + Send + 'static) -> Running<T>
+    /// As [`Runner::run`], with a patience of its own and without waiting for it.
+    pub(super) fn start<T, F>(
+        &self,
+        patience: Patience,
+        request: impl Fn() -> F + Send + 'static,
+    ) -> Running<T>
     where
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send,
     {
-        let (patience, counts) = (self.patience, self.counts.clone());
+        let counts = self.counts.clone();
         self.spawn(async move {
             let (mut tries, mut backoff) = (1, patience.backoff);
             loop {

@@ -49,7 +49,7 @@ impl Staging {
         let key = object_key(&self.name, &hash);
         let (store, at) = (self.remote.store.clone(), self.remote.key(&key));
         let payload = PutPayload::from(object);
-        let upload = self.remote.runner.start(move || {
+        let upload = self.remote.runner.start(self.remote.runner.patience(), move || {
             let (store, at, payload) = (store.clone(), at.clone(), payload.clone());
             async move { store.put(&at, payload).await.map(|_| ()) }
         });
