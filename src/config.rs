@@ -345,6 +345,10 @@ pub const PUSHES_REMEMBERED: usize = 64;
 /// Files of one push.
 pub const PUSH_FILES: usize = 256;
 
+/// Gaussians of one push, all its files together: 248 B each in memory at SH degree 3 are 62 GB, and
+/// as much again while files are joined. The largest upload holds no more, unless it is packed.
+pub const PUSH_GAUSSIANS: u64 = 250_000_000;
+
 /// Bad Gaussians that are named of one file; the others are counted.
 pub const BAD_GAUSSIANS: usize = 16;
 

@@ -103,14 +103,16 @@ impl Engine {
         }))
     }
 
-    /// The latest version of every twin, in order of name. A damaged one is logged and left out,
-    /// so that it does not hide the others.
+    /// The version of every twin that whoever opens it gets, in order of name. A damaged one is logged
+    /// and left out, so that it does not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub async fn twins(&self) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
-        let listings = self.listings.clone();
-        let listed = tokio::task::spawn_blocking(move || listings.read());
+    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
+        let engine = self.clone();
+        let listed = tokio::task::spawn_blocking(move || {
+            engine.listings.read(&|twin| engine.held_latest(twin))
+        });
         Ok(listed.await.map_err(|_| SessionError::Crashed)??)
     }
 
@@ -149,6 +151,18 @@ impl Engine {
     pub fn hold_latest(self: &Arc<Self>, twin: &str, number: u64) -> HeldLatest {
         lock(&self.held).insert(twin.to_owned(), number);
         HeldLatest { engine: self.clone(), twin: twin.to_owned() }
+    }
+
+    /// The version that is held, where one is.
+    pub fn held_latest(&self, twin: &str) -> Option<u64> {
+        lock(&self.held).get(twin).copied()
+    }
+
+    /// Where a version is held, holds another in its place: one that was made the latest on purpose.
+    pub fn hold_instead(&self, twin: &str, number: u64) {
+        if let Some(held) = lock(&self.held).get_mut(twin) {
+            *held = number;
+        }
     }
 
     /// Opens a version and loads what frames of it need, for those who will switch to it where they
@@ -192,7 +206,7 @@ impl Engine {
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
-        let version = version.or_else(|| lock(&self.held).get(&twin).copied());
+        let version = version.or_else(|| self.held_latest(&twin));
         let opened = tokio::task::spawn_blocking(move || {
             let resident = engine.cache.open(&twin, version)?;
             engine.leases.hold(&resident);
