@@ -7,6 +7,7 @@ mod images;
 mod scene_files;
 
 mod admission;
+mod city;
 mod driving;
 mod exact;
 mod faults;

@@ -100,7 +100,7 @@ impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
-        let limit_bytes = self.memory_gib.map(|gib| (gib * f64::from(1 << 30)) as u64);
+        let limit_bytes = self.memory_gib.map(scene_source::bytes_of_gib);
         let scratch = Scratch::new()?;
         let engine = session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),

@@ -122,6 +122,9 @@ impl Merging {
                 self.pair(start..end, limit_m, &mut partner);
                 (start, end) = (end, (end + GROUP).min(before));
             }
+            if partner.iter().all(Option::is_none) {
+                break;
+            }
             self.join(&partner);
             // A round that joins less than every fiftieth is the last.
             if self.nodes.len() * 50 > before * 49 || self.nodes.len() <= FEWEST {
@@ -133,8 +136,17 @@ impl Merging {
     /// Chooses disjoint pairs of a group, the cheapest first.
     fn pair(&self, group: std::ops::Range<usize>, limit_m: f64, partner: &mut [Option<u32>]) {
         let mut pairs = Vec::new();
-        for first in group.clone() {
-            for second in first + 1..group.end.min(first + 1 + PARTNERS) {
+        // Most pairs are too far apart, whatever their errors: a root less for each of those. The
+        // margin keeps what `price` may accept, however the roots are rounded.
+        let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
+        let nodes = &self.nodes[group.clone()];
+        for (place, from) in nodes.iter().enumerate() {
+            for (ahead, to) in nodes[place + 1..].iter().take(PARTNERS).enumerate() {
+                if from.mean_m.distance_squared(to.mean_m) > farthest_m2 {
+                    continue;
+                }
+                let first = group.start + place;
+                let second = first + 1 + ahead;
                 if let Some(cost) = self.price(first, second, limit_m) {
                     pairs.push(Pair { cost, first, second });
                 }
@@ -192,6 +204,7 @@ impl Merging {
     fn join(&mut self, partner: &[Option<u32>]) {
         let count = self.nodes.len();
         let mut place = vec![u32::MAX; count];
+        let mut is_new = Vec::with_capacity(count);
         let mut end = 0;
         for node in 0..count {
             if place[node] != u32::MAX {
@@ -216,13 +229,18 @@ impl Merging {
             // Never further back than where it was read: the second of a pair comes later.
             self.nodes[end] = joint;
             self.sh.copy_within(node * self.stride..(node + 1) * self.stride, end * self.stride);
+            self.errors_m[end] = if partner[node].is_some() { 0.0 } else { self.errors_m[node] };
+            is_new.push(partner[node].is_some());
             end += 1;
         }
         self.nodes.truncate(end);
         self.sh.truncate(end * self.stride);
-        self.errors_m = vec![0.0; end];
+        self.errors_m.truncate(end);
         for (node, (mean_m, sigma_m)) in self.node_of_leaf.iter_mut().zip(&self.leaves) {
             *node = place[*node as usize];
+            if !is_new[*node as usize] {
+                continue;
+            }
             let joint = &self.nodes[*node as usize];
             let lost_m = (sigma_m - joint.sigma_m()).max(0.0);
             let error_m = joint.mean_m.distance(*mean_m) + 3.0 * lost_m;
