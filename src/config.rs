@@ -368,6 +368,10 @@ pub const GOLDEN_GAUSSIANS: usize = 20_000_000;
 /// same.
 pub const PREFETCH_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// How often it is looked whether that is loaded: twenty times a second add nothing to seconds of
+/// loading.
+pub const PREPARE_POLL: Duration = Duration::from_millis(50);
+
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;
 

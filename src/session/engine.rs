@@ -8,11 +8,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
-use tokio::time::{Instant, timeout_at};
+use tokio::time::{Instant, sleep, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Eye, Lens, Reservation, ResidencyError, Resident, Stats};
+use crate::residency::{
+    Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
+};
 use crate::store::Catalog;
 
 use super::SessionError;
@@ -166,10 +168,11 @@ impl Engine {
     }
 
     /// Opens a version and loads what frames of it need, for those who will switch to it where they
-    /// are: they need not wait.
+    /// are: they need not wait. Only as far as there is room beside what sessions look at and expect,
+    /// whose frames go first, and for no longer than `config::PREFETCH_TIMEOUT`.
     ///
     /// # Errors
-    /// It cannot be opened, or what a frame needs cannot be loaded.
+    /// It cannot be opened.
     pub async fn prepare(
         self: &Arc<Self>,
         twin: &str,
@@ -177,11 +180,18 @@ impl Engine {
         frames: Vec<Vec<Eye>>,
     ) -> Result<(), SessionError> {
         let resident = self.resident(twin.to_owned(), Some(number)).await?;
-        let loaded = tokio::task::spawn_blocking(move || {
-            let profile = &resident.version.manifest.profile;
-            frames.iter().try_for_each(|eyes| resident.scene(eyes, profile).map(|_| ()))
-        });
-        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
+        let deadline = Instant::now() + config::PREFETCH_TIMEOUT;
+        let expectation = Arc::new(Expectation::new(resident));
+        let expected = expectation.clone();
+        let expect = move || {
+            let places: Vec<_> = frames.into_iter().map(|eyes| (Urgency::Imminent, eyes)).collect();
+            expected.prefetch(&places, &expected.resident().version.manifest.profile);
+        };
+        tokio::task::spawn_blocking(expect).await.map_err(|_| SessionError::Crashed)?;
+        while expectation.coming() > 0 && Instant::now() < deadline {
+            sleep(config::PREPARE_POLL).await;
+        }
+        Ok(())
     }
 
     /// Name of the backend.
@@ -219,9 +229,18 @@ impl Engine {
     pub(super) async fn reserve(
         resident: Arc<Resident>,
         lens: Lens,
-    ) -> Result<Arc<Reservation>, SessionError> {
+    ) -> Result<Reservation, SessionError> {
         let reserved = tokio::task::spawn_blocking(move || resident.reserve(lens));
-        Ok(Arc::new(reserved.await.map_err(|_| SessionError::Crashed)??))
+        Ok(reserved.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// The most that a frame of a rig anywhere in the twin needs, in bytes.
+    pub(super) async fn worst_bytes(
+        resident: Arc<Resident>,
+        lens: Lens,
+    ) -> Result<u64, SessionError> {
+        let sought = tokio::task::spawn_blocking(move || resident.worst_bytes(lens));
+        sought.await.map_err(|_| SessionError::Crashed)
     }
 
     /// Does some work on a render thread when its turn comes, and tells how long it waited.
