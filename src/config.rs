@@ -345,6 +345,10 @@ pub const PUSHES_REMEMBERED: usize = 64;
 /// Files of one push.
 pub const PUSH_FILES: usize = 256;
 
+/// Gaussians of one push, all its files together: 248 B each in memory at SH degree 3 are 62 GB, and
+/// as much again while files are joined. The largest upload holds no more, unless it is packed.
+pub const PUSH_GAUSSIANS: u64 = 250_000_000;
+
 /// Bad Gaussians that are named of one file; the others are counted.
 pub const BAD_GAUSSIANS: usize = 16;
 
@@ -363,6 +367,10 @@ pub const GOLDEN_GAUSSIANS: usize = 20_000_000;
 /// How long a push may load what its version changes where sessions drive, before it is ready all the
 /// same.
 pub const PREFETCH_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How often it is looked whether that is loaded: twenty times a second add nothing to seconds of
+/// loading.
+pub const PREPARE_POLL: Duration = Duration::from_millis(50);
 
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;

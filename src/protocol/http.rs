@@ -271,6 +271,9 @@ pub struct VersionInfo {
     pub created_us: i64,
     /// How it came about: `import`, `push` or `rollback`.
     pub kind: String,
+    /// Whether who opens the latest version may get it; not while a push still makes it ready.
+    #[serde(default = "yes")]
+    pub ready: bool,
     /// The version that it was made from: what a push changed, or what a rollback restored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parent: Option<u64>,

@@ -63,6 +63,16 @@ impl Budget {
         Ok(())
     }
 
+    /// Sets memory aside in place of what was taken before; if that is refused, nothing changes.
+    ///
+    /// # Errors
+    /// As [`Budget::take`].
+    pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
+        let before = self.versions.clone();
+        self.give_back(old);
+        self.take(new).inspect_err(|_| self.versions = before)
+    }
+
     /// Gives back what [`Budget::take`] took.
     pub(super) fn give_back(&mut self, claim: &Claim) {
         if let Some(claims) = self.versions.get_mut(&claim.version) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::scene::manifest::{ChunkEntry, Section};
 use crate::scene::{Chunk, Manifest, RenderProfile};
@@ -57,8 +57,9 @@ pub struct Resident {
 /// A frame that waits for what it needs. Dropped, it waits no more.
 #[derive(Debug)]
 pub struct Ticket {
-    resident: Arc<Resident>,
+    /// Dropped first: as long as it waits, the queue names sections by ids that `resident` keeps.
     waiting: Waiting,
+    resident: Arc<Resident>,
     needed: usize,
     asked: Instant,
 }
@@ -120,8 +121,7 @@ impl Cache {
 
     /// What was done so far, and what is held now.
     pub fn stats(&self) -> Stats {
-        let reserved_bytes = lock(&self.shared.budget).held_bytes();
-        Stats { reserved_bytes, ..self.shared.pager.stats() }
+        self.shared.stats()
     }
 
     /// The slot of a version. Slots that nobody holds or opens are dropped, so that they do not
@@ -130,6 +130,13 @@ impl Cache {
         let mut slots = lock(&self.slots);
         slots.retain(|_, slot| Arc::strong_count(slot) > 1 || lock(slot).strong_count() > 0);
         slots.entry((version.hash.clone(), version.number)).or_default().clone()
+    }
+}
+
+impl Shared {
+    fn stats(&self) -> Stats {
+        let reserved_bytes = lock(&self.budget).held_bytes();
+        Stats { reserved_bytes, ..self.pager.stats() }
     }
 }
 
@@ -172,7 +179,7 @@ impl Resident {
         let wanted = self.wanted(self.demand(eyes, profile));
         let (needed, asked) = (wanted.needed.len(), Instant::now());
         let waiting = self.shared.pager.ask(wanted, done)?;
-        Ok(Ticket { resident: self.clone(), waiting, needed, asked })
+        Ok(Ticket { waiting, resident: self.clone(), needed, asked })
     }
 
     /// What a frame of these cameras draws, all of it in memory. Blocks until it is.
@@ -221,7 +228,17 @@ impl Resident {
 
     /// What was done for all twins so far, and what is held now.
     pub fn stats(&self) -> Stats {
-        self.shared.pager.stats()
+        self.shared.stats()
+    }
+
+    /// Bytes of memory that twins take now, what is being loaded included, and bytes there are.
+    pub fn memory(&self) -> (u64, u64) {
+        self.shared.pager.memory()
+    }
+
+    /// What all but one of a hundred of the last loads took, of all twins.
+    pub fn load_p99(&self) -> Duration {
+        self.shared.pager.load_times().quantile(0.99)
     }
 
     pub(super) fn wanted(&self, needed: Vec<Needed>) -> Wanted {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::config;
 
 /// The times of the last loads, oldest overwritten first.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct LoadTimes {
     times: Vec<Duration>,
     next: usize,

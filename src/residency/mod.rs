@@ -27,7 +27,7 @@ pub use demand::{Eye, Needed, demand};
 pub use error::ResidencyError;
 pub use index::Index;
 pub use pager::{Done, Pinned, Urgency};
-pub use reservation::Reservation;
+pub use reservation::{Expectation, Reservation};
 pub use source::Source;
 pub use stats::Stats;
 pub use worst::Lens;

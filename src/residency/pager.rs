@@ -4,7 +4,8 @@
 //! everybody but older frames ([`Asker`]). Threads of its own load, because reading blocks; nobody
 //! else ever waits in here for more than a lock.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -191,7 +192,9 @@ impl Pager {
             if let Some(before) = before {
                 state.withdraw_prefetch(before);
             }
-            state.prefetch(before, wanted, urgencies)
+            let number = state.prefetch(before, wanted, urgencies);
+            state.forget_failures();
+            number
         };
         self.0.work.notify_all();
         number
@@ -199,19 +202,44 @@ impl Pager {
 
     /// Loads nothing more of what was wanted under a number.
     pub(super) fn withdraw_prefetch(&self, number: u64) {
-        self.0.lock().withdraw_prefetch(number);
+        let mut state = self.0.lock();
+        state.withdraw_prefetch(number);
+        state.forget_failures();
     }
 
-    pub(super) fn stats(&self) -> Stats {
+    /// Sections that were wanted under a number and may still come: not those that are there, that
+    /// failed or for which there was no room.
+    pub(super) fn coming(&self, number: u64) -> usize {
         let state = self.0.lock();
-        Stats {
+        let of = |urgency| state.queue.range(places_of(urgency, number));
+        let places = of(Urgency::Imminent).chain(of(Urgency::Speculative));
+        places.filter(|(place, _)| state.table.get(place.id).is_none()).count()
+    }
+
+    /// Bytes of memory in use, and bytes there are.
+    pub(super) fn memory(&self) -> (u64, u64) {
+        let state = self.0.lock();
+        (state.table.held_bytes(), state.table.limit_bytes())
+    }
+
+    /// How long the last loads took.
+    pub(super) fn load_times(&self) -> LoadTimes {
+        self.0.lock().load_times.clone()
+    }
+
+    /// All but what is set aside, which the pager does not know.
+    pub(super) fn stats(&self) -> Stats {
+        // Sorted once the lock is open again.
+        let times = self.load_times();
+        let state = self.0.lock();
+        let stats = Stats {
             held_bytes: state.table.held_bytes(),
             limit_bytes: state.table.limit_bytes(),
             held_sections: state.table.held_sections(),
-            load_p50: state.load_times.quantile(0.5),
-            load_p99: state.load_times.quantile(0.99),
             ..state.stats
-        }
+        };
+        drop(state);
+        Stats { load_p50: times.quantile(0.5), load_p99: times.quantile(0.99), ..stats }
     }
 }
 
@@ -234,7 +262,12 @@ impl Waiting {
 impl Drop for Waiting {
     fn drop(&mut self) {
         // What it was to be told is dropped once the lock is open: it may hold anything.
-        let _done = self.shared.lock().give_up(self.number);
+        let _done = {
+            let mut state = self.shared.lock();
+            let done = state.give_up(self.number);
+            state.forget_failures();
+            done
+        };
         self.shared.work.notify_all();
     }
 }
@@ -369,12 +402,18 @@ impl State {
         let all = wanted.ids.iter().zip(&wanted.needed).zip(urgencies);
         for (order, ((&id, &needed), &urgency)) in (0..).zip(all) {
             self.table.want(id, request);
-            if self.table.is_absent(id) && self.queue.len() < config::QUEUED_SECTIONS {
+            if self.table.get(id).is_none() && self.queue.len() < config::QUEUED_SECTIONS {
                 self.queue.insert(Place { urgency, request, order, id }, needed);
             }
         }
-        // What its owner has wanted since its last time stays; for an owner that is new, everything.
-        let asker = Asker::Prefetch(before.unwrap_or(0));
+        // What its owner has wanted since its last time stays; for an owner that is new, what any
+        // other has.
+        let since = |request: &Request| match request.asker {
+            Asker::Prefetch(since) => Some(since),
+            Asker::Frame(_) => None,
+        };
+        let others = || self.requests.values().filter_map(since).min();
+        let asker = Asker::Prefetch(before.or_else(others).unwrap_or(request));
         self.requests.insert(request, Request { wanted, asker, frame: None });
         request
     }
@@ -386,12 +425,20 @@ impl State {
     }
 
     fn unqueue(&mut self, urgency: Urgency, request: u64) {
-        let first = Place { urgency, request, order: 0, id: 0 };
-        let last = Place { urgency, request, order: u32::MAX, id: Id::MAX };
-        let places: Vec<Place> = self.queue.range(first..=last).map(|(place, _)| *place).collect();
+        let places = self.queue.range(places_of(urgency, request));
+        let places: Vec<Place> = places.map(|(place, _)| *place).collect();
         places.iter().for_each(|place| {
             self.queue.remove(place);
         });
+    }
+
+    /// Drops the failures of what nobody wants any more: whoever wants it next has all attempts, and
+    /// its name may become another section's. What is wanted and not there stands in the queue.
+    fn forget_failures(&mut self) {
+        if !self.failures.is_empty() {
+            let wanted: BTreeSet<Id> = self.queue.keys().map(|place| place.id).collect();
+            self.failures.retain(|id, _| wanted.contains(id));
+        }
     }
 
     /// Takes a frame from those that wait.
@@ -450,6 +497,7 @@ impl State {
         over.iter().for_each(|place| {
             self.queue.remove(place);
         });
+        self.forget_failures();
         let Some((id, needed, version, dropped)) = found else { return Next::Wait(soonest) };
         self.stats.evictions += dropped.len() as u64;
         dropped.into_iter().for_each(|dropped| self.is_missing_again(dropped));
@@ -484,7 +532,7 @@ impl State {
         self.stats.loads += 1;
         self.load_times.add(took);
         self.failures.remove(&id);
-        self.table.fill(id, chunk);
+        self.table.fill(id, chunk, self.number);
         let mut complete = Vec::new();
         for number in self.table.waiting(id) {
             let request = self.requests.get_mut(number);
@@ -528,6 +576,7 @@ impl State {
         if attempts < config::LOAD_ATTEMPTS {
             let not_before = Instant::now() + config::LOAD_BACKOFF * 4_u32.pow(attempts - 1);
             self.failures.insert(id, Failure { attempts, not_before });
+            self.forget_failures();
             self.table.fail(id);
             return;
         }
@@ -548,6 +597,12 @@ impl State {
         self.queue.retain(|place, _| place.id != id);
         self.table.fail(id);
     }
+}
+
+/// Where a request's sections stand in the queue.
+fn places_of(urgency: Urgency, request: u64) -> RangeInclusive<Place> {
+    let first = Place { urgency, request, order: 0, id: 0 };
+    first..=Place { order: u32::MAX, id: Id::MAX, ..first }
 }
 
 fn tell(tellings: Tellings) {

@@ -183,9 +183,10 @@ impl Table {
         Some(victims)
     }
 
-    /// A section has arrived.
-    pub(super) fn fill(&mut self, id: Id, chunk: Arc<Chunk>) {
-        self.slots[id as usize].state = State::Here(chunk);
+    /// A section has arrived. That counts as being wanted: the list stays in order of stamps.
+    pub(super) fn fill(&mut self, id: Id, chunk: Arc<Chunk>, stamp: u64) {
+        let slot = &mut self.slots[id as usize];
+        (slot.state, slot.stamp) = (State::Here(chunk), stamp);
         self.held_sections += 1;
         self.link_newest(id);
     }
@@ -280,6 +281,8 @@ mod tests {
             while next != NONE {
                 let slot = &self.slots[next as usize];
                 assert_eq!(slot.older, before);
+                let stamp = |id: Id| self.slots[id as usize].stamp;
+                assert!(before == NONE || stamp(before) <= slot.stamp, "in order of stamps");
                 listed.push(next);
                 (before, next) = (next, slot.newer);
             }
@@ -358,7 +361,11 @@ mod tests {
                     }
                     4 | 5 if !loading.is_empty() => {
                         let id = loading.swap_remove(random.below(loading.len()));
-                        if random.below(4) > 0 { table.fill(id, chunk()) } else { table.fail(id) }
+                        if random.below(4) > 0 {
+                            table.fill(id, chunk(), now);
+                        } else {
+                            table.fail(id);
+                        }
                     }
                     6 => {
                         if let Some(chunk) = table.get(id).cloned() {
@@ -389,7 +396,7 @@ mod tests {
         for (stamp, &id) in (1..).zip(&ids[..3]) {
             table.want(id, stamp);
             assert_eq!(table.reserve(id, Asker::Frame(stamp)), Some(vec![]));
-            table.fill(id, chunk());
+            table.fill(id, chunk(), stamp);
         }
         (table, ids)
     }

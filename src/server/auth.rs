@@ -96,9 +96,14 @@ impl Tokens {
         if file.tokens.is_empty() {
             return Err(wrong("tokens".to_owned(), "there is none: nobody could come in"));
         }
-        let mut tokens = Vec::with_capacity(file.tokens.len());
+        let mut tokens: Vec<Token> = Vec::with_capacity(file.tokens.len());
         for (index, Entry { name, role, token, hash, twins }) in file.tokens.into_iter().enumerate()
         {
+            // Sessions belong to the name.
+            if name.is_empty() || tokens.iter().any(|other| other.grant.name == name) {
+                let reason = "a name is not empty, and of one token only";
+                return Err(wrong(format!("tokens[{index}].name"), reason));
+            }
             let secret = match (token, hash) {
                 (Some(token), None) if token.len() >= MIN_TOKEN_BYTES => {
                     Secret::OfToken(blake3::hash(token.as_bytes()))
@@ -247,6 +252,15 @@ mod tests {
                 "tokens[0].token",
             ),
             (r#"{"tokens": [{"name": "a", "role": "drive"}]}"#, "tokens[0]"),
+            (
+                r#"{"tokens": [{"name": "", "role": "drive", "token": "secretsecretsecret"}]}"#,
+                "tokens[0].name",
+            ),
+            (
+                r#"{"tokens": [{"name": "a", "role": "drive", "token": "secretsecretsecret"},
+                    {"name": "a", "role": "push", "token": "secretsecretsecrets"}]}"#,
+                "tokens[1].name",
+            ),
             (r#"{"tokens": [{"name": "a", "role": "drive", "hash": "secret"}]}"#, "tokens[0].hash"),
         ] {
             let error = Tokens::parse(text.as_bytes()).unwrap_err().to_string();

@@ -1,6 +1,9 @@
 //! What a request, or a whole connection, can be refused for. `convert` gives each its wire code.
 
+use std::io;
+
 use crate::geometry::{CameraError, PoseError};
+use crate::ingest::IngestError;
 use crate::scene::rig::RigError;
 use crate::session::SessionError;
 use crate::store::StoreError;
@@ -194,7 +197,7 @@ pub(super) enum Fault {
         /// What was tried.
         action: &'static str,
         /// What the operating system says.
-        cause: std::io::Error,
+        cause: io::Error,
     },
     /// The server stops.
     #[error("the server is shutting down; resume or start again when it is back")]
@@ -214,6 +217,17 @@ impl From<StoreError> for Fault {
 }
 
 impl Fault {
+    /// Whether what was pushed is at fault, or the base that it was made from: the same again would
+    /// be refused again. Everything else may pass.
+    pub(super) fn is_content(&self) -> bool {
+        match self {
+            Self::Content { .. } | Self::OutOfRange { .. } => true,
+            Self::Session(SessionError::Twin(StoreError::Overlap { .. })) => true,
+            Self::Session(SessionError::Twin(error)) => is_content(error),
+            _ => false,
+        }
+    }
+
     /// Whether the connection cannot go on.
     pub(super) fn is_fatal(&self) -> bool {
         matches!(
@@ -225,4 +239,21 @@ impl Fault {
                 | Self::ShuttingDown
         )
     }
+}
+
+/// Whether a commit was refused for what it holds.
+pub(super) fn is_content(error: &StoreError) -> bool {
+    match error {
+        StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),
+        StoreError::Clamped { .. }
+        | StoreError::Profile(_)
+        | StoreError::Field { .. }
+        | StoreError::ManifestSize { .. } => true,
+        _ => false,
+    }
+}
+
+/// Whether a disk, or what somebody may have of it, is full.
+pub(super) fn is_full(cause: &io::Error) -> bool {
+    matches!(cause.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }

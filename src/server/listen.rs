@@ -1,5 +1,6 @@
 //! Accepts connections, a bounded number of them.
 
+use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -9,7 +10,7 @@ use hyper_util::service::TowerToHyperService;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 
 use crate::config;
 
@@ -80,6 +81,18 @@ impl Patience {
         *self.until.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now() + self.period;
     }
 
+    /// Does what the client waits for, and whose time is not its own; the request goes on until then.
+    pub(super) async fn during<T>(&self, work: impl Future<Output = T>) -> T {
+        let mut work = pin!(work);
+        loop {
+            self.extend();
+            if let Ok(done) = timeout(self.period / 2, &mut work).await {
+                self.extend();
+                return done;
+            }
+        }
+    }
+
     async fn over(&self) {
         loop {
             let until = *self.until.lock().unwrap_or_else(PoisonError::into_inner);
@@ -100,5 +113,23 @@ fn prepare(stream: &TcpStream) {
         stream.set_nodelay(true).and_then(|()| SockRef::from(stream).set_tcp_keepalive(&keepalive));
     if let Err(error) = set {
         tracing::warn!("cannot set socket options: {error}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_client_is_not_cut_off_while_it_waits_for_the_server() {
+        let patience = Patience::new(Duration::from_millis(400));
+        tokio::select! {
+            biased;
+            () = patience.over() => panic!("cut off in the middle of it"),
+            () = patience.during(tokio::time::sleep(Duration::from_millis(1200))) => {}
+        }
+        // Its own silence still is.
+        let silent = timeout(Duration::from_secs(10), patience.over());
+        silent.await.expect("over some time");
     }
 }

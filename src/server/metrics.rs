@@ -126,7 +126,11 @@ impl Collector for Residency {
             ("evictions", "Sections that made room for others".to_owned(), stats.evictions),
             ("prefetches_dropped", "Prefetches without room".to_owned(), stats.prefetches_dropped),
             ("waits", "Frames that had to wait".to_owned(), stats.waits),
-            ("waits_given_up", "Frames not complete in time".to_owned(), stats.waits_given_up),
+            (
+                "waits_given_up",
+                "Frames not complete in time, or for a section that failed".to_owned(),
+                stats.waits_given_up,
+            ),
         ] {
             let counter = ConstCounter::new(count);
             let name = format!("residency_{name}");
@@ -148,8 +152,11 @@ impl Collector for Residency {
             }
         }
         let seconds = |duration: std::time::Duration| duration.as_secs_f64();
+        let (name, help) = ("residency_wait_seconds", "How long frames waited, together");
+        let counter = ConstCounter::new(seconds(stats.wait_time));
+        let kind = counter.metric_type();
+        counter.encode(encoder.encode_descriptor(name, help, None, kind)?)?;
         for (name, help, value) in [
-            ("wait_seconds", "How long frames waited, together", seconds(stats.wait_time)),
             ("held_bytes", "Memory in use", stats.held_bytes as f64),
             ("limit_bytes", "Memory there is", stats.limit_bytes as f64),
             ("reserved_bytes", "Memory set aside for sessions", stats.reserved_bytes as f64),

@@ -12,7 +12,7 @@ use crate::ingest::{self, IngestError};
 use crate::scene::chunk::cell_at;
 use crate::scene::manifest::Provenance;
 use crate::scene::{Gaussians, RenderProfile};
-use crate::session::{Changed, SessionError};
+use crate::session::{Changed, Engine, HeldLatest};
 use crate::store::{Catalog, Change, Kind, Settings, Storage, StoreError, Version};
 
 use super::Server;
@@ -34,7 +34,7 @@ pub(super) async fn run(server: Arc<Server>, push: Arc<Push>, ask: Ask, uploads:
         () = server.stopped() => Err(Fault::ShuttingDown),
     };
     let ended = ended.map_err(|fault| {
-        let state = if is_content(&fault) { State::Refused } else { State::Failed };
+        let state = if fault.is_content() { State::Refused } else { State::Failed };
         tracing::warn!(?state, "a push ended: {fault}");
         (state, fault)
     });
@@ -45,21 +45,6 @@ pub(super) async fn run(server: Arc<Server>, push: Arc<Push>, ask: Ask, uploads:
     };
     server.metrics.pushed(outcome);
     push.end(ended);
-}
-
-/// Whether a fault lies in what was pushed: the same again would fail again.
-fn is_content(fault: &Fault) -> bool {
-    match fault {
-        Fault::Content { .. } | Fault::OutOfRange { .. } => true,
-        Fault::Session(SessionError::Twin(error)) => !matches!(
-            error,
-            StoreError::Io { .. }
-                | StoreError::Damaged { .. }
-                | StoreError::Conflict { .. }
-                | StoreError::NotSynced { .. }
-        ),
-        _ => false,
-    }
 }
 
 /// What the files hold, as one.
@@ -84,17 +69,17 @@ async fn publish(
     push.enter(State::Validating);
     let (catalog, asked) = (server.engine.catalog().clone(), ask.clone());
     let base = blocking(move || find_base(&catalog, &asked)).await?.map(Arc::new);
-    let scene = Arc::new(validate(server, push, &ask, scene, base.as_ref()).await?);
+    let scene = validate(server, push, &ask, scene, base.clone()).await?;
 
     push.enter(State::Committing);
-    let latest = base.as_ref().map(|base| base.number);
-    let (catalog, told) = (server.engine.catalog().clone(), push.clone());
-    // Until it is ready, who opens the latest gets the one before.
-    let latest = ask.base.map_or(Ok(latest), |_| latest_of(&catalog, &ask.twin).map(Some))?;
-    let held = latest.map(|number| server.engine.hold_latest(&ask.twin, number));
-    let asked = ask.clone();
-    let version =
-        blocking(move || commit(&catalog, &told, &asked, &scene, base.as_deref())).await?;
+    let (engine, told, asked) = (server.engine.clone(), push.clone(), ask.clone());
+    let (held, version) = blocking(move || {
+        // Until it is ready, who opens the latest gets what is the latest now: comparing took its time.
+        let held = hold_latest(&engine, &asked.twin)?;
+        let version = commit(engine.catalog(), &told, &asked, &scene, base.as_deref())?;
+        Ok((held, version))
+    })
+    .await?;
     tracing::info!(twin = ask.twin, version = version.number, "pushed");
 
     push.enter(State::Prefetching);
@@ -143,14 +128,12 @@ fn read(push: &Push, ask: &Ask, uploads: &[Arc<Upload>]) -> Result<Scene, Fault>
             }
             Err(error) => return Err(refused(error)),
         };
-        file.axes.apply(&mut gaussians);
         let (count, first_bad) = (gaussians.len() as u64, Vec::new());
         report.files.push(FileReport { name: name.clone(), gaussians: count, bad: 0, first_bad });
+        report.gaussians += count;
+        fits(&name, report.gaussians).inspect_err(|_| push.tell(report.clone()))?;
+        file.axes.apply(&mut gaussians);
         joined = join(joined, gaussians);
-        report.gaussians = joined.len() as u64;
-        if report.gaussians > config::IMPORT_GAUSSIANS {
-            return Err(refused(IngestError::TooMany { count: report.gaussians }));
-        }
         sources.push(hash);
         options.extend(file.options.clone());
         before += upload.announced().size;
@@ -163,6 +146,19 @@ fn read(push: &Push, ask: &Ask, uploads: &[Arc<Upload>]) -> Result<Scene, Fault>
         return Err(Fault::Content { reason, cells: Vec::new() });
     }
     Ok(Scene { gaussians: Arc::new(joined), sources, options, report })
+}
+
+/// Whether a push may have so many Gaussians, counted up to one of its files.
+fn fits(name: &str, count: u64) -> Result<(), Fault> {
+    let most = config::PUSH_GAUSSIANS;
+    if count <= most {
+        return Ok(());
+    }
+    let reason = format!(
+        "{name}: the push has {count} Gaussians with this file; at most {most} fit one: push the \
+         scene in parts, some cells each"
+    );
+    Err(Fault::Content { reason, cells: Vec::new() })
 }
 
 /// One scene after the other; the lower SH degree gets zeros.
@@ -190,18 +186,43 @@ fn find_base(catalog: &Catalog, ask: &Ask) -> Result<Option<Version>, Fault> {
     }
 }
 
-fn latest_of(catalog: &Catalog, twin: &str) -> Result<u64, Fault> {
-    Ok(catalog.versions(twin)?.last().map_or(0, |entry| entry.number))
+/// Keeps what is the latest version; none if the twin is new.
+fn hold_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<HeldLatest>, Fault> {
+    let versions = match engine.catalog().versions(twin) {
+        Ok(versions) => versions,
+        Err(StoreError::NoTwin { .. }) => return Ok(None),
+        Err(error) => return Err(error.into()),
+    };
+    Ok(versions.last().map(|latest| engine.hold_latest(twin, latest.number)))
 }
 
 /// Looks at what would change, and at how it looks.
 async fn validate(
     server: &Arc<Server>,
     push: &Arc<Push>,
+    ask: &Arc<Ask>,
+    scene: Scene,
+    base: Option<Arc<Version>>,
+) -> Result<Scene, Fault> {
+    let (told, asked, before) = (push.clone(), ask.clone(), base.clone());
+    let (mut scene, changed) =
+        blocking(move || changes(&told, &asked, scene, before.as_ref())).await?;
+    if let Some(changed) = changed {
+        let progress = |done, total| push.progress(done, total);
+        scene.report.golden = server.engine.compare(changed, ask.poses.clone(), &progress).await?;
+        push.tell(scene.report.clone());
+    }
+    looks_alike(ask, &scene, base.as_deref())?;
+    Ok(scene)
+}
+
+/// What would change of the base; and what there is to compare, if it can be compared.
+fn changes(
+    push: &Push,
     ask: &Ask,
     scene: Scene,
     base: Option<&Arc<Version>>,
-) -> Result<Scene, Fault> {
+) -> Result<(Scene, Option<Changed>), Fault> {
     let Scene { mut gaussians, sources, options, mut report } = scene;
     // What is stored of a twin has one SH degree; a lower one gets zeros.
     if let Some(base) = base
@@ -226,20 +247,51 @@ async fn validate(
         let must = format!("set, for {} Gaussians; at most {most} are compared", gaussians.len());
         return Err(Fault::OutOfRange { field: "golden".to_owned(), must });
     }
-    if let Some(base) = base.filter(|base| fits && base.manifest.sh_degree == gaussians.sh_degree) {
-        let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
-        let changed = Changed {
-            before: base.clone(),
-            gaussians: inside(&gaussians, &changed, left_out),
-            cells: changed,
-            profile: profile(ask, base.manifest.profile)?,
+    let base = base.filter(|base| fits && base.manifest.sh_degree == gaussians.sh_degree);
+    let changed = match base {
+        Some(base) => {
+            let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
+            Some(Changed {
+                before: base.clone(),
+                gaussians: inside(&gaussians, &changed, left_out),
+                cells: changed,
+                profile: profile(ask, base.manifest.profile)?,
+            })
+        }
+        None => None,
+    };
+    Ok((Scene { gaussians, sources, options, report }, changed))
+}
+
+/// Refuses what differs by more than was asked for, and what cannot be compared although it was.
+fn looks_alike(ask: &Ask, scene: &Scene, base: Option<&Version>) -> Result<(), Fault> {
+    let Some(least_db) = ask.min_psnr_db else { return Ok(()) };
+    let golden = &scene.report.golden;
+    if golden.is_empty() {
+        let why = match base {
+            None => "there is no version before it: leave it out".to_owned(),
+            Some(Version { manifest, .. }) if manifest.sh_degree != scene.gaussians.sh_degree => {
+                format!(
+                    "the SH degree is {}, and {} in the version before: leave it out",
+                    scene.gaussians.sh_degree, manifest.sh_degree
+                )
+            }
+            Some(Version { manifest, .. })
+                if ask.poses.is_none() && manifest.trajectories.is_empty() =>
+            {
+                "the twin has no trajectory: name golden.poses".to_owned()
+            }
+            Some(_) if ask.poses.as_ref().is_some_and(Vec::is_empty) => {
+                "golden.poses names none".to_owned()
+            }
+            Some(_) => {
+                "a camera of the twin's rig cannot be drawn smaller: leave it out".to_owned()
+            }
         };
-        let progress = |done, total| push.progress(done, total);
-        report.golden = server.engine.compare(changed, ask.poses.clone(), &progress).await?;
-        push.tell(report.clone());
+        let must = format!("{least_db}, but nothing can be compared: {why}");
+        return Err(Fault::OutOfRange { field: "golden.min_psnr_db".to_owned(), must });
     }
-    let least_db = ask.min_psnr_db.unwrap_or(f64::NEG_INFINITY);
-    let worst = report.golden.iter().enumerate().find(|(_, golden)| golden.psnr_db < least_db);
+    let worst = golden.iter().enumerate().find(|(_, golden)| golden.psnr_db < least_db);
     if let Some((index, golden)) = worst {
         let [x, y, z] = golden.world_from_rig.position_m.to_array();
         let reason = format!(
@@ -249,7 +301,7 @@ async fn validate(
         );
         return Err(Fault::Content { reason, cells: Vec::new() });
     }
-    Ok(Scene { gaussians, sources, options, report })
+    Ok(())
 }
 
 /// The Gaussians within some cells.
@@ -327,5 +379,19 @@ fn provenance(ask: &Ask, scene: &Scene) -> Provenance {
         source: format!("blake3:{source}"),
         builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
         options,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_push_has_a_largest_size() {
+        assert!(fits("a.ply", config::PUSH_GAUSSIANS).is_ok());
+        let error = fits("b.ply", config::PUSH_GAUSSIANS + 1).unwrap_err();
+        assert!(error.is_content());
+        let text = error.to_string();
+        assert!(text.starts_with("b.ply") && text.contains("250000001"), "{text}");
     }
 }

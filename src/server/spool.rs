@@ -5,6 +5,7 @@
 //! <spool>/<id>.json        what was announced
 //! <spool>/<id>.part        what has arrived
 //! <spool>/<id>.data        all of it, and it is what the digest promises
+//! <spool>/<id>.gone        thrown away: freeing a large file takes a while
 //! ```
 //!
 //! The id is the digest: the same content is the same upload. Half an upload survives a restart, and
@@ -25,7 +26,7 @@ use tokio::time::timeout;
 
 use crate::config;
 
-use super::fault::Fault;
+use super::fault::{Fault, is_full};
 
 /// How much a server keeps of uploads; see the constants in [`crate::config`] that are the defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -114,6 +115,8 @@ impl Spool {
             return Err(Fault::OutOfRange { field: "size".to_owned(), must });
         }
         let id = announced.digest.id();
+        // Dropped after the lock is given back.
+        let mut gone = Vec::new();
         let mut uploads = self.lock();
         if let Some(upload) = uploads.get(&id) {
             if upload.announced.size != announced.size {
@@ -127,13 +130,16 @@ impl Spool {
             upload.touch();
             return Ok(upload.clone());
         }
-        self.make_room(&mut uploads, announced.size)?;
+        self.make_room(&mut uploads, announced.size, &mut gone)?;
         let upload = Arc::new(Upload::new(&self.dir, announced, 0, SystemTime::now()));
-        upload.create().map_err(|cause| upload.failed("write to", cause))?;
+        let created = upload.create().map_err(|cause| upload.failed("write to", cause));
+        let begun = created.and_then(|()| match upload.announced.size {
+            0 => upload.finish(),
+            _ => Ok(()),
+        });
+        // Nothing is left of what is refused.
+        begun.inspect_err(|_| gone.push(upload.set_aside()))?;
         uploads.insert(id, upload.clone());
-        if upload.announced.size == 0 {
-            upload.finish()?;
-        }
         Ok(upload)
     }
 
@@ -145,8 +151,12 @@ impl Spool {
 
     /// Throws an upload away.
     pub(super) fn forget(&self, upload: &Upload) {
-        self.lock().remove(&upload.id);
-        upload.remove();
+        let mut uploads = self.lock();
+        uploads.remove(&upload.id);
+        // Under the lock: its name may be given again right after.
+        let gone = upload.set_aside();
+        drop(uploads);
+        drop(gone);
     }
 
     /// Throws away what is too old, and used by nobody.
@@ -155,10 +165,12 @@ impl Spool {
             let idle = upload.touched().elapsed().unwrap_or_default() >= self.limits.age;
             idle && Arc::strong_count(upload) == 1
         };
+        // Dropped after the lock is given back.
+        let mut gone = Vec::new();
         self.lock().retain(|_, upload| {
             let keep = !too_old(upload);
             if !keep {
-                upload.remove();
+                gone.push(upload.set_aside());
             }
             keep
         });
@@ -180,6 +192,7 @@ impl Spool {
         &self,
         uploads: &mut BTreeMap<String, Arc<Upload>>,
         size: u64,
+        gone: &mut Vec<Gone>,
     ) -> Result<(), Fault> {
         loop {
             let bytes: u64 = uploads.values().map(|upload| upload.announced.size).sum();
@@ -200,7 +213,7 @@ impl Spool {
                 return Err(Fault::StorageFull { reason });
             };
             if let Some(upload) = uploads.remove(&id) {
-                upload.remove();
+                gone.push(upload.set_aside());
             }
         }
     }
@@ -215,7 +228,7 @@ impl Spool {
         }
         let is_ours = |name: &str| {
             let (id, kind) = name.split_once('.')?;
-            let known = ["json", "part", "data"].contains(&kind);
+            let known = ["json", "part", "data", "gone"].contains(&kind);
             Digest::of_id(id).filter(|_| known).map(|_| id.to_owned())
         };
         let ids: BTreeSet<String> = names.iter().filter_map(|name| is_ours(name)).collect();
@@ -241,7 +254,7 @@ impl Spool {
                 Some(upload) => {
                     uploads.insert(id, Arc::new(upload));
                 }
-                None => remove_all(&self.dir, &id),
+                None => drop(Gone::of(&self.dir, &id)),
             }
         }
         Ok(())
@@ -326,14 +339,15 @@ impl Upload {
     }
 
     fn failed(&self, action: &'static str, cause: io::Error) -> Fault {
-        if matches!(cause.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {
+        if is_full(&cause) {
             return Fault::StorageFull { reason: format!("{cause}") };
         }
         Fault::Spool { action, cause }
     }
 
-    fn remove(&self) {
-        remove_all(&self.dir, &self.id);
+    /// Takes its files away, at once: a new upload may have its name.
+    fn set_aside(&self) -> Gone {
+        Gone::of(&self.dir, &self.id)
     }
 
     fn file(&self, kind: &str) -> PathBuf {
@@ -465,15 +479,35 @@ impl Algorithm {
     }
 }
 
-fn remove_all(dir: &Path, id: &str) {
-    // What says that there is something goes last: a kill in between leaves what the next start
-    // removes.
-    for kind in ["part", "data", "json"] {
-        let path = dir.join(format!("{id}.{kind}"));
-        if let Err(error) = fs::remove_file(&path)
-            && error.kind() != io::ErrorKind::NotFound
-        {
-            tracing::warn!("cannot remove {}: {error}", path.display());
+/// What an upload had on disk. Dropped, it is freed, which for tens of GB takes a while.
+#[must_use]
+struct Gone(PathBuf);
+
+impl Gone {
+    fn of(dir: &Path, id: &str) -> Self {
+        let [part, data, gone, json] =
+            ["part", "data", "gone", "json"].map(|kind| dir.join(format!("{id}.{kind}")));
+        // What says that there is something goes last: a kill in between leaves what the next start
+        // removes.
+        for path in [part, data] {
+            warn(&path, fs::rename(&path, &gone));
         }
+        warn(&json, fs::remove_file(&json));
+        Self(gone)
+    }
+}
+
+impl Drop for Gone {
+    fn drop(&mut self) {
+        warn(&self.0, fs::remove_file(&self.0));
+    }
+}
+
+/// Says what could not be taken away; what is not there was.
+fn warn(path: &Path, removed: io::Result<()>) {
+    if let Err(error) = removed
+        && error.kind() != io::ErrorKind::NotFound
+    {
+        tracing::warn!("cannot remove {}: {error}", path.display());
     }
 }

@@ -49,9 +49,15 @@ pub(super) async fn versions(
     Path(name): Path<String>,
 ) -> Answered {
     grant.reaches(&name)?;
-    let catalog = server.engine.catalog().clone();
-    let versions = blocking(move || Ok(catalog.versions(&name)?)).await?;
-    Ok(Json(convert::versions(&versions)).into_response())
+    let engine = server.engine.clone();
+    let (versions, held) = blocking(move || {
+        let versions = engine.catalog().versions(&name)?;
+        // After the log: a push holds the latest before it commits.
+        let held = engine.held_latest(&name);
+        Ok((versions, held))
+    })
+    .await?;
+    Ok(Json(convert::versions(&versions, held)).into_response())
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.
@@ -64,9 +70,11 @@ pub(super) async fn rollback(
     grant.may(Role::Admin)?;
     grant.reaches(&name)?;
     let number = convert::rollback(&body)?;
-    let catalog = server.engine.catalog().clone();
+    let engine = server.engine.clone();
     let version = blocking(move || {
-        let version = catalog.rollback(&name, number)?;
+        let version = engine.catalog().rollback(&name, number)?;
+        // A push that is on its way to be ready does not keep it back.
+        engine.hold_instead(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok(version)
     });

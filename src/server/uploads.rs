@@ -100,8 +100,9 @@ pub(super) async fn append(
         return Ok(answer(StatusCode::OK, &upload));
     }
     let (writer, found) = receive(&server, &upload, writer, &patience, body).await?;
-    let upload = blocking(move || settle(&spool, upload, writer, (offset, digest, found))).await;
-    Ok(answer(StatusCode::OK, &*upload?))
+    // All of a large upload is hashed here, while no byte comes.
+    let settled = blocking(move || settle(&spool, upload, writer, (offset, digest, found)));
+    Ok(answer(StatusCode::OK, &*patience.during(settled).await?))
 }
 
 /// Writes a body as it comes, and hashes it. Blocks nobody but its own connection.

@@ -84,11 +84,24 @@ impl Ahead<'_> {
 }
 
 /// What is left of a hint for an ego that has come so far: what lies behind the last pose that it is
-/// near is done.
+/// near is done. A pose that is much farther along the hint than from its front to the ego is still to
+/// come, however near: a hint may lead back to its start.
 pub(super) fn rest(hint: &[Pose], now: Pose) -> &[Pose] {
-    let near =
-        |pose: &Pose| pose.position_m.distance(now.position_m) <= 2.0 * config::PREFETCH_SPACING_M;
-    hint.iter().rposition(near).map_or(hint, |last| &hint[last + 1..])
+    let near_m = 2.0 * config::PREFETCH_SPACING_M;
+    let Some(front) = hint.first() else { return hint };
+    let most_m = 2.0 * front.position_m.distance(now.position_m) + near_m;
+    let (mut way_m, mut before, mut done) = (0.0, front, 0);
+    for (index, pose) in hint.iter().enumerate() {
+        way_m += pose.position_m.distance(before.position_m);
+        if way_m > most_m {
+            break;
+        }
+        if pose.position_m.distance(now.position_m) <= near_m {
+            done = index + 1;
+        }
+        before = pose;
+    }
+    &hint[done..]
 }
 
 /// Poses along straight lines between others, some metres apart.
@@ -226,6 +239,12 @@ mod tests {
         assert_eq!(rest(&hint, at(-100.0, 0.0)), hint);
         assert_eq!(rest(&hint, at(5.0, 38.0)), &hint[2..]);
         assert_eq!(rest(&hint, at(40.0, 40.0)), []);
+        // Around a block, back to where it began.
+        let block = [at(0.0, 0.0), at(0.0, 40.0), at(40.0, 40.0), at(40.0, 0.0), at(0.0, 0.0)];
+        assert_eq!(rest(&block, at(0.0, 0.0)), &block[1..]);
+        assert_eq!(rest(&block[1..], at(0.0, 2.0)), &block[1..]);
+        assert_eq!(rest(&block[1..], at(0.0, 30.0)), &block[2..]);
+        assert_eq!(rest(&block[4..], at(3.0, 0.0)), []);
         let long = [at(0.0, 0.0), at(1e6, 0.0)];
         assert_eq!(along(&long).len(), config::PREFETCH_PLACES);
     }

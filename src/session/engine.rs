@@ -8,11 +8,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
-use tokio::time::{Instant, timeout_at};
+use tokio::time::{Instant, sleep, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Eye, Lens, Reservation, ResidencyError, Resident, Stats};
+use crate::residency::{
+    Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
+};
 use crate::store::Catalog;
 
 use super::SessionError;
@@ -103,14 +105,16 @@ impl Engine {
         }))
     }
 
-    /// The latest version of every twin, in order of name. A damaged one is logged and left out,
-    /// so that it does not hide the others.
+    /// The version of every twin that whoever opens it gets, in order of name. A damaged one is logged
+    /// and left out, so that it does not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub async fn twins(&self) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
-        let listings = self.listings.clone();
-        let listed = tokio::task::spawn_blocking(move || listings.read());
+    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
+        let engine = self.clone();
+        let listed = tokio::task::spawn_blocking(move || {
+            engine.listings.read(&|twin| engine.held_latest(twin))
+        });
         Ok(listed.await.map_err(|_| SessionError::Crashed)??)
     }
 
@@ -151,11 +155,24 @@ impl Engine {
         HeldLatest { engine: self.clone(), twin: twin.to_owned() }
     }
 
+    /// The version that is held, where one is.
+    pub fn held_latest(&self, twin: &str) -> Option<u64> {
+        lock(&self.held).get(twin).copied()
+    }
+
+    /// Where a version is held, holds another in its place: one that was made the latest on purpose.
+    pub fn hold_instead(&self, twin: &str, number: u64) {
+        if let Some(held) = lock(&self.held).get_mut(twin) {
+            *held = number;
+        }
+    }
+
     /// Opens a version and loads what frames of it need, for those who will switch to it where they
-    /// are: they need not wait.
+    /// are: they need not wait. Only as far as there is room beside what sessions look at and expect,
+    /// whose frames go first, and for no longer than `config::PREFETCH_TIMEOUT`.
     ///
     /// # Errors
-    /// It cannot be opened, or what a frame needs cannot be loaded.
+    /// It cannot be opened.
     pub async fn prepare(
         self: &Arc<Self>,
         twin: &str,
@@ -163,11 +180,18 @@ impl Engine {
         frames: Vec<Vec<Eye>>,
     ) -> Result<(), SessionError> {
         let resident = self.resident(twin.to_owned(), Some(number)).await?;
-        let loaded = tokio::task::spawn_blocking(move || {
-            let profile = &resident.version.manifest.profile;
-            frames.iter().try_for_each(|eyes| resident.scene(eyes, profile).map(|_| ()))
-        });
-        Ok(loaded.await.map_err(|_| SessionError::Crashed)??)
+        let deadline = Instant::now() + config::PREFETCH_TIMEOUT;
+        let expectation = Arc::new(Expectation::new(resident));
+        let expected = expectation.clone();
+        let expect = move || {
+            let places: Vec<_> = frames.into_iter().map(|eyes| (Urgency::Imminent, eyes)).collect();
+            expected.prefetch(&places, &expected.resident().version.manifest.profile);
+        };
+        tokio::task::spawn_blocking(expect).await.map_err(|_| SessionError::Crashed)?;
+        while expectation.coming() > 0 && Instant::now() < deadline {
+            sleep(config::PREPARE_POLL).await;
+        }
+        Ok(())
     }
 
     /// Name of the backend.
@@ -192,7 +216,7 @@ impl Engine {
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
-        let version = version.or_else(|| lock(&self.held).get(&twin).copied());
+        let version = version.or_else(|| self.held_latest(&twin));
         let opened = tokio::task::spawn_blocking(move || {
             let resident = engine.cache.open(&twin, version)?;
             engine.leases.hold(&resident);
@@ -205,9 +229,18 @@ impl Engine {
     pub(super) async fn reserve(
         resident: Arc<Resident>,
         lens: Lens,
-    ) -> Result<Arc<Reservation>, SessionError> {
+    ) -> Result<Reservation, SessionError> {
         let reserved = tokio::task::spawn_blocking(move || resident.reserve(lens));
-        Ok(Arc::new(reserved.await.map_err(|_| SessionError::Crashed)??))
+        Ok(reserved.await.map_err(|_| SessionError::Crashed)??)
+    }
+
+    /// The most that a frame of a rig anywhere in the twin needs, in bytes.
+    pub(super) async fn worst_bytes(
+        resident: Arc<Resident>,
+        lens: Lens,
+    ) -> Result<u64, SessionError> {
+        let sought = tokio::task::spawn_blocking(move || resident.worst_bytes(lens));
+        sought.await.map_err(|_| SessionError::Crashed)
     }
 
     /// Does some work on a render thread when its turn comes, and tells how long it waited.

@@ -47,23 +47,30 @@ impl Listings {
         Self { catalog, known: Mutex::default() }
     }
 
-    /// The latest version of every twin, in order of name. A damaged one is logged and left out,
-    /// so that it does not hide the others.
+    /// The latest version of every twin, in order of name, or the one that is `held` in its place. A
+    /// damaged one is logged and left out, so that it does not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub(super) fn read(&self) -> Result<Vec<Arc<TwinSummary>>, StoreError> {
+    pub(super) fn read(
+        &self,
+        held: &dyn Fn(&str) -> Option<u64>,
+    ) -> Result<Vec<Arc<TwinSummary>>, StoreError> {
         let listed = self.catalog.twins()?;
         // Held while reading, so that clients that come together read each manifest once.
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         let mut fresh = BTreeMap::new();
         for listing in listed {
+            // Asked for after the log is read: a push holds the latest before it commits.
+            let held = held(&listing.name);
+            let number = held.unwrap_or(listing.number);
+            // The hash of one that is held is not listed: numbers go up while it is.
             let is_this = |summary: &Arc<TwinSummary>| {
-                (summary.number, &summary.hash) == (listing.number, &listing.hash)
+                summary.number == number && (held.is_some() || summary.hash == listing.hash)
             };
             let summary = match known.remove(&listing.name).filter(is_this) {
                 Some(summary) => summary,
-                None => match self.catalog.version(&listing.name, Some(listing.number)) {
+                None => match self.catalog.version(&listing.name, Some(number)) {
                     Ok(version) => Arc::new(TwinSummary::of(version)),
                     Err(error) => {
                         tracing::warn!(twin = listing.name, "not listed: {error}");

@@ -13,6 +13,7 @@ mod error;
 mod golden;
 mod leases;
 mod listing;
+mod lookout;
 mod observation;
 mod opening;
 mod record;
@@ -48,6 +49,7 @@ pub use record::{
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 
 use ahead::{Ahead, Route};
+use lookout::Lookout;
 pub(crate) use observation::eyes;
 use observation::{Assembly, Layout};
 use opening::{choose_cameras, resolve_start};
@@ -57,7 +59,8 @@ use record::{Line, Recorder};
 #[derive(Debug)]
 pub struct Session {
     engine: Arc<Engine>,
-    reservation: Arc<Reservation>,
+    reservation: Reservation,
+    lookout: Lookout,
     name: String,
     profile_hash: blake3::Hash,
     rig_name: String,
@@ -69,6 +72,8 @@ pub struct Session {
     /// Number of the current episode's file, and the file once something was rendered.
     episode_number: u64,
     recorder: Option<Recorder>,
+    /// The file does not say yet that what follows is of this version.
+    switched: bool,
     /// The recorded drive that the agent may follow, and where it says that it goes.
     route: Option<Arc<Route>>,
     hint: Vec<Pose>,
@@ -127,6 +132,8 @@ impl Session {
             episode: Episode::new(opening.seed, start, dt_us),
             episode_number: 0,
             recorder: None,
+            switched: false,
+            lookout: Lookout::default(),
             engine,
             reservation,
             name,
@@ -184,7 +191,7 @@ impl Session {
         let line = frame_line(FrameRequest::Reset, &next, &[start], &frame);
         let (recorder, number) = self.begin_recording(&next, line).await?;
         self.finish(Outcome::Completed).await;
-        (self.recorder, self.episode_number) = (Some(recorder), number);
+        (self.recorder, self.episode_number, self.switched) = (Some(recorder), number, false);
         self.episode = next;
         self.hint.clear();
         self.look_ahead();
@@ -206,7 +213,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sees another version of the twin from now on, or its latest; the episode goes on.
+    /// Sees another version of the twin from now on, or its latest; the episode goes on. It is on
+    /// record with the next frame, so that a switch that fails or is dropped leaves no trace.
     ///
     /// # Errors
     /// The version cannot be had: the session stays with its own.
@@ -217,21 +225,11 @@ impl Session {
             return Ok(());
         }
         let lens = lens(self.layout.cameras());
-        let reservation = Engine::reserve(resident.clone(), lens).await?;
-        let profile = resident.version.manifest.profile;
-        let profile_hash = record::profile_hash(&profile);
-        // A file that is not begun yet will begin with the new version.
-        if let Some(recorder) = self.recorder.clone() {
-            let switched = RecordedVersion {
-                step: self.episode.step(),
-                version: resident.version.number,
-                version_hash: resident.version.hash.clone(),
-                profile,
-                profile_hash: profile_hash.to_hex().to_string(),
-            };
-            append(recorder, Line::Version(switched)).await?;
-        }
-        (self.reservation, self.profile_hash) = (reservation, profile_hash);
+        let bytes = Engine::worst_bytes(resident.clone(), lens).await?;
+        // From here on, nothing waits: the switch happens as a whole.
+        self.reservation.exchange(resident, bytes)?;
+        self.profile_hash = record::profile_hash(&self.resident().version.manifest.profile);
+        self.switched = true;
         let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
         places.extend(self.ahead().places());
         self.expect(places);
@@ -330,8 +328,8 @@ impl Session {
             assembly.add_queue_time(queued);
             assembly.add_waiting(waited_for, waited);
         }
-        let stats = self.resident().stats();
-        assembly.finish(stats.held_bytes, stats.limit_bytes)
+        let (held_bytes, limit_bytes) = self.resident().memory();
+        assembly.finish(held_bytes, limit_bytes)
     }
 
     /// Loads what the next steps will need, while the agent thinks.
@@ -345,7 +343,7 @@ impl Session {
     /// What is known of where the ego goes.
     fn ahead(&self) -> Ahead<'_> {
         let (least, most) = config::PREFETCH_AHEAD;
-        let ahead = (3 * self.resident().stats().load_p99).clamp(least, most);
+        let ahead = (3 * self.resident().load_p99()).clamp(least, most);
         let steps = ahead.as_secs_f64() / self.frame_took.as_secs_f64().max(1e-3);
         Ahead {
             now: self.episode.world_from_rig(),
@@ -358,14 +356,13 @@ impl Session {
 
     /// Has what is seen from some places loaded by others.
     fn expect(&self, places: Vec<(Urgency, Pose)>) {
-        let (reservation, layout) = (self.reservation.clone(), self.layout.clone());
-        // Nobody waits for it, and a defect in it is logged where it happens.
-        drop(tokio::task::spawn_blocking(move || {
+        let (expectation, layout) = (self.reservation.expectation().clone(), self.layout.clone());
+        self.lookout.look(move || {
             let eyes_at = |(urgency, pose)| (urgency, eyes(&View::of_rig(layout.cameras(), pose)));
             let places: Vec<_> = places.into_iter().map(eyes_at).collect();
-            let profile = &reservation.resident().version.manifest.profile;
-            reservation.prefetch(&places, profile);
-        }));
+            let profile = &expectation.resident().version.manifest.profile;
+            expectation.prefetch(&places, profile);
+        });
     }
 
     /// Waits until everything that a frame needs is in memory, all at once.
@@ -398,13 +395,29 @@ impl Session {
     ) -> Result<(), SessionError> {
         let line = frame_line(request, episode, poses, frame);
         match self.recorder.clone() {
-            Some(recorder) => append(recorder, line).await,
+            Some(recorder) => {
+                let version = self.switched.then(|| self.version_line());
+                append(recorder, version.into_iter().chain([line]).collect()).await?;
+            }
             None => {
                 let (recorder, number) = self.begin_recording(&self.episode, line).await?;
                 (self.recorder, self.episode_number) = (Some(recorder), number);
-                Ok(())
             }
         }
+        self.switched = false;
+        Ok(())
+    }
+
+    /// Says that what follows is of this version.
+    fn version_line(&self) -> Line {
+        let version = &self.resident().version;
+        Line::Version(RecordedVersion {
+            step: self.episode.step(),
+            version: version.number,
+            version_hash: version.hash.clone(),
+            profile: version.manifest.profile,
+            profile_hash: self.profile_hash.to_hex().to_string(),
+        })
     }
 
     /// Begins the file of an episode that has not moved yet, with its first frame.
@@ -446,7 +459,7 @@ impl Session {
     /// Writes the last line. The episode is over either way: a failure is only logged.
     async fn finish(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
-        if let Err(error) = append(recorder, Line::End(self.episode.summary(outcome))).await {
+        if let Err(error) = append(recorder, vec![Line::End(self.episode.summary(outcome))]).await {
             tracing::warn!(session = self.name, "the episode's summary is missing: {error}");
         }
     }
@@ -461,8 +474,8 @@ fn lens(cameras: &[RigCamera]) -> Lens {
     }
 }
 
-async fn append(recorder: Recorder, line: Line) -> Result<(), SessionError> {
-    let appended = tokio::task::spawn_blocking(move || recorder.append(&[line])).await;
+async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
+    let appended = tokio::task::spawn_blocking(move || recorder.append(&lines)).await;
     Ok(appended.map_err(|_| SessionError::Crashed)??)
 }
 

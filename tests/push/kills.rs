@@ -80,7 +80,7 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
     let mut serving = Serving::start(dir.path());
     let begun = Instant::now();
     push(serving.client.clone(), scene(KILLS), "first".to_owned()).await;
-    let whole = begun.elapsed();
+    let mut whole = begun.elapsed();
     let mut random = Random(1);
     let (mut on_the_way, mut old, mut new) = (0, 0, 0);
     for round in 0..KILLS {
@@ -105,13 +105,19 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
             more => panic!("{more} versions of one push, round {round}"),
         }
         let catalog = Catalog::open(&twins).unwrap();
-        let verified = catalog.verify("test", &mut |_, _| {}).unwrap();
-        assert!(verified.damaged.is_empty(), "round {round}: {:?}", verified.damaged);
+        let checked = catalog.fsck("test", &mut |_, _| {}).unwrap();
+        assert!(checked.is_sound(), "round {round}: {checked:?}");
         serving = Serving::start(dir.path());
+        let begun = Instant::now();
         let retried = push(serving.client.clone(), path, id);
         let version = tokio::time::timeout(Duration::from_secs(60), retried).await.unwrap();
         assert_eq!(version, before + 1, "the client's next try, round {round}");
+        // The machine has others to serve: the kills follow how long it takes now.
+        if after == before {
+            whole = (whole * 7 + begun.elapsed()) / 8;
+        }
     }
     eprintln!("{KILLS} kills within {whole:?}: {on_the_way} on the way, {old} old, {new} new");
     assert!(on_the_way >= KILLS / 2, "only {on_the_way} kills came in time");
+    assert!(old > 0 && new > 0, "{old} kills left the old version, {new} the new one");
 }

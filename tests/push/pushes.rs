@@ -5,11 +5,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use serde_json::json;
-use wildcity::client::{Cells, PushState};
+use wildcity::client::{Cells, NewPush, Push, PushState};
 use wildcity::protocol::error::Code;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::store::Catalog;
 
+use crate::scene_files::gaussians;
 use crate::support::TestServer;
 use crate::{client, get, in_cell, post, push, push_of, write};
 
@@ -182,6 +183,43 @@ async fn views_before_and_after_are_compared() {
     });
     let again = again.await;
     assert_eq!(again.state, PushState::Ready, "{again:?}");
+}
+
+/// Whoever asks for a likeness does not get a version that was compared with nothing.
+#[tokio::test]
+async fn a_likeness_that_cannot_be_seen_is_refused() {
+    let server = TestServer::start().await;
+    let alike = |push: &mut NewPush| push.golden.min_psnr_db = Some(1.0);
+    let refused = |pushed: &Push, why: &str| {
+        let error = pushed.error.as_ref().expect(why);
+        assert_eq!((pushed.state, error.code), (PushState::Refused, Code::OutOfRange));
+        assert!(error.message.contains(why), "{}", error.message);
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), "a.ply", &in_cell([0, 0], 20, 1));
+    let client = client(&server);
+    let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
+    let fresh = async |change: &dyn Fn(&mut NewPush)| {
+        let mut asked = push_of(&[&upload.id]);
+        change(&mut asked);
+        let begun = client.push("fresh", &asked).await.unwrap();
+        client.wait(begun, &mut |_| {}).await.unwrap()
+    };
+    refused(&fresh(&alike).await, "no version before");
+    assert_eq!(fresh(&|_| {}).await.state, PushState::Ready);
+    refused(&fresh(&alike).await, "no trajectory");
+    let nowhere = |push: &mut NewPush| {
+        alike(push);
+        push.golden.poses = Some(Vec::new());
+    };
+    refused(&fresh(&nowhere).await, "names none");
+    let other = gaussians(40, 1, 8.0, 3);
+    let pushed = push(&server, &other, |push| {
+        alike(push);
+        push.cells = Some(Cells::All(wildcity::client::All::All));
+    });
+    refused(&pushed.await, "SH degree is 1, and 0");
+    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
 }
 
 /// A session's frame that crashes the renderer, or a comparison that does, ends that alone.

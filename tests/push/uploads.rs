@@ -89,8 +89,9 @@ async fn half_an_upload_survives_a_restart_and_rubbish_does_not() {
     append(&server, &path, 0, "", &content[..60_000]).await;
     let twins = server.twins.path().to_owned();
     let hash = blake3::hash(b"never announced").to_hex();
-    let (orphan, other) = (format!("blake3-{hash}.part"), "notes.txt");
-    for name in [&orphan, other] {
+    let orphans = ["part", "gone"].map(|kind| format!("blake3-{hash}.{kind}"));
+    let other = "notes.txt";
+    for name in orphans.iter().map(String::as_str).chain([other]) {
         std::fs::write(twins.join(".uploads").join(name), b"x").unwrap();
     }
     let TestServer { running, twins: kept, .. } = server;
@@ -99,7 +100,7 @@ async fn half_an_upload_survives_a_restart_and_rubbish_does_not() {
     assert_eq!(get(&server, &path).await.body["offset"], 60_000);
     let end = append(&server, &path, 60_000, "", &content[60_000..]).await;
     assert_eq!(end.body["complete"], true, "{end:?}");
-    assert!(!twins.join(".uploads").join(orphan).exists());
+    assert!(orphans.iter().all(|orphan| !twins.join(".uploads").join(orphan).exists()));
     assert!(twins.join(".uploads").join(other).exists(), "what is not ours stays");
     drop(kept);
 }
@@ -124,6 +125,14 @@ async fn what_is_not_what_was_promised_is_refused_and_forgotten() {
     append(&server, &path, 0, "", &bad).await.refused(422, "upload_digest");
     get(&server, &path).await.refused(404, "unknown_upload");
     assert_eq!(spooled(&server), Vec::<String>::new());
+
+    // Without a byte it is checked at once.
+    let digest = format!("blake3:{:064}", 0);
+    let empty = json!({ "name": "empty.ply", "size": 0, "digest": digest });
+    for _ in 0..2 {
+        post(&server, "/v1/uploads", &empty).await.refused(422, "upload_digest");
+        assert_eq!(spooled(&server), Vec::<String>::new());
+    }
 
     let path = begin(&server, &good).await.header("location").unwrap().to_owned();
     append(&server, &path, 1, "", &good[1..]).await.refused(409, "upload_offset");

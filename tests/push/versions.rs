@@ -189,10 +189,58 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
         session.resident().version.number
     };
     assert_eq!(latest().await, 2);
+    let listed = async || engine.twins().await.unwrap()[0].number;
+    assert_eq!(listed().await, 2);
     let held = engine.hold_latest("test", 1);
-    assert_eq!(latest().await, 1);
+    assert_eq!((latest().await, listed().await), (1, 1));
+    // A rollback in between is the latest at once.
+    engine.hold_instead("test", 2);
+    assert_eq!((latest().await, listed().await), (2, 2));
     drop(held);
-    assert_eq!(latest().await, 2);
+    engine.hold_instead("test", 1);
+    assert_eq!((latest().await, listed().await), (2, 2), "nothing is held");
+}
+
+/// The same over the wire, of a push that takes its time to make its version ready.
+#[tokio::test]
+async fn what_is_not_ready_is_not_the_latest() {
+    let server = rendering(None).await;
+    let mut agent = driver(&server, "a").await;
+    agent.step(1.0).await;
+    let seen = std::cell::Cell::new(0);
+    for round in 0..20 {
+        let over = std::cell::Cell::new(false);
+        let pushing = async {
+            let gaussians = in_cell([0, 0], 20_000, 2000 + round);
+            let pushed = push(&server, &gaussians, |push| {
+                push.id = Some(format!("p-{round}"));
+            });
+            assert_eq!(pushed.await.version, Some(round + 2));
+            over.set(true);
+        };
+        let looking = async {
+            let path = format!("/v1/twins/test/pushes/p-{round}");
+            while !over.get() {
+                let twin = get(&server, "/v1/twins/test").await.body;
+                let versions = get(&server, "/v1/twins/test/versions").await.body;
+                // It was not ready yet when the others were asked.
+                let state = get(&server, &path).await.body["state"].clone();
+                if state == "prefetching" {
+                    let last = versions["versions"].as_array().unwrap().last().unwrap().clone();
+                    seen.set(seen.get() + u64::from(last["version"] == round + 2));
+                    assert_eq!(twin["version"], round + 1, "{twin}");
+                    assert_eq!(last["ready"], last["version"] == round + 1, "{last}");
+                }
+            }
+        };
+        tokio::join!(pushing, looking);
+        if seen.get() > 0 {
+            break;
+        }
+    }
+    assert!(seen.get() > 0, "no push was seen while it was made ready");
+    let versions = get(&server, "/v1/twins/test/versions").await.body["versions"].clone();
+    assert!(versions.as_array().unwrap().iter().all(|version| version["ready"] == true));
 }
 
 /// What a session needs of a new version is in memory when the push is ready.

@@ -8,8 +8,8 @@ use wildcity::config;
 use wildcity::residency::{Cache, Lens, Needed, ResidencyError};
 use wildcity::scene::Chunk;
 
-use crate::scene_files::Random;
-use crate::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
+use crate::scene_files::{Random, gaussians};
+use crate::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
 
 const LENS: Lens = Lens { focal_px: 70.0, radius_m: 1.7 };
 
@@ -33,6 +33,30 @@ fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
     assert_eq!(cache.stats().reserved_bytes, 2 * worst_bytes);
     drop(held);
     assert!(resident.reserve(LENS).is_ok(), "what is given back is there again");
+    assert_eq!(cache.stats().reserved_bytes, 0);
+}
+
+#[test]
+fn another_version_takes_the_room_of_the_one_before() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut scene = gaussians(20_000, 1, 600.0, 1);
+    commit(dir.path(), "street", &scene);
+    scene.sh[0] += 0.5;
+    commit(dir.path(), "street", &scene);
+    let catalog = wildcity::store::Catalog::open(dir.path()).unwrap();
+    let all = Cache::new(catalog.clone()).open("street", None).unwrap();
+    let limit_bytes = all.worst_bytes(LENS) * 3 / 2;
+    assert!(limit_bytes < all.whole_bytes());
+    let cache = Cache::limited(catalog, Some(limit_bytes));
+    let [old, new] = [1, 2].map(|number| cache.open("street", Some(number)).unwrap());
+    let mut reservation = old.reserve(LENS).unwrap();
+    assert!(new.reserve(LENS).is_err(), "there is no room for both");
+    reservation.exchange(new.clone(), new.worst_bytes(LENS)).unwrap();
+    // Refused, it stays what it is.
+    assert!(reservation.exchange(old, limit_bytes + 1).is_err());
+    assert!(Arc::ptr_eq(reservation.resident(), &new));
+    assert_eq!(new.stats().reserved_bytes, reservation.bytes());
+    drop(reservation);
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 

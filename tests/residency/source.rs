@@ -60,6 +60,11 @@ impl Faulty {
         self.state.lock().unwrap().reads.get(&place).copied().unwrap_or(0)
     }
 
+    /// How often any was read.
+    pub(crate) fn all_reads(&self) -> u64 {
+        self.state.lock().unwrap().reads.values().map(|&reads| u64::from(reads)).sum()
+    }
+
     /// The most that any section was read.
     pub(crate) fn most_reads(&self) -> u32 {
         self.state.lock().unwrap().reads.values().copied().max().unwrap_or(0)

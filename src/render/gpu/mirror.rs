@@ -8,7 +8,7 @@
 mod encode;
 mod free;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::{Arc, Weak};
 
@@ -33,6 +33,8 @@ pub(super) struct Mirror {
     pages: Vec<Option<Page>>,
     /// By address, which is a chunk's own for as long as the weak pointer lives.
     resident: BTreeMap<usize, Resident>,
+    /// The same by the frame that drew them last, and address: the first goes first.
+    by_frame: BTreeSet<(u64, usize)>,
     /// Counts calls of [`Mirror::hold`].
     frame: u64,
 }
@@ -64,7 +66,8 @@ pub(super) struct Place {
 impl Mirror {
     /// An empty one that takes so much of the device's memory at most.
     pub(super) fn new(limit_bytes: u64) -> Self {
-        Self { limit_bytes, pages: Vec::new(), resident: BTreeMap::new(), frame: 0 }
+        let (resident, by_frame) = (BTreeMap::new(), BTreeSet::new());
+        Self { limit_bytes, pages: Vec::new(), resident, by_frame, frame: 0 }
     }
 
     /// Makes a scene resident. What main memory has dropped is dropped here too.
@@ -77,6 +80,7 @@ impl Mirror {
         if self.hold_beside_others(device, scene).is_err() {
             // Its clusters would fit, but not between the others: everything goes, and they come anew.
             self.resident.clear();
+            self.by_frame.clear();
             self.pages.clear();
             self.hold_beside_others(device, scene).map_err(|Full| RenderError::DeviceMemory {
                 needed_bytes: scene.chunks.iter().map(|chunk| lines_of(chunk)).sum::<u64>()
@@ -111,7 +115,11 @@ impl Mirror {
         let mut missing = Vec::new();
         for chunk in &scene.chunks {
             match self.resident.get_mut(&address(chunk)) {
-                Some(resident) => resident.last_frame = self.frame,
+                Some(resident) => {
+                    self.by_frame.remove(&(resident.last_frame, address(chunk)));
+                    self.by_frame.insert((self.frame, address(chunk)));
+                    resident.last_frame = self.frame;
+                }
                 None => missing.push(chunk),
             }
         }
@@ -132,6 +140,7 @@ impl Mirror {
             let (chunk, last_frame) = (Arc::downgrade(chunk), self.frame);
             let address = chunk.as_ptr() as usize;
             self.resident.insert(address, Resident { chunk, places, last_frame });
+            self.by_frame.insert((last_frame, address));
         }
         Ok(())
     }
@@ -176,13 +185,17 @@ impl Mirror {
 
     /// Drops what was not drawn for longest.
     fn evict(&mut self) -> Result<(), Full> {
-        let others = self.resident.iter().filter(|(_, resident)| resident.last_frame < self.frame);
-        let oldest = others.min_by_key(|(_, resident)| resident.last_frame);
-        let address = *oldest.ok_or(Full)?.0;
-        if let Some(Resident { places, .. }) = self.resident.remove(&address) {
+        let oldest = self.by_frame.first().filter(|(last_frame, _)| *last_frame < self.frame);
+        let &(_, address) = oldest.ok_or(Full)?;
+        self.drop_chunk(address);
+        Ok(())
+    }
+
+    fn drop_chunk(&mut self, address: usize) {
+        if let Some(Resident { places, last_frame, .. }) = self.resident.remove(&address) {
+            self.by_frame.remove(&(last_frame, address));
             self.give_back(&places);
         }
-        Ok(())
     }
 
     fn drop_dead(&mut self) {
@@ -191,9 +204,7 @@ impl Mirror {
             .map(|(&address, _)| address)
             .collect();
         for address in dead {
-            if let Some(Resident { places, .. }) = self.resident.remove(&address) {
-                self.give_back(&places);
-            }
+            self.drop_chunk(address);
         }
         for slot in &mut self.pages {
             if slot.as_ref().is_some_and(|page| page.free.is_all(page.lines)) {

@@ -5,7 +5,7 @@ use crate::protocol::error::Code;
 use crate::render::RenderError;
 use crate::residency::ResidencyError;
 use crate::scene::rig::RigError;
-use crate::server::fault::Fault;
+use crate::server::fault::{Fault, is_content, is_full};
 use crate::session::SessionError;
 use crate::store::StoreError;
 
@@ -71,30 +71,24 @@ pub(super) fn cells(fault: &Fault) -> &[[i32; 2]] {
     }
 }
 
-/// Whether a commit was refused for what it holds.
-fn is_content(error: &StoreError) -> bool {
-    matches!(
-        error,
-        StoreError::Gaussians(_)
-            | StoreError::Clamped { .. }
-            | StoreError::Profile(_)
-            | StoreError::Field { .. }
-            | StoreError::ManifestSize { .. }
-    )
-}
-
 fn of_session(error: &SessionError) -> (Code, Option<String>) {
     let field = |text: &str| Some(text.to_owned());
     match error {
         SessionError::Twin(StoreError::Name { .. }) => (Code::InvalidName, field("twin")),
         SessionError::Twin(StoreError::NoTwin { .. }) => (Code::UnknownTwin, field("twin")),
-        SessionError::Twin(StoreError::NoVersion { .. }) => {
+        SessionError::Twin(StoreError::NoVersion { .. } | StoreError::Collected { .. }) => {
             (Code::UnknownVersion, field("version"))
         }
         SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
             (Code::Conflict, None)
         }
         SessionError::Twin(error) if is_content(error) => (Code::PushRefused, None),
+        SessionError::Twin(StoreError::Io { cause, .. }) if is_full(cause) => {
+            (Code::StorageFull, None)
+        }
+        SessionError::Twin(
+            StoreError::NotSynced { .. } | StoreError::Unsettled { .. } | StoreError::Url { .. },
+        ) => (Code::Internal, None),
         SessionError::Residency(error) => match error {
             ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => {
                 (Code::Busy, field("twin"))
@@ -122,11 +116,79 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
         }
         SessionError::EpisodeOver { .. } => (Code::SessionState, None),
         SessionError::Busy { .. } => (Code::Busy, None),
+        SessionError::Render(RenderError::DeviceMemory { .. }) => (Code::Busy, field("twin")),
         SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),
         SessionError::Render(_)
         | SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
         | SessionError::Thread { .. } => (Code::Internal, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+    use crate::scene::Record;
+
+    /// Only what lies in the push itself is refused for good.
+    #[test]
+    fn what_a_commit_can_end_with() {
+        let io = |kind: io::ErrorKind| StoreError::Io {
+            action: "write",
+            path: "city/chunk".into(),
+            cause: kind.into(),
+        };
+        let (name, number, cells) = ("city".to_owned(), 2, vec![[0, 0]]);
+        let (base, latest, settings) = (1, 2, Vec::new());
+        let (url, reason) = ("s3://x".to_owned(), "no credentials".to_owned());
+        let (record, field, count, gaussians) = (Record::default(), "mean", 1, 2);
+        for (error, refused, code) in [
+            (io(io::ErrorKind::StorageFull), false, Code::StorageFull),
+            (io(io::ErrorKind::QuotaExceeded), false, Code::StorageFull),
+            (io(io::ErrorKind::PermissionDenied), false, Code::TwinDamaged),
+            (
+                StoreError::Unsettled {
+                    name: name.clone(),
+                    number,
+                    cause: io::ErrorKind::TimedOut.into(),
+                },
+                false,
+                Code::Internal,
+            ),
+            (
+                StoreError::NotSynced {
+                    name: name.clone(),
+                    number,
+                    cause: Box::new(io(io::ErrorKind::Other)),
+                },
+                false,
+                Code::Internal,
+            ),
+            (StoreError::Url { url, reason }, false, Code::Internal),
+            (StoreError::Collected { name: name.clone(), number }, false, Code::UnknownVersion),
+            (
+                StoreError::Format { path: "city/log/2".into(), found: 9, supported: 1 },
+                false,
+                Code::TwinDamaged,
+            ),
+            (StoreError::Conflict { name: name.clone(), number }, false, Code::Conflict),
+            (StoreError::Overlap { name, base, latest, cells, settings }, true, Code::Conflict),
+            (StoreError::Clamped { record, field, count, gaussians }, true, Code::PushRefused),
+        ] {
+            let fault = Fault::from(error);
+            assert_eq!((fault.is_content(), code_and_field(&fault).0), (refused, code), "{fault}");
+        }
+    }
+
+    /// The device may have room again when others have left.
+    #[test]
+    fn a_scene_that_a_device_has_no_room_for_may_be_tried_again() {
+        let error = RenderError::DeviceMemory { needed_bytes: 2 << 30, limit_bytes: 1 << 30 };
+        let fault = Fault::Session(error.into());
+        assert_eq!(code_and_field(&fault), (Code::Busy, Some("twin".to_owned())));
+        assert!(fault.to_string().contains("2147483648"), "{fault}");
     }
 }

@@ -209,13 +209,14 @@ pub(in crate::server) fn rollback(body: &[u8]) -> Result<u64, Fault> {
     parse::<http::Rollback>(body).map(|rollback| rollback.version)
 }
 
-/// The versions of a twin, the latest last; or one that was just made.
-pub(in crate::server) fn versions(versions: &[LogEntry]) -> Value {
+/// The versions of a twin, the latest last. Those after one that is held are not ready.
+pub(in crate::server) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
     let version = |entry: &LogEntry| http::VersionInfo {
         version: entry.number,
         version_hash: entry.hash.clone(),
         created_us: entry.created_us,
         kind: entry.kind.to_string(),
+        ready: held.is_none_or(|held| entry.number <= held),
         parent: entry.parent,
     };
     json!({ "versions": versions.iter().map(version).collect::<Vec<_>>() })

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import http.client
 import json
@@ -104,14 +105,21 @@ def push(
     asked |= {name: value for name, value in optional.items() if value is not None}
     at = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
     # Asked again under the same id if the answer is lost: carried out once.
-    answer = wire.patiently("POST", at, asked)
+    answer, again = wire.patiently("POST", at, asked), 0
     while True:
         done, total = answer["progress"]["done"], answer["progress"]["total"]
         told(PushProgress(answer["state"], done, total))
         if answer["state"] in ("ready", "refused", "failed"):
             return _ended(answer)
         time.sleep(POLL_S)
-        answer = wire.patiently("GET", f"{at}/{answer['id']}", None)
+        try:
+            answer = wire.patiently("GET", f"{at}/{answer['id']}", None)
+        except Refused as refused:
+            # The server started again, and knows no pushes from before. Its uploads are still there.
+            if refused.code != "unknown_push" or again >= TRIES:
+                raise
+            again += 1
+            answer = wire.patiently("POST", at, asked)
 
 
 def rollback(
@@ -215,7 +223,10 @@ class _Wire:
         content = json.dumps(body, allow_nan=False).encode() if isinstance(body, dict) else body
         connection = self._dial(self._host, self._port, timeout=self._timeout)
         try:
-            connection.request(method, path, content, sent)
+            connection.connect()
+            # A server that refuses a body need not read all of it: its answer says why.
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                connection.request(method, path, content, sent)
             response = connection.getresponse()
             status, text = response.status, response.read()
         except (OSError, http.client.HTTPException) as error:
