@@ -144,6 +144,9 @@ pub const SCENE_PARTS: usize = 100_000;
 /// lorry of 60 m² gets one every 17 mm.
 pub const MESH_GAUSSIANS: u32 = 200_000;
 
+/// Parts that long triangles of a mesh are halved into, all together, of 232 bytes: 100 MB.
+pub const MESH_PARTS: usize = 400_000;
+
 /// Most values beside arrays of a NuRec payload, of 32 bytes each in memory. A log's tracks are
 /// 100,000.
 pub const NUREC_VALUES: usize = 1 << 20;
@@ -197,6 +200,12 @@ pub const CACHE_GIB: u32 = 16;
 
 /// Versions that garbage collection keeps, unless told otherwise: a day of hourly pushes, twice.
 pub const GC_KEEP: u32 = 50;
+
+/// How long a version stays in use for garbage collection after its server last said so, ...
+pub const LEASE: Duration = Duration::from_secs(900);
+
+/// ... and how often it says so: two may be lost.
+pub const LEASE_RENEWAL: Duration = Duration::from_secs(300);
 
 /// How long garbage stays, unless told otherwise: longer than any commit is in preparation.
 pub const GC_GRACE: &str = "24h";

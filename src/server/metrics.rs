@@ -133,6 +133,20 @@ impl Collector for Residency {
             let kind = counter.metric_type();
             counter.encode(encoder.encode_descriptor(&name, &help, None, kind)?)?;
         }
+        if let Some(traffic) = self.0.catalog().traffic() {
+            for (name, help, count) in [
+                ("requests", "Requests to the object store", traffic.requests),
+                ("retries", "Requests that were tried again", traffic.retries),
+                ("failures", "Requests that failed for good", traffic.failures),
+                ("cache_hits", "Parts of objects found in the disk cache", traffic.cache_hits),
+                ("cache_misses", "Parts of objects that were fetched", traffic.cache_misses),
+            ] {
+                let counter = ConstCounter::new(count);
+                let name = format!("store_{name}");
+                let kind = counter.metric_type();
+                counter.encode(encoder.encode_descriptor(&name, help, None, kind)?)?;
+            }
+        }
         let seconds = |duration: std::time::Duration| duration.as_secs_f64();
         for (name, help, value) in [
             ("wait_seconds", "How long frames waited, together", seconds(stats.wait_time)),

@@ -10,6 +10,7 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::{Server, listen};
+use crate::config;
 
 /// A server that listens. Dropping it stops it without waiting.
 pub struct Running {
@@ -32,6 +33,16 @@ async fn reap_uploads(server: &Server) {
     }
 }
 
+/// Keeps what sessions use from garbage collection, until dropped.
+async fn renew_leases(server: &Server) {
+    loop {
+        tokio::time::sleep(config::LEASE_RENEWAL).await;
+        if let Err(error) = server.engine.renew_leases().await {
+            tracing::warn!("leases were not renewed: {error}");
+        }
+    }
+}
+
 impl Running {
     pub(super) fn new(
         server: Arc<Server>,
@@ -45,6 +56,7 @@ impl Running {
             tokio::select! {
                 () = reaping.sessions.reap() => {}
                 () = reap_uploads(&reaping) => {}
+                () = renew_leases(&reaping) => {}
                 () = reaping.stopped() => {}
             }
         });

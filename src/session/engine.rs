@@ -12,10 +12,13 @@ use tokio::time::{Instant, sleep, timeout_at};
 
 use crate::config;
 use crate::render::Backend;
-use crate::residency::{Cache, Expectation, Eye, Lens, Reservation, Resident, Stats, Urgency};
+use crate::residency::{
+    Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
+};
 use crate::store::Catalog;
 
 use super::SessionError;
+use super::leases::Leases;
 use super::listing::{Listings, TwinSummary};
 
 /// What an engine is made of.
@@ -39,6 +42,7 @@ pub struct EngineSettings {
 pub struct Engine {
     listings: Arc<Listings>,
     cache: Cache,
+    leases: Arc<Leases>,
     episodes: PathBuf,
     backend: Arc<dyn Backend>,
     step_timeout: Duration,
@@ -88,9 +92,17 @@ impl Engine {
                 .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         }
         let listings = Arc::new(Listings::new(cache.catalog().clone()));
-        let answers = Answers::default();
-        let held = Mutex::default();
-        Ok(Arc::new(Self { listings, cache, episodes, backend, step_timeout, jobs, answers, held }))
+        Ok(Arc::new(Self {
+            listings,
+            leases: Arc::new(Leases::new(cache.catalog().clone())),
+            cache,
+            episodes,
+            backend,
+            step_timeout,
+            jobs,
+            answers: Answers::default(),
+            held: Mutex::default(),
+        }))
     }
 
     /// The latest version of every twin, in order of name. A damaged one is logged and left out,
@@ -117,6 +129,17 @@ impl Engine {
     /// The twins that can be opened.
     pub fn catalog(&self) -> &Catalog {
         self.cache.catalog()
+    }
+
+    /// Tells the store which versions are still in use, so that no garbage is made of them. For a server
+    /// to call every [`config::LEASE_RENEWAL`].
+    ///
+    /// # Errors
+    /// The store cannot be told. What it was told before holds for [`config::LEASE`].
+    pub async fn renew_leases(&self) -> Result<(), SessionError> {
+        let leases = self.leases.clone();
+        let renewed = tokio::task::spawn_blocking(move || leases.renew());
+        Ok(renewed.await.map_err(|_| SessionError::Crashed)??)
     }
 
     /// Frames that wait for the renderer.
@@ -180,7 +203,11 @@ impl Engine {
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
         let version = version.or_else(|| lock(&self.held).get(&twin).copied());
-        let opened = tokio::task::spawn_blocking(move || engine.cache.open(&twin, version));
+        let opened = tokio::task::spawn_blocking(move || {
+            let resident = engine.cache.open(&twin, version)?;
+            engine.leases.hold(&resident);
+            Ok::<_, ResidencyError>(resident)
+        });
         Ok(opened.await.map_err(|_| SessionError::Crashed)??)
     }
 

@@ -11,6 +11,7 @@ mod engine;
 mod episode;
 mod error;
 mod golden;
+mod leases;
 mod listing;
 mod lookout;
 mod observation;

@@ -116,6 +116,31 @@ fn what_is_wrong_with_a_mesh_is_said() {
     assert!(nowhere.contains("neither splats nor triangles with an area"), "{nowhere}");
 }
 
+/// Slivers of no area beside a square: many, and as long as can be. None of them is kept.
+#[test]
+fn slivers_take_no_memory() {
+    let mut sliver = square("", "");
+    let json_end = sliver.windows(4).position(|part| part == b"BIN\0").unwrap() - 4;
+    let mut json = String::from_utf8(sliver[20..json_end].to_vec()).unwrap();
+    let count = 100_000;
+    let mut buffer = sliver.split_off(json_end + 8);
+    buffer.truncate(102);
+    buffer.extend([0, 1, 1].repeat(count));
+    json = json.replace(r#""count":6"#, &format!(r#""count":{}"#, 6 + 3 * count));
+    json = json.replace(r#""byteLength":6}"#, &format!(r#""byteLength":{}}}"#, 6 + 3 * count));
+    json = json.replace(r#""byteLength":102"#, &format!(r#""byteLength":{}"#, 102 + 3 * count));
+    let g = read(&glb((json, buffer))).unwrap();
+    assert!((200_000..202_000).contains(&g.len()), "{}", g.len());
+    assert!(peak_bytes() < 1 << 30, "{} B", peak_bytes());
+}
+
+/// The most memory that this process ever had.
+fn peak_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    1024 * line.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
+}
+
 #[test]
 fn damaged_meshes_end_in_an_answer() {
     let whole = square("", "");

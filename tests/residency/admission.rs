@@ -2,9 +2,11 @@
 
 use std::sync::Arc;
 use std::sync::mpsc::channel;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use wildcity::residency::{Cache, Lens, ResidencyError};
+use wildcity::config;
+use wildcity::residency::{Cache, Lens, Needed, ResidencyError};
+use wildcity::scene::Chunk;
 
 use crate::scene_files::{Random, gaussians};
 use crate::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
@@ -87,6 +89,45 @@ fn askers_that_nobody_admitted_get_on_one_after_the_other() {
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     race(&cache.open("demo", None).unwrap(), 8, false);
     assert!(cache.stats().held_bytes <= limit_bytes);
+}
+
+/// Whoever lets go of what fills the memory wakes up who waits for room: nobody has to look again.
+#[test]
+fn the_end_of_a_frame_makes_room_at_once() {
+    let all = unlimited().open("demo", None).unwrap();
+    let frame = |station_m: f64| eyes(&views(demo().at(station_m)));
+    let bytes = |station_m: f64| -> u64 {
+        let needed = all.demand(&frame(station_m), &PROFILE);
+        let chunks = &all.version.manifest.chunks;
+        let count = |n: &Needed| chunks[n.chunk].sections[n.section].count;
+        needed.iter().map(|n| Chunk::bytes_of(1, count(n).into())).sum()
+    };
+    // Either fits, and both together do not.
+    let limit_bytes = bytes(0.0).max(bytes(500.0)) + bytes(0.0) / 4;
+    assert!(limit_bytes < bytes(0.0) + bytes(500.0));
+    let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+    let resident = cache.open("demo", None).unwrap();
+    let mut slowest = Duration::ZERO;
+    for _ in 0..5 {
+        let first = resident.scene(&frame(0.0), &PROFILE).unwrap();
+        let (tell, told) = channel();
+        let (other, eyes, before) = (resident.clone(), frame(500.0), cache.stats().waits);
+        let waiting = std::thread::spawn(move || {
+            let second = other.scene(&eyes, &PROFILE).unwrap();
+            tell.send(Instant::now()).unwrap();
+            drop(second);
+        });
+        while cache.stats().waits == before {
+            std::thread::yield_now();
+        }
+        // Time to find that there is no room, and to fall asleep; a loader that is late finds room.
+        std::thread::sleep(config::ROOM_POLL / 4);
+        let dropped = Instant::now();
+        drop(first);
+        slowest = slowest.max(told.recv_timeout(PATIENCE).unwrap() - dropped);
+        waiting.join().unwrap();
+    }
+    assert!(slowest < config::ROOM_POLL / 4, "{slowest:?}");
 }
 
 /// Threads that each draw forty frames in places of their own.

@@ -4,6 +4,7 @@
 mod support;
 
 mod http;
+mod leases;
 mod load;
 mod observation;
 mod refused;

@@ -103,12 +103,17 @@ pub(crate) fn twins() -> tempfile::TempDir {
 
 /// Commits a version of the twin `test`.
 pub(crate) fn commit_twin(dir: &Path) {
+    commit_twin_of(dir, 2.0);
+}
+
+/// The same of a logarithm of the odds of opacity: another number, another version.
+pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
     let gaussians = Gaussians {
         sh_degree: 0,
         means_m: (0..64).map(|i| [f64::from(i), f64::from(i % 5) - 2.0, 1.0]).collect(),
         quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 64],
         ln_scales: vec![[-1.0; 3]; 64],
-        logit_opacities: vec![2.0; 64],
+        logit_opacities: vec![logit_opacity; 64],
         sh: (0..64 * 3).map(|i| (i % 7) as f32 * 0.3 - 0.9).collect(),
     };
     let keyframe = |i: i64| Keyframe {

@@ -1,0 +1,28 @@
+//! What a session sees is no garbage, however old it is.
+
+use std::time::Duration;
+
+use wildcity::store::{Catalog, Keep};
+
+use crate::support::{PATIENCE, TestServer, commit_twin_of};
+
+#[tokio::test]
+async fn a_version_that_a_session_sees_is_kept() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    commit_twin_of(server.twins.path(), 1.0);
+    let keep = Keep { versions: 1, grace: Duration::ZERO };
+    for _ in 0..2 {
+        assert_eq!(catalog.collect("test", keep, false).unwrap().kept, [1, 2]);
+    }
+    agent.step(1.0).await;
+    server.running.stop().await;
+    // The last task of the server may still hold it for a moment.
+    let ended = async {
+        while catalog.collect("test", keep, true).unwrap().kept != [2] {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, ended).await.expect("the lease ends");
+}
