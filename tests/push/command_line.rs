@@ -34,9 +34,9 @@ async fn a_file_is_pushed_and_reported() {
     let err = String::from_utf8(done.stderr).unwrap();
     assert!(!done.status.success() && err.contains("(9, 9)"), "{err}");
     let done = tokio::task::block_in_place(|| run(&["--base", "1"]));
-    let err = String::from_utf8(done.stderr).unwrap();
-    assert!(!done.status.success() && err.contains("changed since version 1"), "{err}");
+    // What changed since is this very content: an answer may have been lost.
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let done = tokio::task::block_in_place(|| run(&["--cells", "x"]));
     assert!(!done.status.success());
-    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 2);
+    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 3);
 }
