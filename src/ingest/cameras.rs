@@ -1,4 +1,4 @@
-//! Camera lists: JSON files of pinhole views in the scene's own axes.
+//! Camera lists: JSON files of views in the scene's own axes.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat};
 use serde::Deserialize;
 
 use crate::config;
-use crate::geometry::camera::Pinhole;
+use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::{Camera, CameraError, Pose, PoseError};
 
 use super::file::{self, FileError};
@@ -102,10 +102,12 @@ struct Entry {
     name: String,
     width: u64,
     height: u64,
-    fx: f64,
-    fy: f64,
+    fx: Option<f64>,
+    fy: Option<f64>,
     cx: f64,
     cy: f64,
+    lens: Option<LensFields>,
+    windshield: Option<WindshieldFields>,
     near: Option<f64>,
     position: Option<[f64; 3]>,
     position_ply: Option<[f64; 3]>,
@@ -147,7 +149,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
 }
 
 fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
-    let Entry { name, width, height, fx, fy, cx, cy, near, .. } = entry;
+    let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, .. } = entry;
     let position = match (entry.position, entry.position_ply) {
         (Some(position), None) | (None, Some(position)) => position,
         _ => return Err(CamerasError::Position { name }),
@@ -169,7 +171,10 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let pose = Pose::checked(position, q);
     let world_from_camera =
         pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
-    let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy })
-        .map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
+    let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
+    let (focal_px, center_px) = ([fx, fy], [cx, cy]);
+    let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
+    let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
+    let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near })
 }

@@ -4,22 +4,33 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::camera::Pinhole;
+use crate::geometry::camera::Shutter;
+use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::{Camera, CameraError, Pose};
 
 /// A camera on the vehicle.
 ///
 /// In rig files, manifests and episodes it looks as on the wire: `{"name", "width", "height", "fx",
-/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels.
+/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels; what is no pinhole
+/// has `lens`, `windshield` and `shutter` besides ([`crate::geometry::camera::json`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(from = "CameraFields", into = "CameraFields")]
+#[serde(try_from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
     /// Name within the rig, `[a-z0-9._-]+`.
     pub name: String,
-    /// Size and intrinsics.
+    /// Size, intrinsics and lens.
     pub camera: Camera,
     /// Where the camera stands on the rig (`camera_to_rig` on the wire).
     pub rig_from_camera: Pose,
+    /// How its rows are exposed one after the other; all at once if absent.
+    pub shutter: Option<Shutter>,
+}
+
+impl RigCamera {
+    /// A camera whose rows are exposed all at once.
+    pub fn new(name: impl Into<String>, camera: Camera, rig_from_camera: Pose) -> Self {
+        Self { name: name.into(), camera, rig_from_camera, shutter: None }
+    }
 }
 
 /// The cameras of one vehicle, in the order in which images are answered.
@@ -98,14 +109,17 @@ impl Rig {
             return Err(RigError::Name { name: self.name.clone() });
         }
         let mut names = BTreeSet::new();
-        for RigCamera { name, camera, .. } in &self.cameras {
+        for RigCamera { name, camera, shutter, .. } in &self.cameras {
             if !is_name(name) {
                 return Err(RigError::Name { name: name.clone() });
             }
             if !names.insert(name) {
                 return Err(RigError::Duplicate { name: name.clone() });
             }
-            Camera::checked(camera.width_px.into(), camera.height_px.into(), camera.pinhole)
+            let shutter = shutter.as_ref().map_or(Ok(()), Shutter::check);
+            camera
+                .check()
+                .and(shutter)
                 .map_err(|cause| RigError::Camera { name: name.clone(), cause })?;
         }
         Ok(())
@@ -131,43 +145,58 @@ struct CameraFields {
     name: String,
     width: u32,
     height: u32,
-    fx: f64,
-    fy: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    fx: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    fy: Option<f64>,
     cx: f64,
     cy: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    lens: Option<LensFields>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    windshield: Option<WindshieldFields>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    shutter: Option<Shutter>,
     camera_to_rig: Pose,
 }
 
 impl From<RigCamera> for CameraFields {
-    fn from(RigCamera { name, camera, rig_from_camera: camera_to_rig }: RigCamera) -> Self {
-        let Camera { width_px: width, height_px: height, pinhole } = camera;
-        let Pinhole { fx, fy, cx, cy } = pinhole;
-        Self { name, width, height, fx, fy, cx, cy, camera_to_rig }
+    fn from(from: RigCamera) -> Self {
+        let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter } = from;
+        let Intrinsics { size_px, focal_px, center_px, lens, windshield } = Intrinsics::of(&camera);
+        let ([width, height], [fx, fy], [cx, cy]) = (size_px, focal_px, center_px);
+        Self { name, width, height, fx, fy, cx, cy, lens, windshield, shutter, camera_to_rig }
     }
 }
 
-/// Whoever reads a rig calls [`Rig::check`], which names the camera at fault.
-impl From<CameraFields> for RigCamera {
-    fn from(fields: CameraFields) -> Self {
-        let CameraFields { name, width, height, fx, fy, cx, cy, camera_to_rig } = fields;
-        let pinhole = Pinhole { fx, fy, cx, cy };
-        let camera = Camera { width_px: width, height_px: height, pinhole };
-        Self { name, camera, rig_from_camera: camera_to_rig }
+/// Whoever reads a rig calls [`Rig::check`], which names the camera at fault; this refuses only what
+/// makes no camera at all.
+impl TryFrom<CameraFields> for RigCamera {
+    type Error = RigError;
+
+    fn try_from(fields: CameraFields) -> Result<Self, RigError> {
+        let CameraFields { name, width, height, fx, fy, cx, cy, lens, windshield, .. } = fields;
+        let (size_px, focal_px, center_px) = ([width, height], [fx, fy], [cx, cy]);
+        let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
+        match intrinsics.camera() {
+            Ok(camera) => {
+                let (rig_from_camera, shutter) = (fields.camera_to_rig, fields.shutter);
+                Ok(Self { name, camera, rig_from_camera, shutter })
+            }
+            Err(cause) => Err(RigError::Camera { name, cause }),
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::camera::Pinhole;
     use glam::DVec3;
 
     fn camera(name: &str) -> RigCamera {
         let pinhole = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 40.0 };
-        RigCamera {
-            name: name.into(),
-            camera: Camera { width_px: 100, height_px: 80, pinhole },
-            rig_from_camera: Pose::IDENTITY,
-        }
+        RigCamera::new(name, Camera::ideal(100, 80, pinhole), Pose::IDENTITY)
     }
 
     #[test]
@@ -196,8 +225,56 @@ mod tests {
                 + r#""camera_to_rig":{"xyz":[0.0,0.0,0.0],"q":[1.0,0.0,0.0,0.0]}}]}"#
         );
         assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), rig);
-        let fisheye = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
-        assert!(serde_json::from_str::<Rig>(&fisheye).is_err(), "a lens that is not drawn");
+        let unknown = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
+        assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
+    }
+
+    #[test]
+    fn lenses_and_shutters_are_written_as_they_are_read() {
+        let rig = |more: &str| {
+            let camera =
+                format!(r#"{{"name":"front","width":100,"height":80,{more},"cx":50.0,"cy":40.0,"#);
+            let rig = r#""camera_to_rig":{"xyz":[0,0,0],"q":[1,0,0,0]}}]}"#;
+            serde_json::from_str::<Rig>(&format!(r#"{{"name":"test","cameras":[{camera}{rig}"#))
+        };
+        for more in [
+            r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[0.1,0,0,0,0,0],"p":[0.001,0]}"#,
+            r#""fx":50,"fy":50,"lens":{"model":"fisheye","k":[0.02,0,0,0]}"#,
+            r#""lens":{"model":"ftheta","reference":"angle_to_pixel","polynomial":[0,60,0,0,0,0],
+                "linear_cde":[1,0,0],"max_angle":1.2}"#,
+            r#""fx":50,"fy":50,"windshield":{"reference":"forward","horizontal":[0.01,1,0],
+                "vertical":[0,0,1]},"shutter":{"direction":"top_to_bottom","duration_us":30000}"#,
+        ] {
+            let read = rig(more).unwrap();
+            assert_eq!(read.check(), Ok(()), "{more}");
+            assert!(!read.cameras[0].camera.is_ideal());
+            let text = serde_json::to_string(&read).unwrap();
+            assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), read, "{text}");
+        }
+        let zeros = r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[0,0,0,0,0,0]}"#;
+        assert!(rig(zeros).unwrap().cameras[0].camera.is_ideal(), "a pinhole by another name");
+        let refused = |more: &str| match rig(more) {
+            Err(error) => error.to_string(),
+            Ok(rig) => rig.check().unwrap_err().to_string(),
+        };
+        for (more, reason) in [
+            (
+                r#""fx":50,"fy":50,"lens":{"model":"fisheye","k":[-9,0,0,0],"max_angle":9}"#,
+                "max_angle",
+            ),
+            (r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[-1e6,0,0,0,0,0]}"#, "an eighth"),
+            (r#""lens":{"model":"fisheye","k":[0,0,0,0]}"#, "fx is missing"),
+            (
+                r#""fx":50,"fy":50,"shutter":{"direction":"top_to_bottom","duration_us":0}"#,
+                "shutter",
+            ),
+            (
+                r#""fx":50,"fy":50,"windshield":{"reference":"forward","horizontal":[0,1],"vertical":[0]}"#,
+                "1, 3, 6",
+            ),
+        ] {
+            assert!(refused(more).contains(reason), "{}", refused(more));
+        }
     }
 
     #[test]

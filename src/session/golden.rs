@@ -6,7 +6,6 @@ use std::sync::Arc;
 use tokio::time::Instant;
 
 use crate::config;
-use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, Pose};
 use crate::render::psnr::psnr_db_of_bytes;
 use crate::render::{Frame, Target, View};
@@ -159,13 +158,12 @@ fn stations(changed: &Changed) -> Vec<Pose> {
 
 /// A camera with the same field of view, and fewer pixels.
 fn small(camera: &RigCamera) -> Option<RigCamera> {
-    let Camera { width_px, height_px, pinhole: Pinhole { fx, fy, cx, cy } } = camera.camera;
+    let Camera { width_px, height_px, .. } = camera.camera;
     let scale = f64::from(config::GOLDEN_SIDE_PX) / f64::from(width_px.max(height_px));
     if scale >= 1.0 {
         return Some(camera.clone());
     }
     let side = |px: u32| (f64::from(px) * scale).round().max(1.0) as u64;
-    let pinhole = Pinhole { fx: fx * scale, fy: fy * scale, cx: cx * scale, cy: cy * scale };
-    let small = Camera::checked(side(width_px), side(height_px), pinhole).ok()?;
+    let small = camera.camera.scaled(side(width_px), side(height_px)).ok()?;
     Some(RigCamera { camera: small, ..camera.clone() })
 }

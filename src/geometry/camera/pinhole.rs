@@ -41,6 +41,23 @@ impl Pinhole {
         Ok(())
     }
 
+    /// Slope of a ray beyond which [`Pinhole::slope_beyond`] goes on straight: 82.9° off the axis.
+    const STRAIGHT: f64 = 8.0;
+
+    /// The slopes x/z and y/z of a direction; from 8 on, they rise with the angle as they do at 8, and
+    /// on behind the camera, so that the shape of what reaches there is finite.
+    #[inline(always)]
+    pub(super) fn slope_beyond(direction: DVec3) -> DVec2 {
+        let off_axis = direction.truncate().length();
+        let within = off_axis < Self::STRAIGHT * direction.z;
+        if within {
+            return direction.truncate() / direction.z;
+        }
+        let beyond_rad = off_axis.atan2(direction.z) - Self::STRAIGHT.atan();
+        let per_rad = 1.0 + Self::STRAIGHT * Self::STRAIGHT;
+        direction.truncate() / off_axis.max(1e-300) * (Self::STRAIGHT + per_rad * beyond_rad)
+    }
+
     /// Where a camera-space point lands, in pixels; meaningless unless `z > 0`.
     pub fn project(&self, point_m: DVec3) -> DVec2 {
         DVec2::new(

@@ -1,0 +1,156 @@
+//! NVIDIA's f-theta: a polynomial between the angle off the axis and the distance in pixels.
+
+use glam::{DMat2, DVec2, DVec3};
+
+use super::CameraError;
+use super::fisheye::{at_angle, radial};
+use super::rising::{Rising, TERMS};
+
+/// `pixel = [[c, d], [e, 1]] r(θ) (x, y)/|(x, y)| + principal point`, for the angle
+/// `θ = atan2(|(x, y)|, z)` (NVIDIA's public description of its vehicle cameras).
+///
+/// Calibrations give two polynomials, of which one is exact and the other its approximate inverse.
+/// Only the exact one, the reference, is kept here, and inverted by Newton's method.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FTheta {
+    reference: Reference,
+    polynomial: [f64; 6],
+    linear_cde: [f64; 3],
+    max_angle_rad: f64,
+    rising: Rising,
+}
+
+/// Which way the exact polynomial goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reference {
+    /// From radians off the axis to pixels from the principal point.
+    AngleToPixel,
+    /// From pixels to radians.
+    PixelToAngle,
+}
+
+impl FTheta {
+    /// Longest distance from the principal point, in pixels: what keeps a polynomial of pixels in f64.
+    const MOST_PX: f64 = 65_536.0;
+
+    /// With coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and how far off the axis
+    /// rays are seen.
+    pub fn new(
+        reference: Reference,
+        polynomial: [f64; 6],
+        linear_cde: [f64; 3],
+        max_angle_rad: f64,
+    ) -> Self {
+        let mut coefficients = [0.0; TERMS];
+        coefficients[..6].copy_from_slice(&polynomial);
+        let rising = match reference {
+            Reference::AngleToPixel => Rising::new(coefficients, max_angle_rad),
+            Reference::PixelToAngle => {
+                let whole = Rising::new(coefficients, Self::MOST_PX);
+                Rising::new(coefficients, whole.invert(max_angle_rad).min(whole.end()))
+            }
+        };
+        Self { reference, polynomial, linear_cde, max_angle_rad, rising }
+    }
+
+    /// Which way the polynomial goes.
+    pub fn reference(&self) -> Reference {
+        self.reference
+    }
+
+    /// Coefficients of powers 0 to 5, in radians and pixels.
+    pub fn polynomial(&self) -> [f64; 6] {
+        self.polynomial
+    }
+
+    /// `[c, d, e]`.
+    pub fn linear_cde(&self) -> [f64; 3] {
+        self.linear_cde
+    }
+
+    /// The angle off the axis that was asked for.
+    pub fn max_angle_rad(&self) -> f64 {
+        self.max_angle_rad
+    }
+
+    /// How far off the axis it sees.
+    pub fn limit_rad(&self) -> f64 {
+        match self.reference {
+            Reference::AngleToPixel => self.rising.end(),
+            Reference::PixelToAngle if self.rising.end() > 0.0 => self.rising.at(self.rising.end()),
+            Reference::PixelToAngle => 0.0,
+        }
+    }
+
+    /// Focal lengths along x and y at the axis, in pixels.
+    pub fn focal_px(&self) -> DVec2 {
+        DVec2::new(self.linear_cde[0], 1.0) * self.central_px()
+    }
+
+    /// `[[c, d], [e, 1]]`.
+    pub fn linear(&self) -> DMat2 {
+        let [c, d, e] = self.linear_cde;
+        DMat2::from_cols(DVec2::new(c, e), DVec2::new(d, 1.0))
+    }
+
+    /// The same for an image that is `scale` times as wide and high.
+    pub(super) fn scaled(&self, scale: DVec2) -> Self {
+        let [c, d, e] = self.linear_cde;
+        let wider = scale.x / scale.y;
+        let mut polynomial = self.polynomial;
+        for (power, coefficient) in polynomial.iter_mut().enumerate() {
+            *coefficient *= match self.reference {
+                Reference::AngleToPixel => scale.y,
+                Reference::PixelToAngle => scale.y.powi(-(power as i32)),
+            };
+        }
+        Self::new(self.reference, polynomial, [c * wider, d * wider, e], self.max_angle_rad)
+    }
+
+    pub(super) fn check(&self) -> Result<(), CameraError> {
+        super::check_numbers("lens.polynomial", &self.polynomial)?;
+        super::check_numbers("lens.linear_cde", &self.linear_cde)?;
+        super::check_max_angle(Some(self.max_angle_rad))?;
+        if self.polynomial[0] != 0.0 {
+            let must = "the axis lands on the principal point: the first coefficient is 0";
+            let field = "lens.polynomial[0]";
+            return Err(CameraError::Intrinsic { field, value: self.polynomial[0], must });
+        }
+        let upright = self.linear().determinant();
+        let usable = self.linear_cde[0] > 0.0 && upright > 1e-3;
+        if !usable {
+            let must = "the determinant of [[c, d], [e, 1]] is above 0.001, and so is c";
+            return Err(CameraError::Intrinsic { field: "lens.linear_cde", value: upright, must });
+        }
+        super::check_field(self.limit_rad())
+    }
+
+    /// Where a direction lands, in pixels from the principal point; beyond the limit it goes on straight.
+    #[inline(always)]
+    pub(super) fn offset_px(&self, direction: DVec3) -> DVec2 {
+        let central_px = self.central_px();
+        self.linear()
+            * match self.reference {
+                Reference::AngleToPixel => radial(direction, |a| self.rising.at(a), central_px),
+                Reference::PixelToAngle => radial(direction, |a| self.rising.invert(a), central_px),
+            }
+    }
+
+    /// The unit direction that lands there, if it is within the limit.
+    pub(super) fn direction(&self, offset_px: DVec2) -> Option<DVec3> {
+        let round = self.linear().inverse() * offset_px;
+        let angle_rad = match self.reference {
+            Reference::AngleToPixel => self.rising.invert(round.length()),
+            Reference::PixelToAngle => self.rising.at(round.length()),
+        };
+        at_angle(round, angle_rad, self.limit_rad())
+    }
+
+    /// Pixels per radian at the axis.
+    fn central_px(&self) -> f64 {
+        match self.reference {
+            Reference::AngleToPixel => self.polynomial[1],
+            Reference::PixelToAngle => 1.0 / self.polynomial[1],
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! Lenses and windshields as rig files and camera lists write them.
+//!
+//! ```text
+//! {"model": "opencv", "k": [k1, .. k6], "p": [p1, p2], "s": [s1, .. s4]}
+//! {"model": "fisheye", "k": [k1, .. k4], "max_angle": radians}
+//! {"model": "ftheta", "reference": "angle_to_pixel", "polynomial": [c0, .. c5],
+//!  "linear_cde": [c, d, e], "max_angle": radians}
+//! {"reference": "forward", "horizontal": [..], "vertical": [..]}
+//! ```
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    Bivariate, Camera, CameraError, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
+    WindshieldReference,
+};
+
+/// A camera without its place: what JSON says of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Intrinsics {
+    /// Width and height, in pixels.
+    pub size_px: [u32; 2],
+    /// Focal lengths, in pixels; an f-theta lens has its own.
+    pub focal_px: [Option<f64>; 2],
+    /// Principal point, in pixels.
+    pub center_px: [f64; 2],
+    /// What is no pinhole.
+    pub lens: Option<LensFields>,
+    /// What stands before it.
+    pub windshield: Option<WindshieldFields>,
+}
+
+/// A lens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "model", rename_all = "lowercase", deny_unknown_fields)]
+pub enum LensFields {
+    /// OpenCV's distortion.
+    Opencv {
+        /// k1 to k6.
+        k: [f64; 6],
+        /// p1 and p2.
+        #[serde(default)]
+        p: [f64; 2],
+        /// s1 to s4.
+        #[serde(default)]
+        s: [f64; 4],
+    },
+    /// OpenCV's fisheye.
+    Fisheye {
+        /// k1 to k4.
+        k: [f64; 4],
+        /// How far off the axis it sees, in radians; as far as the polynomial rises if absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        max_angle: Option<f64>,
+    },
+    /// NVIDIA's f-theta.
+    Ftheta {
+        /// Which way the polynomial goes.
+        reference: ReferenceField,
+        /// Coefficients of powers 0 to 5.
+        polynomial: [f64; 6],
+        /// `[c, d, e]` of `[[c, d], [e, 1]]`.
+        linear_cde: [f64; 3],
+        /// How far off the axis it sees, in radians.
+        max_angle: f64,
+    },
+}
+
+/// Which way an f-theta polynomial goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReferenceField {
+    /// From radians to pixels.
+    AngleToPixel,
+    /// From pixels to radians.
+    PixelToAngle,
+}
+
+/// A windshield.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WindshieldFields {
+    /// Which way the polynomials go.
+    pub reference: WindshieldReferenceField,
+    /// Coefficients of the angle to the right.
+    pub horizontal: Vec<f64>,
+    /// Coefficients of the angle downwards.
+    pub vertical: Vec<f64>,
+}
+
+/// Which way a windshield's polynomials go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WindshieldReferenceField {
+    /// From the world's rays to the lens'.
+    Forward,
+    /// From the lens' rays to the world's.
+    Backward,
+}
+
+impl Intrinsics {
+    /// The camera that they describe; whether it can be used is for [`Camera::check`] to say.
+    ///
+    /// # Errors
+    /// A focal length is missing, or a windshield has no polynomial's number of coefficients.
+    pub fn camera(&self) -> Result<Camera, CameraError> {
+        let lens = self.lens.as_ref().map(LensFields::lens).unwrap_or_default();
+        let own = match &lens {
+            Lens::FTheta(lens) => Some(lens.focal_px()),
+            _ => None,
+        };
+        let focal = |field, axis: usize| {
+            let given = self.focal_px[axis].or(own.map(|own| own[axis]));
+            given.ok_or(CameraError::Missing { field })
+        };
+        let [cx, cy] = self.center_px;
+        let pinhole = Pinhole { fx: focal("fx", 0)?, fy: focal("fy", 1)?, cx, cy };
+        let windshield = self.windshield.as_ref().map(WindshieldFields::windshield).transpose()?;
+        let [width_px, height_px] = self.size_px;
+        Ok(Camera { width_px, height_px, pinhole, lens, windshield })
+    }
+
+    /// What describes a camera.
+    pub fn of(camera: &Camera) -> Self {
+        let Pinhole { fx, fy, cx, cy } = camera.pinhole;
+        Self {
+            size_px: [camera.width_px, camera.height_px],
+            focal_px: [Some(fx), Some(fy)],
+            center_px: [cx, cy],
+            lens: LensFields::of(&camera.lens),
+            windshield: camera.windshield.as_ref().map(WindshieldFields::of),
+        }
+    }
+}
+
+impl LensFields {
+    fn lens(&self) -> Lens {
+        match *self {
+            Self::Opencv { k, p, s } => Lens::opencv(OpenCv::new(k, p, s)),
+            Self::Fisheye { k, max_angle } => Lens::Fisheye(Fisheye::new(k, max_angle)),
+            Self::Ftheta { reference, polynomial, linear_cde, max_angle } => {
+                let reference = match reference {
+                    ReferenceField::AngleToPixel => Reference::AngleToPixel,
+                    ReferenceField::PixelToAngle => Reference::PixelToAngle,
+                };
+                Lens::FTheta(FTheta::new(reference, polynomial, linear_cde, max_angle))
+            }
+        }
+    }
+
+    fn of(lens: &Lens) -> Option<Self> {
+        Some(match lens {
+            Lens::Pinhole => return None,
+            Lens::OpenCv(lens) => Self::Opencv { k: lens.k(), p: lens.p(), s: lens.s() },
+            Lens::Fisheye(lens) => Self::Fisheye { k: lens.k(), max_angle: lens.max_angle_rad() },
+            Lens::FTheta(lens) => Self::Ftheta {
+                reference: match lens.reference() {
+                    Reference::AngleToPixel => ReferenceField::AngleToPixel,
+                    Reference::PixelToAngle => ReferenceField::PixelToAngle,
+                },
+                polynomial: lens.polynomial(),
+                linear_cde: lens.linear_cde(),
+                max_angle: lens.max_angle_rad(),
+            },
+        })
+    }
+}
+
+impl WindshieldFields {
+    fn windshield(&self) -> Result<Windshield, CameraError> {
+        let reference = match self.reference {
+            WindshieldReferenceField::Forward => WindshieldReference::Forward,
+            WindshieldReferenceField::Backward => WindshieldReference::Backward,
+        };
+        let horizontal = Bivariate::new("windshield.horizontal", &self.horizontal)?;
+        let vertical = Bivariate::new("windshield.vertical", &self.vertical)?;
+        Ok(Windshield::new(reference, horizontal, vertical))
+    }
+
+    fn of(windshield: &Windshield) -> Self {
+        Self {
+            reference: match windshield.reference() {
+                WindshieldReference::Forward => WindshieldReferenceField::Forward,
+                WindshieldReference::Backward => WindshieldReferenceField::Backward,
+            },
+            horizontal: windshield.horizontal().coefficients().to_vec(),
+            vertical: windshield.vertical().coefficients().to_vec(),
+        }
+    }
+}

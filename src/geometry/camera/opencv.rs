@@ -1,0 +1,156 @@
+//! OpenCV's model of ordinary lenses: radial, tangential and thin prism distortion of the pinhole.
+
+use glam::{DMat2, DVec2, DVec3};
+
+use super::CameraError;
+use super::rising::last;
+
+/// `(x, y) -> (x, y) icD + tangential + prism` of the slopes `x/z, y/z`, with
+/// `icD = (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's `projectPoints`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OpenCv {
+    k: [f64; 6],
+    p: [f64; 2],
+    s: [f64; 4],
+    /// The slope up to which it is used: see [`OpenCv::limit_slope`].
+    limit_slope: f64,
+}
+
+impl OpenCv {
+    /// Largest slope of a ray: 82.9° off the axis, where a pixel in the middle is 65 wide.
+    const MOST_SLOPE: f64 = 8.0;
+
+    /// Least radial factor: below, calibrations have left the range that they were made in (gsplat's
+    /// bound).
+    const LEAST_FACTOR: f64 = 0.8;
+
+    /// How much of its slope at the axis `r icD(r)` must keep, as of every lens.
+    const LEAST_RISE: f64 = 0.02;
+
+    /// Steps in which the limit is looked for.
+    const STEPS: u32 = 2048;
+
+    /// With coefficients k1 to k6, p1 and p2, s1 to s4.
+    pub fn new(k: [f64; 6], p: [f64; 2], s: [f64; 4]) -> Self {
+        let mut lens = Self { k, p, s, limit_slope: 0.0 };
+        let usable = |slope: f64| {
+            let (factor, rise) = lens.radial(slope * slope);
+            factor > Self::LEAST_FACTOR && factor + 2.0 * slope * slope * rise >= Self::LEAST_RISE
+        };
+        lens.limit_slope = last(usable, Self::MOST_SLOPE, Self::STEPS);
+        lens
+    }
+
+    /// Whether all coefficients are zero: a pinhole.
+    pub fn is_pinhole(&self) -> bool {
+        self.k.iter().chain(&self.p).chain(&self.s).all(|&c| c == 0.0)
+    }
+
+    /// k1 to k6.
+    pub fn k(&self) -> [f64; 6] {
+        self.k
+    }
+
+    /// p1 and p2.
+    pub fn p(&self) -> [f64; 2] {
+        self.p
+    }
+
+    /// s1 to s4.
+    pub fn s(&self) -> [f64; 4] {
+        self.s
+    }
+
+    /// How far off the axis it sees, as a slope: as far as `icD` is above 0.8, and the image does not
+    /// fold back, but never beyond 8.
+    pub fn limit_slope(&self) -> f64 {
+        self.limit_slope
+    }
+
+    pub(super) fn check(&self) -> Result<(), CameraError> {
+        super::check_numbers("lens.k", &self.k)?;
+        super::check_numbers("lens.p", &self.p)?;
+        super::check_numbers("lens.s", &self.s)?;
+        super::check_field(self.limit_slope.atan())
+    }
+
+    /// Where a direction lands, in focal lengths; beyond the limit it goes on straight in the angle.
+    #[inline(always)]
+    pub(super) fn plane(&self, direction: DVec3) -> DVec2 {
+        let off_axis = direction.truncate().length();
+        let within = off_axis < self.limit_slope * direction.z;
+        if within {
+            return self.distort(direction.truncate() / direction.z);
+        }
+        let azimuth = direction.truncate() / off_axis.max(1e-300);
+        let edge = azimuth * self.limit_slope;
+        let beyond_rad = off_axis.atan2(direction.z) - self.limit_slope.atan();
+        let slope_per_rad = 1.0 + self.limit_slope * self.limit_slope;
+        self.distort(edge) + self.jacobian(edge) * azimuth * (slope_per_rad * beyond_rad)
+    }
+
+    /// The unit direction that lands there, if it is within the limit.
+    pub(super) fn direction(&self, plane: DVec2) -> Option<DVec3> {
+        let most = self.limit_slope;
+        let mut slope = plane.clamp_length_max(most);
+        for _ in 0..32 {
+            let step = self.jacobian(slope).inverse() * (self.distort(slope) - plane);
+            let next = (slope - step).clamp_length_max(1.01 * most);
+            let done = next.distance_squared(slope) <= 1e-30;
+            slope = next;
+            if done {
+                break;
+            }
+        }
+        let lands = self.distort(slope).distance(plane) <= 1e-9 * (1.0 + plane.length());
+        let upright = self.jacobian(slope).determinant() > 0.0;
+        let seen = lands && upright && slope.length() <= most * (1.0 + 1e-12);
+        seen.then(|| slope.extend(1.0).normalize())
+    }
+
+    #[inline(always)]
+    fn distort(&self, slope: DVec2) -> DVec2 {
+        let DVec2 { x, y } = slope;
+        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        let r2 = x * x + y * y;
+        let (factor, _) = self.radial(r2);
+        DVec2::new(
+            x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + (s1 + s2 * r2) * r2,
+            y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + (s3 + s4 * r2) * r2,
+        )
+    }
+
+    /// `∂distort/∂slope`.
+    fn jacobian(&self, slope: DVec2) -> DMat2 {
+        let DVec2 { x, y } = slope;
+        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        let r2 = x * x + y * y;
+        let (factor, rise) = self.radial(r2);
+        let (prism_x, prism_y) = (2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2));
+        let across = 2.0 * x * y * rise;
+        DMat2::from_cols(
+            DVec2::new(
+                factor + 2.0 * x * x * rise + 2.0 * p1 * y + 6.0 * p2 * x + prism_x * x,
+                across + 2.0 * p1 * x + 2.0 * p2 * y + prism_y * x,
+            ),
+            DVec2::new(
+                across + 2.0 * p1 * x + 2.0 * p2 * y + prism_x * y,
+                factor + 2.0 * y * y * rise + 6.0 * p1 * y + 2.0 * p2 * x + prism_y * y,
+            ),
+        )
+    }
+
+    /// `icD` and its derivative by r²; not a number where its denominator is not above zero.
+    #[inline(always)]
+    fn radial(&self, r2: f64) -> (f64, f64) {
+        let [k1, k2, k3, k4, k5, k6] = self.k;
+        let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        if below <= 0.0 {
+            return (f64::NAN, f64::NAN);
+        }
+        let above_rise = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
+        let below_rise = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6);
+        (above / below, (above_rise * below - above * below_rise) / (below * below))
+    }
+}

@@ -1,0 +1,201 @@
+//! A windshield before the lens: it turns rays by what two polynomials of their angles say.
+
+use glam::{DVec2, DVec3};
+
+use super::CameraError;
+
+/// Most coefficients of a polynomial: order 5.
+const MOST: usize = 21;
+
+/// `φ = asin(x/|p|)`, `θ = asin(y/|p|)` outside become `h(φ, θ)`, `v(φ, θ)` inside, or the other way
+/// (NVIDIA's public description of its bivariate windshield model).
+///
+/// Calibrations give polynomials both ways, of which one pair is exact. Only that is kept here.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Windshield {
+    reference: WindshieldReference,
+    horizontal: Bivariate,
+    vertical: Bivariate,
+}
+
+/// Which way the exact polynomials go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WindshieldReference {
+    /// From the world's rays to the lens'.
+    Forward,
+    /// From the lens' rays to the world's.
+    Backward,
+}
+
+/// `Σ c φ^i θ^j`, for j from 0 and, within, i from 0 to order - j.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bivariate {
+    coefficients: [f64; MOST],
+    count: usize,
+}
+
+impl Windshield {
+    /// Rays closer to the image plane than this are left alone: `z` as a share of their length. No
+    /// camera looks through a windshield at 84°.
+    const LEAST_Z: f64 = 0.1;
+
+    /// How far it may turn a ray, in radians. Real ones turn by 0.01.
+    pub(super) const MOST_RAD: f64 = 0.2;
+
+    /// How much the turning may differ between two rays, as a share of the angle between them: what
+    /// leaves the inversion halving its error at each step. Real ones have 0.02.
+    const MOST_CHANGE: f64 = 0.5;
+
+    /// Steps of the inversion: 2^-52 at worst.
+    const STEPS: u32 = 52;
+
+    /// With coefficients in the order of [`Bivariate`].
+    pub fn new(reference: WindshieldReference, horizontal: Bivariate, vertical: Bivariate) -> Self {
+        Self { reference, horizontal, vertical }
+    }
+
+    /// Which way the polynomials go.
+    pub fn reference(&self) -> WindshieldReference {
+        self.reference
+    }
+
+    /// The polynomial of the angle to the right.
+    pub fn horizontal(&self) -> &Bivariate {
+        &self.horizontal
+    }
+
+    /// The polynomial of the angle downwards.
+    pub fn vertical(&self) -> &Bivariate {
+        &self.vertical
+    }
+
+    /// Checks it over a pyramid of rays, whose slopes are at most these.
+    pub(super) fn check(&self, most_slope: DVec2) -> Result<(), CameraError> {
+        super::check_numbers("windshield.horizontal", self.horizontal.coefficients())?;
+        super::check_numbers("windshield.vertical", self.vertical.coefficients())?;
+        let refused =
+            |value, must| Err(CameraError::Intrinsic { field: "windshield", value, must });
+        let h = 1e-4;
+        for i in -8..=8 {
+            for j in -8..=8 {
+                let slope = most_slope * DVec2::new(f64::from(i), f64::from(j)) / 8.0;
+                let at = angles(slope.extend(1.0).normalize());
+                let turned = |at: DVec2| self.polynomials(at) - at;
+                let most = turned(at).length();
+                let little = most <= Self::MOST_RAD;
+                if !little {
+                    return refused(most, "a windshield turns rays by at most 0.2 rad");
+                }
+                let change = [DVec2::X, DVec2::Y].map(|axis| {
+                    (turned(at + h * axis) - turned(at - h * axis)).length() / (2.0 * h)
+                });
+                let change = change[0].hypot(change[1]);
+                let even = change <= Self::MOST_CHANGE;
+                if !even {
+                    return refused(
+                        change,
+                        "neighbouring rays are turned by less than half their angle apart",
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The unit direction inside, of a direction outside.
+    #[inline(always)]
+    pub(super) fn inside(&self, outside: DVec3) -> DVec3 {
+        self.turn(outside, WindshieldReference::Forward)
+    }
+
+    /// The unit direction outside, of a direction inside.
+    pub(super) fn outside(&self, inside: DVec3) -> DVec3 {
+        self.turn(inside, WindshieldReference::Backward)
+    }
+
+    fn turn(&self, direction: DVec3, way: WindshieldReference) -> DVec3 {
+        let unit = direction.normalize();
+        if unit.z < Self::LEAST_Z {
+            return unit;
+        }
+        let from = angles(unit);
+        let to = if way == self.reference {
+            self.polynomials(from)
+        } else {
+            // polynomials(x) = from, for polynomials that are nearly the identity.
+            let mut x = from;
+            for _ in 0..Self::STEPS {
+                let off = self.polynomials(x) - from;
+                x -= off;
+                if off.length_squared() <= 1e-32 {
+                    break;
+                }
+            }
+            x
+        };
+        let (x, y) = (to.x.sin(), to.y.sin());
+        DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).normalize()
+    }
+
+    fn polynomials(&self, angles_rad: DVec2) -> DVec2 {
+        DVec2::new(self.horizontal.at(angles_rad), self.vertical.at(angles_rad))
+    }
+}
+
+fn angles(unit: DVec3) -> DVec2 {
+    DVec2::new(unit.x.clamp(-1.0, 1.0).asin(), unit.y.clamp(-1.0, 1.0).asin())
+}
+
+impl Bivariate {
+    /// From 1, 3, 6, 10, 15 or 21 coefficients: orders 0 to 5.
+    ///
+    /// # Errors
+    /// Another number of them.
+    pub fn new(field: &'static str, coefficients: &[f64]) -> Result<Self, CameraError> {
+        let count = coefficients.len();
+        let whole = (0..=5).any(|order| (order + 1) * (order + 2) / 2 == count);
+        if !whole {
+            let must =
+                "a polynomial of order N has (N + 1)(N + 2)/2 coefficients: 1, 3, 6, 10, 15 or 21";
+            return Err(CameraError::Intrinsic { field, value: count as f64, must });
+        }
+        let mut padded = [0.0; MOST];
+        padded[..count].copy_from_slice(coefficients);
+        Ok(Self { coefficients: padded, count })
+    }
+
+    /// As they were given.
+    pub fn coefficients(&self) -> &[f64] {
+        &self.coefficients[..self.count]
+    }
+
+    /// The same in the places of order 5, with zeros between: `c[i, j]` at `j * 6 - j (j - 1)/2 + i`.
+    pub fn of_order_five(&self) -> [f64; 21] {
+        let mut wide = [0.0; MOST];
+        let mut from = self.coefficients().iter();
+        let order = self.order();
+        let mut first = 0;
+        for j in 0..=order {
+            for i in 0..=order - j {
+                wide[first + i] = from.next().copied().unwrap_or(0.0);
+            }
+            first += 6 - j;
+        }
+        wide
+    }
+
+    fn order(&self) -> usize {
+        (0..=5).find(|order| (order + 1) * (order + 2) / 2 == self.count).unwrap_or(0)
+    }
+
+    fn at(&self, angles_rad: DVec2) -> f64 {
+        let order = self.order();
+        let (mut sum, mut power, mut rest) = (0.0, 1.0, self.coefficients());
+        for j in 0..=order {
+            let (row, others) = rest.split_at(order + 1 - j);
+            sum += power * row.iter().rev().fold(0.0, |sum, c| sum * angles_rad.x + c);
+            (power, rest) = (power * angles_rad.y, others);
+        }
+        sum
+    }
+}
