@@ -12,30 +12,14 @@ pub mod psnr;
 pub mod reference;
 pub mod relay;
 pub mod stage;
+pub mod unscented;
+pub mod view;
 
-use crate::geometry::{Camera, Pose};
-use crate::scene::rig::RigCamera;
-use crate::scene::{RenderProfile, Rig, Scene};
+use crate::geometry::Camera;
+use crate::geometry::camera::Field;
+use crate::scene::{Rays, RenderProfile, Rig, Scene};
 
-/// A camera somewhere in the world.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct View {
-    /// Size and intrinsics.
-    pub camera: Camera,
-    /// Where the camera stands.
-    pub world_from_camera: Pose,
-}
-
-impl View {
-    /// The cameras of a rig that stands somewhere.
-    pub fn of_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
-        let view = |camera: &RigCamera| Self {
-            camera: camera.camera,
-            world_from_camera: world_from_rig * camera.rig_from_camera,
-        };
-        cameras.iter().map(view).collect()
-    }
-}
+pub use view::{Rolling, View};
 
 /// One chain of stages: all views of one step.
 #[derive(Clone, Copy, Debug)]
@@ -51,17 +35,34 @@ pub struct Frame<'a> {
 /// Most views of one frame: those of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
-/// Where the pixels of one view go, row by row from the top; what is `None` is not computed.
+/// Where the pixels of one view go, row by row from the top; what is `None` is not computed. What the
+/// view's lens does not see is 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
     /// `[height, width, 4]`: linear premultiplied red, green, blue on black, and opacity.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
     pub rgb8: Option<&'a mut [u8]>,
-    /// `[height, width]`: expected camera z in metres, 0 where opacity is 0.
+    /// `[height, width]`: expected depth ([`Camera::depth_m`]) in metres, 0 where opacity is 0.
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
+}
+
+impl Target<'_> {
+    /// Zeroes what a camera's lens does not see: nothing, where it is a pinhole.
+    fn mask(&mut self, camera: &Camera) {
+        let Some(field) = Field::of(camera) else { return };
+        if let Some(rgb8) = &mut self.rgb8 {
+            field.clear(camera, 3, rgb8);
+        }
+        for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
+        {
+            if let Some(image) = image {
+                field.clear(camera, values, image);
+            }
+        }
+    }
 }
 
 /// Called once per view, as soon as its pixels are final, from a worker thread: the place to
@@ -89,6 +90,15 @@ pub enum RenderError {
     Views {
         /// How many were given.
         count: usize,
+    },
+    /// The backend draws splats alone.
+    #[error(
+        "the {backend} backend draws splats, and the profile asks for rays=exact: use the reference \
+         backend, or rays=splats"
+    )]
+    ExactRays {
+        /// Its name.
+        backend: &'static str,
     },
     /// A target's buffer is not of its view's size.
     #[error(
@@ -198,6 +208,15 @@ impl Frame<'_> {
             }
         }
         Ok(())
+    }
+
+    /// # Errors
+    /// The profile asks for rays that no splats are drawn for.
+    pub fn check_splats(&self, backend: &'static str) -> Result<(), RenderError> {
+        match self.profile.rays {
+            Rays::Splats => Ok(()),
+            Rays::Exact => Err(RenderError::ExactRays { backend }),
+        }
     }
 
     /// # Errors

@@ -2,6 +2,23 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How a Gaussian becomes pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rays {
+    /// It is projected once, as an ellipse.
+    #[default]
+    Splats,
+    /// Every pixel's own ray meets it: by definition, and as slow. The reference backend alone does.
+    Exact,
+}
+
+impl Rays {
+    fn is_splats(&self) -> bool {
+        *self == Self::Splats
+    }
+}
+
 /// Constants of the image formation that differ between trainers (gsplat, INRIA, brush, ...).
 ///
 /// The defaults are gsplat 1.6's "classic" mode. Sources per field: rendering semantics of gsplat
@@ -29,6 +46,10 @@ pub struct RenderProfile {
     /// Distance from the nearest camera beyond which a block is not drawn, in metres; none, and
     /// everything is.
     pub reach_m: Option<f64>,
+    /// How Gaussians become pixels. Not written unless it is said, so that profiles from before keep
+    /// their hashes.
+    #[serde(skip_serializing_if = "Rays::is_splats")]
+    pub rays: Rays,
 }
 
 impl Default for RenderProfile {
@@ -43,6 +64,7 @@ impl Default for RenderProfile {
             stop: 1e-4,
             tau_px: 1.0,
             reach_m: None,
+            rays: Rays::Splats,
         }
     }
 }
@@ -72,7 +94,7 @@ pub enum ProfileError {
 
 impl RenderProfile {
     /// Names of the fields, as `--profile` and manifests spell them.
-    pub const KEYS: [&'static str; 9] = [
+    pub const KEYS: [&'static str; 10] = [
         "near",
         "far",
         "blur",
@@ -82,6 +104,7 @@ impl RenderProfile {
         "stop",
         "tau_px",
         "reach_m",
+        "rays",
     ];
 
     /// # Errors
@@ -151,6 +174,9 @@ impl RenderProfile {
             "tau_px" => self.tau_px = number()?,
             "reach_m" if value == "none" => self.reach_m = None,
             "reach_m" => self.reach_m = Some(number()?),
+            "rays" if value == "splats" => self.rays = Rays::Splats,
+            "rays" if value == "exact" => self.rays = Rays::Exact,
+            "rays" => return Err(bad("expected splats or exact".into())),
             _ => return Err(bad(format!("there is no field {key:?}"))),
         }
         self.check()
@@ -177,6 +203,7 @@ mod tests {
             "near=NaN",
             "tau_px=-1",
             "reach_m=far",
+            "rays=some",
         ] {
             assert!(profile.clone().set(bad).is_err(), "{bad}");
         }
@@ -184,7 +211,8 @@ mod tests {
 
     #[test]
     fn the_keys_are_the_fields() {
-        let json = serde_json::to_value(RenderProfile::default()).unwrap();
+        let json = serde_json::to_value(RenderProfile { rays: Rays::Exact, ..Default::default() });
+        let json = json.unwrap();
         let mut fields: Vec<_> = json.as_object().unwrap().keys().map(String::as_str).collect();
         let mut keys = RenderProfile::KEYS.to_vec();
         fields.sort_unstable();

@@ -8,6 +8,8 @@ mod data;
 mod gpu;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/lenses.rs"]
+mod lenses;
 #[path = "../support/poisons.rs"]
 mod poisons;
 #[path = "../support/scene_files.rs"]
@@ -18,6 +20,7 @@ mod streets;
 mod truths;
 
 mod bench;
+mod cameras;
 mod command_line;
 mod definition;
 mod determinism;

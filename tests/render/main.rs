@@ -6,6 +6,8 @@ mod blobs;
 mod data;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/lenses.rs"]
+mod lenses;
 #[path = "../support/poisons.rs"]
 mod poisons;
 #[path = "../support/scene_files.rs"]
@@ -15,7 +17,9 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod cameras;
 mod determinism;
 mod extremes;
+mod models;
 mod others;
 mod parity;

@@ -91,10 +91,8 @@ pub(crate) fn look(
         cx: 0.5 * f64::from(width_px),
         cy: 0.5 * f64::from(height_px),
     };
-    View {
-        camera: Camera { width_px, height_px, pinhole },
-        world_from_camera: Pose { position_m, rotation: DQuat::from_mat3(&axes).normalize() },
-    }
+    let world_from_camera = Pose { position_m, rotation: DQuat::from_mat3(&axes).normalize() };
+    View::new(Camera::ideal(width_px, height_px, pinhole), world_from_camera)
 }
 
 /// Peak signal-to-noise ratio in dB, for values whose peak is 1.
@@ -160,9 +158,9 @@ pub(crate) fn agree(image: &Image, truth: &Image) -> Result<f64, String> {
 
 /// A part of a view's image, as a view of its own.
 pub(crate) fn crop(whole: View, [left, top]: [u32; 2], [width_px, height_px]: [u32; 2]) -> View {
-    let p = whole.camera.pinhole;
-    let pinhole = Pinhole { cx: p.cx - f64::from(left), cy: p.cy - f64::from(top), ..p };
-    View { camera: Camera { width_px, height_px, pinhole }, ..whole }
+    let corner = [left, top].map(u64::from);
+    let camera = whole.camera.cropped(corner, [width_px, height_px].map(u64::from)).unwrap();
+    View { camera, ..whole }
 }
 
 /// Largest difference between a crop and the same part of the whole, inside a margin: the slope clamp

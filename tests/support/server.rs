@@ -145,18 +145,12 @@ pub(crate) fn rig() -> Rig {
     let camera = |name: &str, width_px, height_px, yaw_rad: f64| {
         // Camera axes are x right, y down, z forward; rig axes x forward, y left, z up.
         let forward = DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
-        RigCamera {
-            name: name.to_owned(),
-            camera: Camera {
-                width_px,
-                height_px,
-                pinhole: Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 },
-            },
-            rig_from_camera: Pose {
-                position_m: DVec3::new(0.5, 0.0, 1.5),
-                rotation: DQuat::from_rotation_z(yaw_rad) * forward,
-            },
-        }
+        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
+        let rig_from_camera = Pose {
+            position_m: DVec3::new(0.5, 0.0, 1.5),
+            rotation: DQuat::from_rotation_z(yaw_rad) * forward,
+        };
+        RigCamera::new(name, Camera::ideal(width_px, height_px, pinhole), rig_from_camera)
     };
     let cameras = vec![camera("front", 8, 6, 0.0), camera("rear", 5, 4, std::f64::consts::PI)];
     Rig { name: "pair".to_owned(), cameras }

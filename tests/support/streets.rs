@@ -67,15 +67,9 @@ pub(crate) fn demo_street() -> (Gaussians, [View; 2]) {
     let world_from_rig = street.trajectory.at_station(60.0);
     let view = |name: &str| {
         let mounted = rig.cameras.iter().find(|camera| camera.name == name).unwrap();
-        let p = mounted.camera.pinhole;
-        let eighth = |c: f64| c / 8.0;
-        let pinhole =
-            Pinhole { fx: eighth(p.fx), fy: eighth(p.fy), cx: eighth(p.cx), cy: eighth(p.cy) };
         let (width_px, height_px) = (mounted.camera.width_px / 8, mounted.camera.height_px / 8);
-        View {
-            camera: Camera { width_px, height_px, pinhole },
-            world_from_camera: world_from_rig * mounted.rig_from_camera,
-        }
+        let eighth = mounted.camera.scaled(width_px.into(), height_px.into()).unwrap();
+        View::new(eighth, world_from_rig * mounted.rig_from_camera)
     };
     let views = [view("front"), view("left")];
     (street.gaussians, views)

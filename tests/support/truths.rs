@@ -8,7 +8,7 @@ use wildcity::geometry::Camera;
 use wildcity::geometry::camera::Pinhole;
 use wildcity::ingest;
 use wildcity::render::View;
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity::scene::{Rays, RenderProfile, Scene};
 
 use crate::data::real;
 use crate::images::look;
@@ -32,7 +32,7 @@ pub(crate) fn gsplat() -> Option<Truth> {
     let pinhole = Pinhole { fx: 0.5 * w, fy: 0.5 * w, cx: 0.5 * w, cy: 0.5 * h };
     let at = DVec3::new(0.123, 0.456, -8.0);
     let view = View {
-        camera: Camera { width_px, height_px, pinhole },
+        camera: Camera::ideal(width_px, height_px, pinhole),
         ..look([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
     };
     let rgba = out.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
@@ -49,7 +49,7 @@ pub(crate) fn skull_front() -> Option<Truth> {
     );
     let listed = ingest::cameras::read(&camera).unwrap().remove(0);
     let profile = RenderProfile { near: listed.near.unwrap(), ..GSPLAT_OF_THEN };
-    let view = View { camera: listed.camera, world_from_camera: listed.world_from_camera };
+    let view = View::new(listed.camera, listed.world_from_camera);
     Some(Truth { scene: read(&scene), profile, view, rgba: npy(&image) })
 }
 
@@ -69,6 +69,7 @@ const GSPLAT_OF_THEN: RenderProfile = RenderProfile {
     stop: 1e-4,
     tau_px: 1.0,
     reach_m: None,
+    rays: Rays::Splats,
 };
 
 /// The values of a little-endian float32 `.npy` file.

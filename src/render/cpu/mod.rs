@@ -3,6 +3,7 @@
 //! Deterministic: what runs in parallel writes to places that do not depend on the schedule, and
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
+mod bent;
 mod bin;
 mod handover;
 mod lanes;
@@ -108,6 +109,7 @@ impl Cpu {
         last: Stage,
     ) -> Result<(Between, FrameStats), RenderError> {
         frame.check_views()?;
+        frame.check_splats(self.name())?;
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
@@ -173,6 +175,7 @@ impl Backend for Cpu {
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
+        frame.check_splats(self.name())?;
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);

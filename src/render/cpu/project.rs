@@ -8,12 +8,14 @@ use std::sync::{Mutex, PoisonError};
 use fearless_simd::{Level, dispatch, f32x16, f64x8, i32x16, prelude::*};
 use rayon::prelude::*;
 
+use super::bent;
 use super::lanes::Vec3x16;
+use crate::render::Frame;
 use crate::render::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
-use crate::render::{Frame, View};
-use crate::scene::chunk::{CLUSTER, LANES, Lanes, column};
-use crate::scene::{Chunk, RenderProfile, sh};
+use crate::render::unscented::Bent;
+use crate::scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
+use crate::scene::{Chunk, sh};
 
 /// Clusters of a unit: 4096 Gaussians take some 100 µs, long enough to be worth handing out.
 const UNIT_CLUSTERS: usize = 16;
@@ -50,8 +52,17 @@ struct Job<'a> {
     view: usize,
     chunk: &'a Chunk,
     clusters: std::ops::Range<usize>,
-    chunk_view: ChunkView,
-    frustum: Frustum,
+    sight: Sight<'a>,
+}
+
+/// How a view sees a chunk.
+#[derive(Clone, Copy)]
+#[allow(clippy::large_enum_variant, reason = "nearly all are the large one")]
+enum Sight<'a> {
+    /// A pinhole at rest.
+    Straight { chunk_view: ChunkView, frustum: Frustum },
+    /// A lens, or a rolling shutter.
+    Bent(&'a Bent<'a>),
 }
 
 impl Projected {
@@ -60,7 +71,9 @@ impl Projected {
         let Self { pages, units, free } = self;
         let all_free = free.get_mut().unwrap_or_else(PoisonError::into_inner);
         all_free.append(pages);
-        let jobs: Vec<Job<'_>> = jobs(frame);
+        let bent: Vec<Option<Bent<'_>>> =
+            frame.views.iter().map(|view| Bent::of(view, frame.profile)).collect();
+        let jobs: Vec<Job<'_>> = jobs(frame, &bent);
         let filled: Vec<(usize, Vec<Page>)> = jobs
             .par_iter()
             .map_init(Vec::new, |splats, job| {
@@ -121,52 +134,65 @@ fn into_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
 }
 
 /// The units of a frame: chunks that a view cannot see cost one test.
-fn jobs<'a>(frame: &Frame<'a>) -> Vec<Job<'a>> {
+fn jobs<'a>(frame: &Frame<'a>, bent: &'a [Option<Bent<'a>>]) -> Vec<Job<'a>> {
     let mut jobs = Vec::new();
-    for (index, view) in frame.views.iter().enumerate() {
+    for (index, (view, bent)) in frame.views.iter().zip(bent).enumerate() {
         for chunk in &frame.scene.chunks {
-            jobs_of(index, view, chunk, frame.profile, &mut jobs);
+            let sight = match bent {
+                Some(bent) => Sight::Bent(bent),
+                None => Sight::Straight {
+                    chunk_view: ChunkView::new(view, chunk),
+                    frustum: Frustum::new(view, chunk, frame.profile),
+                },
+            };
+            jobs_of(index, sight, chunk, &mut jobs);
         }
     }
     jobs
 }
 
-fn jobs_of<'a>(
-    index: usize,
-    view: &View,
-    chunk: &'a Chunk,
-    profile: &RenderProfile,
-    jobs: &mut Vec<Job<'a>>,
-) {
-    let frustum = Frustum::new(view, chunk, profile);
+impl Sight<'_> {
+    #[inline(always)]
+    fn may_see(&self, chunk: &Chunk, cluster: &Cluster) -> bool {
+        let Cluster { min_m, max_m, sigma_m, .. } = *cluster;
+        match self {
+            Self::Straight { frustum, .. } => frustum.may_see(min_m, max_m, sigma_m),
+            Self::Bent(bent) => bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
+        }
+    }
+}
+
+fn jobs_of<'a>(view: usize, sight: Sight<'a>, chunk: &'a Chunk, jobs: &mut Vec<Job<'a>>) {
     let visible = |clusters: &std::ops::Range<usize>| {
         let mut clusters = chunk.clusters()[clusters.clone()].iter();
-        clusters.any(|cluster| frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m))
+        clusters.any(|cluster| sight.may_see(chunk, cluster))
     };
-    let chunk_view = ChunkView::new(view, chunk);
     let count = chunk.clusters().len();
     let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
-    jobs.extend(ranges.filter(visible).map(|clusters| Job {
-        view: index,
-        chunk,
-        clusters,
-        chunk_view,
-        frustum,
-    }));
+    jobs.extend(ranges.filter(visible).map(|clusters| Job { view, chunk, clusters, sight }));
 }
 
 #[inline(always)]
 fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut Vec<Splat>) {
     let blocks = job.chunk.len().div_ceil(LANES);
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
-        if !job.frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m) {
+        if !job.sight.may_see(job.chunk, cluster) {
             continue;
         }
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
             let columns = job.chunk.block(block);
             let degree = job.chunk.sh_degree();
-            if let Some(lanes) = project_block(simd, columns, degree, &job.chunk_view, cutoffs) {
+            let lanes = match &job.sight {
+                Sight::Straight { chunk_view, .. } => {
+                    project_block(simd, columns, degree, chunk_view, cutoffs)
+                }
+                Sight::Bent(view) => {
+                    let origin_m = job.chunk.origin_m();
+                    bent::project_block(simd, columns, degree, (view, origin_m), cutoffs)
+                }
+            };
+            if let Some(lanes) = lanes {
                 lanes.append(splats);
             }
         }
@@ -174,20 +200,21 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
 }
 
 /// Sixteen splats as columns, and which of them are visible.
-struct SplatLanes {
-    visible: u64,
-    mean_x: [f32; LANES],
-    mean_y: [f32; LANES],
-    l0: [f32; LANES],
-    l1: [f32; LANES],
-    l2: [f32; LANES],
-    log2_opacity: [f32; LANES],
-    red: [f32; LANES],
-    green: [f32; LANES],
-    blue: [f32; LANES],
-    depth_m: [f32; LANES],
-    extent_x: [f32; LANES],
-    extent_y: [f32; LANES],
+#[derive(Default)]
+pub(super) struct SplatLanes {
+    pub(super) visible: u64,
+    pub(super) mean_x: [f32; LANES],
+    pub(super) mean_y: [f32; LANES],
+    pub(super) l0: [f32; LANES],
+    pub(super) l1: [f32; LANES],
+    pub(super) l2: [f32; LANES],
+    pub(super) log2_opacity: [f32; LANES],
+    pub(super) red: [f32; LANES],
+    pub(super) green: [f32; LANES],
+    pub(super) blue: [f32; LANES],
+    pub(super) depth_m: [f32; LANES],
+    pub(super) extent_x: [f32; LANES],
+    pub(super) extent_y: [f32; LANES],
 }
 
 impl SplatLanes {
@@ -325,7 +352,7 @@ fn root_row<S: Simd>(
 }
 
 /// `√(log2(e)/2)`: what turns standard deviations into the unit of [`Splat::factor`].
-const LOG2_UNIT: f32 = 0.849_321_8;
+pub(super) const LOG2_UNIT: f32 = 0.849_321_8;
 
 /// Screen ellipses, by their factor.
 struct Ellipse<S: Simd> {
@@ -395,7 +422,12 @@ fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
 
 /// `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
 #[inline(always)]
-fn color<S: Simd>(simd: S, columns: &[Lanes], degree: u8, toward: Vec3x16<S>) -> Vec3x16<S> {
+pub(super) fn color<S: Simd>(
+    simd: S,
+    columns: &[Lanes],
+    degree: u8,
+    toward: Vec3x16<S>,
+) -> Vec3x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
     let half = Vec3x16 { x: splat(0.5), y: splat(0.5), z: splat(0.5) };
     let mut rgb = Vec3x16::load(simd, columns, column::SH).mul_add(splat(sh::C0), half);

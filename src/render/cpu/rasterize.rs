@@ -50,6 +50,7 @@ pub(super) fn rasterize(
                 evaluations.fetch_add(count, Relaxed);
             });
             drop(bands);
+            target.mask(&view.camera);
             finished(index, target);
         },
     );

@@ -24,7 +24,7 @@ mod sort;
 mod traffic;
 mod turns;
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use rayon::ThreadPool;
@@ -41,8 +41,9 @@ use self::read_back::Drawn;
 use self::resolve::{Pixels, Planes};
 use self::shaders::Shaders;
 use self::turns::Turns;
+use super::cpu::{Cpu, Simd};
 use super::stage::{Between, Stage};
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
 use crate::config;
 
 /// The wgpu backend.
@@ -59,6 +60,8 @@ pub struct Gpu {
     /// is encoded.
     cull: ThreadPool,
     turns: Turns,
+    /// Projects what no matrix does: the views of lenses and rolling shutters. Made for the first one.
+    host: OnceLock<Cpu>,
     /// Gone after the device failed, and made again by the next frame.
     chain: Mutex<Option<Chain>>,
 }
@@ -157,6 +160,7 @@ impl Gpu {
             deliver,
             cull,
             turns: Turns::default(),
+            host: OnceLock::new(),
             chain: Mutex::new(Some(Chain::new(device, &shaders, limits.mirror_bytes)?)),
             shaders,
         })
@@ -257,6 +261,32 @@ impl Gpu {
         done
     }
 
+    /// Renders a frame in which there is a lens or a rolling shutter: the host projects, and the device
+    /// does the rest.
+    fn render_bent(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        frame.check(targets)?;
+        let host = match self.host.get() {
+            Some(host) => host,
+            None => {
+                let host = Cpu::new(self.threads(), Simd::Best);
+                let failed =
+                    |reason: String| RenderError::Device { device: "the host".into(), reason };
+                let host = host.map_err(|error| failed(error.to_string()))?;
+                self.host.get_or_init(|| host)
+            }
+        };
+        let (between, before) = host.through(frame, Stage::Project)?;
+        let mut stats = self.go_on(&between, frame, targets, finished)?;
+        stats.stages_ms.splice(0..0, before.stages_ms);
+        stats.visible_pairs = before.visible_pairs;
+        Ok(stats)
+    }
+
     /// Draws a frame, and delivers its pixels.
     fn render_with(
         &self,
@@ -266,6 +296,7 @@ impl Gpu {
         draw: impl FnOnce(&mut Chain, Planes) -> Result<Drawn, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
+        frame.check_splats(self.name())?;
         let planes = Planes::of(targets);
         let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
         let asked = Instant::now();
@@ -286,6 +317,7 @@ impl Gpu {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
                 pixels.deliver(view, target);
+                target.mask(&frame.views[index].camera);
                 finished(index, target);
             });
         });
@@ -328,6 +360,9 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
+        if !frame.views.iter().all(View::is_ideal) {
+            return self.render_bent(frame, targets, finished);
+        }
         self.render_with(frame, targets, finished, |chain, planes| {
             chain.draw(frame, planes, &self.cull)
         })
@@ -339,7 +374,6 @@ mod tests {
     use super::*;
     use crate::geometry::camera::Pinhole;
     use crate::geometry::{Camera, Pose};
-    use crate::render::View;
     use crate::scene::{RenderProfile, Scene};
 
     #[test]
@@ -347,8 +381,7 @@ mod tests {
         let mut gpu = Gpu::new(&AdapterChoice::Best, 1)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
-        let camera = Camera { width_px: 16, height_px: 16, pinhole };
-        let views = [View { camera, world_from_camera: Pose::IDENTITY }];
+        let views = [View::new(Camera::ideal(16, 16, pinhole), Pose::IDENTITY)];
         let (scene, profile) = (Scene::default(), RenderProfile::default());
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         let render = |gpu: &Gpu| {

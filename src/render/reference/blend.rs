@@ -29,24 +29,37 @@ pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProf
 
 /// Kerbl et al. 2023, eq. 3, with the cap, the cut and the stop of the profile.
 fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
-    let mut pixel = Pixel { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0 };
+    let mut pixel = Pixel::EMPTY;
     for splat in splats {
         let d = at_px - splat.mean_px;
         let power = -0.5 * (splat.conic.x * d.x * d.x + splat.conic.z * d.y * d.y)
             - splat.conic.y * d.x * d.y;
-        let alpha = (splat.opacity * power.exp()).min(profile.alpha_cap);
-        let touches = alpha >= profile.alpha_cut;
-        if !touches {
-            continue;
-        }
-        let after = pixel.transmittance * (1.0 - alpha);
-        if after <= profile.stop {
+        if !pixel.add(splat.opacity * power.exp(), splat, profile) {
             break;
         }
-        let weight = pixel.transmittance * alpha;
-        pixel.rgb += weight * splat.rgb;
-        pixel.depth_m += weight * splat.depth_m;
-        pixel.transmittance = after;
     }
     pixel
+}
+
+impl Pixel {
+    /// Nothing is in the way.
+    pub(super) const EMPTY: Self = Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0 };
+
+    /// Blends the next splat, of so much alpha before the cap. False if the pixel has stopped.
+    pub(super) fn add(&mut self, alpha: f64, splat: &Splat, profile: &RenderProfile) -> bool {
+        let alpha = alpha.min(profile.alpha_cap);
+        let touches = alpha >= profile.alpha_cut;
+        if !touches {
+            return true;
+        }
+        let after = self.transmittance * (1.0 - alpha);
+        if after <= profile.stop {
+            return false;
+        }
+        let weight = self.transmittance * alpha;
+        self.rgb += weight * splat.rgb;
+        self.depth_m += weight * splat.depth_m;
+        self.transmittance = after;
+        true
+    }
 }

@@ -5,6 +5,7 @@
 
 mod blend;
 mod project;
+mod rays;
 
 use std::time::Instant;
 
@@ -13,6 +14,7 @@ use rayon::prelude::*;
 pub use project::{Splat, project};
 
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use crate::scene::Rays;
 
 /// The f64 backend.
 #[derive(Clone, Copy, Debug, Default)]
@@ -36,6 +38,10 @@ impl Backend for Reference {
             let start = Instant::now();
             let mut splats = project(frame.scene, frame.profile, view);
             project::sort(&mut splats);
+            let solids = match frame.profile.rays {
+                Rays::Splats => Vec::new(),
+                Rays::Exact => rays::solids(frame.scene, &splats),
+            };
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
 
@@ -43,11 +49,15 @@ impl Backend for Reference {
             let width = view.camera.width_px as usize;
             let pixels: Vec<blend::Pixel> = (0..view.camera.height_px)
                 .into_par_iter()
-                .flat_map_iter(|row| blend::row(&splats, row, width, frame.profile))
+                .flat_map_iter(|row| match frame.profile.rays {
+                    Rays::Splats => blend::row(&splats, row, width, frame.profile),
+                    Rays::Exact => rays::row(&splats, &solids, row, view, frame.profile),
+                })
                 .collect();
             blend_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.evaluations += pixels.len() as u64 * splats.len() as u64;
             write(&pixels, target);
+            target.mask(&view.camera);
             finished(index, target);
         }
         stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];

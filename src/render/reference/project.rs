@@ -7,13 +7,17 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::geometry::Camera;
+use crate::geometry::camera::WIDEST_RAD;
 use crate::render::View;
+use crate::render::unscented::BESIDE_RAD;
 use crate::scene::chunk::column;
 use crate::scene::{Chunk, RenderProfile, Scene, sh};
 
 /// A Gaussian on screen.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
+    /// Which it is: its chunk, and its place there.
+    pub of: [usize; 2],
     /// Camera-space z of the centre, in metres: what is sorted.
     pub depth_m: f64,
     /// Centre, in pixels.
@@ -31,10 +35,12 @@ pub struct Splat {
 /// Every Gaussian between near and far that can be seen at all, on the image or beside it, in order
 /// of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
-    let chunks = scene.chunks.par_iter();
+    let chunks = scene.chunks.par_iter().enumerate();
     chunks
-        .flat_map_iter(|chunk| {
-            (0..chunk.len()).filter_map(|i| project_one(chunk, i, profile, view))
+        .flat_map_iter(|(number, chunk)| {
+            let splat =
+                move |i| Some(Splat { of: [number, i], ..project_one(chunk, i, profile, view)? });
+            (0..chunk.len()).filter_map(splat)
         })
         .collect()
 }
@@ -46,41 +52,110 @@ pub(super) fn sort(splats: &mut [Splat]) {
 }
 
 fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View) -> Option<Splat> {
-    let value = |column| f64::from(chunk.value(index, column));
-    let three = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
-
-    let mean_world = chunk.origin_m() + three(column::MEAN);
-    let camera_from_world = view.world_from_camera.inverse();
-    let mean = camera_from_world.transform_point(mean_world);
-    let in_range = mean.z >= profile.near && mean.z <= profile.far;
-    if !in_range {
-        return None;
-    }
-
-    let q = column::QUAT;
-    let rotation = DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q)).normalize();
-    let m = camera_from_world.rotation_matrix()
-        * DMat3::from_quat(rotation)
-        * DMat3::from_diagonal(three(column::SCALE));
-    let [row_x, row_y] = jacobian(mean, &view.camera).map(|row| m.transpose() * row);
-    let det_before = row_x.cross(row_y).length_squared();
-    let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
+    let (mean_world, axes_m) = placed(chunk, index);
+    let seen = if view.is_ideal() {
+        straight(mean_world, axes_m, profile, view)
+    } else {
+        bent(mean_world, axes_m, profile, view)
+    }?;
+    let Seen { depth_m, mean_px, xx, xy, yy, det_before, camera_m } = seen;
     let det = det_before + profile.blur * (xx + yy + profile.blur);
     let (xx, yy) = (xx + profile.blur, yy + profile.blur);
 
-    let mut opacity = value(column::LOG2_OPACITY).exp2();
+    let mut opacity = f64::from(chunk.value(index, column::LOG2_OPACITY)).exp2();
     if profile.antialiased {
         // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
         opacity *= (det_before / det).max(0.005 * 0.005).sqrt();
     }
     let can_be_seen = opacity >= profile.alpha_cut;
     can_be_seen.then(|| Splat {
-        depth_m: mean.z,
-        mean_px: view.camera.pinhole.project(mean),
+        of: [0, index],
+        depth_m,
+        mean_px,
         conic: DVec3::new(yy, -xy, xx) / det,
         opacity,
-        rgb: color(chunk, index, mean_world - view.world_from_camera.position_m),
+        rgb: color(chunk, index, mean_world - camera_m),
         reach_px: (2.0 * (opacity / profile.alpha_cut).ln() * DVec2::new(xx, yy)).map(f64::sqrt),
+    })
+}
+
+/// A Gaussian's centre in the world, and its axes times their standard deviations, in metres.
+pub(super) fn placed(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
+    let value = |column| f64::from(chunk.value(index, column));
+    let three = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
+    let q = column::QUAT;
+    let rotation = DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q)).normalize();
+    let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(three(column::SCALE));
+    (chunk.origin_m() + three(column::MEAN), axes_m)
+}
+
+/// A Gaussian's place and shape on the image, before the blur.
+struct Seen {
+    depth_m: f64,
+    mean_px: DVec2,
+    /// Covariance, in px².
+    xx: f64,
+    xy: f64,
+    yy: f64,
+    /// Its determinant.
+    det_before: f64,
+    /// The camera's centre in the world.
+    camera_m: DVec3,
+}
+
+/// By a pinhole at rest: linearised at the centre.
+fn straight(
+    mean_world: DVec3,
+    axes_m: DMat3,
+    profile: &RenderProfile,
+    view: &View,
+) -> Option<Seen> {
+    let camera_from_world = view.world_from_camera.inverse();
+    let mean = camera_from_world.transform_point(mean_world);
+    let in_range = mean.z >= profile.near && mean.z <= profile.far;
+    if !in_range {
+        return None;
+    }
+    let m = camera_from_world.rotation_matrix() * axes_m;
+    let [row_x, row_y] = jacobian(mean, &view.camera).map(|row| m.transpose() * row);
+    Some(Seen {
+        depth_m: mean.z,
+        mean_px: view.camera.pinhole.project(mean),
+        xx: row_x.dot(row_x),
+        xy: row_x.dot(row_y),
+        yy: row_y.dot(row_y),
+        det_before: row_x.cross(row_y).length_squared(),
+        camera_m: view.world_from_camera.position_m,
+    })
+}
+
+/// By a lens or a rolling shutter: the mean and the scatter of six points, each with weight 1/6.
+fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) -> Option<Seen> {
+    let center = view.land(mean_world, 1.0);
+    let depth_m = view.camera.depth_m(center.point_m);
+    let off_axis_rad = center.point_m.angle_between(DVec3::Z);
+    let widest_rad = (view.camera.limit_rad() + BESIDE_RAD).min(WIDEST_RAD);
+    let in_range = depth_m >= profile.near && depth_m <= profile.far && off_axis_rad <= widest_rad;
+    if !in_range {
+        return None;
+    }
+    let mut points_px = [DVec2::ZERO; 6];
+    for (i, point_px) in points_px.iter_mut().enumerate() {
+        let side = if i % 2 == 0 { 1.0 } else { -1.0 };
+        let point = mean_world + side * 3.0_f64.sqrt() * axes_m.col(i / 2);
+        *point_px = view.land(point, 1.0).at_px;
+    }
+    let mean_px = points_px.iter().sum::<DVec2>() / 6.0;
+    let off_px = points_px.map(|point_px| (point_px - mean_px) / 6.0_f64.sqrt());
+    let pairs = (0..6).flat_map(|i| (0..i).map(move |k| (i, k)));
+    Some(Seen {
+        depth_m,
+        mean_px,
+        xx: off_px.iter().map(|off| off.x * off.x).sum(),
+        xy: off_px.iter().map(|off| off.x * off.y).sum(),
+        yy: off_px.iter().map(|off| off.y * off.y).sum(),
+        det_before: pairs.map(|(i, k)| off_px[i].perp_dot(off_px[k]).powi(2)).sum(),
+        camera_m: center.world_from_camera.position_m,
     })
 }
 

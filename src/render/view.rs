@@ -1,0 +1,145 @@
+//! Views: a camera somewhere in the world, at rest or on its way.
+
+use glam::{DVec2, DVec3};
+
+use crate::geometry::camera::Rolls;
+use crate::geometry::{Camera, Pose};
+use crate::scene::rig::RigCamera;
+
+/// A camera somewhere in the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// Size, intrinsics and lens.
+    pub camera: Camera,
+    /// Where the camera stands: at the end of the exposure.
+    pub world_from_camera: Pose,
+    /// How it came there while its rows were exposed; `None` if all were at once, or it stood still.
+    pub rolling: Option<Rolling>,
+}
+
+/// The way of a camera during one exposure, straight and even.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rolling {
+    /// Which row or column is exposed first.
+    pub direction: Rolls,
+    /// Where the camera stood then.
+    pub world_from_camera_first: Pose,
+}
+
+/// Where a point of the world lands.
+#[derive(Clone, Copy, Debug)]
+pub struct Landing {
+    /// Where on the image or beside it, in pixels.
+    pub at_px: DVec2,
+    /// When it is exposed: 0 with the first row, 1 with the last.
+    pub fraction: f64,
+    /// Where the camera stands then.
+    pub world_from_camera: Pose,
+    /// The point in the camera's frame then, in metres.
+    pub point_m: DVec3,
+}
+
+impl View {
+    /// Rounds of the search for the row that sees a point. Each leaves of the error what the image
+    /// moves per row, a tenth of a row for what passes close by: 1e-16 at worst in the end.
+    const ROUNDS: u32 = 16;
+
+    /// The search ends when it moves by less than this share of the exposure: 1e-7 of 1 m.
+    const STILL: f64 = 1e-7;
+
+    /// A camera at rest.
+    pub fn new(camera: Camera, world_from_camera: Pose) -> Self {
+        Self { camera, world_from_camera, rolling: None }
+    }
+
+    /// The cameras of a rig that stands still.
+    pub fn of_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
+        Self::of_moving_rig(cameras, world_from_rig, &|_| world_from_rig)
+    }
+
+    /// The cameras of a rig that stands somewhere now, and stood at `world_from_rig_before(age_us)` so
+    /// many microseconds ago: where it did matters to cameras with a rolling shutter.
+    pub fn of_moving_rig(
+        cameras: &[RigCamera],
+        world_from_rig: Pose,
+        world_from_rig_before: &dyn Fn(i64) -> Pose,
+    ) -> Vec<Self> {
+        let view = |camera: &RigCamera| {
+            let world_from_camera = world_from_rig * camera.rig_from_camera;
+            let rolling = camera.shutter.and_then(|shutter| {
+                let before = world_from_rig_before(shutter.duration_us);
+                let world_from_camera_first = before * camera.rig_from_camera;
+                let moves = !still(&world_from_camera_first, &world_from_camera);
+                moves.then_some(Rolling { direction: shutter.direction, world_from_camera_first })
+            });
+            Self { camera: camera.camera, world_from_camera, rolling }
+        };
+        cameras.iter().map(view).collect()
+    }
+
+    /// Whether it is a pinhole at rest, which a matrix projects.
+    pub fn is_ideal(&self) -> bool {
+        self.camera.is_ideal() && self.rolling.is_none()
+    }
+
+    /// Where the camera stands when a place of its image, in pixels, is exposed.
+    pub fn world_from_camera_at(&self, at_px: DVec2) -> Pose {
+        match &self.rolling {
+            None => self.world_from_camera,
+            Some(rolling) => self.on_the_way(rolling.direction.fraction(at_px, &self.camera)),
+        }
+    }
+
+    /// The unit direction in the world that a place of the image, in pixels, sees; `None` outside of
+    /// the lens' field. The ray starts where [`View::world_from_camera_at`] says.
+    pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
+        let direction = self.camera.unproject(at_px)?;
+        Some(self.world_from_camera_at(at_px).rotation * direction)
+    }
+
+    /// Where a point of the world lands, in pixels; `None` outside of the lens' field.
+    pub fn project_world(&self, point_m: DVec3) -> Option<DVec2> {
+        self.camera.project(self.land(point_m, 1.0).point_m)
+    }
+
+    /// Where a point of the world lands if the lens is continued beyond its field. With a rolling
+    /// shutter the row decides where the camera stands, and that decides the row: found by going back
+    /// and forth, from a first guess of when.
+    #[inline(always)]
+    pub fn land(&self, world_m: DVec3, guess: f64) -> Landing {
+        let landing = |fraction: f64, world_from_camera: Pose| {
+            let from_camera_m = world_m - world_from_camera.position_m;
+            let point_m = world_from_camera.rotation.inverse() * from_camera_m;
+            let at_px = self.camera.project_beyond(point_m);
+            Landing { at_px, fraction, world_from_camera, point_m }
+        };
+        let Some(rolling) = &self.rolling else { return landing(1.0, self.world_from_camera) };
+        let mut landed = landing(guess, self.on_the_way(guess));
+        for _ in 0..Self::ROUNDS {
+            let fraction = rolling.direction.fraction(landed.at_px, &self.camera);
+            let moved = (fraction - landed.fraction).abs();
+            if moved <= Self::STILL {
+                break;
+            }
+            landed = landing(fraction, self.on_the_way(fraction));
+        }
+        landed
+    }
+
+    /// Where the camera stands at a fraction of the exposure.
+    #[inline(always)]
+    fn on_the_way(&self, fraction: f64) -> Pose {
+        match &self.rolling {
+            None => self.world_from_camera,
+            Some(rolling) => {
+                rolling.world_from_camera_first.interpolate(&self.world_from_camera, fraction)
+            }
+        }
+    }
+}
+
+/// Whether two poses are the same but for rounding: a nanometre, and 1e-12 rad.
+fn still(a: &Pose, b: &Pose) -> bool {
+    let turned = (a.rotation - b.rotation).length().min((a.rotation + b.rotation).length());
+    a.position_m.distance(b.position_m) <= 1e-9 && turned <= 1e-12
+}

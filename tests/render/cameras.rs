@@ -1,0 +1,411 @@
+//! What lenses and rolling shutters make of a scene: against the analytic projection, against every
+//! pixel's own ray, and against the same scene row by row.
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use wildcity::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
+use wildcity::geometry::{Camera, Pose};
+use wildcity::render::reference::Reference;
+use wildcity::render::unscented::Bent;
+use wildcity::render::{Backend, RenderError, Rolling, Target, View};
+use wildcity::scene::{Rays, RenderProfile, Scene};
+
+use crate::blobs::{Blob, scene};
+use crate::images::{
+    Image, agree, cpu, look, max_difference, psnr, render, render_one, try_render,
+};
+use crate::lenses::lenses;
+use crate::streets::street;
+
+/// A target of small opaque balls, 0.3 m apart on a wall 2 m ahead, one at a time.
+fn target(camera: &Camera) -> Vec<(DVec3, DVec2)> {
+    let points = (-4..=4).flat_map(|i| (-2..=2).map(move |k| (f64::from(i), f64::from(k))));
+    let points = points.map(|(x, y)| DVec3::new(0.3 * x, 0.3 * y, 2.0));
+    let seen = points.filter_map(|point_m| Some((point_m, camera.project(point_m)?)));
+    let within = |at_px: DVec2| {
+        at_px.cmpgt(DVec2::splat(5.0)).all() && at_px.cmplt(camera.size_px() - 5.0).all()
+    };
+    seen.filter(|(_, at_px)| within(*at_px)).collect()
+}
+
+/// Where the image of a single ball is, weighted by opacity.
+fn centroid(image: &Image, camera: &Camera) -> DVec2 {
+    let (mut sum, mut weight) = (DVec2::ZERO, 0.0);
+    for (pixel, &opacity) in image.opacity.iter().enumerate() {
+        let (row, column) = (pixel as u32 / camera.width_px, pixel as u32 % camera.width_px);
+        let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
+        sum += f64::from(opacity) * at_px;
+        weight += f64::from(opacity);
+    }
+    sum / weight
+}
+
+/// Draws each ball alone and compares; returns how many there were.
+fn lands(backend: &dyn Backend, name: &str, camera: Camera) -> usize {
+    let target = target(&camera);
+    // Its own image is as wide as the blur, so that the centroid is not that of a bent disc.
+    let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
+    for (point_m, at_px) in &target {
+        let ball = Blob { mean_m: *point_m, sigma_m: DVec3::splat(0.003), ..Blob::default() };
+        let view = View::new(camera, Pose::IDENTITY);
+        let image = render_one(backend, &scene(&[ball]), &fine, view);
+        let off_px = centroid(&image, &camera).distance(*at_px);
+        assert!(off_px < 0.1, "{name}, {} : {off_px:.3} px from {at_px}", backend.name());
+    }
+    target.len()
+}
+
+#[test]
+fn known_points_land_where_the_model_says() {
+    for (name, camera) in lenses() {
+        let half = camera.scaled(96, 50).unwrap();
+        let part = camera.cropped([30, 20], [90, 70]).unwrap();
+        for (camera, least) in [(camera, 20), (half, 20), (part, 5)] {
+            let points = lands(&cpu(), name, camera);
+            assert!(points >= least, "{name}: {points} points");
+        }
+        lands(&Reference, name, camera.scaled(64, 40).unwrap());
+    }
+}
+
+/// Views along a street through each lens, and the profile of every pixel's own ray.
+fn street_scene() -> (Scene, Pose, RenderProfile) {
+    let at = DVec3::new(0.4, 0.0, 20.0);
+    let pose = look([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
+    let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
+    (Scene::from_gaussians(&street(20_000, 1, 31)), pose, exact)
+}
+
+#[test]
+fn every_lens_draws_what_each_pixels_ray_meets() {
+    let (street, pose, exact) = street_scene();
+    for (name, camera) in lenses() {
+        let view = View::new(camera, pose);
+        let truth = render_one(&Reference, &street, &exact, view);
+        let drawn = render_one(&Reference, &street, &RenderProfile::default(), view);
+        let db = psnr(&drawn.rgba, &truth.rgba);
+        println!("{name}: {db:.1} dB against every pixel's ray");
+        assert!(db >= 45.0, "{name}: {db:.1} dB");
+    }
+}
+
+#[test]
+fn the_cpu_backend_draws_lenses_as_they_are_defined() {
+    let (street, pose, _) = street_scene();
+    for (name, camera) in lenses() {
+        let view = View::new(camera, pose);
+        let profile = RenderProfile::default();
+        let truth = render_one(&Reference, &street, &profile, view);
+        assert!(truth.opacity.iter().any(|&o| o > 0.5), "{name}: the view is empty");
+        let image = render_one(&cpu(), &street, &profile, view);
+        agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
+    }
+    // With all that a profile may ask for.
+    for setting in ["antialiased=true", "near=3", "far=30", "blur=0.1"] {
+        let mut profile = RenderProfile::default();
+        profile.set(setting).unwrap();
+        let view = View::new(lenses()[1].1, pose);
+        let truth = render_one(&Reference, &street, &profile, view);
+        agree(&render_one(&cpu(), &street, &profile, view), &truth).unwrap();
+    }
+}
+
+#[test]
+fn zero_distortion_draws_the_bytes_of_a_pinhole() {
+    let (street, pose, _) = street_scene();
+    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let none = Lens::opencv(OpenCv::new([0.0; 6], [0.0; 2], [0.0; 4]));
+    let still = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: pose };
+    let same = View::new(Camera { lens: none, ..ideal }, pose);
+    let profile = RenderProfile::default();
+    let image = render_one(&cpu(), &street, &profile, View::new(ideal, pose));
+    assert!(render_one(&cpu(), &street, &profile, same) == image);
+    // A shutter that rolls while nothing moves is told apart only by how the shape is computed.
+    let unmoved = View { rolling: Some(still), ..same };
+    let db = psnr(&render_one(&cpu(), &street, &profile, unmoved).rgba, &image.rgba);
+    println!("a pinhole by six points: {db:.1} dB of a pinhole");
+    assert!(db > 40.0, "{db:.1} dB");
+    // And a hardly bent one draws hardly another image.
+    let hardly = Lens::opencv(OpenCv::new([1e-9, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]));
+    let hardly = View::new(Camera { lens: hardly, ..ideal }, pose);
+    let off = max_difference(
+        &render_one(&cpu(), &street, &profile, hardly).rgba,
+        &render_one(&cpu(), &street, &profile, unmoved).rgba,
+    );
+    assert!(off < 2.0 / 255.0, "off by {off}");
+}
+
+/// A fisheye of 220° whose image circle lies within the image.
+fn beyond_half() -> Camera {
+    let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
+    let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
+    Camera { lens, ..Camera::ideal(120, 100, pinhole) }
+}
+
+#[test]
+fn t23_beyond_180_degrees_and_never_around() {
+    let camera = beyond_half();
+    assert_eq!(camera.check(), Ok(()));
+    // A ball straight behind, and one at 100° to the right, beyond a pinhole's world.
+    let behind = Blob { mean_m: DVec3::new(0.0, 0.0, -3.0), ..Blob::default() };
+    let (sin, cos) = 100_f64.to_radians().sin_cos();
+    let right = Blob { mean_m: 3.0 * DVec3::new(sin, 0.0, cos), ..Blob::default() };
+    let view = View::new(camera, Pose::IDENTITY);
+    let profile = RenderProfile::default();
+    for backend in [&Reference as &dyn Backend, &cpu()] {
+        let image = render_one(backend, &scene(&[behind_of(&behind)]), &profile, view);
+        assert!(image.opacity.iter().all(|&o| o == 0.0), "{}: from behind", backend.name());
+        let image = render_one(backend, &scene(&[behind_of(&right)]), &profile, view);
+        let at_px = camera.project(right.mean_m).unwrap();
+        assert!(centroid(&image, &camera).distance(at_px) < 0.3);
+        // A wall all around: what the lens does not see stays empty, to the pixel.
+        let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
+        let image = render_one(backend, &scene(&[wall]), &profile, view);
+        for (pixel, &opacity) in image.opacity.iter().enumerate() {
+            let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
+            let seen = camera.unproject(at_px).is_some();
+            assert_eq!(opacity > 0.0, seen, "{} at {at_px}: {opacity}", backend.name());
+            if !seen {
+                assert_eq!(image.rgb8[3 * pixel..3 * pixel + 3], [0; 3]);
+                assert_eq!(image.depth_m[pixel], 0.0);
+            }
+        }
+    }
+    // All around, against every pixel's ray.
+    let (street, pose, exact) = street_scene();
+    let view = View { world_from_camera: pose, ..view };
+    let truth = render_one(&Reference, &street, &exact, view);
+    let drawn = render_one(&cpu(), &street, &RenderProfile::default(), view);
+    let db = psnr(&drawn.rgba, &truth.rgba);
+    println!("a fisheye of 220°: {db:.1} dB against every pixel's ray");
+    assert!(db >= 40.0, "{db:.1} dB");
+}
+
+fn behind_of(blob: &Blob) -> Blob {
+    Blob { mean_m: blob.mean_m, ..Blob::default() }
+}
+
+#[test]
+fn t5_a_camera_within_a_gaussian_and_one_before_it() {
+    let inside =
+        Blob { mean_m: DVec3::new(0.1, 0.0, 0.3), sigma_m: DVec3::splat(2.0), ..Blob::default() };
+    let behind =
+        Blob { mean_m: DVec3::new(0.0, 0.0, -2.0), sigma_m: DVec3::splat(0.3), ..Blob::default() };
+    for (name, camera) in lenses() {
+        let view = View::new(camera, Pose::IDENTITY);
+        let profile = RenderProfile::default();
+        let truth = render_one(&Reference, &scene(&[behind_of_size(&inside)]), &profile, view);
+        let image = render_one(&cpu(), &scene(&[behind_of_size(&inside)]), &profile, view);
+        agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let image = render_one(&cpu(), &scene(&[behind_of_size(&behind)]), &profile, view);
+        assert!(image.opacity.iter().all(|&o| o == 0.0), "{name}: a mirrored contribution");
+    }
+}
+
+fn behind_of_size(blob: &Blob) -> Blob {
+    Blob { mean_m: blob.mean_m, sigma_m: blob.sigma_m, ..Blob::default() }
+}
+
+#[test]
+fn t2_long_things_on_the_ground_beside_the_view() {
+    for (name, camera) in lenses() {
+        let view = View::new(camera, Pose::IDENTITY);
+        for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 5.0]] {
+            for angle in [0.0, 0.5, 1.2, 2.5] {
+                let long = scene(&[Blob {
+                    mean_m: DVec3::new(x, y, 4.0),
+                    rotation: DQuat::from_rotation_y(angle),
+                    sigma_m: DVec3::new(2.0, 0.05, 0.3),
+                    ..Blob::default()
+                }]);
+                let profile = RenderProfile::default();
+                let truth = render_one(&Reference, &long, &profile, view);
+                let image = render_one(&cpu(), &long, &profile, view);
+                agree(&image, &truth)
+                    .unwrap_or_else(|e| panic!("{name}: ({x}, {y}) at {angle}: {e}"));
+            }
+        }
+    }
+}
+
+#[test]
+fn t18_a_part_of_a_lens_image_is_the_image_of_the_part() {
+    let (street, pose, _) = street_scene();
+    for (name, camera) in lenses() {
+        let whole = render_one(&cpu(), &street, &RenderProfile::default(), View::new(camera, pose));
+        for [left, top] in [[0, 0], [90, 48], [61, 17]] {
+            let part = camera.cropped([left, top], [70, 52]).unwrap();
+            let image =
+                render_one(&cpu(), &street, &RenderProfile::default(), View::new(part, pose));
+            for row in 0..52 {
+                let from = 4 * ((row + top as usize) * 160 + left as usize);
+                let off = max_difference(
+                    &image.rgba[4 * row * 70..4 * (row + 1) * 70],
+                    &whole.rgba[from..from + 4 * 70],
+                );
+                assert!(off <= 2e-3, "{name} at {left}, {top}, row {row}: off by {off}");
+            }
+        }
+    }
+}
+
+/// 0.9 m and 0.01 rad during the exposure: 30 m/s for 30 ms, in a curve.
+fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
+    let before = Pose {
+        position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
+        rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
+    };
+    let rolling = Some(Rolling { direction, world_from_camera_first: before });
+    View { camera, world_from_camera: pose, rolling }
+}
+
+#[test]
+fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
+    let (street, pose, exact) = street_scene();
+    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let profile = RenderProfile::default();
+    let fisheye = lenses()[1].1;
+    for (name, camera) in [("pinhole", ideal), ("fisheye", fisheye)] {
+        for direction in
+            [Rolls::TopToBottom, Rolls::BottomToTop, Rolls::LeftToRight, Rolls::RightToLeft]
+        {
+            let view = driven(camera, pose, direction);
+            let image = render_one(&cpu(), &street, &profile, view);
+            let across = matches!(direction, Rolls::LeftToRight | Rolls::RightToLeft);
+            // Each row alone, from where the camera then stands, with every pixel's own ray.
+            let rows = if across { 160 } else { 100 };
+            let mut truth = vec![0.0_f32; 4 * 160 * 100];
+            for row in (0..rows).step_by(7) {
+                let at_px = DVec2::splat(f64::from(row) + 0.5);
+                let world_from_camera = view.world_from_camera_at(at_px);
+                let (corner, size) = if across {
+                    ([u64::from(row), 0], [1, 100])
+                } else {
+                    ([0, u64::from(row)], [160, 1])
+                };
+                let strip = View::new(camera.cropped(corner, size).unwrap(), world_from_camera);
+                let strip = render_one(&Reference, &street, &exact, strip).rgba;
+                for (k, value) in strip.chunks_exact(4).enumerate() {
+                    let pixel =
+                        if across { k * 160 + row as usize } else { row as usize * 160 + k };
+                    truth[4 * pixel..4 * pixel + 4].copy_from_slice(value);
+                }
+            }
+            let of_rows: (Vec<f32>, Vec<f32>) = image
+                .rgba
+                .chunks_exact(4)
+                .zip(truth.chunks_exact(4))
+                .enumerate()
+                .filter(|(pixel, _)| (if across { pixel % 160 } else { pixel / 160 }) % 7 == 0)
+                .flat_map(|(_, (a, b))| a.iter().copied().zip(b.iter().copied()))
+                .unzip();
+            let db = psnr(&of_rows.0, &of_rows.1);
+            let still = View { rolling: None, ..view };
+            let still = render_one(&cpu(), &street, &profile, still);
+            let without = psnr(&still.rgba, &image.rgba);
+            println!(
+                "{name}, {direction:?}: {db:.1} dB of row by row; {without:.1} dB of no rolling"
+            );
+            assert!(db >= 42.0, "{name}, {direction:?}: {db:.1} dB");
+            assert!(without < 30.0, "{name}: the shutter changed nothing");
+        }
+    }
+}
+
+#[test]
+fn the_cpu_backend_rolls_as_it_is_defined() {
+    let (street, pose, _) = street_scene();
+    for camera in [lenses()[0].1, lenses()[2].1] {
+        let view = driven(camera, pose, Rolls::TopToBottom);
+        let truth = render_one(&Reference, &street, &RenderProfile::default(), view);
+        let image = render_one(&cpu(), &street, &RenderProfile::default(), view);
+        agree(&image, &truth).unwrap();
+    }
+    // A point is seen by the row that it lands on, from where the camera stands then.
+    let view = driven(lenses()[0].1, Pose::IDENTITY, Rolls::BottomToTop);
+    let point_m = DVec3::new(0.4, -0.3, 2.0);
+    let at_px = view.project_world(point_m).unwrap();
+    let pose = view.world_from_camera_at(at_px);
+    let ray = view.ray_world(at_px).unwrap();
+    let off_rad = ray.angle_between(point_m - pose.position_m);
+    assert!(off_rad < 1e-6, "{off_rad:e}");
+}
+
+#[test]
+fn t22_six_points_scatter_as_a_million() {
+    // A wide disc at an angle, through the fisheye: mean and covariance on the image, by drawing.
+    let camera = lenses()[1].1;
+    let view = View::new(camera, Pose::IDENTITY);
+    let bent = Bent::of(&view, &RenderProfile::default()).unwrap();
+    let mean_m = DVec3::new(0.6, 0.3, 1.5);
+    let axes_m = DMat3::from_quat(DQuat::from_rotation_y(0.7))
+        * DMat3::from_diagonal(DVec3::new(0.2, 0.3, 0.01));
+    let footprint = bent.project(mean_m, axes_m).unwrap();
+    let covariance = |columns: &[DVec2]| {
+        let sum = |f: fn(&DVec2) -> f64| columns.iter().map(f).sum::<f64>();
+        [sum(|c| c.x * c.x), sum(|c| c.x * c.y), sum(|c| c.y * c.y)]
+    };
+    let six = covariance(&footprint.root_px);
+
+    let mut random = crate::scene_files::Random(77);
+    let mut normal = || {
+        let (u, v) = (random.unit().max(1e-300), random.unit());
+        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+    };
+    let samples: Vec<DVec2> = (0..200_000)
+        .map(|_| {
+            let unit = DVec3::new(normal(), normal(), normal());
+            camera.project_beyond(mean_m + axes_m * unit)
+        })
+        .collect();
+    let count = samples.len() as f64;
+    let mean_px = samples.iter().sum::<DVec2>() / count;
+    let off: Vec<DVec2> = samples.iter().map(|s| (s - mean_px) / count.sqrt()).collect();
+    let many = covariance(&off);
+    let off_px = footprint.mean_px.distance(mean_px);
+    println!("six points: mean off by {off_px:.3} px, covariance {six:.1?} for {many:.1?}");
+    assert!(off_px < 0.2, "{off_px} px");
+    for (six, many) in six.into_iter().zip(many) {
+        assert!((six - many).abs() < 0.05 * many.abs().max(10.0), "{six} for {many}");
+    }
+}
+
+#[test]
+fn exact_rays_are_for_the_reference_alone() {
+    let (_, pose, exact) = street_scene();
+    let view = View::new(lenses()[0].1, pose);
+    let refused = try_render(&cpu(), &Scene::default(), &exact, &[view]).unwrap_err();
+    assert_eq!(refused, RenderError::ExactRays { backend: "cpu" });
+    assert!(refused.to_string().contains("rays=splats"), "{refused}");
+    let mut rgb8 = vec![7; 3 * view.camera.pixels()];
+    let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
+    let frame =
+        wildcity::render::Frame { scene: &Scene::default(), profile: &exact, views: &[view] };
+    assert!(cpu().render(&frame, &mut [target], &|_, _| {}).is_err());
+    assert!(rgb8.iter().all(|&b| b == 7), "nothing was written");
+}
+
+#[test]
+fn exact_rays_of_a_pinhole_are_its_splats_but_for_the_linearisation() {
+    let (street, pose, exact) = street_scene();
+    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let view = View::new(ideal, pose);
+    let truth = render_one(&Reference, &street, &exact, view);
+    let drawn = render_one(&Reference, &street, &RenderProfile::default(), view);
+    let db = psnr(&drawn.rgba, &truth.rgba);
+    println!("pinhole: {db:.1} dB against every pixel's ray");
+    assert!(db >= 40.0, "{db:.1} dB");
+}
+
+#[test]
+fn lenses_and_pinholes_share_a_frame() {
+    let (street, pose, _) = street_scene();
+    let ideal = Camera::ideal(90, 70, Pinhole { fx: 60.0, fy: 60.0, cx: 45.0, cy: 35.0 });
+    let views: Vec<View> =
+        [lenses()[2].1, ideal, beyond_half()].map(|c| View::new(c, pose)).to_vec();
+    let backend = cpu();
+    let profile = RenderProfile::default();
+    let together = render(&backend, &street, &profile, &views);
+    for (view, image) in views.iter().zip(&together) {
+        assert!(render_one(&backend, &street, &profile, *view) == *image);
+    }
+}
