@@ -25,7 +25,7 @@ pub const OBSERVATION_BYTES: usize = 3 << 29;
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
-/// of at most 1.5 kB, together 0.4 MB.
+/// of at most 3 kB, together 0.8 MB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
 /// Connections at once, WebSocket and HTTP together.

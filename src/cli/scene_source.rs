@@ -323,7 +323,7 @@ impl SceneSource {
             profile.set(setting)?;
         }
         profile.check().with_context(|| format!("camera {name:?}"))?;
-        Ok(Shot { name, view: View { camera, world_from_camera }, profile })
+        Ok(Shot { name, view: View::new(camera, world_from_camera), profile })
     }
 
     fn source(&self) -> anyhow::Result<(Source, RenderProfile)> {

@@ -4,9 +4,12 @@
 //! are mistakes: types of requests refuse them, and [`super::unknown_field`] finds them within the
 //! types that both ways share.
 
+use std::collections::BTreeMap;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::camera::{Lens, Shutter, Windshield};
 use super::error::Code;
 
 /// A rigid transform: position in metres, unit quaternion (w, x, y, z).
@@ -199,7 +202,7 @@ pub struct Rig {
     pub cameras: Vec<RigCamera>,
 }
 
-/// A pinhole camera on the vehicle; all intrinsics in pixels.
+/// A camera on the vehicle, a pinhole unless it has a lens; all intrinsics in pixels.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RigCamera {
     /// Name.
@@ -208,14 +211,25 @@ pub struct RigCamera {
     pub width: u64,
     /// Image height.
     pub height: u64,
-    /// Focal length along x.
-    pub fx: f64,
-    /// Focal length along y.
-    pub fy: f64,
+    /// Focal length along x; answers have it always, requests may leave it to an f-theta lens.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fx: Option<f64>,
+    /// Focal length along y, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fy: Option<f64>,
     /// Principal point, x, from the image's left edge.
     pub cx: f64,
     /// Principal point, y, from the image's top edge.
     pub cy: f64,
+    /// The lens, where it is no pinhole.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<Lens>,
+    /// The windshield before it, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub windshield: Option<Windshield>,
+    /// How its rows are exposed one after the other; all at once if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shutter: Option<Shutter>,
     /// `rig_from_camera`: camera axes are x right, y down, z forward.
     pub camera_to_rig: Pose,
 }
@@ -227,6 +241,10 @@ pub struct Outputs {
     /// Names of the cameras to render, in the order wanted; all if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<String>>,
+    /// Other parts and sizes of images than the rig's, by the camera's name; the cameras of `opened`
+    /// describe what is sent.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub images: BTreeMap<String, ImagePart>,
     /// How colour images travel.
     pub encoding: Encoding,
     /// JPEG quality, 1 to 100; ignored by the other encodings.
@@ -242,12 +260,25 @@ impl Default for Outputs {
     fn default() -> Self {
         Self {
             cameras: None,
+            images: BTreeMap::new(),
             encoding: Encoding::Jpeg,
             quality: None,
             depth: false,
             opacity: false,
         }
     }
+}
+
+/// What is sent of a camera's image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct ImagePart {
+    /// First column and row, width and height of the part, in the rig's pixels; all of it if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crop: Option<[u64; 4]>,
+    /// Width and height that the part is drawn at, in pixels; as many as it has if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub size: Option<[u64; 2]>,
 }
 
 /// How colour images travel.

@@ -4,6 +4,7 @@
 //! `seq`. Binary frames are [`observation`]s. The prose is `protocol/README.md`; the JSON schemas
 //! beside it are generated from these types. What HTTP carries beside sessions is in [`http`].
 
+pub mod camera;
 pub mod error;
 pub mod http;
 pub mod message;

@@ -13,6 +13,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::camera::{Lens, Windshield};
 use super::message::{Encoding, Pose};
 
 /// What an observation says beside its tensors.
@@ -89,11 +90,21 @@ pub struct Image {
     pub cx: f64,
     /// Principal point, y, in pixels.
     pub cy: f64,
+    /// The lens, where it is no pinhole, as it maps rays to the image as sent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<Lens>,
+    /// The windshield before it, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub windshield: Option<Windshield>,
+    /// The share of the image that the lens sees, where that is not all of it: elsewhere colour, depth
+    /// and opacity are 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seen: Option<f64>,
     /// `rig_from_camera`.
     pub camera_to_rig: Pose,
-    /// Start of the exposure, in simulated microseconds; equal to the end: a global shutter.
+    /// Exposure of the first row, in simulated microseconds; equal to the end with a global shutter.
     pub shutter_start_us: i64,
-    /// End of the exposure, in simulated microseconds: the image's time.
+    /// Exposure of the last row, in simulated microseconds: the image's time.
     pub shutter_end_us: i64,
     /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
     pub hash: String,

@@ -1,6 +1,7 @@
 //! Wire to session and back: the one place of the server that names the protocol.
 
 mod answer;
+mod camera;
 mod fault;
 mod http;
 mod request;

@@ -7,6 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{HISTORY_POSES, HISTORY_STEP_US};
 use crate::geometry::Pose;
+use crate::render::View;
+use crate::scene::rig::RigCamera;
 
 use super::SessionError;
 
@@ -91,19 +93,36 @@ impl Episode {
         if self.terminated {
             return Err(SessionError::EpisodeOver { steps: self.step });
         }
+        let mut next = self.moved(world_from_rig);
+        next.terminated = terminate;
+        Ok(next)
+    }
+
+    /// The same of whoever knows that it goes on.
+    pub(super) fn moved(&self, world_from_rig: Pose) -> Self {
         let mut next = self.clone();
         let moved_m = world_from_rig.position_m - self.world_from_rig().position_m;
         let time_us = self.time_us() + self.dt_us;
         next.step += 1;
         next.distance_m += moved_m.length();
         next.velocity_m_s = moved_m * (1e6 / self.dt_us as f64);
-        next.terminated = terminate;
         next.track.push_back((time_us, world_from_rig));
         // One pose at or before the history's begin must stay, to interpolate from.
         while next.track.len() > 2 && next.track[1].0 <= time_us - HISTORY_US {
             next.track.pop_front();
         }
-        Ok(next)
+        next
+    }
+
+    /// A rig's cameras somewhere, moving as the ego has just moved: so a rolling shutter sees from any
+    /// place what it would see if the ego had come there as it came to where it is. At the start of an
+    /// episode it stands.
+    pub(super) fn views(&self, cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
+        let now = self.world_from_rig();
+        View::of_moving_rig(cameras, world_from_rig, &|age_us| {
+            let then = self.at(self.time_us() - age_us);
+            if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
+        })
     }
 
     /// Seed of the episode.
@@ -178,6 +197,8 @@ impl Episode {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Camera;
+    use crate::geometry::camera::{Pinhole, Rolls, Shutter};
     use glam::DQuat;
 
     fn at(x_m: f64, yaw_rad: f64) -> Pose {
@@ -227,6 +248,26 @@ mod tests {
         }
         let slow = driven(3, 2_000_000, 20.0);
         assert!((slow.history().xyz_m[0][0] + 15.0).abs() < 1e-4, "{:?}", slow.history().xyz_m[0]);
+    }
+
+    #[test]
+    fn rolling_shutters_see_from_where_the_ego_was() {
+        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
+        let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
+        let still = Episode::new(7, at(0.0, 0.0), 100_000);
+        let driven = driven(3, 100_000, 3.0);
+        assert_eq!(driven.views(&[camera.clone()], at(9.0, 0.0))[0].rolling, None, "global");
+        camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
+        assert_eq!(still.views(&[camera.clone()], at(0.0, 0.0))[0].rolling, None, "it stands");
+        // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
+        for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {
+            let view = driven.views(&[camera.clone()], at(x_m, 0.0))[0];
+            assert!((view.world_from_camera.position_m.x - x_m - 1.5).abs() < 1e-9);
+            let first = view.rolling.unwrap().world_from_camera_first;
+            assert!((first.position_m.x - first_m).abs() < 1e-9, "{first:?}");
+        }
+        let stopped = driven.stepped(at(9.0, 0.0), false).unwrap();
+        assert_eq!(stopped.views(&[camera], at(9.0, 0.0))[0].rolling, None, "it stands again");
     }
 
     #[test]

@@ -42,7 +42,7 @@ pub use listing::{TrajectorySummary, TwinSummary};
 pub use observation::{
     DType, Frame, HEADER_PREFIX_BYTES, Image, Residency, Tensor, TensorKind, Timings,
 };
-pub use opening::{Opening, Outputs, RigChoice, Start};
+pub use opening::{ImagePart, Opening, Outputs, RigChoice, Start};
 pub use record::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs, RecordedVersion,
 };
@@ -277,6 +277,11 @@ impl Session {
         self.layout.cameras()
     }
 
+    /// The share of a camera's image that its lens sees, where that is not all of it.
+    pub fn seen(&self, camera: usize) -> Option<f64> {
+        self.layout.seen(camera)
+    }
+
     /// How colour images travel.
     pub fn encoding(&self) -> Encoding {
         self.layout.encoding()
@@ -313,7 +318,7 @@ impl Session {
         let mut assembly =
             Assembly::new(self.layout.clone(), self.engine.answers(), episode, poses.len())?;
         for world_from_rig in poses {
-            let views = View::of_rig(self.layout.cameras(), world_from_rig);
+            let views = episode.views(self.layout.cameras(), world_from_rig);
             // Before the job is queued: no render thread waits for a disk.
             let pinned = self.pin(deadline, eyes(&views)).await?;
             let (waited_for, waited) = (pinned.waited_for, pinned.waited);

@@ -14,6 +14,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use crate::config;
+use crate::geometry::camera::Field;
 use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
 use crate::residency::Eye;
 use crate::scene::rig::{Rig, RigCamera};
@@ -31,9 +32,10 @@ pub const HEADER_PREFIX_BYTES: usize = 8;
 /// numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 
-/// Room for what the header says per image: three tensors of at most 190 bytes, and 11 numbers of
-/// at most 24 digits, two names and a hash with their escaped keys: below 1,400 bytes.
-const HEADER_IMAGE_BYTES: usize = 1536;
+/// Room for what the header says per image: three tensors of at most 190 bytes, and 12 numbers of
+/// at most 24 digits, two names and a hash with their escaped keys, below 1,400 bytes; a lens of 12
+/// numbers and a windshield of 42, with their keys below 1,600.
+const HEADER_IMAGE_BYTES: usize = 3072;
 
 /// Images of one answer at most.
 const IMAGES: usize = config::OBSERVE_POSES * Rig::MAX_CAMERAS;
@@ -48,6 +50,8 @@ const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 #[derive(Debug)]
 pub(super) struct Layout {
     cameras: Vec<RigCamera>,
+    /// The share of each image that its lens sees, where that is not all.
+    seen: Vec<Option<f64>>,
     encoding: Encoding,
     depth: bool,
     opacity: bool,
@@ -173,13 +177,22 @@ impl Layout {
             let must = format!("{quality}; 1 to 100 are accepted");
             return Err(SessionError::OutOfRange { field: "outputs.quality", must });
         }
-        let layout = Self { cameras, encoding, depth, opacity };
+        let seen = |RigCamera { camera, .. }: &RigCamera| {
+            Field::of(camera).map(|field| field.share(camera))
+        };
+        let seen = cameras.iter().map(seen).collect();
+        let layout = Self { cameras, seen, encoding, depth, opacity };
         layout.check_size(1)?;
         Ok(layout)
     }
 
     pub(super) fn cameras(&self) -> &[RigCamera] {
         &self.cameras
+    }
+
+    /// The share of a camera's image that its lens sees, where that is not all.
+    pub(super) fn seen(&self, camera: usize) -> Option<f64> {
+        self.seen[camera]
     }
 
     pub(super) fn encoding(&self) -> Encoding {
@@ -375,6 +388,7 @@ impl Assembly {
 
 /// What decides how much detail the views need.
 pub(crate) fn eyes(views: &[View]) -> Vec<Eye> {
+    // Of a rolling shutter the end of its way: detail is chosen by distance alone, in every direction.
     let eye = |view: &View| Eye {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),

@@ -1,5 +1,6 @@
 //! What opens a session, resolved against the twin.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::config;
@@ -58,6 +59,8 @@ pub enum RigChoice {
 pub struct Outputs {
     /// Names of the cameras, in the order wanted; all if absent.
     pub cameras: Option<Vec<String>>,
+    /// Other parts and sizes of images, by camera.
+    pub images: BTreeMap<String, ImagePart>,
     /// How colour images travel.
     pub encoding: Encoding,
     /// Whether to add depth.
@@ -66,8 +69,43 @@ pub struct Outputs {
     pub opacity: bool,
 }
 
-/// The rig's name and the wanted cameras in the wanted order.
+/// What is drawn of a camera's image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ImagePart {
+    /// First column and row, width and height, in the rig's pixels.
+    pub crop: Option<[u64; 4]>,
+    /// Width and height that it is drawn at.
+    pub size: Option<[u64; 2]>,
+}
+
+/// The rig's name and the wanted cameras in the wanted order, as they are to be drawn.
 pub(super) fn choose_cameras(
+    resident: &Resident,
+    choice: Option<RigChoice>,
+    outputs: &Outputs,
+) -> Result<(String, Vec<RigCamera>), SessionError> {
+    let (rig, mut cameras) = whole_cameras(resident, choice, outputs)?;
+    for (name, ImagePart { crop, size }) in &outputs.images {
+        let refused = |why: String| {
+            let must = format!("camera {name:?}: {why}");
+            SessionError::OutOfRange { field: "outputs.images", must }
+        };
+        let drawn = cameras.iter_mut().find(|camera| camera.name == *name);
+        let camera = &mut drawn.ok_or_else(|| refused("it is not drawn".into()))?.camera;
+        if let Some([left, top, width, height]) = *crop {
+            let part = camera.cropped([left, top], [width, height]);
+            *camera = part.map_err(|cause| refused(cause.to_string()))?;
+        }
+        if let Some([width, height]) = *size {
+            let scaled = camera.scaled(width, height);
+            *camera = scaled.map_err(|cause| refused(cause.to_string()))?;
+        }
+    }
+    Ok((rig, cameras))
+}
+
+/// The same as the rig has them.
+fn whole_cameras(
     resident: &Resident,
     choice: Option<RigChoice>,
     outputs: &Outputs,

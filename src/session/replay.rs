@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
-use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
+use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
 
 use super::record::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,
 };
-use super::{Summary, observation};
+use super::{Episode, Summary, observation};
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
@@ -227,7 +227,14 @@ impl Recording {
         let cameras = &self.header.rig.cameras;
         let mut pixels: Vec<Vec<u8>> =
             cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
+        let EpisodeHeader { seed, start, dt_us, .. } = self.header;
+        let mut episode = Episode::new(seed, start, dt_us);
         for (index, frame) in self.frames.iter().enumerate() {
+            episode = match (frame.request, frame.poses.first()) {
+                (FrameRequest::Reset, Some(start)) => Episode::new(seed, *start, dt_us),
+                (FrameRequest::Step, Some(pose)) => episode.moved(*pose),
+                _ => episode,
+            };
             while let Some((_, to)) = switches.next_if(|(before, _)| *before <= index) {
                 resident = open(to.version)?;
                 lines_before += 1;
@@ -236,7 +243,7 @@ impl Recording {
             }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
-                let (views, step) = (View::of_rig(cameras, *world_from_rig), frame.step);
+                let (views, step) = (episode.views(cameras, *world_from_rig), frame.step);
                 let profile = &resident.version.manifest.profile;
                 let scene = resident.scene(&observation::eyes(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;

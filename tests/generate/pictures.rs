@@ -19,11 +19,8 @@ fn every_camera_sees_daylight_without_holes() {
     let cpu = Cpu::new(0, Simd::Best).expect("every machine has threads");
     for station_m in [0.0, 60.0, 141.0, 200.0, 280.0] {
         let world_from_rig = DEMO.trajectory.at_station(station_m);
-        for RigCamera { name, camera, rig_from_camera } in &rig.cameras {
-            let view = View {
-                camera: shrunk(camera),
-                world_from_camera: world_from_rig * *rig_from_camera,
-            };
+        for RigCamera { name, camera, rig_from_camera, .. } in &rig.cameras {
+            let view = View::new(shrunk(camera), world_from_rig * *rig_from_camera);
             let rgba = picture(&cpu, &scene, view);
             let what = format!("{name} at {station_m} m");
             let count = rgba.len() as f32;
@@ -38,13 +35,8 @@ fn every_camera_sees_daylight_without_holes() {
 }
 
 fn shrunk(camera: &Camera) -> Camera {
-    let part = 1.0 / f64::from(SHRINK);
-    let Pinhole { fx, fy, cx, cy } = camera.pinhole;
-    Camera {
-        width_px: camera.width_px / SHRINK,
-        height_px: camera.height_px / SHRINK,
-        pinhole: Pinhole { fx: part * fx, fy: part * fy, cx: part * cx, cy: part * cy },
-    }
+    let [width, height] = [camera.width_px, camera.height_px].map(|side| (side / SHRINK).into());
+    camera.scaled(width, height).expect("a quarter of a camera")
 }
 
 fn picture(cpu: &Cpu, scene: &Scene, view: View) -> Vec<[f32; 4]> {

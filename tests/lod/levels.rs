@@ -72,12 +72,9 @@ fn quarter_rig() -> Vec<View> {
     let street = generate::street(&StreetSettings::default()).unwrap();
     let world_from_rig = street.trajectory.at_station(60.0);
     let view = |mounted: &RigCamera| {
-        let Camera { width_px, height_px, pinhole: p } = mounted.camera;
-        let pinhole = Pinhole { fx: p.fx / 4.0, fy: p.fy / 4.0, cx: p.cx / 4.0, cy: p.cy / 4.0 };
-        View {
-            camera: Camera { width_px: width_px / 4, height_px: height_px / 4, pinhole },
-            world_from_camera: world_from_rig * mounted.rig_from_camera,
-        }
+        let Camera { width_px, height_px, .. } = mounted.camera;
+        let quarter = mounted.camera.scaled((width_px / 4).into(), (height_px / 4).into());
+        View::new(quarter.unwrap(), world_from_rig * mounted.rig_from_camera)
     };
     Rig::preset("vehicle6").unwrap().cameras.iter().map(view).collect()
 }

@@ -40,7 +40,7 @@ fn every_record_keeps_a_capture() {
     let Some(path) = data::real("scenes/skull/skull.ply") else { return };
     let camera = data::real("reference/skull_front.camera.json").unwrap();
     let camera = wildcity::ingest::cameras::read(&camera).unwrap().remove(0);
-    let views = [View { camera: camera.camera, world_from_camera: camera.world_from_camera }];
+    let views = [View::new(camera.camera, camera.world_from_camera)];
     let scene = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
     every_record_keeps(&scene, &views, "skull");
 }

@@ -183,7 +183,10 @@ fn image(
     tensor: String,
     hash: String,
 ) -> Image {
-    let RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig } = camera.clone();
+    let RigCamera { name, width, height, cx, cy, lens, windshield, shutter, .. } = camera.clone();
+    let (fx, fy) = (camera.fx.unwrap_or_default(), camera.fy.unwrap_or_default());
+    let exposed_us = shutter.map_or(0, |shutter| shutter.duration_us);
+    let seen = lens.map(|_| 0.75);
     Image {
         camera: name,
         index,
@@ -196,8 +199,11 @@ fn image(
         fy,
         cx,
         cy,
-        camera_to_rig,
-        shutter_start_us: 200_000,
+        lens,
+        windshield,
+        seen,
+        camera_to_rig: camera.camera_to_rig.clone(),
+        shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
         hash,
     }

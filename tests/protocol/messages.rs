@@ -1,6 +1,7 @@
 //! Golden text messages: one file per request and per answer.
 
 use serde_json::{Value, json};
+use wildcity::protocol::camera::{Lens, Rolls, Shutter};
 use wildcity::protocol::error::Code;
 use wildcity::protocol::message::*;
 use wildcity::protocol::{PROTOCOL, unknown_field};
@@ -92,10 +93,13 @@ pub(crate) fn front() -> RigCamera {
         name: "front".into(),
         width: 4,
         height: 3,
-        fx: 3.5,
-        fy: 3.5,
+        fx: Some(3.5),
+        fy: Some(3.5),
         cx: 2.0,
         cy: 1.5,
+        lens: None,
+        windshield: None,
+        shutter: None,
         camera_to_rig: pose([1.6, 0.0, 1.5], [0.5, -0.5, 0.5, -0.5]),
     }
 }
@@ -103,6 +107,8 @@ pub(crate) fn front() -> RigCamera {
 pub(crate) fn rear() -> RigCamera {
     RigCamera {
         name: "rear".into(),
+        lens: Some(Lens::Fisheye { k: [-0.03, -0.005, -0.001, 0.001], max_angle: Some(1.2) }),
+        shutter: Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 }),
         camera_to_rig: pose([-0.9, 0.0, 1.4], [0.5, -0.5, -0.5, 0.5]),
         ..front()
     }
@@ -120,6 +126,11 @@ fn requests() -> Vec<(&'static str, Request)> {
         rig: Some(RigChoice::Full(rig)),
         outputs: Outputs {
             cameras: Some(vec!["front".into(), "rear".into()]),
+            images: [(
+                "front".to_owned(),
+                ImagePart { crop: Some([1, 0, 3, 3]), size: Some([6, 6]) },
+            )]
+            .into(),
             encoding: Encoding::Raw,
             quality: Some(85),
             depth: true,

@@ -178,6 +178,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
             rig: None,
             outputs: Outputs {
                 cameras: None,
+                images: BTreeMap::new(),
                 encoding: Encoding::Raw,
                 depth: false,
                 opacity: false,

@@ -1,5 +1,6 @@
 //! Sessions that drive: through the engine, with a small budget, and over what breaks.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -35,10 +36,8 @@ fn bench(cache: Cache) -> Bench {
 /// The two cameras of the other tests, as a rig.
 fn rig() -> Rig {
     let cameras = views(Pose::IDENTITY).into_iter().zip(["front", "left"]);
-    let camera = |(view, name): (wildcity::render::View, &str)| RigCamera {
-        name: name.to_owned(),
-        camera: view.camera,
-        rig_from_camera: view.world_from_camera,
+    let camera = |(view, name): (wildcity::render::View, &str)| {
+        RigCamera::new(name, view.camera, view.world_from_camera)
     };
     Rig { name: "pair".to_owned(), cameras: cameras.map(camera).collect() }
 }
@@ -49,8 +48,13 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let outputs =
-            Outputs { cameras: None, encoding: Encoding::Raw, depth: false, opacity: false };
+        let outputs = Outputs {
+            cameras: None,
+            images: BTreeMap::new(),
+            encoding: Encoding::Raw,
+            depth: false,
+            opacity: false,
+        };
         let opening = Opening {
             twin: "demo".to_owned(),
             version: None,

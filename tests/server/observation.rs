@@ -102,6 +102,48 @@ async fn raw_pixels_depth_and_opacity_are_the_renderers() {
 }
 
 #[tokio::test]
+async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    let lens = json!({ "model": "fisheye", "k": [0.0, 0.0, 0.0, 0.0], "max_angle": 0.5 });
+    let camera = json!({
+        "name": "wide", "width": 16, "height": 12, "fx": 10.0, "fy": 10.0, "cx": 8.0, "cy": 6.0,
+        "lens": lens, "shutter": { "direction": "top_to_bottom", "duration_us": 30_000 },
+        "camera_to_rig": pose(0.0),
+    });
+    let part = json!({ "wide": { "crop": [2, 0, 12, 12], "size": [24, 12] } });
+    let opened = agent
+        .open(json!({
+            "rig": { "name": "r", "cameras": [camera] },
+            "outputs": { "images": part, "encoding": "raw" },
+        }))
+        .await;
+    let seen = agent.step(1.0).await;
+    for said in [&opened["cameras"][0], &seen.meta["images"][0]] {
+        assert_eq!((&said["width"], &said["height"]), (&json!(24), &json!(12)));
+        assert_eq!((&said["fx"], &said["fy"]), (&json!(20.0), &json!(10.0)));
+        assert_eq!((&said["cx"], &said["cy"]), (&json!(12.0), &json!(6.0)));
+        assert_eq!(said["lens"], lens);
+    }
+    let image = &seen.meta["images"][0];
+    assert_eq!(
+        (&image["shutter_start_us"], &image["shutter_end_us"]),
+        (&json!(70_000), &json!(100_000))
+    );
+    // A disc of 5 px around the middle of 12 x 12.
+    let share = image["seen"].as_f64().unwrap();
+    assert!((share - 25.0 * std::f64::consts::PI / 144.0).abs() < 0.05, "{share}");
+    // What does not lie within the image is refused.
+    let mut agent = server.agent().await;
+    for part in [json!({ "front": { "crop": [0, 0, 9, 6] } }), json!({ "top": {} })] {
+        let answer = agent.try_open(json!({ "outputs": { "images": part } })).await;
+        crate::support::refused(&answer, "out_of_range");
+        assert_eq!(answer["field"], "outputs.images");
+    }
+    server.still_serves().await;
+}
+
+#[tokio::test]
 async fn floats_can_be_read_in_place() {
     let server = TestServer::start().await;
     // 5 x 4 px: 60 raw bytes, and a JPEG of whatever length.

@@ -65,7 +65,8 @@ async fn mistakes_are_named_by_their_path() {
     let good = camera(r#","fy":8"#);
     let rig = |camera: String| format!(r#""rig":{{"name":"r","cameras":[{good},{camera}]}}"#);
     for (fields, field, reason) in [
-        (rig(camera("")), "rig.cameras[1]", "missing field `fy`"),
+        (rig(good.replace("\"cx\":4,", "")), "rig.cameras[1]", "missing field `cx`"),
+        (rig(camera(r#","fy":8,"lens":{"model":"ftheta"}"#)), "rig.cameras[1].lens", "reference"),
         (rig(good.replace("\"width\":8", "\"width\":-1")), "rig.cameras[1].width", "-1"),
         (rig(good.replace("\"width\":8", "\"width\":1e9")), "rig.cameras[1].width", "floating"),
         (rig(camera(r#","fy":8,"fov":90"#)), "rig.cameras[1].fov", "no field"),
@@ -200,6 +201,19 @@ async fn sessions_that_cannot_be_opened() {
         (one(json!({ "width": 0 })), "camera_invalid", "rig.cameras[1].width"),
         (one(json!({ "height": 1_000_000_000 })), "camera_invalid", "rig.cameras[1].height"),
         (one(json!({ "fx": -1.0 })), "camera_invalid", "rig.cameras[1].fx"),
+        (one(json!({ "fy": null })), "camera_invalid", "rig.cameras[1].fy"),
+        (
+            one(json!({ "lens": { "model": "fisheye", "k": [-1e9, 0, 0, 0] } })),
+            "camera_invalid",
+            "rig.cameras[1].lens",
+        ),
+        (
+            one(
+                json!({ "shutter": { "direction": "top_to_bottom", "duration_us": 1_000_000_000 } }),
+            ),
+            "camera_invalid",
+            "rig.cameras[1].shutter.duration_us",
+        ),
         (one(json!({ "name": "other" })), "invalid_name", "rig.cameras"),
         (rig(vec![]), "out_of_range", "rig.cameras"),
         (rig(vec![camera(json!({})); 17]), "out_of_range", "rig.cameras"),

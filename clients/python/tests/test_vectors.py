@@ -15,11 +15,14 @@ from wildcity import (
     BadFrame,
     Camera,
     Code,
+    ImagePart,
+    Lens,
     Observation,
     Outputs,
     Pose,
     ProtocolError,
     Rig,
+    Shutter,
     Station,
 )
 from wildcity.core import Conversation
@@ -30,7 +33,11 @@ ABOVE = Pose((12.5, -3.25, 30.0))
 LOG = Station("log", 12.5)
 FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
 REAR = dataclasses.replace(
-    FRONT, name="rear", camera_to_rig=Pose((-0.9, 0.0, 1.4), (0.5, -0.5, -0.5, 0.5))
+    FRONT,
+    name="rear",
+    camera_to_rig=Pose((-0.9, 0.0, 1.4), (0.5, -0.5, -0.5, 0.5)),
+    lens=Lens("fisheye", k=(-0.03, -0.005, -0.001, 0.001), max_angle=1.2),
+    shutter=Shutter("top_to_bottom", 30_000),
 )
 
 REQUESTS: dict[str, Callable[[Conversation], Any]] = {
@@ -42,7 +49,14 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
         seed=42,
         start=LOG,
         rig=Rig("pair", (FRONT, REAR)),
-        outputs=Outputs(("front", "rear"), "raw", 85, depth=True, opacity=True),
+        outputs=Outputs(
+            ("front", "rear"),
+            "raw",
+            85,
+            depth=True,
+            opacity=True,
+            images={"front": ImagePart((1, 0, 3, 3), (6, 6))},
+        ),
         dt_us=100_000,
         deadline_ms=20_000,
     ),

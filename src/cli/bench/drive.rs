@@ -2,6 +2,7 @@
 
 mod report;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -189,6 +190,7 @@ impl Drive {
             rig: rig.map(RigChoice::Full),
             outputs: Outputs {
                 cameras: None,
+                images: BTreeMap::new(),
                 encoding: Encoding::Jpeg(config::JPEG_QUALITY),
                 depth: false,
                 opacity: false,

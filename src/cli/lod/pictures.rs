@@ -80,7 +80,7 @@ fn shots(lod: &Lod, version: &Version) -> anyhow::Result<Vec<(String, View)>> {
         let listed = cameras::read(path).with_context(|| format!("{}", path.display()))?;
         let view = |listed: cameras::ListedCamera| {
             let cameras::ListedCamera { name, camera, world_from_camera, .. } = listed;
-            (name, View { camera, world_from_camera })
+            (name, View::new(camera, world_from_camera))
         };
         return Ok(listed.into_iter().map(view).collect());
     }

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use crate::config;
+use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, Pose};
 use crate::protocol::http::Refusal;
 use crate::protocol::message::{
@@ -22,6 +23,7 @@ use crate::session::{
 use crate::store::Version;
 
 use super::SUBPROTOCOL;
+use super::camera::{beyond, shutter_to};
 use super::fault::{cells, code_and_field};
 
 /// To `hello`.
@@ -75,7 +77,14 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
         dt_us: session.dt_us(),
         deadline_ms: session.deadline().as_millis() as u64,
         cameras: session.cameras().iter().map(camera).collect(),
-        outputs: message::Outputs { cameras: Some(names), encoding, quality, depth, opacity },
+        outputs: message::Outputs {
+            cameras: Some(names),
+            images: BTreeMap::new(),
+            encoding,
+            quality,
+            depth,
+            opacity,
+        },
         trajectories: manifest
             .trajectories
             .iter()
@@ -240,8 +249,11 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     let (episode, version) = (session.episode(), &session.resident().version);
     let (time_us, (encoding, _)) = (episode.time_us(), encoding(session.encoding()));
     let image = |(drawn, name): (&crate::session::Image, &String)| {
-        let RigCamera { name: camera, width, height, fx, fy, cx, cy, camera_to_rig } =
-            camera(&session.cameras()[drawn.camera]);
+        let mounted = &session.cameras()[drawn.camera];
+        let Pinhole { fx, fy, cx, cy } = mounted.camera.pinhole;
+        let RigCamera { name: camera, width, height, lens, windshield, camera_to_rig, .. } =
+            camera(mounted);
+        let exposed_us = mounted.shutter.map_or(0, |shutter| shutter.duration_us);
         Image {
             camera,
             index: drawn.camera as u64,
@@ -254,8 +266,11 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             fy,
             cx,
             cy,
+            lens,
+            windshield,
+            seen: session.seen(drawn.camera),
             camera_to_rig,
-            shutter_start_us: time_us,
+            shutter_start_us: time_us - exposed_us,
             shutter_end_us: time_us,
             hash: drawn.hash.to_hex().to_string(),
         }
@@ -321,15 +336,19 @@ fn trajectory_info(log: TrajectorySummary) -> TrajectoryInfo {
 }
 
 fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {
-    let Camera { width_px, height_px, pinhole } = camera.camera;
+    let Camera { width_px, height_px, pinhole, .. } = camera.camera;
+    let (lens, windshield) = beyond(&camera.camera);
     RigCamera {
         name: camera.name.clone(),
         width: width_px.into(),
         height: height_px.into(),
-        fx: pinhole.fx,
-        fy: pinhole.fy,
+        fx: Some(pinhole.fx),
+        fy: Some(pinhole.fy),
         cx: pinhole.cx,
         cy: pinhole.cy,
+        lens,
+        windshield,
+        shutter: camera.shutter.map(shutter_to),
         camera_to_rig: pose(&camera.rig_from_camera),
     }
 }

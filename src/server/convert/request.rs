@@ -5,15 +5,16 @@ use std::time::Duration;
 use serde::Deserialize;
 
 use crate::config;
-use crate::geometry::camera::Pinhole;
-use crate::geometry::{Camera, Pose};
+use crate::geometry::Pose;
+use crate::geometry::camera::json::Intrinsics;
 use crate::protocol::message::{self, Request};
 use crate::protocol::unknown_field;
 use crate::scene::rig::{Rig, RigCamera, is_name};
 use crate::server::fault::Fault;
-use crate::session::{Encoding, Opening, Outputs, RigChoice, Start};
+use crate::session::{Encoding, ImagePart, Opening, Outputs, RigChoice, Start};
 
 use super::SUBPROTOCOL;
+use super::camera::{lens_of, shutter_of, windshield_of};
 
 /// A text frame, checked as far as it can be on its own.
 #[derive(Debug)]
@@ -209,7 +210,8 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         Some(message::RigChoice::Preset(name)) => Some(RigChoice::Preset(name)),
         Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(rig_of(rig)?)),
     };
-    let message::Outputs { cameras, encoding, quality, depth, opacity } = open.outputs;
+    let message::Outputs { cameras, images, encoding, quality, depth, opacity } = open.outputs;
+    let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
     let encoding = match encoding {
         message::Encoding::Jpeg => Encoding::Jpeg(quality.unwrap_or(config::JPEG_QUALITY)),
         message::Encoding::Png => Encoding::Png,
@@ -221,7 +223,13 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         seed: open.seed,
         start: open.start.map(start_of).transpose()?,
         rig,
-        outputs: Outputs { cameras, encoding, depth, opacity },
+        outputs: Outputs {
+            cameras,
+            images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
+            encoding,
+            depth,
+            opacity,
+        },
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
     };
@@ -246,13 +254,21 @@ fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
         .enumerate()
         .map(|(index, camera)| {
             let field = format!("rig.cameras[{index}]");
-            let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig } = camera;
-            let camera = Camera::checked(width, height, Pinhole { fx, fy, cx, cy });
-            Ok(RigCamera {
-                name: name_of(&format!("{field}.name"), name)?,
-                rig_from_camera: pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?,
-                camera: camera.map_err(|cause| Fault::Camera { field, cause })?,
-            })
+            let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig, .. } =
+                camera;
+            let name = name_of(&format!("{field}.name"), name)?;
+            let rig_from_camera = pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?;
+            let intrinsics = Intrinsics {
+                size_px: [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX)),
+                focal_px: [fx, fy],
+                center_px: [cx, cy],
+                lens: camera.lens.map(lens_of),
+                windshield: camera.windshield.map(windshield_of),
+            };
+            let fault = |cause| Fault::Camera { field: field.clone(), cause };
+            let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
+            let shutter = camera.shutter.map(shutter_of).transpose().map_err(fault)?;
+            Ok(RigCamera { name, camera: checked.map_err(fault)?, rig_from_camera, shutter })
         })
         .collect::<Result<_, Fault>>()?;
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };

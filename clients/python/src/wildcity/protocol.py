@@ -53,20 +53,59 @@ class Station:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A pinhole camera on the vehicle; sizes and intrinsics in pixels.
+class Lens:
+    """How a lens maps rays to pixels, where it is no pinhole; each model has its own fields.
 
-    `camera_to_rig` takes camera coordinates (x right, y down, z forward) to the rig's.
+    `opencv`: k (6), p (2), s (4). `fisheye`: k (4), max_angle or none. `ftheta`: reference, polynomial
+    (6), linear_cde (3), max_angle. Angles are in radians off the axis.
+    """
+
+    model: Literal["opencv", "fisheye", "ftheta"]
+    k: tuple[float, ...] | None = None
+    p: tuple[float, ...] | None = None
+    s: tuple[float, ...] | None = None
+    reference: Literal["angle_to_pixel", "pixel_to_angle"] | None = None
+    polynomial: tuple[float, ...] | None = None
+    linear_cde: tuple[float, ...] | None = None
+    max_angle: float | None = None
+
+
+@dataclass(frozen=True)
+class Windshield:
+    """What turns rays before the lens: polynomials of the angles to the right and downwards."""
+
+    reference: Literal["forward", "backward"]
+    horizontal: tuple[float, ...]
+    vertical: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """A shutter that exposes rows, or columns, one after the other."""
+
+    direction: Literal["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
+    duration_us: int
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera on the vehicle, a pinhole unless it has a lens; sizes and intrinsics in pixels.
+
+    `camera_to_rig` takes camera coordinates (x right, y down, z forward) to the rig's. An f-theta lens
+    has its focal lengths from its polynomial: leave fx and fy None there.
     """
 
     name: str
     width: int
     height: int
-    fx: float
-    fy: float
+    fx: float | None
+    fy: float | None
     cx: float
     cy: float
     camera_to_rig: Pose
+    lens: Lens | None = None
+    windshield: Windshield | None = None
+    shutter: Shutter | None = None
 
 
 @dataclass(frozen=True)
@@ -78,14 +117,26 @@ class Rig:
 
 
 @dataclass(frozen=True)
+class ImagePart:
+    """What is sent of a camera's image: crop is (left, top, width, height), size (width, height)."""
+
+    crop: tuple[int, int, int, int] | None = None
+    size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
 class Outputs:
-    """What each observation holds: which cameras (all if absent), how encoded, with what."""
+    """What each observation holds: which cameras (all if absent), how encoded, with what.
+
+    `images` are other parts and sizes than the rig's, by the camera's name.
+    """
 
     cameras: tuple[str, ...] | None = None
     encoding: Encoding = "jpeg"
     quality: int | None = None
     depth: bool = False
     opacity: bool = False
+    images: dict[str, ImagePart] | None = None
 
 
 @dataclass(frozen=True)
@@ -238,7 +289,8 @@ class Ego:
 class ImageInfo:
     """One image: its camera, the request's pose it shows, size, intrinsics, times, hash.
 
-    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding.
+    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding. `seen` is the
+    share of it that the lens sees, where that is not all: the rest is 0.
     """
 
     camera: str
@@ -256,6 +308,9 @@ class ImageInfo:
     shutter_start_us: int
     shutter_end_us: int
     hash: str
+    lens: Lens | None = None
+    windshield: Windshield | None = None
+    seen: float | None = None
 
 
 @dataclass(frozen=True)
@@ -343,6 +398,8 @@ def encode(value: Any) -> Any:
         return {name: encode(item) for name, item in fields.items() if item is not None}
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [encode(item) for item in value]
+    if isinstance(value, dict):
+        return {name: encode(item) for name, item in value.items()}
     return value
 
 

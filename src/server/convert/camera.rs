@@ -1,0 +1,86 @@
+//! Cameras, both ways.
+
+use crate::geometry::camera::json::{
+    Intrinsics, LensFields, ReferenceField, WindshieldFields, WindshieldReferenceField,
+};
+use crate::geometry::camera::{Camera, CameraError, Rolls, Shutter};
+use crate::protocol::camera as wire;
+
+/// Wire to lens.
+pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
+    match lens {
+        wire::Lens::Opencv { k, p, s } => LensFields::Opencv { k, p, s },
+        wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
+        wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
+            let reference = match reference {
+                wire::Reference::AngleToPixel => ReferenceField::AngleToPixel,
+                wire::Reference::PixelToAngle => ReferenceField::PixelToAngle,
+            };
+            LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
+        }
+    }
+}
+
+/// Wire to windshield.
+pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
+    let wire::Windshield { reference, horizontal, vertical } = windshield;
+    let reference = match reference {
+        wire::WindshieldReference::Forward => WindshieldReferenceField::Forward,
+        wire::WindshieldReference::Backward => WindshieldReferenceField::Backward,
+    };
+    WindshieldFields { reference, horizontal, vertical }
+}
+
+/// Wire to shutter.
+pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
+    let wire::Shutter { direction, duration_us } = shutter;
+    let direction = match direction {
+        wire::Rolls::TopToBottom => Rolls::TopToBottom,
+        wire::Rolls::BottomToTop => Rolls::BottomToTop,
+        wire::Rolls::LeftToRight => Rolls::LeftToRight,
+        wire::Rolls::RightToLeft => Rolls::RightToLeft,
+    };
+    let shutter = Shutter { direction, duration_us };
+    shutter.check().map(|()| shutter)
+}
+
+/// Camera to wire: what it is beyond a pinhole.
+pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Windshield>) {
+    let Intrinsics { lens, windshield, .. } = Intrinsics::of(camera);
+    (lens.map(lens_to), windshield.map(windshield_to))
+}
+
+/// Shutter to wire.
+pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
+    let Shutter { direction, duration_us } = shutter;
+    let direction = match direction {
+        Rolls::TopToBottom => wire::Rolls::TopToBottom,
+        Rolls::BottomToTop => wire::Rolls::BottomToTop,
+        Rolls::LeftToRight => wire::Rolls::LeftToRight,
+        Rolls::RightToLeft => wire::Rolls::RightToLeft,
+    };
+    wire::Shutter { direction, duration_us }
+}
+
+fn lens_to(lens: LensFields) -> wire::Lens {
+    match lens {
+        LensFields::Opencv { k, p, s } => wire::Lens::Opencv { k, p, s },
+        LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
+        LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
+            let reference = match reference {
+                ReferenceField::AngleToPixel => wire::Reference::AngleToPixel,
+                ReferenceField::PixelToAngle => wire::Reference::PixelToAngle,
+            };
+            wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
+        }
+    }
+}
+
+fn windshield_to(windshield: WindshieldFields) -> wire::Windshield {
+    let WindshieldFields { reference, horizontal, vertical } = windshield;
+    let reference = match reference {
+        WindshieldReferenceField::Forward => wire::WindshieldReference::Forward,
+        WindshieldReferenceField::Backward => wire::WindshieldReference::Backward,
+    };
+    wire::Windshield { reference, horizontal, vertical }
+}
