@@ -1,7 +1,6 @@
 //! What the vehicle's cameras see: daylight without holes.
 
 use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::render::{Backend, Frame, Target, View};
 use wildcity::scene::rig::RigCamera;

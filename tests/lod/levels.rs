@@ -3,7 +3,6 @@ use std::fs;
 use glam::DVec3;
 use wildcity::generate::{self, StreetSettings};
 use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
 use wildcity::render::View;
 use wildcity::scene::chunk::{Partition, column};
 use wildcity::scene::rig::{Rig, RigCamera};

@@ -272,7 +272,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
             let image = render_one(&cpu(), &street, &profile, view);
             let across = matches!(direction, Rolls::LeftToRight | Rolls::RightToLeft);
             // Each row alone, from where the camera then stands, with every pixel's own ray.
-            let rows = if across { 160 } else { 100 };
+            let rows: u32 = if across { 160 } else { 100 };
             let mut truth = vec![0.0_f32; 4 * 160 * 100];
             for row in (0..rows).step_by(7) {
                 let at_px = DVec2::splat(f64::from(row) + 0.5);

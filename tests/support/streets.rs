@@ -2,8 +2,6 @@
 
 use glam::DVec3;
 use wildcity::generate::{self, StreetSettings};
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
 use wildcity::render::View;
 use wildcity::scene::{Gaussians, Rig, sh};
 

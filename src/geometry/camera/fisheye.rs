@@ -43,11 +43,6 @@ impl Fisheye {
         self.radius.end()
     }
 
-    /// Coefficients of θ⁰ to θ⁹.
-    pub fn polynomial(&self) -> &[f64; 10] {
-        self.radius.coefficients()
-    }
-
     pub(super) fn check(&self) -> Result<(), CameraError> {
         super::check_numbers("lens.k", &self.k)?;
         super::check_max_angle(self.max_angle_rad)?;

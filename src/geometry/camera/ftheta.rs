@@ -88,7 +88,7 @@ impl FTheta {
     }
 
     /// `[[c, d], [e, 1]]`.
-    pub fn linear(&self) -> DMat2 {
+    fn linear(&self) -> DMat2 {
         let [c, d, e] = self.linear_cde;
         DMat2::from_cols(DVec2::new(c, e), DVec2::new(d, 1.0))
     }

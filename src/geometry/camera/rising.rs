@@ -81,11 +81,6 @@ impl Rising {
     pub(super) fn end(&self) -> f64 {
         self.end
     }
-
-    /// The coefficients, the constant first.
-    pub(super) fn coefficients(&self) -> &[f64; TERMS] {
-        &self.coefficients
-    }
 }
 
 /// The largest of `0..=most` up to which something holds, which does at 0.

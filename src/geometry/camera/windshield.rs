@@ -40,7 +40,7 @@ impl Windshield {
     const LEAST_Z: f64 = 0.1;
 
     /// How far it may turn a ray, in radians. Real ones turn by 0.01.
-    pub(super) const MOST_RAD: f64 = 0.2;
+    const MOST_RAD: f64 = 0.2;
 
     /// How much the turning may differ between two rays, as a share of the angle between them: what
     /// leaves the inversion halving its error at each step. Real ones have 0.02.
@@ -167,21 +167,6 @@ impl Bivariate {
     /// As they were given.
     pub fn coefficients(&self) -> &[f64] {
         &self.coefficients[..self.count]
-    }
-
-    /// The same in the places of order 5, with zeros between: `c[i, j]` at `j * 6 - j (j - 1)/2 + i`.
-    pub fn of_order_five(&self) -> [f64; 21] {
-        let mut wide = [0.0; MOST];
-        let mut from = self.coefficients().iter();
-        let order = self.order();
-        let mut first = 0;
-        for j in 0..=order {
-            for i in 0..=order - j {
-                wide[first + i] = from.next().copied().unwrap_or(0.0);
-            }
-            first += 6 - j;
-        }
-        wide
     }
 
     fn order(&self) -> usize {
