@@ -3,5 +3,7 @@
 #[path = "../support/server.rs"]
 mod support;
 
+mod ego;
+mod integrators;
 mod record;
 mod replay;
