@@ -128,7 +128,6 @@ pub struct Action {
 
 /// How the ego moves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
 pub struct Dynamics {
     /// The model.
     pub model: Model,

@@ -336,7 +336,11 @@ impl Ego {
             position_m: car.position_m.extend(0.0),
             rotation: DQuat::from_rotation_z(car.yaw_rad),
         };
-        let world_from_rig = ground.settle(self.world_from_rig * start_from_rig);
+        // Who stands stays to the bit: the product would be normalised once more.
+        let world_from_rig = match start_from_rig == Pose::IDENTITY {
+            true => self.world_from_rig,
+            false => ground.settle(self.world_from_rig * start_from_rig),
+        };
         let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
         let velocity_m_s = world_from_rig.rotation * DVec3::new(car.speed_m_s, rear_m_s, 0.0);
         Self {

@@ -93,10 +93,13 @@ impl Path {
         before.start_from_rig
     }
 
-    /// What it wants in the plane.
+    /// What it wants in the plane, by its own poses: where the rig is counts only beside a single one. Else
+    /// a rig that is behind would find a path that begins fast and brakes.
     pub(super) fn wishes(&self) -> Wishes {
         let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
-        let places: Vec<(f64, DVec2, f64)> = std::iter::once(&start)
+        let start = (self.poses.len() == 1).then_some(start);
+        let places: Vec<(f64, DVec2, f64)> = start
+            .iter()
             .chain(&self.poses)
             .map(|pose| {
                 let forward = pose.start_from_rig.rotation * DVec3::X;
@@ -125,12 +128,13 @@ impl Path {
 }
 
 impl Wishes {
-    /// What is wanted at a time in seconds; after the end, what is wanted there.
+    /// What is wanted at a time in seconds: before the first pose as it would have come there, after the
+    /// last what is wanted there.
     pub(super) fn at(&self, time_s: f64) -> Wanted {
         let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
         let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };
         let Some((from_s, from)) = after.checked_sub(1).map(|before| &self.knots[before]) else {
-            return *to;
+            return to.before(to_s - time_s);
         };
         let t = (time_s - from_s) / (to_s - from_s);
         let between = |from: f64, to: f64| from + t * (to - from);
@@ -141,6 +145,17 @@ impl Wishes {
             acceleration_m_s2: between(from.acceleration_m_s2, to.acceleration_m_s2),
             yaw_rate_rad_s: between(from.yaw_rate_rad_s, to.yaw_rate_rad_s),
         }
+    }
+}
+
+impl Wanted {
+    /// The same some seconds earlier, at constant acceleration and yaw rate.
+    fn before(&self, seconds: f64) -> Self {
+        let speed_m_s = self.speed_m_s - seconds * self.acceleration_m_s2;
+        let yaw_rad = self.yaw_rad - seconds * self.yaw_rate_rad_s;
+        let way_m = seconds * 0.5 * (speed_m_s + self.speed_m_s);
+        let between = DVec2::from_angle(0.5 * (yaw_rad + self.yaw_rad));
+        Self { position_m: self.position_m - way_m * between, yaw_rad, speed_m_s, ..*self }
     }
 }
 

@@ -7,6 +7,7 @@ use crate::config;
 use super::Action;
 use super::path::{Wanted, Wishes, wrapped};
 use super::single_track::SingleTrack;
+use super::vehicle::Vehicle;
 
 /// How stiffly the car is pulled along the path, in 1/s: an error of place and speed decays as
 /// `(1 + 2 t) e^(-2 t)`. Ten times slower than the drive's lag allows before it swings.
@@ -26,11 +27,12 @@ const TURNS_M_S: f64 = 0.1;
 ///
 /// Linear in the errors, with what the path itself needs ahead of them: along it
 /// `a = a* + 4 (v* - v) + 4 Δs`, across it `κ = κ* + Δy / l² + 2 Δψ / l`, whose errors decay as
-/// `(1 + s / l) e^(-s / l)` over the way s. Both are cut to what an action may be.
+/// `(1 + s / l) e^(-s / l)` over the way s; Δψ is to where the car goes, not to where it heads. Both are cut to
+/// what an action may be.
 pub(super) fn track(wishes: &Wishes, time_s: f64, lag_s: f64, car: &SingleTrack) -> Action {
     let (now, soon) = (wishes.at(time_s), wishes.at(time_s + lag_s));
     let ahead_m = DVec2::from_angle(-now.yaw_rad).rotate(now.position_m - car.position_m);
-    let off_rad = wrapped(now.yaw_rad - car.yaw_rad);
+    let off_rad = wrapped(now.yaw_rad - car.yaw_rad - drift_rad(car));
     let acceleration_m_s2 = soon.acceleration_m_s2
         + 2.0 * PULL_1_S * (now.speed_m_s - car.speed_m_s)
         + PULL_1_S * PULL_1_S * ahead_m.x;
@@ -48,6 +50,12 @@ pub(super) fn track(wishes: &Wishes, time_s: f64, lag_s: f64, car: &SingleTrack)
 
 fn curvature(wanted: &Wanted) -> f64 {
     if wanted.speed_m_s.abs() < TURNS_M_S { 0.0 } else { wanted.yaw_rate_rad_s / wanted.speed_m_s }
+}
+
+/// By how much the car moves to the left of its heading, in radians: in a turn its rear axle slips.
+fn drift_rad(car: &SingleTrack) -> f64 {
+    let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
+    if car.speed_m_s.abs() < TURNS_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }
 }
 
 /// Which way the car goes; at rest, which way it is to go.
