@@ -16,7 +16,7 @@ pub(super) const POINTS: usize = 5;
 /// Where they lie in it: the zeros of Radau's right polynomial of degree 5.
 pub(super) const NODES: [f64; POINTS] = [
     0.057_104_196_114_517_68,
-    0.276_843_013_638_123_83,
+    0.276_843_013_638_123_8,
     0.583_590_432_368_916_8,
     0.860_240_135_656_219_5,
     1.0,
@@ -84,10 +84,11 @@ fn solved<const N: usize>(mut rows: [[f64; N]; N], mut right: [f64; N]) -> [f64;
         let pivot = (column..N).max_by(larger).unwrap_or(column);
         rows.swap(column, pivot);
         right.swap(column, pivot);
+        let above = rows[column];
         for row in column + 1..N {
-            let factor = rows[row][column] / rows[column][column];
-            for k in column..N {
-                rows[row][k] -= factor * rows[column][k];
+            let factor = rows[row][column] / above[column];
+            for (number, pivotal) in rows[row].iter_mut().zip(above).skip(column) {
+                *number -= factor * pivotal;
             }
             right[row] -= factor * right[column];
         }
