@@ -202,7 +202,7 @@ fn image(
         lens,
         windshield,
         seen,
-        camera_to_rig: camera.camera_to_rig.clone(),
+        camera_to_rig: camera.camera_to_rig,
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
         hash,
