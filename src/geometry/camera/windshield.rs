@@ -35,9 +35,10 @@ pub struct Bivariate {
 }
 
 impl Windshield {
-    /// Rays closer to the image plane than this are left alone: `z` as a share of their length. No
-    /// camera looks through a windshield at 84°.
-    const LEAST_Z: f64 = 0.1;
+    /// It turns rays in full up to 81° off the axis, and not at all from 87° on: z as a share of their
+    /// length. Without an end, polynomials would turn what is beside the camera anywhere; with a sudden one,
+    /// a Gaussian across it would be torn.
+    const FADES_Z: [f64; 2] = [0.05, 0.15];
 
     /// How far it may turn a ray, in radians. Real ones turn by 0.01.
     const MOST_RAD: f64 = 0.2;
@@ -115,17 +116,23 @@ impl Windshield {
 
     fn turn(&self, direction: DVec3, way: WindshieldReference) -> DVec3 {
         let unit = direction.normalize();
-        if unit.z < Self::LEAST_Z {
+        let [none, all] = Self::FADES_Z;
+        if unit.z < none {
             return unit;
         }
         let from = angles(unit);
+        let turned = |at: DVec2| {
+            let z = (1.0 - at.x.sin().powi(2) - at.y.sin().powi(2)).max(0.0).sqrt();
+            let share = ((z - none) / (all - none)).clamp(0.0, 1.0);
+            at + share * (self.polynomials(at) - at)
+        };
         let to = if way == self.reference {
-            self.polynomials(from)
+            turned(from)
         } else {
-            // polynomials(x) = from, for polynomials that are nearly the identity.
+            // turned(x) = from, where x is nearly from.
             let mut x = from;
             for _ in 0..Self::STEPS {
-                let off = self.polynomials(x) - from;
+                let off = turned(x) - from;
                 x -= off;
                 if off.length_squared() <= 1e-32 {
                     break;
