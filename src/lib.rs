@@ -13,10 +13,11 @@
 //! | [`residency`] | what is in memory now, what a frame draws | config, geometry, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
+//! | [`report`] | error against run time, and what happens at the extremes | config, geometry, scene, generate, store, residency, render, session |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
-//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, server, client |
+//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, report, server, client |
 //!
 //! Data goes one way: file, ingest, store, residency, render, session, server, agent; an agent's
 //! pose goes server, session. Nothing downstream calls upstream.
@@ -44,6 +45,7 @@ pub mod geometry;
 pub mod ingest;
 pub mod protocol;
 pub mod render;
+pub mod report;
 pub mod residency;
 pub mod scene;
 pub mod server;

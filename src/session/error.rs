@@ -2,6 +2,7 @@
 
 use crate::render::RenderError;
 use crate::residency::ResidencyError;
+use crate::scene::profile::ProfileError;
 use crate::store::StoreError;
 
 use super::record::RecordError;
@@ -57,6 +58,9 @@ pub enum SessionError {
         /// What it is, and what is accepted.
         must: String,
     },
+    /// The profile that is asked for cannot be had.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
     /// The images of one answer have too many pixels.
     #[error("the answer has {pixels} pixels; at most {limit} fit: ask for fewer or smaller images")]
     AnswerTooLarge {

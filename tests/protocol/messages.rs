@@ -129,8 +129,12 @@ fn requests() -> Vec<(&'static str, Request)> {
         deadline_ms: Some(20_000),
         ..Open::twin("street")
     };
-    let preset =
-        Open { seq: 1, rig: Some(RigChoice::Preset("vehicle6".into())), ..Open::twin("street") };
+    let preset = Open {
+        seq: 1,
+        rig: Some(RigChoice::Preset("vehicle6".into())),
+        profile: [("tau_px".to_owned(), 2.0.into())].into_iter().collect(),
+        ..Open::twin("street")
+    };
     let there = pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]);
     let above = pose([12.5, -3.25, 30.0], [1.0, 0.0, 0.0, 0.0]);
     let start = Start::Pose { pose: there };

@@ -22,7 +22,7 @@ use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{Gaussians, RenderProfile};
+use wildcity::scene::{Gaussians, ProfileChanges, RenderProfile};
 use wildcity::server::{self, Config, Limits, Running};
 use wildcity::store::{Catalog, NewVersion, Storage};
 
@@ -190,6 +190,7 @@ impl TestServer {
             uploads: twins.path().join(".uploads"),
             tokens: None,
             backend: painter.clone(),
+            profile: ProfileChanges::default(),
             limits: Limits::default(),
         };
         change(&mut config);

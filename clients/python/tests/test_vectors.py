@@ -46,7 +46,7 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
         dt_us=100_000,
         deadline_ms=20_000,
     ),
-    "open_preset": lambda c: c.open("street", rig="vehicle6"),
+    "open_preset": lambda c: c.open("street", rig="vehicle6", profile={"tau_px": 2.0}),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),

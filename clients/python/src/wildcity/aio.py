@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TypeVar
 
@@ -68,6 +68,7 @@ class Client:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
@@ -81,6 +82,7 @@ class Client:
                 seed=seed,
                 start=start,
                 rig=rig,
+                profile=profile,
                 outputs=outputs,
                 dt_us=dt_us,
                 deadline_ms=deadline_ms,

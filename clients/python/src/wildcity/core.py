@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, TypeVar
 
@@ -70,6 +70,7 @@ class Conversation:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
@@ -80,6 +81,7 @@ class Conversation:
             "session": session,
             "start": _start(start),
             "rig": encode(rig),
+            "profile": None if profile is None else dict(profile),
             "dt_us": dt_us,
             "deadline_ms": deadline_ms,
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TypeVar
 
@@ -67,6 +67,7 @@ class Client:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
@@ -80,6 +81,7 @@ class Client:
                 seed=seed,
                 start=start,
                 rig=rig,
+                profile=profile,
                 outputs=outputs,
                 dt_us=dt_us,
                 deadline_ms=deadline_ms,
