@@ -13,7 +13,7 @@
 //! | [`residency`] | what is in memory now, what a frame draws | config, geometry, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
-//! | [`report`] | error against run time, and what happens at the extremes | config, geometry, scene, generate, store, residency, render, session |
+//! | [`report`] | error against run time, and what happens at the extremes | geometry, scene, generate, residency, render, session |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |

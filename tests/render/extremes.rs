@@ -19,14 +19,16 @@ fn case(number: &str) -> &'static Case {
     CASES.iter().find(|case| case.number == number).unwrap()
 }
 
-/// Makes sure that a case holds, or is a limit of every backend that the table names.
-fn holds(case: &Case, backend: &dyn Backend) {
-    let outcome = case.run(backend, false);
-    match outcome.verdict {
-        Verdict::Held => assert!(outcome.checks > 0 && outcome.strain <= 1.0, "{outcome:?}"),
-        Verdict::NotRun => assert!(NOT_RUN.contains(&case.number), "{outcome:?}"),
-        Verdict::Missed => panic!("{outcome:?}"),
-    }
+/// Makes sure that every case holds, or is a limit of every backend that the table names.
+fn all_hold(backend: &dyn Backend) {
+    let outcomes = CASES.iter().map(|case| case.run(backend, false));
+    let wrong = outcomes.filter(|outcome| match outcome.verdict {
+        Verdict::Held => outcome.checks == 0 || outcome.strain > 1.0,
+        Verdict::NotRun => !NOT_RUN.contains(&outcome.case),
+        Verdict::Missed => true,
+    });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
 /// Cases that are named limits, and those that take gigabytes.
@@ -34,13 +36,12 @@ const NOT_RUN: &[&str] = &["T21", "T22", "T23", "T24"];
 
 #[test]
 fn the_table_holds_on_the_cpu_backend() {
-    let cpu = cpu();
-    CASES.iter().for_each(|case| holds(case, &cpu));
+    all_hold(&cpu());
 }
 
 #[test]
 fn the_table_holds_on_the_definition() {
-    CASES.iter().for_each(|case| holds(case, &Reference));
+    all_hold(&Reference);
 }
 
 #[test]

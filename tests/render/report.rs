@@ -108,9 +108,11 @@ fn errors_and_costs_go_the_way_they_must() {
     for m in &all {
         let errors = &m.errors;
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
-        assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{m:?}");
-        assert!(m.least_db.iter().all(|least| *least <= errors.psnr_db + 10.0), "{m:?}");
-        assert!(m.worst.files.iter().all(|file| file.starts_with(b"\x89PNG")), "{m:?}");
+        assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{errors:?}");
+        let least_db = m.least_db[0].min(m.least_db[1]);
+        assert!(least_db <= errors.psnr_db, "{}: {least_db} dB, {errors:?}", m.setting.name);
+        let files = &m.worst.files;
+        assert!(files.iter().all(|file| file.starts_with(b"\x89PNG")), "{}", m.setting.name);
         assert!(m.cost.step_ms > 0.0);
     }
     assert!(front(&all).iter().any(|on| *on) && !front(&all).iter().all(|on| *on));

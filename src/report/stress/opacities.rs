@@ -162,9 +162,9 @@ pub(super) const T28: Case = Case {
 fn t28(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let fog = (0..70_000).map(|i| Blob {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
-        sigma_m: DVec3::ONE,
-        // Just above the cut; no pixel stops before the last of them.
-        opacity: 1.01 / 255.0,
+        // 80 px, so that all of the tile is just above the cut; no pixel stops before the last of them.
+        sigma_m: DVec3::splat(100.0),
+        opacity: 1.05 / 255.0,
         ..Blob::default()
     });
     let fog = scene(&fog.collect::<Vec<_>>());

@@ -123,7 +123,7 @@ fn t9(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 pub(super) const T10: Case = Case {
     number: "T10",
     what: "a street 1,000 km off through the record of 32 B",
-    bound: "centres within half of 2^-23 of twice a cell's extent, drawn at 60 dB or more",
+    bound: "centres within half a step of 2^-16 m, drawn at 60 dB or more",
     run: Run::Light(t10),
 };
 
