@@ -13,7 +13,7 @@ use serde_json::json;
 use crate::client::{Client, Observation, Open, Pose};
 use crate::generate::{self, StreetSettings};
 use crate::scene::manifest::Provenance;
-use crate::scene::{ProfileChanges, Record, RenderProfile, Rig, Trajectory};
+use crate::scene::{ProfileChanges, Record, Rig, Trajectory};
 use crate::server::{self, Limits};
 use crate::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
@@ -195,11 +195,8 @@ fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Versi
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = generate::REVISION;
-    let provenance = Provenance {
-        source: format!("{STREET}{revision}: {}", serde_json::to_string(&settings)?),
-        builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).into(),
-        options: Vec::new(),
-    };
+    let settings_json = serde_json::to_string(&settings)?;
+    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
     let why = match built(&catalog, name, &provenance)? {
         Ok(version) => return Ok(version),
         Err(why) => why,
@@ -209,13 +206,10 @@ fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Versi
     let bar = progress::count("writing");
     let version = catalog.commit(
         NewVersion {
-            name,
-            gaussians: &street.gaussians,
-            profile: RenderProfile::default(),
             rig: Rig::preset("vehicle6"),
             trajectories: vec![street.trajectory],
-            provenance,
             storage,
+            ..NewVersion::of(name, &street.gaussians, provenance)
         },
         &mut progress::show(&bar),
     )?;

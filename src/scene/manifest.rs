@@ -102,6 +102,14 @@ pub struct Provenance {
     pub options: Vec<String>,
 }
 
+impl Provenance {
+    /// Something that this build makes of a source, without options.
+    pub fn of(source: String) -> Self {
+        let builder = concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned();
+        Self { source, builder, options: Vec::new() }
+    }
+}
+
 impl Manifest {
     /// The layout that this build writes.
     pub const FORMAT: u32 = 1;

@@ -34,17 +34,7 @@ pub struct RenderProfile {
 
 impl Default for RenderProfile {
     fn default() -> Self {
-        Self {
-            near: 0.01,
-            far: 1e10,
-            blur: 0.3,
-            antialiased: false,
-            alpha_cap: 0.99,
-            alpha_cut: 1.0 / 255.0,
-            stop: 1e-4,
-            tau_px: 1.0,
-            reach_m: None,
-        }
+        Self::DEFAULT
     }
 }
 
@@ -85,6 +75,19 @@ pub enum ProfileError {
 }
 
 impl RenderProfile {
+    /// As gsplat 1.6 renders in its classic mode.
+    pub const DEFAULT: Self = Self {
+        near: 0.01,
+        far: 1e10,
+        blur: 0.3,
+        antialiased: false,
+        alpha_cap: 0.99,
+        alpha_cut: 1.0 / 255.0,
+        stop: 1e-4,
+        tau_px: 1.0,
+        reach_m: None,
+    };
+
     /// Names of the fields, as `--profile` and manifests spell them.
     pub const KEYS: [&'static str; 9] = [
         "near",

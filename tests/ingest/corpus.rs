@@ -22,10 +22,14 @@ pub(crate) struct Case {
 /// Gaussians of every case.
 pub(crate) const COUNT: usize = 6;
 
-/// A case of every format.
+/// A scene of one file without a checksum.
+pub(crate) fn one(name: &'static str, bytes: Vec<u8>) -> Case {
+    Case { name, files: vec![("scene".into(), bytes)], wrap: |b| b }
+}
+
+/// A case of every format of splats.
 pub(crate) fn corpus() -> Vec<Case> {
     let [flat, some, all] = [0, 1, 3].map(|degree| gaussians(COUNT, degree, 20.0, 9));
-    let one = |name, bytes| Case { name, files: vec![("scene".into(), bytes)], wrap: |b| b };
     let (json, buffer) = gltf(&some, r#","rotation":[0,1,0,0]"#, r#""uri":"splats.bin","#);
     let two = vec![("scene.gltf".to_owned(), json.into_bytes()), ("splats.bin".into(), buffer)];
     let whole = |name, files| Case { name, files, wrap: |b| b };

@@ -9,7 +9,7 @@ use crate::{data, read, refusal};
 
 /// A square of 2 m at z = 1 with red and green at the left corners and blue at the right ones, of two
 /// triangles with indices; `primitive` and `more` are JSON within the primitive and the document.
-fn square(primitive: &str, more: &str) -> Vec<u8> {
+pub(crate) fn square(primitive: &str, more: &str) -> Vec<u8> {
     let positions: [[f32; 3]; 4] =
         [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]];
     let colors: [[f32; 3]; 4] =

@@ -23,19 +23,14 @@ use wildcity::store::{Catalog, NewVersion, Storage};
 /// Two cameras of a twin whose levels are seen: a street of 40 m, 30,000 Gaussians.
 fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Arc<Resident> {
     let catalog = Catalog::open(dir).unwrap();
+    let street = generate::canyon(30_000, &mut |_, _| {});
     let new = NewVersion {
-        name: "street",
-        gaussians: &generate::canyon(30_000, &mut |_, _| {}),
         // Full detail, so that other errors are seen alone.
-        profile: RenderProfile { tau_px: 0.0, ..RenderProfile::default() },
+        profile: RenderProfile { tau_px: 0.0, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
-        provenance: Provenance {
-            source: "test".into(),
-            builder: "test".into(),
-            options: Vec::new(),
-        },
         storage: Storage { record: Record::F32, levels: true },
+        ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     Cache::new(catalog).open("street", None).unwrap()
