@@ -14,7 +14,7 @@ pub mod trajectory;
 pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;
-pub use profile::{Rays, RenderProfile};
+pub use profile::{ProfileChanges, Rays, RenderProfile};
 pub use record::Record;
 pub use rig::Rig;
 pub use trajectory::Trajectory;

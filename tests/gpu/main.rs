@@ -1,7 +1,5 @@
 //! The gpu backend against the others, on any Vulkan device; lavapipe is enough.
 
-#[path = "../support/blobs.rs"]
-mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/gpu.rs"]
@@ -10,8 +8,6 @@ mod gpu;
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
-#[path = "../support/poisons.rs"]
-mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]
@@ -35,3 +31,5 @@ mod parts;
 mod slips;
 mod stages;
 mod twins;
+
+use wildcity::report::stress::blobs;

@@ -9,12 +9,12 @@ use wildcity::render::unscented::Bent;
 use wildcity::render::{Backend, RenderError, Rolling, Target, View};
 use wildcity::scene::{Rays, RenderProfile, Scene};
 
-use crate::blobs::{Blob, scene};
 use crate::images::{
     Image, agree, cpu, look, max_difference, psnr, render, render_one, try_render,
 };
 use crate::lenses::lenses;
 use crate::streets::street;
+use wildcity::report::stress::blobs::{Blob, scene};
 
 /// A target of small opaque balls, 0.3 m apart on a wall 2 m ahead, one at a time.
 fn target(camera: &Camera) -> Vec<(DVec3, DVec2)> {

@@ -1,15 +1,11 @@
 //! The backends against each other, against images made by others, and at the extremes.
 
-#[path = "../support/blobs.rs"]
-mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/images.rs"]
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
-#[path = "../support/poisons.rs"]
-mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]
@@ -23,3 +19,4 @@ mod extremes;
 mod models;
 mod others;
 mod parity;
+mod report;

@@ -17,7 +17,7 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
-use crate::scene::{Manifest, Rig};
+use crate::scene::{Manifest, ProfileChanges, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
 use crate::sim::Dynamics;
 
@@ -189,6 +189,7 @@ impl Drive {
             seed: 0,
             start: None,
             rig: rig.map(RigChoice::Full),
+            profile: ProfileChanges::default(),
             outputs: Outputs {
                 cameras: None,
                 images: BTreeMap::new(),

@@ -9,6 +9,7 @@ use crate::geometry::Pose;
 use crate::geometry::camera::json::Intrinsics;
 use crate::protocol::message::{self, Request};
 use crate::protocol::unknown_field;
+use crate::scene::ProfileChanges;
 use crate::scene::rig::{Rig, RigCamera, is_name};
 use crate::server::fault::Fault;
 use crate::session::{Encoding, ImagePart, Opening, Outputs, RigChoice, SessionError, Start};
@@ -159,6 +160,7 @@ struct Fields {
     seed: Option<u64>,
     start: Option<message::Start>,
     rig: Option<message::RigChoice>,
+    profile: Option<serde_json::Map<String, serde_json::Value>>,
     outputs: Option<message::Outputs>,
     dt_us: Option<i64>,
     deadline_ms: Option<u64>,
@@ -228,6 +230,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         seed: open.seed,
         start: open.start.map(start_of).transpose()?,
         rig,
+        profile: ProfileChanges::new(open.profile),
         outputs: Outputs {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
