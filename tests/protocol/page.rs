@@ -60,8 +60,8 @@ fn the_hex_example_is_the_golden_frame() {
             bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
         assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
     }
-    assert!(page.contains("(3,216 bytes) has N = 0x880 = 2,176"));
-    assert_eq!((frame.len(), &frame[..8]), (3216, &2176_u64.to_le_bytes()[..]));
+    assert!(page.contains("(3,312 bytes) has N = 0x8e0 = 2,272"));
+    assert_eq!((frame.len(), &frame[..8]), (3312, &2272_u64.to_le_bytes()[..]));
 }
 
 /// Every code is explained, and no other.
