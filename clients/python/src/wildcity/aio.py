@@ -178,8 +178,13 @@ class Session:
             raise WildCityError("this session was opened by another client")
         return self._opened
 
-    async def step(self, pose: Pose, *, terminate: bool = False) -> Observation:
-        """Moves the ego to its next `world_from_rig`; `terminate` ends the episode with it."""
+    async def step(
+        self, movement: Pose | Trajectory | Action, *, terminate: bool = False
+    ) -> Observation:
+        """Moves the ego; `terminate` ends the episode with it.
+
+        To its next `world_from_rig`, if it teleports; by an action, if it is a car; along a trajectory in either case.
+        """
         return await self._client._run(self._conversation.step(movement, terminate))
 
     async def observe(self, poses: Sequence[Pose]) -> Observation:
