@@ -13,8 +13,11 @@ pub mod reference;
 pub mod relay;
 pub mod stage;
 
+use glam::{DVec2, DVec3};
+
 use crate::geometry::{Camera, Pose};
 use crate::scene::rig::RigCamera;
+use crate::scene::sky::SkyError;
 use crate::scene::{RenderProfile, Rig, Scene};
 
 /// A camera somewhere in the world.
@@ -35,6 +38,14 @@ impl View {
         };
         cameras.iter().map(view).collect()
     }
+
+    /// The direction in which a point of the image looks: of unit length, in world axes. `None` where
+    /// the image shows nothing.
+    pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
+        let p = &self.camera.pinhole;
+        let ray = DVec3::new((at_px.x - p.cx) / p.fx, (at_px.y - p.cy) / p.fy, 1.0);
+        Some((self.world_from_camera.rotation * ray).normalize())
+    }
 }
 
 /// One chain of stages: all views of one step.
@@ -54,7 +65,8 @@ pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 /// Where the pixels of one view go, row by row from the top; what is `None` is not computed.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear premultiplied red, green, blue on black, and opacity.
+    /// `[height, width, 4]`: linear red, green, blue, those of Gaussians premultiplied, on the sky or the
+    /// background; and the opacity of the Gaussians alone.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
     pub rgb8: Option<&'a mut [u8]>,
@@ -131,6 +143,9 @@ pub enum RenderError {
         /// What they may take.
         limit_bytes: u64,
     },
+    /// The sky cannot be drawn as the profile asks.
+    #[error(transparent)]
+    Sky(#[from] SkyError),
     /// The device failed. It is opened anew for the next frame.
     #[error("{device} failed: {reason}")]
     Device {

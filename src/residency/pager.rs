@@ -562,7 +562,7 @@ impl State {
     ) -> (Done, Result<Pinned, ResidencyError>) {
         let chunks = request.wanted.ids.iter().filter_map(|&id| self.table.get(id).cloned());
         let pinned = Pinned {
-            scene: Scene { chunks: chunks.collect() },
+            scene: Scene { chunks: chunks.collect(), sky: request.wanted.sky.clone() },
             shared: shared.clone(),
             waited_for: frame.waited_for,
             waited: if frame.waited_for == 0 { Duration::ZERO } else { frame.asked.elapsed() },

@@ -9,6 +9,7 @@ pub mod record;
 pub mod rig;
 pub mod route;
 pub mod sh;
+pub mod sky;
 pub mod trajectory;
 
 pub use chunk::{Chunk, Scene};
@@ -17,4 +18,5 @@ pub use manifest::Manifest;
 pub use profile::RenderProfile;
 pub use record::Record;
 pub use rig::Rig;
+pub use sky::Sky;
 pub use trajectory::Trajectory;

@@ -20,11 +20,18 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("clap", &["cli"]),
     ("anyhow", &["cli"]),
     ("indicatif", &["cli"]),
-    ("fearless_simd", &["render/cpu"]),
+    ("fearless_simd", &["render/cpu", "scene/sky"]),
     ("wgpu", &["render/gpu"]),
     (
         "rayon",
-        &["render", "scene/chunk.rs", "generate/city.rs", "ingest/validate.rs", "store/pack.rs"],
+        &[
+            "render",
+            "scene/chunk.rs",
+            "scene/sky",
+            "generate/city.rs",
+            "ingest/validate.rs",
+            "store/pack.rs",
+        ],
     ),
     ("tokio", &["server", "client", "session", "cli", "store/remote"]),
     // The catalog is made from one that is open.

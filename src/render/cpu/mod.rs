@@ -3,6 +3,7 @@
 //! Deterministic: what runs in parallel writes to places that do not depend on the schedule, and
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
+mod behind;
 mod bin;
 mod handover;
 mod lanes;
@@ -19,6 +20,7 @@ use rayon::ThreadPool;
 
 use crate::config;
 
+use self::behind::Behind;
 use super::layout::Cutoffs;
 use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
@@ -178,10 +180,12 @@ impl Backend for Cpu {
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
+            let behind = Behind::of(frame)?;
             scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
             let mut clock = Clock::start();
             let Scratch { projected, bins, .. } = scratch;
-            let input = rasterize::Input { projected, bins, views: frame.views, cutoffs: &cutoffs };
+            let (views, behind) = (frame.views, &*behind);
+            let input = rasterize::Input { projected, bins, views, behind, cutoffs: &cutoffs };
             stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
             clock.stage("rasterize", &mut stats);
             Ok(stats)

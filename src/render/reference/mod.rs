@@ -3,6 +3,7 @@
 //! It differentiates the camera numerically and inverts the covariance plainly, so that a slip in
 //! the other backends' hand-derived formulas has nowhere to hide.
 
+mod behind;
 mod blend;
 mod project;
 
@@ -43,7 +44,11 @@ impl Backend for Reference {
             let width = view.camera.width_px as usize;
             let pixels: Vec<blend::Pixel> = (0..view.camera.height_px)
                 .into_par_iter()
-                .flat_map_iter(|row| blend::row(&splats, row, width, frame.profile))
+                .flat_map_iter(|row| {
+                    let mut pixels = blend::row(&splats, row, width, frame.profile);
+                    behind::add(frame, view, row, &mut pixels);
+                    pixels
+                })
                 .collect();
             blend_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.evaluations += pixels.len() as u64 * splats.len() as u64;
