@@ -13,9 +13,9 @@ use serde_json::json;
 use crate::client::{Client, Observation, Open, Pose};
 use crate::generate::{self, StreetSettings};
 use crate::scene::manifest::Provenance;
-use crate::scene::{RenderProfile, Rig, Trajectory};
+use crate::scene::{Rig, Trajectory};
 use crate::server::{self, Limits};
-use crate::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use crate::store::{Catalog, NewVersion, StoreError, Version};
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -187,11 +187,8 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = generate::REVISION;
-    let provenance = Provenance {
-        source: format!("{STREET}{revision}: {}", serde_json::to_string(&settings)?),
-        builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).into(),
-        options: Vec::new(),
-    };
+    let settings_json = serde_json::to_string(&settings)?;
+    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
     let why = match built(&catalog, &provenance)? {
         Ok(version) => return Ok(version),
         Err(why) => why,
@@ -201,13 +198,9 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
     let bar = progress::count("writing");
     let version = catalog.commit(
         NewVersion {
-            name: TWIN,
-            gaussians: &street.gaussians,
-            profile: RenderProfile::default(),
             rig: Rig::preset("vehicle6"),
             trajectories: vec![street.trajectory],
-            provenance,
-            storage: Storage::default(),
+            ..NewVersion::of(TWIN, &street.gaussians, provenance)
         },
         &mut progress::show(&bar),
     )?;

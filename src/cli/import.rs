@@ -148,11 +148,7 @@ impl Import {
             profile,
             rig,
             trajectories,
-            provenance: Provenance {
-                source: format!("blake3:{source}"),
-                builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
-                options,
-            },
+            provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
             storage: Storage { record: self.record, levels: !self.no_lod },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));

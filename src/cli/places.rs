@@ -63,13 +63,7 @@ pub(super) struct Episodes {
 impl Episodes {
     /// The directory given, or the user's own.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
-        if let Some(dir) = &self.episodes {
-            return Ok(dir.clone());
-        }
-        match user_dir("XDG_STATE_HOME", ".local/state") {
-            Some(state) => Ok(state.join("wildcity/episodes")),
-            None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --episodes DIR"),
-        }
+        state_dir(self.episodes.as_ref(), "episodes")
     }
 }
 
@@ -85,13 +79,18 @@ pub(super) struct Uploads {
 impl Uploads {
     /// The directory given, or the user's own.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
-        if let Some(dir) = &self.uploads {
-            return Ok(dir.clone());
-        }
-        match user_dir("XDG_STATE_HOME", ".local/state") {
-            Some(state) => Ok(state.join("wildcity/uploads")),
-            None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --uploads DIR"),
-        }
+        state_dir(self.uploads.as_ref(), "uploads")
+    }
+}
+
+/// The directory given with an option, or the one of the same name among the user's own.
+fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
+    if let Some(dir) = given {
+        return Ok(dir.clone());
+    }
+    match user_dir("XDG_STATE_HOME", ".local/state") {
+        Some(state) => Ok(state.join("wildcity").join(name)),
+        None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --{name} DIR"),
     }
 }
 

@@ -38,19 +38,7 @@ pub struct RenderProfile {
 
 impl Default for RenderProfile {
     fn default() -> Self {
-        Self {
-            near: 0.01,
-            far: 1e10,
-            blur: 0.3,
-            antialiased: false,
-            alpha_cap: 0.99,
-            alpha_cut: 1.0 / 255.0,
-            stop: 1e-4,
-            tau_px: 1.0,
-            reach_m: None,
-            sky_error: 0.5 / 255.0,
-            background: [0.0; 3],
-        }
+        Self::DEFAULT
     }
 }
 
@@ -78,6 +66,21 @@ pub enum ProfileError {
 }
 
 impl RenderProfile {
+    /// As gsplat 1.6 renders in its classic mode.
+    pub const DEFAULT: Self = Self {
+        near: 0.01,
+        far: 1e10,
+        blur: 0.3,
+        antialiased: false,
+        alpha_cap: 0.99,
+        alpha_cut: 1.0 / 255.0,
+        stop: 1e-4,
+        tau_px: 1.0,
+        reach_m: None,
+        sky_error: 0.5 / 255.0,
+        background: [0.0; 3],
+    };
+
     /// Names of the fields, as `--profile` and manifests spell them.
     pub const KEYS: [&'static str; 11] = [
         "near",

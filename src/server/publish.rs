@@ -375,11 +375,7 @@ fn provenance(ask: &Ask, scene: &Scene) -> Provenance {
     let mut options = scene.options.clone();
     options.extend((!ask.levels).then(|| "lod=off".to_owned()));
     options.extend(ask.note.as_ref().map(|note| format!("note={note}")));
-    Provenance {
-        source: format!("blake3:{source}"),
-        builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned(),
-        options,
-    }
+    Provenance { options, ..Provenance::of(format!("blake3:{source}")) }
 }
 
 #[cfg(test)]

@@ -26,6 +26,21 @@ pub struct NewVersion<'a> {
     pub storage: Storage,
 }
 
+impl<'a> NewVersion<'a> {
+    /// Gaussians alone, rendered and stored by default.
+    pub fn of(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
+        Self {
+            name,
+            gaussians,
+            profile: RenderProfile::DEFAULT,
+            rig: None,
+            trajectories: Vec::new(),
+            provenance,
+            storage: Storage::default(),
+        }
+    }
+}
+
 impl Catalog {
     /// Writes a version and makes it the latest, all or nothing. The same content as the latest
     /// version's is that version: no new one is made. `progress` gets Gaussians written and Gaussians

@@ -28,19 +28,8 @@ use images::{cpu, psnr, render};
 
 /// Stores a scene as the next version of twin "street".
 fn commit(dir: &Path, gaussians: &Gaussians, storage: Storage) -> Result<Version, StoreError> {
-    let new = NewVersion {
-        name: "street",
-        gaussians,
-        profile: RenderProfile::default(),
-        rig: None,
-        trajectories: Vec::new(),
-        provenance: Provenance {
-            source: "test".into(),
-            builder: "test".into(),
-            options: Vec::new(),
-        },
-        storage,
-    };
+    let provenance = Provenance::of("test".into());
+    let new = NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) };
     Catalog::open(dir)?.commit(new, &mut |_, _| {})
 }
 

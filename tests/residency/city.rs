@@ -37,11 +37,7 @@ fn city() -> &'static City {
             profile: PROFILE,
             rig: Rig::preset("vehicle6"),
             trajectories: vec![drive.clone()],
-            provenance: Provenance {
-                source: "test".into(),
-                builder: "test".into(),
-                options: Vec::new(),
-            },
+            provenance: Provenance::of("test".into()),
         };
         commit.replace(None, settings).unwrap();
         City { dir, drive }

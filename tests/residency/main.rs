@@ -25,7 +25,7 @@ use wildcity::render::View;
 use wildcity::residency::{Cache, Eye, Needed, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
-use wildcity::store::{Catalog, NewVersion, Storage, Version};
+use wildcity::store::{Catalog, NewVersion, Version};
 
 use images::{cpu, look, render};
 
@@ -33,17 +33,7 @@ use images::{cpu, look, render};
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// What a frame of the twin draws of it: within 120 m, so that a drive needs ever other parts.
-const PROFILE: RenderProfile = RenderProfile {
-    near: 0.01,
-    far: 1e10,
-    blur: 0.3,
-    antialiased: false,
-    alpha_cap: 0.99,
-    alpha_cut: 1.0 / 255.0,
-    stop: 1e-4,
-    tau_px: 1.0,
-    reach_m: Some(120.0),
-};
+const PROFILE: RenderProfile = RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT };
 
 /// The demo street, sparser and longer: 600 m, all levels of detail.
 struct Demo {
@@ -75,19 +65,8 @@ impl Demo {
 }
 
 fn commit(dir: &Path, name: &str, gaussians: &Gaussians) -> Version {
-    let new = NewVersion {
-        name,
-        gaussians,
-        profile: PROFILE,
-        rig: None,
-        trajectories: Vec::new(),
-        provenance: Provenance {
-            source: "test".into(),
-            builder: "test".into(),
-            options: Vec::new(),
-        },
-        storage: Storage::default(),
-    };
+    let provenance = Provenance::of("test".into());
+    let new = NewVersion { profile: PROFILE, ..NewVersion::of(name, gaussians, provenance) };
     Catalog::open(dir).unwrap().commit(new, &mut |_, _| {}).unwrap()
 }
 

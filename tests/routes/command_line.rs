@@ -93,4 +93,7 @@ fn what_cannot_be_is_told_and_nothing_is_written() {
     let told = refused(&["subsample", "log.json", "--step-m", "nan", out[0], out[1]], at);
     assert!(told.contains("step_m is NaN"), "{told}");
     assert!(!at.join("out.json").exists());
+    let told = refused(&["cut", "log.json", "--length-m", "2,5,2.0001", "--out", "cuts"], at);
+    assert!(told.contains("--length-m") && told.contains("2m"), "{told}");
+    assert!(!at.join("cuts").exists());
 }

@@ -21,24 +21,14 @@ mod round_trip;
 use std::path::{Path, PathBuf};
 
 use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, Record, RenderProfile};
+use wildcity::scene::{Gaussians, Record};
 use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 fn street(gaussians: &Gaussians) -> NewVersion<'_> {
-    NewVersion {
-        name: "street",
-        gaussians,
-        profile: RenderProfile::default(),
-        rig: None,
-        trajectories: Vec::new(),
-        provenance: Provenance {
-            source: "test".into(),
-            builder: "test".into(),
-            options: Vec::new(),
-        },
-        storage: Storage { record: Record::F32, levels: false },
-    }
+    let storage = Storage { record: Record::F32, levels: false };
+    let provenance = Provenance::of("test".into());
+    NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }
 
 fn commit(dir: &Path, new: NewVersion<'_>) -> Result<Version, StoreError> {

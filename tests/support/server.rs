@@ -19,12 +19,12 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity::scene::Gaussians;
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{Gaussians, RenderProfile};
 use wildcity::server::{self, Config, Limits, Running};
-use wildcity::store::{Catalog, NewVersion, Storage};
+use wildcity::store::{Catalog, NewVersion};
 
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -125,17 +125,9 @@ pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
     };
     let log = Trajectory { name: "log".to_owned(), keyframes: (0..10).map(keyframe).collect() };
     let new = NewVersion {
-        name: "test",
-        gaussians: &gaussians,
-        profile: RenderProfile::default(),
         rig: Some(rig()),
         trajectories: vec![log],
-        provenance: Provenance {
-            source: "test".to_owned(),
-            builder: "test".to_owned(),
-            options: vec![],
-        },
-        storage: Storage::default(),
+        ..NewVersion::of("test", &gaussians, Provenance::of("test".to_owned()))
     };
     Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
 }

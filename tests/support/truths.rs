@@ -59,17 +59,7 @@ pub(crate) fn read(path: &Path) -> Scene {
 }
 
 /// How gsplat rendered when the images of the real data were made.
-const GSPLAT_OF_THEN: RenderProfile = RenderProfile {
-    near: 0.01,
-    far: 1e10,
-    blur: 0.3,
-    antialiased: false,
-    alpha_cap: 0.999,
-    alpha_cut: 1.0 / 255.0,
-    stop: 1e-4,
-    tau_px: 1.0,
-    reach_m: None,
-};
+const GSPLAT_OF_THEN: RenderProfile = RenderProfile { alpha_cap: 0.999, ..RenderProfile::DEFAULT };
 
 /// The values of a little-endian float32 `.npy` file.
 fn npy(path: &Path) -> Vec<f32> {

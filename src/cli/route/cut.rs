@@ -1,5 +1,6 @@
 //! `wildcity route cut`.
 
+use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
@@ -38,6 +39,15 @@ impl Cut {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let trajectory = read_trajectory(&self.drive)?;
         let route = Route::new(&trajectory)?;
+        let mut labels = BTreeSet::new();
+        for &length_m in &self.length_m {
+            let label = route::label(length_m);
+            let once = labels.insert(label.clone());
+            anyhow::ensure!(
+                once,
+                "--length-m: two lengths would both be written to files called {label}; give each once"
+            );
+        }
         output::make_dir(&self.out)?;
         let mut index = Vec::new();
         for length_m in self.length_m {

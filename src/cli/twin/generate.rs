@@ -94,15 +94,11 @@ impl Generate {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
             trajectories: vec![generate::city_drive(&settings)?],
-            provenance: Provenance {
-                source: format!(
-                    "city {}: {}",
-                    generate::REVISION,
-                    serde_json::to_string(&settings)?
-                ),
-                builder: concat!("wildcity ", env!("CARGO_PKG_VERSION")).into(),
-                options: Vec::new(),
-            },
+            provenance: Provenance::of(format!(
+                "city {}: {}",
+                generate::REVISION,
+                serde_json::to_string(&settings)?
+            )),
         };
         let version = commit.replace(None, parts)?;
         bar.finish_and_clear();

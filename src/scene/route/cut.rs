@@ -67,8 +67,8 @@ fn piece(route: &Route<'_>, number: usize, stations_m: [f64; 2]) -> Result<Cut, 
     Ok(Cut { stations_m, from_us: first.time_us, trajectory })
 }
 
-/// A length as names have it: `50m`, `2.5km`.
-fn label(length_m: f64) -> String {
+/// A length as names of pieces have it, to the millimetre or the metre: `50m`, `2.5km`.
+pub fn label(length_m: f64) -> String {
     let millimetre_m = |value: f64| (1e3 * value).round() / 1e3;
     if length_m < 1_000.0 {
         format!("{}m", millimetre_m(length_m))

@@ -11,7 +11,7 @@ use super::Trajectory;
 use super::trajectory::{Keyframe, TrajectoryError};
 
 pub use clock::{Association, Pair, associate};
-pub use cut::{Cut, MAX_CUTS, cuts};
+pub use cut::{Cut, MAX_CUTS, cuts, label};
 
 /// Distance between keyframes of a route, in metres.
 pub const KEYFRAME_M: f64 = 0.5;
