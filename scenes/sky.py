@@ -1,4 +1,5 @@
-"""Trains the demo twin's sky: `python scenes/sky.py` writes `scenes/sky.safetensors` (numpy alone).
+"""Trains the demo twin's sky: `python scenes/sky.py` writes `scenes/sky.safetensors` (numpy alone);
+`python scenes/sky.py truths` writes what `tests/render/sky.rs` compares with.
 
 The network is the sky of street reconstructions (OmniRe's SkyModel, Chen et al. 2024): a direction,
 its sines and cosines over seven octaves and an appearance of 16 numbers, three layers of 64, the input
@@ -137,5 +138,36 @@ def write(path, tensors):
         file.write(struct.pack("<Q", len(text)) + text + body)
 
 
+def colours(tensors, away, image=None):
+    """The network in f64, by definition: colours [n, 3] towards unit directions [n, 3]."""
+    layer = lambda i, x: x @ tensors[f"sky_head.layers.{i}.weight"].T + tensors[f"sky_head.layers.{i}.bias"]
+    tensors = {name: values.astype(np.float64) for name, values in tensors.items()}
+    images = tensors["appearance_embedding.weight"]
+    appearance = images.mean(axis=0) if image is None else images[image]
+    x = np.concatenate([encode(away), np.tile(appearance, (len(away), 1))], axis=1)
+    hidden = np.concatenate([np.maximum(layer(0, x), 0.0), x], axis=1)
+    return 1.0 / (1.0 + np.exp(-layer(2, np.maximum(layer(1, hidden), 0.0))))
+
+
+def read(path):
+    """All tensors of a safetensors file of F32."""
+    data = open(path, "rb").read()
+    length = struct.unpack("<Q", data[:8])[0]
+    header, body = json.loads(data[8 : 8 + length]), data[8 + length :]
+    header.pop("__metadata__", None)
+    values = lambda t: np.frombuffer(body[slice(*t["data_offsets"])], "<f4").reshape(t["shape"])
+    return {name: values(tensor) for name, tensor in header.items()}
+
+
+def truths(path):
+    """What `tests/render/sky.json` holds: directions, and their colours as numpy computes them."""
+    tensors, away = read(path), look(np.random.default_rng(3), 48)
+    seen = [[*direction, *colours(tensors, direction[None])[0], *colours(tensors, direction[None], 1)[0]] for direction in away]
+    return "[\n" + ",\n".join(json.dumps([float(f"{value:.17g}") for value in row]) for row in seen) + "\n]\n"
+
+
 if __name__ == "__main__":
-    write(sys.argv[1] if len(sys.argv) > 1 else "scenes/sky.safetensors", train(steps=16_000))
+    if sys.argv[1:] == ["truths"]:
+        sys.stdout.write(truths("scenes/sky.safetensors"))
+    else:
+        write("scenes/sky.safetensors", train(steps=16_000))

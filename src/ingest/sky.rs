@@ -45,13 +45,20 @@ pub fn read(path: &Path, image: Option<u32>) -> Result<SkyFile, IngestError> {
     if path.is_dir() {
         return kept_faces(&folder(path)?, image);
     }
-    let bytes = read_whole(path, config::SKY_FILE_BYTES)?;
+    read_bytes(&read_whole(path, config::SKY_FILE_BYTES)?, image)
+}
+
+/// Reads a sky from the bytes of a file.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestError> {
     if bytes.get(8) == Some(&b'{') {
-        let Weights { layers, appearances } = Weights::read(&bytes)?;
+        let Weights { layers, appearances } = Weights::read(bytes)?;
         let bytes = kept_network(&layers, &appearances)?;
         return Ok(SkyFile { model: decode(&bytes, image)?, bytes });
     }
-    kept_faces(&faces(&picture(&bytes)?)?, image)
+    kept_faces(&faces(&picture(bytes)?)?, image)
 }
 
 /// A sky as a twin keeps it.
@@ -92,7 +99,7 @@ impl Weights {
             let name = |what: &str| format!("sky_head.layers.{number}.{what}");
             let (shape, weight) = floats(&tensors, &name("weight"), 2)?;
             let (_, bias) = floats(&tensors, &name("bias"), 1)?;
-            Ok(Layer { outputs: shape[0], inputs: shape[1], weight, bias })
+            Ok::<_, IngestError>(Layer { outputs: shape[0], inputs: shape[1], weight, bias })
         };
         let layers = [layer(0)?, layer(1)?, layer(2)?];
         let appearances = if tensors.names().contains(&APPEARANCES) {
@@ -267,7 +274,8 @@ fn folder(path: &Path) -> Result<RgbImage, IngestError> {
         let found = found.ok_or_else(|| {
             bad(name, format!("there is no {name}.png or {name}.jpg in {}", path.display()))
         })?;
-        let part = |cause: FileError| IngestError::Part { name: found.display().to_string(), cause };
+        let part =
+            |cause: FileError| IngestError::Part { name: found.display().to_string(), cause };
         let bytes = file::read_whole(found, config::SKY_FILE_BYTES).map_err(part)?;
         let picture = picture(&bytes)?;
         let side = strip.as_ref().map_or(picture.width(), RgbImage::width);

@@ -1,5 +1,6 @@
 //! What a city twin is made of: Gaussians in chunks and levels of detail, a rig, recorded trajectories, a manifest.
 
+pub mod appearance;
 pub mod chunk;
 pub mod gaussian;
 pub mod lod;

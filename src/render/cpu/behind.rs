@@ -1,10 +1,8 @@
-//! What is behind the Gaussians: a sky, or one colour. The first part of stage resolve, for twins that
-//! have either; others skip it.
+//! What is behind the Gaussians: the first part of stage resolve, for frames that have something there.
 
 use std::sync::Arc;
 
 use fearless_simd::{f32x16, i32x16, prelude::*, u32x16};
-use glam::{DMat3, DVec3};
 
 use super::lanes::Vec3x16;
 use super::resolve::TileSums;
@@ -18,40 +16,29 @@ const BLOCKS: usize = 16;
 
 /// What is behind the Gaussians of one view.
 #[derive(Debug)]
-pub(super) enum Behind {
-    /// Black: nothing is added.
-    Nothing,
-    /// One colour, linear.
-    Background([f32; 3]),
-    /// A sky, and what takes `(x, y, 1)` in pixels to a direction in its axes, of any length: rows.
-    Sky(Drawn, [[f32; 3]; 3]),
+pub(super) struct Behind {
+    drawn: Drawn,
+    /// Takes `(x, y, 1)` in pixels to a direction in the sky's axes, of any length: rows.
+    sky_from_pixel: [[f32; 3]; 3],
 }
 
 impl Behind {
-    /// What is behind each view of a frame.
+    /// What is behind each view of a frame; empty if nothing is.
     ///
     /// # Errors
     /// The sky cannot be drawn as the profile asks.
     pub(super) fn of(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
-        let of_view: Box<dyn Fn(&View) -> Self> = match &frame.scene.sky {
-            Some(sky) => {
-                let (drawn, axes) = (sky.drawn(frame.profile.sky_error)?, sky.sky_from_world());
-                Box::new(move |view| Self::Sky(drawn.clone(), sky_from_pixel(axes, view)))
-            }
-            None if frame.profile.background == [0.0; 3] => Box::new(|_| Self::Nothing),
-            None => {
-                let rgb = frame.profile.background.map(|c| c as f32);
-                Box::new(move |_| Self::Background(rgb))
-            }
-        };
+        let Some((drawn, axes)) = frame.behind()? else { return Ok(Vec::new()) };
+        let of_view =
+            |view: &View| Self { drawn: drawn.clone(), sky_from_pixel: view.sky_from_pixel(axes) };
         Ok(frame.views.iter().map(of_view).collect())
     }
 
     /// What evaluating a network needs, where one is evaluated.
     pub(super) fn scratch(&self) -> Option<Scratch> {
-        match self {
-            Self::Sky(Drawn::Exact(network), _) => Some(network.scratch()),
-            _ => None,
+        match &self.drawn {
+            Drawn::Exact(network) => Some(network.scratch()),
+            Drawn::Map(_) => None,
         }
     }
 
@@ -64,41 +51,16 @@ impl Behind {
         scratch: &mut Option<Scratch>,
         sums: &mut TileSums,
     ) {
-        match self {
-            Self::Nothing => {}
-            Self::Background(rgb) => {
-                for block in 0..BLOCKS {
-                    let shows = f32x16::load_array_ref(simd, &sums.transmittance[block]);
-                    add(simd, shows, rgb.map(|c| f32x16::splat(simd, c)), block, sums);
-                }
-            }
-            Self::Sky(drawn, sky_from_pixel) => {
-                for block in 0..BLOCKS {
-                    add_sky(simd, (drawn, sky_from_pixel), at_px, block, scratch, sums);
-                }
-            }
+        for block in 0..BLOCKS {
+            add_sky(simd, self, at_px, block, scratch, sums);
         }
     }
-}
-
-/// Takes `(x, y, 1)` of a pinhole's image to a direction in the sky's axes. As directions matter only up
-/// to their length, f32 is right to 1e-7 rad.
-fn sky_from_pixel(sky_from_world: DMat3, view: &View) -> [[f32; 3]; 3] {
-    let p = &view.camera.pinhole;
-    let camera_from_pixel = DMat3::from_cols(
-        DVec3::new(1.0 / p.fx, 0.0, 0.0),
-        DVec3::new(0.0, 1.0 / p.fy, 0.0),
-        DVec3::new(-p.cx / p.fx, -p.cy / p.fy, 1.0),
-    );
-    let world_from_camera = view.world_from_camera.rotation_matrix();
-    let rows = (sky_from_world * world_from_camera * camera_from_pixel).transpose();
-    rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
 }
 
 #[inline(always)]
 fn add_sky<S: Simd>(
     simd: S,
-    (drawn, sky_from_pixel): (&Drawn, &[[f32; 3]; 3]),
+    behind: &Behind,
     at_px: [u32; 2],
     block: usize,
     scratch: &mut Option<Scratch>,
@@ -115,9 +77,9 @@ fn add_sky<S: Simd>(
     let x = f32x16::from_fn(simd, |lane| (at_px[0] + left + lane as u32 % edge) as f32 + 0.5);
     let y = f32x16::from_fn(simd, |lane| (at_px[1] + top + lane as u32 / edge) as f32 + 0.5);
     let row = |[a, b, c]: [f32; 3]| x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
-    let [first, second, third] = *sky_from_pixel;
+    let [first, second, third] = behind.sky_from_pixel;
     let away = Vec3x16 { x: row(first), y: row(second), z: row(third) };
-    let rgb = match (drawn, scratch) {
+    let rgb = match (&behind.drawn, scratch) {
         (Drawn::Map(map), _) => look_up(simd, map, away),
         (Drawn::Exact(network), Some(scratch)) => {
             let unit = away.scale(splat(1.0) / away.dot(away).sqrt());
@@ -127,18 +89,7 @@ fn add_sky<S: Simd>(
         // `scratch` is made for every network.
         (Drawn::Exact(_), None) => return,
     };
-    add(simd, shows.select(transmittance, splat(0.0)), rgb, block, sums);
-}
-
-/// `sums += weight * rgb`.
-#[inline(always)]
-fn add<S: Simd>(
-    simd: S,
-    weight: f32x16<S>,
-    rgb: [f32x16<S>; 3],
-    block: usize,
-    sums: &mut TileSums,
-) {
+    let weight = shows.select(transmittance, splat(0.0));
     for (sum, colour) in sums.rgb.iter_mut().zip(rgb) {
         let sum = &mut sum[block];
         weight.mul_add(colour, f32x16::load_array_ref(simd, sum)).store_array(sum);

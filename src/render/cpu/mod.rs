@@ -3,6 +3,7 @@
 //! Deterministic: what runs in parallel writes to places that do not depend on the schedule, and
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
+mod appearance;
 mod behind;
 mod bin;
 mod handover;
@@ -175,12 +176,14 @@ impl Backend for Cpu {
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
+        // Outside of the pool: baking waits for threads, and one that waits for its own pool may take up
+        // other work there.
+        let behind = Behind::of(frame)?;
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
-            let behind = Behind::of(frame)?;
             scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
             let mut clock = Clock::start();
             let Scratch { projected, bins, .. } = scratch;

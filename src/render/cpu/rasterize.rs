@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*, u16x32};
 use rayon::prelude::*;
 
+use super::appearance;
 use super::behind::Behind;
 use super::bin::{Bins, Grid};
 use super::project::Projected;
@@ -106,15 +107,21 @@ fn rasterize_band<S: Simd>(
     band: &mut Band<'_>,
 ) -> u64 {
     let mut lists = Lists::default();
-    let behind = &input.behind[view];
-    let mut sky = behind.scratch();
+    let behind = input.behind.get(view);
+    let mut scratch = behind.and_then(Behind::scratch);
     let mut evaluations = 0;
     for column in 0..columns {
         let tile = input.bins.tile(view, row * columns as usize + column as usize);
         let at = [column * TILE_PX, row as u32 * TILE_PX];
         let mut sums = TileSums::default();
-        evaluations += rasterize_tile(simd, input, tile, at, &mut lists, (&mut sums, band.wants_depth()));
-        behind.add(simd, at, &mut sky, &mut sums);
+        evaluations +=
+            rasterize_tile(simd, input, tile, at, &mut lists, (&mut sums, band.wants_depth()));
+        if let Some(behind) = behind {
+            behind.add(simd, at, &mut scratch, &mut sums);
+        }
+        if let Some(appearance) = band.appearance {
+            appearance::apply(simd, appearance, at, &mut sums);
+        }
         resolve::resolve(simd, &sums, at[0], band);
     }
     evaluations

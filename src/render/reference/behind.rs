@@ -10,13 +10,13 @@ use crate::scene::sky::SKY_CUT;
 pub(super) fn add(frame: &Frame<'_>, view: &View, row: u32, pixels: &mut [Pixel]) {
     for (column, pixel) in pixels.iter_mut().enumerate() {
         let at_px = DVec2::new(column as f64 + 0.5, f64::from(row) + 0.5);
-        let behind = match &frame.scene.sky {
-            None => DVec3::from_array(frame.profile.background),
-            Some(sky) => match view.ray_world(at_px) {
-                Some(ray) if pixel.transmittance >= SKY_CUT => sky.rgb(ray),
-                _ => DVec3::ZERO,
-            },
-        };
-        pixel.rgb += pixel.transmittance * behind;
+        let Some(ray) = view.ray_world(at_px) else { continue };
+        if pixel.transmittance >= SKY_CUT {
+            let behind = match &frame.scene.sky {
+                Some(sky) => sky.rgb(ray),
+                None => DVec3::from_array(frame.profile.background),
+            };
+            pixel.rgb += pixel.transmittance * behind;
+        }
     }
 }

@@ -56,7 +56,8 @@ impl Grid {
                     for lane in 0..LANES {
                         let column = (block * LANES + lane).min(edge - 1);
                         let s = column as f64 / (edge - 1) as f64;
-                        let away = CubeMap::direction(face, [s, t]).normalize().as_vec3().to_array();
+                        let away =
+                            CubeMap::direction(face, [s, t]).normalize().as_vec3().to_array();
                         for (axis, value) in directions.iter_mut().zip(away) {
                             axis[lane] = value;
                         }
@@ -79,14 +80,14 @@ impl Grid {
         let rows = finer.rgb.par_chunks(finer.edge).enumerate();
         let worst = rows.map(|(row, values)| {
             let (face, row) = (row / finer.edge, row % finer.edge);
-            let coarse = |row: usize| &self.rgb[(face * self.edge + row) * self.edge..][..self.edge];
+            let coarse =
+                |row: usize| &self.rgb[(face * self.edge + row) * self.edge..][..self.edge];
             let (above, below) = (coarse(row / 2), coarse(row.div_ceil(2)));
             let mut worst: f32 = 0.0;
             for (column, value) in values.iter().enumerate() {
                 let (left, right) = (column / 2, column.div_ceil(2));
                 for c in 0..3 {
-                    let patch =
-                        above[left][c] + above[right][c] + below[left][c] + below[right][c];
+                    let patch = above[left][c] + above[right][c] + below[left][c] + below[right][c];
                     worst = worst.max((0.25 * patch - value[c]).abs());
                 }
             }

@@ -82,6 +82,12 @@ impl CubeMap {
         Ok(Self { edge, scale: side_px as f64, offset: 0.5, error: 0.0, texels })
     }
 
+    /// The same colour everywhere.
+    pub fn plain(rgb: DVec3) -> Self {
+        let texels = vec![packed(rgb); FACES * 4];
+        Self { edge: 2, scale: 1.0, offset: 0.0, error: Self::STEP, texels }
+    }
+
     /// From values at `i / (edge - 1)`, face by face, row by row; `error` is how far off they are.
     pub(super) fn from_nodes(edge: usize, nodes: &[[f32; 3]], error: f64) -> Self {
         let texel = |rgb: &[f32; 3]| packed(DVec3::from_array(rgb.map(f64::from)));

@@ -28,8 +28,8 @@ pub struct Sky {
     model: Model,
     /// Takes world axes to the model's: a rotation, perhaps with a mirror.
     sky_from_world: DMat3,
-    /// What was baked last, and for which error.
-    baked: Mutex<Option<(f64, Arc<CubeMap>)>>,
+    /// For which error it was baked last, and what came of it.
+    baked: Mutex<Option<(f64, Result<Arc<CubeMap>, SkyError>)>>,
 }
 
 /// What a sky is made of.
@@ -82,7 +82,10 @@ pub enum SkyError {
         count: usize,
     },
     /// Faces that are empty or too large.
-    #[error("a face of the sky is {side_px} pixels wide; 1 to {} are accepted", CubeMap::MAX_SIDE_PX)]
+    #[error(
+        "a face of the sky is {side_px} pixels wide; 1 to {} are accepted",
+        CubeMap::MAX_SIDE_PX
+    )]
     Side {
         /// Width of a face, in pixels.
         side_px: usize,
@@ -149,14 +152,16 @@ impl Sky {
             Model::Network(_, folded) => {
                 // Held while baking: whoever comes meanwhile waits for the map rather than bakes another.
                 let mut baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-                if let Some((error, map)) = &*baked
-                    && *error == sky_error
-                {
-                    return Ok(Drawn::Map(map.clone()));
-                }
-                let map = Arc::new(bake::bake(folded, sky_error)?);
-                *baked = Some((sky_error, map.clone()));
-                Ok(Drawn::Map(map))
+                let known = baked.as_ref().filter(|(error, _)| *error == sky_error);
+                let map = match known {
+                    Some((_, map)) => map.clone(),
+                    None => {
+                        let map = bake::bake(folded, sky_error).map(Arc::new);
+                        *baked = Some((sky_error, map.clone()));
+                        map
+                    }
+                };
+                map.map(Drawn::Map)
             }
         }
     }
@@ -164,7 +169,7 @@ impl Sky {
     /// Memory that it takes, in bytes.
     pub fn bytes(&self) -> usize {
         let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-        let baked = baked.as_ref().map_or(0, |(_, map)| map.bytes());
+        let baked = baked.iter().flat_map(|(_, map)| map).map(|map| map.bytes()).sum::<usize>();
         baked
             + match &self.model {
                 Model::Network(network, _) => 2 * network.bytes(),
