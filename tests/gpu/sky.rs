@@ -164,7 +164,7 @@ fn slips_are_caught() {
         ("rasterize_map", RenderProfile::DEFAULT, "rows[1].y * at_px.y", "rows[1].x * at_px.y"),
         ("rasterize_network", EXACT, "i32(cosine)) & vec4i(1)", "0) & vec4i(1)"),
         ("rasterize_network", EXACT, "select(0u, behind.encoded, behind.skip != 0u)", "0u"),
-        ("rasterize_network", EXACT, "max(sums[k], vec4f(0.0))", "sums[k]"),
+        ("rasterize_network", EXACT, "max(sums.low[k], vec4f(0.0))", "sums.low[k]"),
     ] {
         let shaders = Shaders::default().with_slip(stage, part, slip);
         let images = render(&gpu_with(shaders.expect(part)), &empty(sky()), &profile, &views);

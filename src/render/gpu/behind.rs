@@ -20,7 +20,7 @@ use crate::render::{Frame, MAX_VIEWS, RenderError};
 use crate::scene::appearance::{Appearance, Exposure};
 use crate::scene::sky::{Drawn, Folded, Network};
 
-// Private memory of `shaders/sky_network.wgsl`: the widest layer, beside 3 + 6 x 10 encoded values.
+// Private memory of `shaders/sky_network.wgsl`: 256 + 256 + 3 + 6 x 10 vectors.
 const _: () = assert!(Network::MAX_WIDTH == 256 && 3 + 6 * Network::MAX_OCTAVES == 63);
 
 /// What is behind the Gaussians of the frame at hand.
