@@ -15,8 +15,14 @@ pub mod stage;
 pub mod unscented;
 pub mod view;
 
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+
 use crate::geometry::Camera;
 use crate::geometry::camera::Field;
+use crate::scene::appearance::Appearance;
+use crate::scene::sky::{CubeMap, Drawn, SkyError};
 use crate::scene::{Rays, RenderProfile, Rig, Scene};
 
 pub use view::{Rolling, View};
@@ -39,7 +45,8 @@ pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 /// view's lens does not see is 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear premultiplied red, green, blue on black, and opacity.
+    /// `[height, width, 4]`: linear red, green, blue, those of Gaussians premultiplied, on the sky or the
+    /// background; and the opacity of the Gaussians alone.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
     pub rgb8: Option<&'a mut [u8]>,
@@ -47,6 +54,8 @@ pub struct Target<'a> {
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
+    /// What the camera makes of the colours, of `rgba` and `rgb8` alike.
+    pub appearance: Option<&'a Appearance>,
 }
 
 impl Target<'_> {
@@ -114,6 +123,16 @@ pub enum RenderError {
         /// The length that the camera asks for.
         wanted: usize,
     },
+    /// An overlay is not of its view's size.
+    #[error("view {view}: the overlay is {given:?} pixels, and the image {wanted:?}")]
+    Overlay {
+        /// Which view.
+        view: usize,
+        /// Width and height of the overlay.
+        given: [u32; 2],
+        /// Width and height of the image.
+        wanted: [u32; 2],
+    },
     /// Not one target for each view.
     #[error("{targets} targets for {views} views; each view needs its own")]
     Targets {
@@ -141,6 +160,9 @@ pub enum RenderError {
         /// What they may take.
         limit_bytes: u64,
     },
+    /// The sky cannot be drawn as the profile asks.
+    #[error(transparent)]
+    Sky(#[from] SkyError),
     /// The device failed. It is opened anew for the next frame.
     #[error("{device} failed: {reason}")]
     Device {
@@ -185,6 +207,22 @@ pub trait Backend: Send + Sync {
 }
 
 impl Frame<'_> {
+    /// What is behind the Gaussians, and what takes directions in the world to its axes: the sky, or the
+    /// profile's background as a sky of one colour; `None` if that is black.
+    ///
+    /// # Errors
+    /// [`RenderError::Sky`].
+    pub fn behind(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
+        match &self.scene.sky {
+            Some(sky) => Ok(Some((sky.drawn(self.profile.sky_error)?, sky.sky_from_world()))),
+            None if self.profile.background == [0.0; 3] => Ok(None),
+            None => {
+                let map = CubeMap::plain(DVec3::from_array(self.profile.background));
+                Ok(Some((Drawn::Map(Arc::new(map)), DMat3::IDENTITY)))
+            }
+        }
+    }
+
     /// # Errors
     /// Names the first view whose target does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
@@ -201,6 +239,12 @@ impl Frame<'_> {
                 ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
             ];
+            if let Some(overlay) = target.appearance.and_then(|seen| seen.overlay.as_ref()) {
+                let wanted = [camera.width_px, camera.height_px];
+                if overlay.size_px() != wanted {
+                    return Err(RenderError::Overlay { view, given: overlay.size_px(), wanted });
+                }
+            }
             for (buffer, given, wanted) in lengths {
                 if let Some(given) = given.filter(|&given| given != wanted) {
                     return Err(RenderError::TargetSize { view, buffer, given, wanted });

@@ -1,6 +1,6 @@
 //! Views: a camera somewhere in the world, at rest or on its way.
 
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 
 use crate::geometry::camera::Rolls;
 use crate::geometry::{Camera, Pose};
@@ -95,6 +95,20 @@ impl View {
     pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
         let direction = self.camera.unproject(at_px)?;
         Some(self.world_from_camera_at(at_px).rotation * direction)
+    }
+
+    /// Of a pinhole at rest: rows that take `(x, y, 1)` of the image to a direction in a sky's axes, of any
+    /// length. As only its direction matters, f32 is right to 1e-7 rad.
+    pub(super) fn sky_from_pixel(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
+        let p = &self.camera.pinhole;
+        let camera_from_pixel = DMat3::from_cols(
+            DVec3::new(1.0 / p.fx, 0.0, 0.0),
+            DVec3::new(0.0, 1.0 / p.fy, 0.0),
+            DVec3::new(-p.cx / p.fx, -p.cy / p.fy, 1.0),
+        );
+        let world_from_camera = self.world_from_camera.rotation_matrix();
+        let rows = (sky_from_world * world_from_camera * camera_from_pixel).transpose();
+        rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
     }
 
     /// Where a point of the world lands, in pixels; `None` outside of the lens' field.

@@ -143,10 +143,10 @@ impl Step {
         let (mut rgb8, mut depth_m, mut opacity) =
             (vec![0; 3 * pixels], vec![0.0; pixels], vec![0.0; pixels]);
         let target = Target {
-            rgba: None,
             rgb8: Some(&mut rgb8),
             depth_m: self.depth.then_some(&mut depth_m),
             opacity: self.opacity.then_some(&mut opacity),
+            ..Target::default()
         };
         let frame = Frame { scene: &self.scene, profile: &self.profile, views: &[view] };
         Ok(backend.render(&frame, &mut [target], &|_, _| {})?.evaluations)

@@ -51,6 +51,11 @@ pub struct RenderProfile {
     /// their hashes.
     #[serde(skip_serializing_if = "Rays::is_splats")]
     pub rays: Rays,
+    /// Largest error of a baked sky, in colour from 0 to 1; 0 evaluates the sky for every pixel. No
+    /// matter to twins without one.
+    pub sky_error: f64,
+    /// What is behind everything in twins without a sky: linear red, green, blue.
+    pub background: [f64; 3],
 }
 
 impl Default for RenderProfile {
@@ -108,10 +113,12 @@ impl RenderProfile {
         tau_px: 1.0,
         reach_m: None,
         rays: Rays::Splats,
+        sky_error: 0.5 / 255.0,
+        background: [0.0; 3],
     };
 
     /// Names of the fields, as `--profile` and manifests spell them.
-    pub const KEYS: [&'static str; 10] = [
+    pub const KEYS: [&'static str; 12] = [
         "near",
         "far",
         "blur",
@@ -122,6 +129,8 @@ impl RenderProfile {
         "tau_px",
         "reach_m",
         "rays",
+        "sky_error",
+        "background",
     ];
 
     /// # Errors
@@ -161,6 +170,18 @@ impl RenderProfile {
                 self.reach_m.is_none_or(|reach_m| (0.0..=1e9).contains(&reach_m)),
                 "reach_m is from 0 to 1e9 m, or none",
             ),
+            (
+                "sky_error",
+                self.sky_error,
+                self.sky_error == 0.0 || (1e-4..=1.0).contains(&self.sky_error),
+                "sky_error is 0 (exact) or from 1e-4 to 1",
+            ),
+            (
+                "background",
+                self.background.into_iter().find(|c| !(0.0..=1.0).contains(c)).unwrap_or(0.0),
+                self.background.iter().all(|c| (0.0..=1.0).contains(c)),
+                "each of its colours is from 0 to 1",
+            ),
         ];
         match holds.into_iter().find(|(_, _, holds, _)| !holds) {
             Some((field, value, _, must)) => Err(ProfileError::Value { field, value, must }),
@@ -194,6 +215,14 @@ impl RenderProfile {
             "rays" if value == "splats" => self.rays = Rays::Splats,
             "rays" if value == "exact" => self.rays = Rays::Exact,
             "rays" => return Err(bad("expected splats or exact".into())),
+            "sky_error" => self.sky_error = number()?,
+            "background" => {
+                let colours: Result<Vec<f64>, _> = value.split(',').map(str::parse).collect();
+                self.background = colours
+                    .ok()
+                    .and_then(|colours| colours.try_into().ok())
+                    .ok_or_else(|| bad("expected red,green,blue as 0.5,0.6,0.8".into()))?;
+            }
             _ => return Err(bad(format!("there is no field {key:?}"))),
         }
         self.check()
@@ -274,6 +303,9 @@ mod tests {
             "tau_px=-1",
             "reach_m=far",
             "rays=some",
+            "sky_error=1e-9",
+            "background=1,1",
+            "background=1,1,2",
         ] {
             assert!(profile.clone().set(bad).is_err(), "{bad}");
         }

@@ -10,6 +10,8 @@ mod images;
 mod lenses;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/skies.rs"]
+mod skies;
 #[path = "../support/streets.rs"]
 mod streets;
 #[path = "../support/truths.rs"]
@@ -28,6 +30,7 @@ mod mirror;
 mod overlap;
 mod parity;
 mod parts;
+mod sky;
 mod slips;
 mod stages;
 mod twins;

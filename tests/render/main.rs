@@ -8,11 +8,14 @@ mod images;
 mod lenses;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/skies.rs"]
+mod skies;
 #[path = "../support/streets.rs"]
 mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod appearance;
 mod cameras;
 mod determinism;
 mod extremes;
@@ -20,3 +23,4 @@ mod models;
 mod others;
 mod parity;
 mod report;
+mod sky;

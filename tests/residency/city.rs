@@ -37,6 +37,7 @@ fn city() -> &'static City {
             profile: PROFILE,
             rig: Rig::preset("vehicle6"),
             trajectories: vec![drive.clone()],
+            sky: None,
             provenance: Provenance::of("test".into()),
         };
         commit.replace(None, settings).unwrap();
