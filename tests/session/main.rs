@@ -4,6 +4,8 @@
 mod support;
 
 mod ego;
+mod integrators;
 mod long;
 mod record;
 mod replay;
+mod study;
