@@ -18,6 +18,7 @@ mod replay;
 mod route;
 mod scene_source;
 mod serve;
+mod sky_source;
 mod time;
 mod twin;
 

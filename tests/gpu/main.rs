@@ -12,6 +12,8 @@ mod images;
 mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/skies.rs"]
+mod skies;
 #[path = "../support/streets.rs"]
 mod streets;
 #[path = "../support/truths.rs"]
@@ -29,6 +31,7 @@ mod mirror;
 mod overlap;
 mod parity;
 mod parts;
+mod sky;
 mod slips;
 mod stages;
 mod twins;
