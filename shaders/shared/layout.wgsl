@@ -33,11 +33,7 @@ struct Behind {
     scale: f32,
     offset: f32,
     edge: u32,
-    octaves: u32,
-    encoded: u32,
-    width: u32,
-    identity: u32,
-    skip: u32,
+    pad0: u32,
     sky_from_pixel: array<array<vec4f, 3>, MAX_VIEWS>,
 }
 

@@ -1,16 +1,17 @@
-//! Skies on the device: baked and evaluated, against the cpu backend; and nothing of it without one.
+//! Skies on the device, against the cpu backend; and nothing of it without one.
 
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 use wildcity::render::gpu::shaders::Shaders;
+use wildcity::render::gpu::{AdapterChoice, Gpu};
 use wildcity::render::{Backend, RenderError, View};
 use wildcity::scene::sky::{CubeMap, Model};
 use wildcity::scene::{RenderProfile, Scene, Sky};
 
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
 use crate::images::{agree, cpu, look, max_difference, render, render_one, try_render};
-use crate::skies::{appearance, demo_model, draw_seen, empty, network, sky};
+use crate::skies::{appearance, demo_model, draw_seen, empty, sky};
 use crate::streets::{street, street_views};
 
 const EXACT: RenderProfile = RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT };
@@ -39,37 +40,37 @@ fn a_baked_sky() {
     assert!(difference(&scene, &RenderProfile::DEFAULT) < 2e-5);
 }
 
+/// Skies are looked up: evaluating one is the cpu's.
 #[test]
-fn an_evaluated_sky() {
-    let scene = empty(Arc::new(Sky::new(demo_model(Some(1)), DMat3::IDENTITY)));
-    assert!(difference(&scene, &EXACT) < 2e-5);
-    for (identity, octaves, appearance, skip) in
-        [(true, 0, 0, true), (false, 6, 16, true), (true, 5, 3, false)]
-    {
-        let model = Model::network(network(identity, octaves, appearance, skip));
-        let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
-        let off = difference(&scene, &EXACT);
-        assert!(off < 2e-5, "{identity} {octaves} {appearance} {skip}: off by {off}");
-    }
+fn an_evaluated_sky_is_refused() {
+    let refused = try_render(&gpu(), &empty(sky()), &EXACT, &all_around()[..1]);
+    assert_eq!(refused, Err(RenderError::ExactSky { backend: "gpu" }));
 }
 
 #[test]
 fn images_and_a_background() {
-    let rgb8: Vec<u8> = (0..6 * 9 * 9 * 3).map(|i| (i * 37 % 251) as u8).collect();
+    // A colour for every direction, so that edges of faces are no seams.
+    let mut rgb8 = Vec::new();
+    for face in 0..6 {
+        for k in 0..81 {
+            let at = |k: usize| (k as f64 + 0.5) / 9.0;
+            let away = CubeMap::direction(face, [at(k % 9), at(k / 9)]).normalize();
+            rgb8.extend((away * 120.0 + 128.0).to_array().map(|c| c as u8));
+        }
+    }
     let model = Model::cube(CubeMap::from_faces(9, &rgb8).unwrap());
     let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
-    // Pixels of chance: a colour changes by its whole within 3 px.
-    assert!(difference(&scene, &RenderProfile::DEFAULT) < 1e-4);
+    assert!(difference(&scene, &RenderProfile::DEFAULT) < 5e-3);
     let background = RenderProfile { background: [0.2, 0.4, 0.9], ..RenderProfile::DEFAULT };
     assert!(difference(&Scene::default(), &background) < 1e-6);
     // One sky after another, on one device.
     let (gpu, views) = (gpu(), all_around());
     for scene in [empty(sky()), Scene::default(), scene, empty(sky())] {
-        for profile in [EXACT, RenderProfile::DEFAULT, background] {
+        for profile in [RenderProfile::DEFAULT, background] {
             let images = render(&gpu, &scene, &profile, &views);
             let truths = render(&cpu(), &scene, &profile, &views);
             for (image, truth) in images.iter().zip(&truths) {
-                assert!(max_difference(&image.rgba, &truth.rgba) < 1e-4);
+                assert!(max_difference(&image.rgba, &truth.rgba) < 5e-3);
             }
         }
     }
@@ -80,12 +81,10 @@ fn a_sky_behind_gaussians() {
     let street = Scene::from_gaussians(&street(20_000, 1, 6));
     let scene = Scene { sky: Some(sky()), ..street };
     let gpu = gpu();
-    for profile in [EXACT, RenderProfile::DEFAULT] {
-        let images = render(&gpu, &scene, &profile, &street_views());
-        let truths = render(&cpu(), &scene, &profile, &street_views());
-        for (image, truth) in images.iter().zip(&truths) {
-            agree(image, truth).unwrap();
-        }
+    let images = render(&gpu, &scene, &RenderProfile::DEFAULT, &street_views());
+    let truths = render(&cpu(), &scene, &RenderProfile::DEFAULT, &street_views());
+    for (image, truth) in images.iter().zip(&truths) {
+        agree(image, truth).unwrap();
     }
     // In parts, the same bytes.
     let small = gpu_with_limits(bindings(2 << 20));
@@ -100,8 +99,6 @@ fn a_sky_that_no_binding_holds_is_refused() {
     let refused = try_render(&small, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
     let what = "bytes of a sky in one binding of the GPU";
     assert_eq!(refused, Err(RenderError::TooMany { what, limit: 64 << 10 }));
-    // A network is small.
-    render_one(&small, &empty(sky()), &EXACT, view);
 }
 
 #[test]
@@ -123,52 +120,34 @@ fn what_cameras_make_of_colours() {
     }
 }
 
-/// What is not compiled cannot fail: the variants of `rasterize` with a sky do not parse here.
+/// What is not compiled cannot fail: the variant of `rasterize` with a sky does not parse here.
 #[test]
 fn without_a_sky_nothing_of_it_is_compiled() {
+    let broken = || {
+        let shaders = Shaders::default();
+        shaders.with_slip("rasterize_sky", "fn sky(away: Away)", "fn sky(away: Nothing)").unwrap()
+    };
     let view = all_around()[0];
-    for (stage, profile) in
-        [("rasterize_map", RenderProfile::DEFAULT), ("rasterize_network", EXACT)]
-    {
-        let other = if stage == "rasterize_map" { EXACT } else { RenderProfile::DEFAULT };
-        let broken = || {
-            let shaders = Shaders::default();
-            shaders.with_slip(stage, "fn sky(away: Away)", "fn sky(away: Nothing)").unwrap()
-        };
-        let gpu = gpu_with(broken());
-        render_one(&gpu, &Scene::default(), &profile, view);
-        render_one(&gpu, &empty(sky()), &other, view);
-        let direct = wildcity::render::gpu::Gpu::with_shaders(
-            &wildcity::render::gpu::AdapterChoice::Best,
-            0,
-            broken(),
-        );
-        let failed = try_render(&direct.unwrap(), &empty(sky()), &profile, &[view]);
-        assert!(matches!(failed, Err(RenderError::Device { .. })), "{stage}: {failed:?}");
-    }
+    render_one(&gpu_with(broken()), &Scene::default(), &RenderProfile::DEFAULT, view);
+    // Nobody listens here: this one is to fail.
+    let gpu = Gpu::with_shaders(&AdapterChoice::Best, 0, broken()).unwrap();
+    let failed = try_render(&gpu, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
+    assert!(matches!(failed, Err(RenderError::Device { .. })), "{failed:?}");
 }
 
 /// A comparison that cannot fail proves nothing.
 #[test]
 fn slips_are_caught() {
     let views = all_around();
-    for (stage, profile, part, slip) in [
-        ("rasterize_map", RenderProfile::DEFAULT, "bits.x >> 16u", "bits.x >> 17u"),
-        (
-            "rasterize_map",
-            RenderProfile::DEFAULT,
-            "select(vec4u(3u), vec4u(2u), north)",
-            "vec4u(2u)",
-        ),
-        ("rasterize_map", RenderProfile::DEFAULT, "v[k] - row[k]", "u[k] - column[k]"),
-        ("rasterize_map", RenderProfile::DEFAULT, "rows[1].y * at_px.y", "rows[1].x * at_px.y"),
-        ("rasterize_network", EXACT, "i32(cosine)) & vec4i(1)", "0) & vec4i(1)"),
-        ("rasterize_network", EXACT, "select(0u, behind.encoded, behind.skip != 0u)", "0u"),
-        ("rasterize_network", EXACT, "max(sums.low[k], vec4f(0.0))", "sums.low[k]"),
+    for (part, slip) in [
+        ("bits.x >> 16u", "bits.x >> 17u"),
+        ("select(vec4u(3u), vec4u(2u), north)", "vec4u(2u)"),
+        ("v[k] - row[k]", "u[k] - column[k]"),
+        ("rows[1].y * at_px.y", "rows[1].x * at_px.y"),
     ] {
-        let shaders = Shaders::default().with_slip(stage, part, slip);
-        let images = render(&gpu_with(shaders.expect(part)), &empty(sky()), &profile, &views);
-        let truths = render(&cpu(), &empty(sky()), &profile, &views);
+        let shaders = Shaders::default().with_slip("rasterize_sky", part, slip).expect(part);
+        let images = render(&gpu_with(shaders), &empty(sky()), &RenderProfile::DEFAULT, &views);
+        let truths = render(&cpu(), &empty(sky()), &RenderProfile::DEFAULT, &views);
         let off = images.iter().zip(&truths).map(|(a, b)| max_difference(&a.rgba, &b.rgba));
         assert!(off.fold(0.0, f32::max) > 1e-3, "{part} went unnoticed");
     }

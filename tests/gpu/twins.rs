@@ -80,7 +80,7 @@ fn layouts_are_the_same() {
             blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
         }
         Behind {
-            scale, offset, edge, octaves, encoded, width, identity, skip, sky_from_pixel,
+            scale, offset, edge, pad0, sky_from_pixel,
         }
         Seen { exposure, overlay_px, first_overlay, exposed }
         ChunkView {

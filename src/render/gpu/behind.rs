@@ -1,7 +1,7 @@
 //! What is behind the Gaussians and what cameras make of it, on the device: made with the first frame
 //! that has either.
 //!
-//! Twin of `render/cpu/{behind,appearance}.rs`; WGSL: `shaders/{behind,sky_map,sky_network,appearance}.wgsl`,
+//! Twin of `render/cpu/{behind,appearance}.rs`; WGSL: `shaders/{behind,sky_map,appearance}.wgsl`,
 //! linked into `rasterize`.
 
 use std::sync::Arc;
@@ -18,10 +18,7 @@ use super::resolve::Planes;
 use super::shaders::Shaders;
 use crate::render::{Frame, MAX_VIEWS, RenderError};
 use crate::scene::appearance::{Appearance, Exposure};
-use crate::scene::sky::{Drawn, Folded, Network};
-
-// Private memory of `shaders/sky_network.wgsl`: 256 + 256 + 3 + 6 x 10 vectors.
-const _: () = assert!(Network::MAX_WIDTH == 256 && 3 + 6 * Network::MAX_OCTAVES == 63);
+use crate::scene::sky::{CubeMap, Drawn};
 
 /// What is behind the Gaussians of the frame at hand.
 #[derive(Debug)]
@@ -31,14 +28,7 @@ pub(super) struct Behind {
     seen: Growing,
     overlays: Growing,
     /// Whose values the device holds.
-    held: Option<Drawn>,
-    map: Variant,
-    network: Variant,
-}
-
-/// `rasterize` with one kind of sky.
-#[derive(Debug, Default)]
-struct Variant {
+    held: Option<Arc<CubeMap>>,
     module: Option<ShaderModule>,
     kernels: [Option<Kernel>; Planes::VARIANTS],
 }
@@ -53,8 +43,8 @@ impl Behind {
             seen: Growing::new(device, "appearances", uniform),
             overlays: Growing::new(device, "overlays", storage),
             held: None,
-            map: Variant::default(),
-            network: Variant::default(),
+            module: None,
+            kernels: [const { None }; Planes::VARIANTS],
         }
     }
 
@@ -69,35 +59,22 @@ impl Behind {
         (drawn, axes): (Drawn, DMat3),
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
-        let limit = device.binding_bytes();
         let mut behind = layout::Behind::zeroed();
         for (slot, view) in behind.sky_from_pixel.iter_mut().zip(frame.views) {
             *slot = view.sky_from_pixel(axes).map(|[a, b, c]| [a, b, c, 0.0]);
         }
-        let words: Vec<u32>;
-        let values: &[u8] = match &drawn {
-            Drawn::Map(map) => {
-                let [scale, offset] = map.look_up();
-                (behind.scale, behind.offset) = (scale as f32, offset as f32);
-                behind.edge = map.edge() as u32;
-                bytemuck::cast_slice(map.texels())
-            }
-            Drawn::Exact(network) => {
-                let [octaves, encoded, width] = network.sizes().map(|size| size as u32);
-                (behind.octaves, behind.encoded, behind.width) = (octaves, encoded, width);
-                behind.identity = network.identity().into();
-                behind.skip = network.skip().into();
-                words = network.values().map(f32::to_bits).collect();
-                bytemuck::cast_slice(&words)
-            }
-        };
-        if values.len() as u64 > limit {
+        let Drawn::Map(map) = drawn else { return Err(RenderError::ExactSky { backend: "gpu" }) };
+        let [scale, offset] = map.look_up();
+        (behind.scale, behind.offset) = (scale as f32, offset as f32);
+        behind.edge = map.edge() as u32;
+        let limit = device.binding_bytes();
+        if map.bytes() as u64 > limit {
             let what = "bytes of a sky in one binding of the GPU";
             return Err(RenderError::TooMany { what, limit });
         }
-        if !self.holds(&drawn) {
-            self.values.fill(device, values);
-            self.held = Some(drawn);
+        if !self.held.as_ref().is_some_and(|held| Arc::ptr_eq(held, &map)) {
+            self.values.fill(device, bytemuck::cast_slice(map.texels()));
+            self.held = Some(map);
         }
         self.views.fill(device, bytemuck::bytes_of(&behind));
         self.see(device, appearances)
@@ -130,16 +107,6 @@ impl Behind {
         Ok(())
     }
 
-    fn holds(&self, drawn: &Drawn) -> bool {
-        match (&self.held, drawn) {
-            (Some(Drawn::Map(held)), Drawn::Map(map)) => Arc::ptr_eq(held, map),
-            (Some(Drawn::Exact(held)), Drawn::Exact(network)) => {
-                Arc::<Folded>::ptr_eq(held, network)
-            }
-            _ => false,
-        }
-    }
-
     /// The kernel that draws it, and its resources beside those of `rasterize`.
     pub(super) fn kernel(
         &mut self,
@@ -147,12 +114,8 @@ impl Behind {
         shaders: &Shaders,
         planes: Planes,
     ) -> (&Kernel, [(u32, BindingResource<'_>); 4]) {
-        let (variant, stage) = match &self.held {
-            Some(Drawn::Exact(_)) => (&mut self.network, "rasterize_network"),
-            _ => (&mut self.map, "rasterize_map"),
-        };
-        let module = variant.module.get_or_insert_with(|| module(device, shaders, stage));
-        let kernel = variant.kernels[planes.variant()]
+        let module = self.module.get_or_insert_with(|| module(device, shaders, "rasterize_sky"));
+        let kernel = self.kernels[planes.variant()]
             .get_or_insert_with(|| Kernel::new(device, module, "main", &planes.constants()));
         let resources = [
             (8, self.views.bind()),

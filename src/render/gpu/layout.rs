@@ -141,26 +141,18 @@ impl Frame {
     }
 }
 
-/// What is behind the Gaussians of all views (800 bytes).
+/// What is behind the Gaussians of all views (784 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Behind {
-    /// Of a cube map: a face's width in values, ...
+    /// A face's width in values, ...
     pub scale: f32,
     /// ... where its first one lies, ...
     pub offset: f32,
     /// ... and values along an edge.
     pub edge: u32,
-    /// Of a network: octaves of sines and cosines, ...
-    pub octaves: u32,
-    /// ... values of a direction and its octaves, ...
-    pub encoded: u32,
-    /// ... outputs of a hidden layer, ...
-    pub width: u32,
-    /// ... 1 if it reads the direction itself, too, ...
-    pub identity: u32,
-    /// ... and 1 if the second layer reads the input again.
-    pub skip: u32,
+    /// Zero.
+    pub pad0: u32,
     /// By view, rows that take `(x, y, 1)` in pixels to a direction of any length.
     pub sky_from_pixel: [[[f32; 4]; 3]; MAX_VIEWS],
 }

@@ -1,6 +1,6 @@
 //! The WGSL of each stage, with its `#import NAME` lines replaced by `shaders/shared/NAME.wgsl`
 //! (`shaders/resolve.wgsl` for `resolve`, and likewise the skies). That one directive is the whole
-//! preprocessor; `#import SKY` in `rasterize` stands for one of three, each a variant of the stage.
+//! preprocessor; `#import SKY` in `rasterize` stands for one of two, each a variant of the stage.
 
 /// The linked sources of all stages.
 #[derive(Clone, Debug)]
@@ -22,11 +22,7 @@ impl Default for Shaders {
         ];
         let mut stages = stages.map(|(name, source)| (name, link(source))).to_vec();
         let rasterize = include_str!("../../../shaders/rasterize.wgsl");
-        for (name, sky) in [
-            ("rasterize", "plain"),
-            ("rasterize_map", "sky_map"),
-            ("rasterize_network", "sky_network"),
-        ] {
+        for (name, sky) in [("rasterize", "plain"), ("rasterize_sky", "sky_map")] {
             stages.push((name, link(&rasterize.replace("#import SKY", &format!("#import {sky}")))));
         }
         Self { stages }
@@ -66,7 +62,6 @@ const SHARED: &[(&str, &str)] = &[
     ("behind", include_str!("../../../shaders/behind.wgsl")),
     ("resolve", include_str!("../../../shaders/resolve.wgsl")),
     ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
-    ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
 ];
 
 fn link(stage: &str) -> String {

@@ -6,8 +6,8 @@
 //! there and by `a / 2` in the middle (a below a half): at most twice what is seen. So twice the largest
 //! difference is the error that is stated, and rounding to 16 bits on top.
 //!
-//! The first grid has 129 values along an edge, 0.9° or less apart: the finest sine of seven octaves has
-//! a period of 5.6°, so that nothing that it can draw lies unseen between two values.
+//! The first grid has 129 values along an edge, 0.9° or less apart, and is compared with one of 0.45°: the
+//! finest sine of seven octaves has a period of 5.6°, so that nothing that it draws lies unseen between.
 
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 use rayon::prelude::*;

@@ -84,29 +84,6 @@ impl Folded {
         }
     }
 
-    /// Octaves, values of an encoded direction, and outputs of a hidden layer: a multiple of 8.
-    pub fn sizes(&self) -> [usize; 3] {
-        [self.octaves, self.encoded, self.width]
-    }
-
-    /// Whether the direction itself is read, too.
-    pub fn identity(&self) -> bool {
-        self.identity
-    }
-
-    /// Whether the second layer reads the input again.
-    pub fn skip(&self) -> bool {
-        self.skip
-    }
-
-    /// Layer by layer, and for each eight outputs of one: eight biases, and eight weights per input.
-    pub fn values(&self) -> impl Iterator<Item = f32> + '_ {
-        self.layers.iter().flat_map(|layer| {
-            let groups = layer.weight.chunks_exact(layer.inputs).zip(&layer.bias);
-            groups.flat_map(|(weights, bias)| bias.iter().chain(weights.as_flattened()).copied())
-        })
-    }
-
     /// Room for evaluations.
     pub fn scratch(&self) -> Scratch {
         let zero = |len| vec![Lanes([0.0; LANES]); len];
