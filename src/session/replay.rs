@@ -1,4 +1,4 @@
-//! Replay: renders a recorded episode again and compares every image.
+//! Replay: drives and renders a recorded episode again, and compares every pose and image.
 
 use std::fs::File;
 use std::io::{self, BufRead as _, BufReader, Read as _};
@@ -10,10 +10,12 @@ use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::RenderProfile;
 use crate::scene::rig::{RigCamera, RigError};
+use crate::sim::{EgoError, Ground};
 
 use super::record::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,
 };
+use super::retrace::{Retrace, StrayedStep};
 use super::{Summary, observation};
 
 /// A recorded episode.
@@ -36,6 +38,8 @@ pub struct Report {
     pub images: u64,
     /// What is not as it was when the episode was recorded.
     pub changes: Vec<Change>,
+    /// The first step whose command does not lead where it did.
+    pub strayed: Option<StrayedStep>,
     /// The first image that differs.
     pub difference: Option<Difference>,
 }
@@ -45,7 +49,7 @@ pub struct Report {
 pub enum Extent {
     /// To the end, whatever differs.
     Whole,
-    /// To the first image that differs.
+    /// To the first image that differs, or the first step that strays.
     FirstDifference,
 }
 
@@ -131,6 +135,14 @@ pub enum ReplayError {
         /// Why.
         cause: ResidencyError,
     },
+    /// What is on record is no command for the episode's ego.
+    #[error("step {step}: {cause}")]
+    Ego {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: EgoError,
+    },
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
     Render {
@@ -208,11 +220,11 @@ impl Recording {
         Ok(Self { header: header.ok_or_else(empty)?, frames, versions, end })
     }
 
-    /// Renders the episode again, from the versions of its twin that `open` gives. Each image is
+    /// Drives and renders the episode again, on the versions of its twin that `open` gives. Each image is
     /// shown to `visit` before it is compared.
     ///
     /// # Errors
-    /// A version cannot be had, the backend refuses a frame, or `visit` fails.
+    /// A version cannot be had, a command is none, the backend refuses a frame, or `visit` fails.
     pub fn replay(
         &self,
         open: &mut dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError>,
@@ -222,8 +234,9 @@ impl Recording {
     ) -> Result<Report, ReplayError> {
         let mut resident = open(self.header.version)?;
         let mut profile = &self.header.profile;
-        let mut report =
-            Report { images: 0, changes: self.changes(&resident, backend), difference: None };
+        let changes = self.changes(&resident, backend);
+        let mut report = Report { images: 0, changes, strayed: None, difference: None };
+        let mut retrace = Retrace::new(&self.header);
         let mut switches = self.versions.iter().peekable();
         let mut lines_before = 2;
         let cameras = &self.header.rig.cameras;
@@ -236,6 +249,16 @@ impl Recording {
                 profile = &to.profile;
                 let recorded = (&*to.version_hash, &*to.profile_hash);
                 report.changes.extend(scene_changes(recorded, &resident, profile));
+            }
+            let ground = Ground::of(&resident.version.manifest.trajectories);
+            let strayed = retrace
+                .follow(frame, index + lines_before, &ground)
+                .map_err(|cause| ReplayError::Ego { step: frame.step, cause })?;
+            if report.strayed.is_none() && strayed.is_some() {
+                report.strayed = strayed;
+                if extent == Extent::FirstDifference {
+                    return Ok(report);
+                }
             }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {

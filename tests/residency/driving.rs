@@ -60,6 +60,7 @@ impl Bench {
             rig: Some(RigChoice::Full(rig())),
             profile: ProfileChanges::default(),
             outputs,
+            dynamics: wildcity::sim::Dynamics::default(),
             dt_us: None,
             deadline,
         };

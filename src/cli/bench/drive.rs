@@ -18,6 +18,7 @@ use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
 use crate::scene::{Manifest, ProfileChanges, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use crate::sim::Dynamics;
 
 use report::{Report, Row};
 
@@ -194,6 +195,7 @@ impl Drive {
                 depth: false,
                 opacity: false,
             },
+            dynamics: Dynamics::default(),
             dt_us: None,
             deadline: None,
         }

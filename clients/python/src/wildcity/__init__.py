@@ -19,7 +19,9 @@ from .errors import (
 )
 from .observation import Observation, View
 from .protocol import (
+    Action,
     Camera,
+    Dynamics,
     Ego,
     ImageInfo,
     Metadata,
@@ -31,6 +33,8 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    TimedPose,
+    Trajectory,
     TrajectoryInfo,
     TwinInfo,
     Welcome,
@@ -41,12 +45,14 @@ from .sync import Client, Session, connect
 __version__ = _version("wildcity")
 
 __all__ = [
+    "Action",
     "BadFrame",
     "Camera",
     "Client",
     "Code",
     "ConnectFailed",
     "Disconnected",
+    "Dynamics",
     "Ego",
     "ImageInfo",
     "Metadata",
@@ -66,6 +72,8 @@ __all__ = [
     "Summary",
     "Switched",
     "TimedOut",
+    "TimedPose",
+    "Trajectory",
     "TrajectoryInfo",
     "TwinInfo",
     "View",

@@ -20,7 +20,10 @@ from .observation import Observation
 from .protocol import (
     OBSERVATION_BYTES,
     PROTOCOL,
+    Action,
     Closed,
+    Dynamics,
+    Model,
     Ok,
     Opened,
     Outputs,
@@ -31,6 +34,7 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    Trajectory,
     Welcome,
     decode_answer,
     encode,
@@ -72,6 +76,7 @@ class Conversation:
         rig: str | Rig | None = None,
         profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
+        dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
     ) -> Exchange[Opened]:
@@ -82,6 +87,7 @@ class Conversation:
             "start": _start(start),
             "rig": encode(rig),
             "profile": None if profile is None else dict(profile),
+            "dynamics": encode(dynamics),
             "dt_us": dt_us,
             "deadline_ms": deadline_ms,
         }
@@ -91,9 +97,9 @@ class Conversation:
         self.session = opened.session
         return opened
 
-    def step(self, pose: Pose, terminate: bool) -> Exchange[Observation]:
+    def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
         """Moves."""
-        fields = {"pose": encode(pose), "terminate": terminate}
+        fields = {**_movement(movement), "terminate": terminate}
         return (yield from self._next("step", Observation, fields))
 
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
@@ -196,6 +202,12 @@ def translated(error: BaseException, timeout: float) -> WildCityError | None:
     if isinstance(error, (ConnectionClosed, OSError)):
         return Disconnected(str(error))
     return None
+
+
+def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
+    if isinstance(movement, Trajectory):
+        return {"trajectory": encode(movement.poses)}
+    return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
 
 
 def _start(start: Pose | Station | None) -> Any:
