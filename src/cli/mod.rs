@@ -15,9 +15,11 @@ mod progress;
 mod push;
 mod render;
 mod replay;
+mod report;
 mod route;
 mod scene_source;
 mod serve;
+mod stress;
 mod time;
 mod twin;
 
@@ -45,6 +47,8 @@ enum Command {
     Route(route::Route),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
+    Stress(stress::Stress),
+    Report(report::Command),
     Devices(devices::Devices),
 }
 
@@ -64,6 +68,8 @@ pub fn main() -> ExitCode {
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
+        Command::Stress(command) => command.run(),
+        Command::Report(command) => command.run(),
         Command::Devices(command) => command.run(),
     };
     match result {

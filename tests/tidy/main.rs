@@ -34,7 +34,8 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("flate2", &["ingest"]),
     ("zip", &["ingest/archive.rs"]),
     ("image_webp", &["ingest/sog"]),
-    ("data_encoding", &["ingest/gltf", "server/uploads.rs"]),
+    ("data_encoding", &["ingest/gltf", "report/page.rs", "server/uploads.rs"]),
+    ("plotters", &["report/plots.rs"]),
 ];
 
 /// Who may touch files: those of a twin only `store/local`; the others scenes and settings of the user,
