@@ -149,7 +149,8 @@ fn project_shape(own: Geometry, view: ChunkView, decided: bool) -> Projected {
         return Projected();
     }
 
-    // V = J W R S, with J at the clamped slope, and no wider than f32 can square twice.
+    // V = J W R S, with J at the clamped slope. What is wider than f32 can square twice is computed in a
+    // larger unit than the pixel, blur and all.
     let slope = vec2f(x, y) / z;
     let mean_px = view.focal_px * slope + view.center_px;
     let clamped = clamp(slope, view.slope_min, view.slope_max);
@@ -161,9 +162,10 @@ fn project_shape(own: Geometry, view: ChunkView, decided: bool) -> Projected {
     var v0 = ((right - clamped.x * forward) * px_per_m.x) * rotation * own.scale_m;
     var v1 = ((down - clamped.y * forward) * px_per_m.y) * rotation * own.scale_m;
     let widest = max(max_component(abs(v0)), max_component(abs(v1)));
-    let shrink = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
-    v0 *= shrink;
-    v1 *= shrink;
+    let per_px = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
+    v0 *= per_px;
+    v1 *= per_px;
+    let blur = frame.blur_px2 * per_px * per_px;
 
     // The covariance, its determinant (a sum of positives), and the factor of its inverse.
     let xx = dot(v0, v0);
@@ -171,14 +173,14 @@ fn project_shape(own: Geometry, view: ChunkView, decided: bool) -> Projected {
     let b = dot(v0, v1);
     let minors = cross(v0, v1);
     let det_before = dot(minors, minors);
-    let det = frame.blur_px2 * (xx + yy + frame.blur_px2) + det_before;
-    let a = xx + frame.blur_px2;
-    let c = yy + frame.blur_px2;
+    let det = blur * (xx + yy + blur) + det_before;
+    let a = xx + blur;
+    let c = yy + blur;
     var log2_opacity = own.log2_opacity;
     if frame.antialiased != 0u {
         log2_opacity += 0.5 * log2(max(det_before / det, 0.005 * 0.005));
     }
-    let unit = 0.8493218; // sqrt(log2(e) / 2)
+    let unit = 0.8493218 * per_px; // sqrt(log2(e) / 2)
     let root_c = sqrt(c);
     let root_det = sqrt(det);
     let l2 = unit / root_c;

@@ -233,6 +233,15 @@ pub const GC_GRACE: &str = "24h";
 /// Largest rig or trajectory file: what fits a manifest.
 pub const SETTINGS_FILE_BYTES: u64 = MANIFEST_BYTES;
 
+/// Largest profile file: nine fields of at most 40 B.
+pub const PROFILE_FILE_BYTES: u64 = 64 << 10;
+
+/// Most stations of a report: with four offsets and six cameras, 1,536 windows of the reference.
+pub const REPORT_STATIONS: i64 = 64;
+
+/// Largest window of a report, in pixels: with the most stations, 100 million pixels of 40 B.
+pub const REPORT_WINDOW_PX: i64 = 256;
+
 /// Largest camera list: 300 B per camera, so 50,000 cameras.
 pub const CAMERA_LIST_BYTES: u64 = 16 << 20;
 

@@ -14,10 +14,11 @@
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`sim`] | what moves: the ego | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render, sim |
+//! | [`report`] | error against run time, and what happens at the extremes | geometry, scene, generate, residency, render, session |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, sim, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
-//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, sim, session, server, client |
+//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, sim, session, report, server, client |
 //!
 //! Data goes one way: file, ingest, store, residency, render, session, server, agent; an agent's
 //! pose or action goes server, session, sim, session. Nothing downstream calls upstream.
@@ -45,6 +46,7 @@ pub mod geometry;
 pub mod ingest;
 pub mod protocol;
 pub mod render;
+pub mod report;
 pub mod residency;
 pub mod scene;
 pub mod server;

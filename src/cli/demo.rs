@@ -15,9 +15,9 @@ use crate::client::{Client, Observation, Open, Pose};
 use crate::generate::{self, StreetSettings};
 use crate::ingest::sky;
 use crate::scene::manifest::Provenance;
-use crate::scene::{Rig, Trajectory};
+use crate::scene::{ProfileChanges, Record, Rig, Trajectory};
 use crate::server::{self, Limits};
-use crate::store::{Catalog, NewSky, NewVersion, SkyBytes, StoreError, Version};
+use crate::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -53,7 +53,9 @@ Examples:
   wildcity serve            (then the twin \"demo\" can be opened by any agent)";
 
 /// Name of the demo twin.
-const TWIN: &str = "demo";
+pub(super) const TWIN: &str = "demo";
+/// The same, of `wildcity report`.
+const EXACT_TWIN: &str = "demo-f32";
 /// How the source of every revision of it begins.
 const STREET: &str = "street ";
 /// How fast the agent drives, in m/s; a step takes 0.1 s.
@@ -64,7 +66,7 @@ const MOSAIC_STEPS: u64 = 10;
 impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
-        let version = demo_twin(&twins)?;
+        let version = demo_twin(&twins, TWIN, Storage::default())?;
         output::make_dir(&self.out)?;
         let config = server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
@@ -74,6 +76,7 @@ impl Demo {
             uploads: self.out.join("uploads"),
             tokens: None,
             backend: Arc::from(self.engine.backend()?),
+            profile: ProfileChanges::default(),
             limits: Limits::default(),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
@@ -183,15 +186,20 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
     Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
 }
 
+/// The demo street in the record that leaves nothing out, under a name of its own.
+pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
+    demo_twin(twins, EXACT_TWIN, Storage { record: Record::F32, ..Storage::default() })
+}
+
 /// The demo twin in the user's store: built on first use, and again after the generator changed or
 /// the disk lost some of it.
-fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
+fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = generate::REVISION;
     let settings_json = serde_json::to_string(&settings)?;
     let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
-    let why = match built(&catalog, &provenance)? {
+    let why = match built(&catalog, name, &provenance)? {
         Ok(version) => return Ok(version),
         Err(why) => why,
     };
@@ -208,7 +216,8 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
                 image: None,
                 sky_from_world: DMat3::IDENTITY,
             })),
-            ..NewVersion::of(TWIN, &street.gaussians, provenance)
+            storage,
+            ..NewVersion::of(name, &street.gaussians, provenance)
         },
         &mut progress::show(&bar),
     )?;
@@ -222,10 +231,11 @@ fn demo_twin(twins: &Path) -> anyhow::Result<Version> {
 /// The name belongs to a twin that somebody imported: it is not ours to add a version to.
 fn built(
     catalog: &Catalog,
+    name: &str,
     provenance: &Provenance,
 ) -> anyhow::Result<Result<Version, &'static str>> {
     const DAMAGED: &str = "again, since it is damaged";
-    let version = match catalog.version(TWIN, None) {
+    let version = match catalog.version(name, None) {
         Ok(version) => version,
         Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
         Err(StoreError::Damaged { .. }) => return Ok(Err(DAMAGED)),
@@ -238,7 +248,7 @@ fn built(
     let found = &version.manifest.provenance;
     anyhow::ensure!(
         found.source.starts_with(STREET),
-        "twin {TWIN:?} in {} is not the demo street (its source is {:?}): give --twins another \
+        "twin {name:?} in {} is not the demo street (its source is {:?}): give --twins another \
          directory, or import yours under another name",
         catalog.dir().display(),
         found.source,
@@ -246,13 +256,13 @@ fn built(
     if found != provenance {
         return Ok(Err("anew, as the generator changed"));
     }
-    Ok(if is_sound(catalog, &version)? { Ok(version) } else { Err(DAMAGED) })
+    Ok(if is_sound(catalog, name, &version)? { Ok(version) } else { Err(DAMAGED) })
 }
 
 /// Whether every chunk of a version is what was committed; older versions may be as they like.
-fn is_sound(catalog: &Catalog, version: &Version) -> anyhow::Result<bool> {
+fn is_sound(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<bool> {
     let bar = progress::bytes("checking");
-    let verified = catalog.verify(TWIN, &mut progress::show(&bar))?;
+    let verified = catalog.verify(name, &mut progress::show(&bar))?;
     bar.finish_and_clear();
     let chunks = &version.manifest.chunks;
     let mut damaged = verified.damaged.iter().map(|damage| &damage.object);

@@ -15,10 +15,12 @@ mod progress;
 mod push;
 mod render;
 mod replay;
+mod report;
 mod route;
 mod scene_source;
 mod serve;
 mod sky_source;
+mod stress;
 mod time;
 mod twin;
 
@@ -46,6 +48,8 @@ enum Command {
     Route(route::Route),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
+    Stress(stress::Stress),
+    Report(report::Command),
     Devices(devices::Devices),
 }
 
@@ -65,6 +69,8 @@ pub fn main() -> ExitCode {
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
+        Command::Stress(command) => command.run(),
+        Command::Report(command) => command.run(),
         Command::Devices(command) => command.run(),
     };
     match result {

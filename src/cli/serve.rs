@@ -10,6 +10,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::config;
 use crate::ingest;
+use crate::scene::{ProfileChanges, RenderProfile};
 use crate::server::{self, Limits, Tokens};
 
 use super::places::{Episodes, Twins, Uploads};
@@ -44,6 +45,11 @@ pub(super) struct Serve {
     /// whatever else fits is kept for the frames to come.
     #[arg(long, value_name = "N", value_parser = gib)]
     memory_gib: Option<f64>,
+
+    /// JSON file of fields of the render profile that every session gets instead of its twin's, as
+    /// `wildcity report` writes it: {"tau_px": 2.0}. A session may ask for others.
+    #[arg(long, value_name = "FILE")]
+    profile: Option<PathBuf>,
 
     #[command(flatten)]
     engine: Engine,
@@ -96,6 +102,7 @@ impl Serve {
             uploads: self.uploads.dir()?,
             tokens,
             backend: Arc::from(self.engine.backend()?),
+            profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             limits: Limits {
                 resident_bytes: self.memory_gib.map(bytes_of_gib),
                 ..Limits::default()
@@ -123,6 +130,15 @@ fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
     let cannot = || format!("--tokens {}", path.display());
     let text = ingest::read_whole(path, config::TOKENS_FILE_BYTES).with_context(cannot)?;
     Tokens::parse(&text).with_context(cannot)
+}
+
+/// A profile file, which must fit a profile: it need not fit every twin's.
+fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
+    let cannot = || format!("--profile {}", path.display());
+    let text = ingest::read_whole(path, config::PROFILE_FILE_BYTES).with_context(cannot)?;
+    let changes: ProfileChanges = serde_json::from_slice(&text).with_context(cannot)?;
+    changes.apply(RenderProfile::default()).with_context(cannot)?;
+    Ok(changes)
 }
 
 fn address(text: &str) -> Result<SocketAddr, String> {

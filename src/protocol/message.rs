@@ -184,6 +184,10 @@ pub struct Open {
     /// Cameras; the twin's rig, or the preset `vehicle6`, if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<RigChoice>,
+    /// Fields of the twin's render profile that this session wants otherwise, as `{"tau_px": 2.0}`; the
+    /// server's own changes, if it has any, for those that are absent.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    pub profile: serde_json::Map<String, serde_json::Value>,
     /// What each observation holds.
     #[serde(default)]
     pub outputs: Outputs,
@@ -209,6 +213,7 @@ impl Open {
             seed: 0,
             start: None,
             rig: None,
+            profile: serde_json::Map::new(),
             outputs: Outputs::default(),
             dynamics: None,
             dt_us: None,

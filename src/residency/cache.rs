@@ -55,7 +55,7 @@ pub struct Resident {
     /// All levels of all of it, in bytes.
     whole_bytes: u64,
     /// The most that a frame needs, by lens: looking for it takes a while.
-    worst: Mutex<Vec<(Lens, u64)>>,
+    worst: Mutex<Vec<(Looks, u64)>>,
 }
 
 /// A frame that waits for what it needs. Dropped, it waits no more.
@@ -67,6 +67,9 @@ pub struct Ticket {
     needed: usize,
     asked: Instant,
 }
+
+/// A lens, and the tau_px and reach_m that it is drawn with.
+type Looks = (Lens, f64, Option<f64>);
 
 impl Cache {
     /// Nothing in memory yet, and room for three quarters of the machine's memory.
@@ -234,20 +237,38 @@ impl Resident {
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
     pub fn reserve(self: &Arc<Self>, lens: Lens) -> Result<Reservation, ResidencyError> {
-        Reservation::new(self.clone(), self.worst_bytes(lens))
+        self.reserve_with(lens, &self.version.manifest.profile)
+    }
+
+    /// The same for frames that are drawn with another profile than the version's.
+    ///
+    /// # Errors
+    /// As [`Resident::reserve`].
+    pub fn reserve_with(
+        self: &Arc<Self>,
+        lens: Lens,
+        profile: &RenderProfile,
+    ) -> Result<Reservation, ResidencyError> {
+        Reservation::new(self.clone(), self.worst_bytes_with(lens, profile))
     }
 
     /// The most that a frame of a rig anywhere in the twin needs, in bytes.
     pub fn worst_bytes(&self, lens: Lens) -> u64 {
-        if let Some((_, bytes)) = lock(&self.worst).iter().find(|(known, _)| *known == lens) {
+        self.worst_bytes_with(lens, &self.version.manifest.profile)
+    }
+
+    /// The same of frames that are drawn with another profile than the version's.
+    pub fn worst_bytes_with(&self, lens: Lens, profile: &RenderProfile) -> u64 {
+        // What of a profile decides how much is drawn.
+        let looks = (lens, profile.tau_px, profile.reach_m);
+        if let Some((_, bytes)) = lock(&self.worst).iter().find(|(known, _)| *known == looks) {
             return *bytes;
         }
-        let manifest = &self.version.manifest;
         let sky_bytes = self.sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
-        let bytes = sky_bytes + worst_bytes(&self.index, manifest, lens, &manifest.profile);
+        let bytes = sky_bytes + worst_bytes(&self.index, &self.version.manifest, lens, profile);
         let mut worst = lock(&self.worst);
         worst.truncate(crate::config::REMEMBERED_LENSES - 1);
-        worst.insert(0, (lens, bytes));
+        worst.insert(0, (looks, bytes));
         bytes
     }
 

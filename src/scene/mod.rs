@@ -16,7 +16,7 @@ pub mod trajectory;
 pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;
-pub use profile::RenderProfile;
+pub use profile::{ProfileChanges, RenderProfile};
 pub use record::Record;
 pub use rig::Rig;
 pub use sky::Sky;

@@ -1,6 +1,7 @@
 //! The render profile: how the twin's trainer rendered, which every backend must repeat.
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
 /// Constants of the image formation that differ between trainers (gsplat, INRIA, brush, ...).
 ///
@@ -43,6 +44,11 @@ impl Default for RenderProfile {
     }
 }
 
+/// Fields of a profile that somebody wants otherwise, by their names: JSON as `{"tau_px": 2.0}`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct ProfileChanges(Map<String, Value>);
+
 /// Why a profile was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ProfileError {
@@ -55,6 +61,14 @@ pub enum ProfileError {
         value: f64,
         /// What must hold instead.
         must: &'static str,
+    },
+    /// Changes are not what they should be.
+    #[error("cannot read profile field {field}: {reason}; the fields are {}", RenderProfile::KEYS.join(", "))]
+    Change {
+        /// The field.
+        field: String,
+        /// What is wrong with it.
+        reason: String,
     },
     /// `key=value` did not parse.
     #[error("cannot read profile setting {setting:?}: {reason}; the keys are {}", RenderProfile::KEYS.join(", "))]
@@ -190,9 +204,62 @@ impl RenderProfile {
     }
 }
 
+impl ProfileChanges {
+    /// What a JSON object says, which need not fit a profile yet.
+    pub fn new(fields: Map<String, Value>) -> Self {
+        Self(fields)
+    }
+
+    /// A profile with the changes.
+    ///
+    /// # Errors
+    /// Names the field that does not exist, does not parse, or is out of range.
+    pub fn apply(&self, profile: RenderProfile) -> Result<RenderProfile, ProfileError> {
+        let mut changed = profile;
+        for (field, value) in &self.0 {
+            let bad = |reason: String| ProfileError::Change { field: field.clone(), reason };
+            let whole = serde_json::to_value(changed).map_err(|e| bad(e.to_string()))?;
+            let Value::Object(mut fields) = whole else {
+                return Err(bad("the profile is no object".to_owned()));
+            };
+            fields.insert(field.clone(), value.clone());
+            let whole = serde_json::from_value(Value::Object(fields));
+            changed = whole.map_err(|e| bad(e.to_string()))?;
+        }
+        changed.check()?;
+        Ok(changed)
+    }
+
+    /// These, and what else others want.
+    pub fn or(&self, others: &Self) -> Self {
+        let mut fields = others.0.clone();
+        fields.extend(self.0.clone());
+        Self(fields)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn changes_are_of_named_fields_and_are_checked() {
+        let changes = |json: &str| serde_json::from_str::<ProfileChanges>(json).unwrap();
+        let own = RenderProfile { near: 0.2, ..Default::default() };
+        let both = changes(r#"{"tau_px": 2}"#).or(&changes(r#"{"tau_px": 4, "reach_m": 90.0}"#));
+        let changed = both.apply(own).unwrap();
+        assert_eq!(changed, RenderProfile { tau_px: 2.0, reach_m: Some(90.0), ..own });
+        assert_eq!(changes(r#"{"reach_m": null}"#).apply(changed).unwrap().reach_m, None);
+        for (bad, named) in [
+            (r#"{"fov": 1}"#, "fov"),
+            (r#"{"tau_px": "2"}"#, "tau_px"),
+            (r#"{"tau_px": -1}"#, "tau_px"),
+            (r#"{"near": 5.0, "far": 4.0}"#, "far"),
+        ] {
+            let said = changes(bad).apply(own).unwrap_err().to_string();
+            assert!(said.contains(named), "{bad}: {said}");
+        }
+    }
 
     #[test]
     fn settings_change_one_field_and_are_checked() {

@@ -157,7 +157,8 @@ impl Connection {
             Command::Open { .. } | Command::Resume { .. } if self.place.is_some() => {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, opening } => {
+            Command::Open { name, mut opening } => {
+                opening.profile = opening.profile.or(&self.server.profile);
                 self.grant.reaches(&opening.twin)?;
                 let name =
                     name.unwrap_or_else(|| format!("s-{}", uuid::Uuid::now_v7().as_simple()));

@@ -46,6 +46,7 @@ use tokio::sync::Semaphore;
 use crate::config;
 use crate::render::Backend;
 use crate::residency::Cache;
+use crate::scene::ProfileChanges;
 use crate::session::{Engine, EngineSettings, SessionError};
 use crate::store::{CacheSettings, Catalog, StoreError};
 
@@ -72,6 +73,8 @@ pub struct Config {
     pub tokens: Option<Tokens>,
     /// What renders.
     pub backend: Arc<dyn Backend>,
+    /// What of every twin's render profile is otherwise, unless a session says more.
+    pub profile: ProfileChanges,
     /// How long the server waits, and for how many.
     pub limits: Limits,
 }
@@ -145,7 +148,8 @@ pub enum ServerError {
 /// The address is not a loopback address and there are no tokens, or it cannot be used, or a directory
 /// cannot. One for uploads that cannot be used is logged: whoever uploads is told.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, cache, episodes, uploads, tokens, backend, limits } = config;
+    let Config { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
+        config;
     if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
@@ -171,6 +175,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         agents: Arc::new(Semaphore::new(limits.connections)),
         stopping,
         limits,
+        profile,
         tokens,
         spool,
         pushes: push::Pushes::new(),
@@ -187,6 +192,7 @@ struct Server {
     /// Becomes true when the server stops.
     stopping: tokio::sync::watch::Receiver<bool>,
     limits: Limits,
+    profile: ProfileChanges,
     tokens: Option<Tokens>,
     /// Or why there is none.
     spool: Result<Arc<Spool>, String>,
@@ -226,7 +232,8 @@ impl Default for Limits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, cache, episodes, uploads, tokens, backend, limits } = self;
+        let Self { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
+            self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
@@ -235,6 +242,7 @@ impl std::fmt::Debug for Config {
             .field("uploads", uploads)
             .field("tokens", &tokens.is_some())
             .field("backend", &backend.name())
+            .field("profile", profile)
             .field("limits", limits)
             .finish()
     }

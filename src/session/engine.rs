@@ -15,6 +15,7 @@ use crate::render::Backend;
 use crate::residency::{
     Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
 };
+use crate::scene::RenderProfile;
 use crate::store::Catalog;
 
 use super::SessionError;
@@ -229,8 +230,9 @@ impl Engine {
     pub(super) async fn reserve(
         resident: Arc<Resident>,
         lens: Lens,
+        profile: RenderProfile,
     ) -> Result<Reservation, SessionError> {
-        let reserved = tokio::task::spawn_blocking(move || resident.reserve(lens));
+        let reserved = tokio::task::spawn_blocking(move || resident.reserve_with(lens, &profile));
         Ok(reserved.await.map_err(|_| SessionError::Crashed)??)
     }
 
@@ -238,8 +240,9 @@ impl Engine {
     pub(super) async fn worst_bytes(
         resident: Arc<Resident>,
         lens: Lens,
+        profile: RenderProfile,
     ) -> Result<u64, SessionError> {
-        let sought = tokio::task::spawn_blocking(move || resident.worst_bytes(lens));
+        let sought = tokio::task::spawn_blocking(move || resident.worst_bytes_with(lens, &profile));
         sought.await.map_err(|_| SessionError::Crashed)
     }
 

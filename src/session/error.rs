@@ -2,6 +2,7 @@
 
 use crate::render::RenderError;
 use crate::residency::ResidencyError;
+use crate::scene::profile::ProfileError;
 use crate::sim::EgoError;
 use crate::store::StoreError;
 
@@ -58,6 +59,9 @@ pub enum SessionError {
         /// What it is, and what is accepted.
         must: String,
     },
+    /// The profile that is asked for cannot be had.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
     /// The images of one answer have too many pixels.
     #[error("the answer has {pixels} pixels; at most {limit} fit: ask for fewer or smaller images")]
     AnswerTooLarge {

@@ -31,6 +31,7 @@ use crate::geometry::Pose;
 use crate::render::View;
 use crate::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
 use crate::scene::rig::{Rig, RigCamera};
+use crate::scene::{ProfileChanges, RenderProfile};
 use crate::sim::{Command, Dynamics, Ego, Ground};
 
 pub use buffer::Buffer;
@@ -66,6 +67,9 @@ pub struct Session {
     reservation: Reservation,
     lookout: Lookout,
     name: String,
+    /// What of every version's profile is otherwise, and the profile that comes of it.
+    changes: ProfileChanges,
+    profile: RenderProfile,
     profile_hash: blake3::Hash,
     rig_name: String,
     layout: Arc<Layout>,
@@ -128,9 +132,13 @@ impl Session {
         let mut logs = manifest.trajectories.iter();
         let route = logs.find(|log| named.is_none_or(|name| log.name == *name));
         let route = route.map(|log| Arc::new(Route::new(log)));
-        let reservation = Engine::reserve(resident.clone(), lens).await?;
+        let changes = opening.profile;
+        let profile = changes.apply(manifest.profile)?;
+        let reservation = Engine::reserve(resident.clone(), lens, profile).await?;
         let session = Self {
-            profile_hash: record::profile_hash(&manifest.profile),
+            profile_hash: record::profile_hash(&profile),
+            changes,
+            profile,
             rig_name,
             layout: Arc::new(layout),
             dynamics,
@@ -245,10 +253,11 @@ impl Session {
             return Ok(());
         }
         let lens = lens(self.layout.cameras());
-        let bytes = Engine::worst_bytes(resident.clone(), lens).await?;
+        let profile = self.changes.apply(resident.version.manifest.profile)?;
+        let bytes = Engine::worst_bytes(resident.clone(), lens, profile).await?;
         // From here on, nothing waits: the switch happens as a whole.
         self.reservation.exchange(resident, bytes)?;
-        self.profile_hash = record::profile_hash(&self.resident().version.manifest.profile);
+        (self.profile, self.profile_hash) = (profile, record::profile_hash(&profile));
         self.switched = true;
         let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
         places.extend(self.ahead().places());
@@ -280,6 +289,11 @@ impl Session {
     /// The memory that is set aside for its worst frame, in bytes.
     pub fn reserved_bytes(&self) -> u64 {
         self.reservation.bytes()
+    }
+
+    /// How it is rendered: the version's profile with the changes that it was opened with.
+    pub fn profile(&self) -> &RenderProfile {
+        &self.profile
     }
 
     /// BLAKE3 of the render profile's JSON.
@@ -342,7 +356,7 @@ impl Session {
             // Before the job is queued: no render thread waits for a disk.
             let pinned = self.pin(deadline, eyes(&views)).await?;
             let (waited_for, waited) = (pinned.waited_for, pinned.waited);
-            let profile = self.resident().version.manifest.profile;
+            let profile = self.profile;
             let (drawn, queued) = self
                 .engine
                 .run(deadline, move |scratch, backend| {
@@ -382,24 +396,24 @@ impl Session {
     /// Has what is seen from some places loaded by others.
     fn expect(&self, places: Vec<(Urgency, Pose)>) {
         let (expectation, layout) = (self.reservation.expectation().clone(), self.layout.clone());
+        let profile = self.profile;
         self.lookout.look(move || {
             let eyes_at = |(urgency, pose)| (urgency, eyes(&View::of_rig(layout.cameras(), pose)));
             let places: Vec<_> = places.into_iter().map(eyes_at).collect();
-            let profile = &expectation.resident().version.manifest.profile;
-            expectation.prefetch(&places, profile);
+            expectation.prefetch(&places, &profile);
         });
     }
 
     /// Waits until everything that a frame needs is in memory, all at once.
     async fn pin(&self, deadline: Instant, eyes: Vec<Eye>) -> Result<Pinned, SessionError> {
         let (reply, answer) = oneshot::channel();
-        let resident = self.resident().clone();
+        let (resident, profile) = (self.resident().clone(), self.profile);
         let ask = move || {
             let done = Box::new(move |pinned| {
                 // Nobody waits any more: the deadline has passed.
                 let _ = reply.send(pinned);
             });
-            resident.ask(&eyes, &resident.version.manifest.profile, done)
+            resident.ask(&eyes, &profile, done)
         };
         let ticket =
             tokio::task::spawn_blocking(ask).await.map_err(|_| SessionError::Crashed)??;
@@ -434,7 +448,7 @@ impl Session {
             step: self.episode.step(),
             version: version.number,
             version_hash: version.hash.clone(),
-            profile: version.manifest.profile,
+            profile: self.profile,
             profile_hash: self.profile_hash.to_hex().to_string(),
         })
     }
@@ -455,7 +469,7 @@ impl Session {
             twin: version.manifest.twin.clone(),
             version: version.number,
             version_hash: version.hash.clone(),
-            profile: version.manifest.profile,
+            profile: self.profile,
             profile_hash: self.profile_hash.to_hex().to_string(),
             backend: self.engine.backend().to_owned(),
             backend_detail: self.engine.backend_detail(),

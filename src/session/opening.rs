@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::config;
 use crate::geometry::Pose;
 use crate::residency::Resident;
+use crate::scene::ProfileChanges;
 use crate::scene::rig::{Rig, RigCamera};
 use crate::sim::Dynamics;
 
@@ -23,6 +24,8 @@ pub struct Opening {
     pub start: Option<Start>,
     /// Cameras: else the twin's rig, else the preset `vehicle6`.
     pub rig: Option<RigChoice>,
+    /// What of the twin's render profile is to be otherwise.
+    pub profile: ProfileChanges,
     /// What each observation holds.
     pub outputs: Outputs,
     /// How the ego moves.

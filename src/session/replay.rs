@@ -8,6 +8,7 @@ use std::sync::Arc;
 use crate::config::EPISODE_LINE_BYTES;
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
 use crate::residency::{ResidencyError, Resident};
+use crate::scene::RenderProfile;
 use crate::scene::rig::{RigCamera, RigError};
 use crate::sim::{EgoError, Ground};
 
@@ -232,6 +233,7 @@ impl Recording {
         visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
     ) -> Result<Report, ReplayError> {
         let mut resident = open(self.header.version)?;
+        let mut profile = &self.header.profile;
         let changes = self.changes(&resident, backend);
         let mut report = Report { images: 0, changes, strayed: None, difference: None };
         let mut retrace = Retrace::new(&self.header);
@@ -244,8 +246,9 @@ impl Recording {
             while let Some((_, to)) = switches.next_if(|(before, _)| *before <= index) {
                 resident = open(to.version)?;
                 lines_before += 1;
+                profile = &to.profile;
                 let recorded = (&*to.version_hash, &*to.profile_hash);
-                report.changes.extend(scene_changes(recorded, &resident));
+                report.changes.extend(scene_changes(recorded, &resident, profile));
             }
             let ground = Ground::of(&resident.version.manifest.trajectories);
             let strayed = retrace
@@ -260,7 +263,6 @@ impl Recording {
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
                 let (views, step) = (View::of_rig(cameras, *world_from_rig), frame.step);
-                let profile = &resident.version.manifest.profile;
                 let scene = resident.scene(&observation::eyes(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
                 let to_draw = RenderFrame { scene: &scene, profile, views: &views };
@@ -306,17 +308,23 @@ impl Recording {
             ("backend detail", &*header.backend_detail, &*backend.detail()),
         ];
         let mut changes = differing(of_build);
-        changes.extend(scene_changes((&header.version_hash, &header.profile_hash), resident));
+        let recorded = (&*header.version_hash, &*header.profile_hash);
+        changes.extend(scene_changes(recorded, resident, &header.profile));
         changes
     }
 }
 
-/// What is not as it was of a version, whose manifest and profile had these hashes.
-fn scene_changes((version, profile): (&str, &str), resident: &Resident) -> Vec<Change> {
-    let now = profile_hash(&resident.version.manifest.profile).to_hex();
+/// What is not as it was of a version, whose manifest and profile had these hashes: the same profile has
+/// another hash in a build that knows more fields.
+fn scene_changes(
+    (version, profile_then): (&str, &str),
+    resident: &Resident,
+    profile: &RenderProfile,
+) -> Vec<Change> {
+    let now = profile_hash(profile).to_hex();
     differing([
         ("version hash", version, &*resident.version.hash),
-        ("profile hash", profile, now.as_str()),
+        ("profile hash", profile_then, now.as_str()),
     ])
 }
 

@@ -1,15 +1,11 @@
 //! The gpu backend against the others, on any Vulkan device; lavapipe is enough.
 
-#[path = "../support/blobs.rs"]
-mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/gpu.rs"]
 mod gpu;
 #[path = "../support/images.rs"]
 mod images;
-#[path = "../support/poisons.rs"]
-mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/skies.rs"]
@@ -35,3 +31,5 @@ mod sky;
 mod slips;
 mod stages;
 mod twins;
+
+use wildcity::report::stress::blobs;

@@ -129,8 +129,12 @@ fn requests() -> Vec<(&'static str, Request)> {
         deadline_ms: Some(20_000),
         ..Open::twin("street")
     };
-    let preset =
-        Open { seq: 1, rig: Some(RigChoice::Preset("vehicle6".into())), ..Open::twin("street") };
+    let preset = Open {
+        seq: 1,
+        rig: Some(RigChoice::Preset("vehicle6".into())),
+        profile: [("tau_px".to_owned(), 2.0.into())].into_iter().collect(),
+        ..Open::twin("street")
+    };
     let dynamics = Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true };
     let driven =
         Open { seq: 1, dynamics: Some(DynamicsChoice::Full(dynamics)), ..Open::twin("street") };

@@ -9,6 +9,7 @@ use serde_json::json;
 use wildcity::client::PushState;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
+use wildcity::scene::ProfileChanges;
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Extent, Opening, Outputs, Recording, Session,
 };
@@ -176,6 +177,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
             seed: 0,
             start: None,
             rig: None,
+            profile: ProfileChanges::default(),
             outputs: Outputs {
                 cameras: None,
                 encoding: Encoding::Raw,

@@ -1,13 +1,9 @@
 //! The backends against each other, against images made by others, and at the extremes.
 
-#[path = "../support/blobs.rs"]
-mod blobs;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/images.rs"]
 mod images;
-#[path = "../support/poisons.rs"]
-mod poisons;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/skies.rs"]
@@ -22,4 +18,5 @@ mod determinism;
 mod extremes;
 mod others;
 mod parity;
+mod report;
 mod sky;

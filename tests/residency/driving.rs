@@ -7,6 +7,7 @@ use glam::{DQuat, DVec3};
 use wildcity::config;
 use wildcity::geometry::Pose;
 use wildcity::residency::{Cache, Needed, ResidencyError, Resident};
+use wildcity::scene::ProfileChanges;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
@@ -57,6 +58,7 @@ impl Bench {
             seed: 0,
             start: Some(wildcity::session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
+            profile: ProfileChanges::default(),
             outputs,
             dynamics: wildcity::sim::Dynamics::default(),
             dt_us: None,

@@ -7,6 +7,7 @@ mod http;
 mod leases;
 mod load;
 mod observation;
+mod profile;
 mod refused;
 mod resume;
 mod shutdown;

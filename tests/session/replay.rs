@@ -8,6 +8,7 @@ use serde_json::json;
 use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
+use wildcity::scene::ProfileChanges;
 use wildcity::server::{self, Config, Limits};
 use wildcity::session::{Extent, FrameRequest, Recording, ReplayError, Report};
 use wildcity::store::Catalog;
@@ -141,12 +142,16 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         uploads: twins.path().join(".uploads"),
         tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
+        profile: ProfileChanges::default(),
         limits: Limits::default(),
     };
     let running = server::start(config).await.unwrap();
     let mut agent = Agent::connect(running.address()).await;
     agent.hello().await;
-    agent.open(json!({ "session": "a", "outputs": { "encoding": "raw" } })).await;
+    // With a profile of its own: what was recorded is drawn, not what the twin says.
+    let own =
+        json!({ "session": "a", "profile": { "blur": 4.0 }, "outputs": { "encoding": "raw" } });
+    agent.open(own).await;
     drive(&mut agent).await;
     let path = episodes.path().join("a-1.jsonl");
 

@@ -20,6 +20,7 @@ use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 use wildcity::scene::Gaussians;
+use wildcity::scene::ProfileChanges;
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
@@ -182,6 +183,7 @@ impl TestServer {
             uploads: twins.path().join(".uploads"),
             tokens: None,
             backend: painter.clone(),
+            profile: ProfileChanges::default(),
             limits: Limits::default(),
         };
         change(&mut config);

@@ -41,7 +41,11 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("flate2", &["ingest"]),
     ("zip", &["ingest/archive.rs"]),
     ("image_webp", &["ingest/sog"]),
-    ("data_encoding", &["ingest/gltf", "scene/appearance.rs", "server/uploads.rs"]),
+    (
+        "data_encoding",
+        &["ingest/gltf", "report/page.rs", "scene/appearance.rs", "server/uploads.rs"],
+    ),
+    ("plotters", &["report/plots.rs"]),
 ];
 
 /// Who may touch files: those of a twin only `store/local`; the others scenes and settings of the user,

@@ -53,7 +53,7 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
         dt_us=100_000,
         deadline_ms=20_000,
     ),
-    "open_preset": lambda c: c.open("street", rig="vehicle6"),
+    "open_preset": lambda c: c.open("street", rig="vehicle6", profile={"tau_px": 2.0}),
     "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),

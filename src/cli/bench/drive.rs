@@ -16,7 +16,7 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
-use crate::scene::{Manifest, Rig};
+use crate::scene::{Manifest, ProfileChanges, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
 use crate::sim::Dynamics;
 
@@ -188,6 +188,7 @@ impl Drive {
             seed: 0,
             start: None,
             rig: rig.map(RigChoice::Full),
+            profile: ProfileChanges::default(),
             outputs: Outputs {
                 cameras: None,
                 encoding: Encoding::Jpeg(config::JPEG_QUALITY),

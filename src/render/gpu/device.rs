@@ -3,6 +3,8 @@
 
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::sync::atomic::AtomicU64;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use futures_util::FutureExt;
@@ -187,6 +189,27 @@ pub(super) struct Device {
     binding_limit: u64,
     /// The first thing that went wrong since the last look.
     fault: Arc<Mutex<Option<String>>>,
+    /// What was made and run, so that who pays for what can be shown.
+    made: Counted,
+}
+
+/// [`Made`] in the making.
+#[derive(Debug, Default)]
+struct Counted {
+    pipelines: AtomicU64,
+    buffers: AtomicU64,
+    dispatches: AtomicU64,
+}
+
+/// What was made and run on a device since it was opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Made {
+    /// Kernels that were compiled.
+    pub pipelines: u64,
+    /// Buffers, those that grew anew.
+    pub buffers: u64,
+    /// Kernels that were started.
+    pub dispatches: u64,
 }
 
 impl Device {
@@ -219,7 +242,7 @@ impl Device {
             note(&refused, error.to_string());
         }));
         device.set_device_lost_callback(move |_, message| note(&lost, message));
-        Ok(Self { device, queue, info, limits, binding_limit, fault })
+        Ok(Self { device, queue, info, limits, binding_limit, fault, made: Counted::default() })
     }
 
     /// Tells of what went wrong since the last call.
@@ -287,8 +310,27 @@ impl Device {
         has_clock.then(|| self.queue.get_timestamp_period())
     }
 
+    /// What was made and run since the device was opened.
+    pub(super) fn made(&self) -> Made {
+        let Counted { pipelines, buffers, dispatches } = &self.made;
+        let [pipelines, buffers, dispatches] =
+            [pipelines, buffers, dispatches].map(|count| count.load(Relaxed));
+        Made { pipelines, buffers, dispatches }
+    }
+
+    /// A kernel was compiled.
+    pub(super) fn count_pipeline(&self) {
+        self.made.pipelines.fetch_add(1, Relaxed);
+    }
+
+    /// A kernel is started.
+    pub(super) fn count_dispatch(&self) {
+        self.made.dispatches.fetch_add(1, Relaxed);
+    }
+
     /// A buffer of its own, at least 256 bytes.
     pub(super) fn buffer(&self, label: &str, bytes: u64, usage: BufferUsages) -> Buffer {
+        self.made.buffers.fetch_add(1, Relaxed);
         self.device.create_buffer(&BufferDescriptor {
             label: Some(label),
             size: bytes.next_multiple_of(256).max(256),

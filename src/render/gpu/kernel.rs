@@ -37,6 +37,7 @@ impl Kernel {
         entry: &'static str,
         constants: &[(&str, f64)],
     ) -> Self {
+        device.count_pipeline();
         let pipeline = device.device.create_compute_pipeline(&ComputePipelineDescriptor {
             label: Some(entry),
             layout: None,
@@ -61,6 +62,7 @@ impl Kernel {
         groups: Groups<'_>,
         resources: &[(u32, BindingResource<'_>)],
     ) {
+        device.count_dispatch();
         let entries: Vec<BindGroupEntry<'_>> = resources
             .iter()
             .map(|(binding, resource)| BindGroupEntry {

@@ -32,7 +32,7 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
-pub use device::{AdapterChoice, DeviceInfo, GpuError, devices};
+pub use device::{AdapterChoice, DeviceInfo, GpuError, Made, devices};
 pub use roofline::Roofline;
 pub use traffic::FrameWork;
 
@@ -96,6 +96,8 @@ pub struct GpuUse {
     pub parts: u64,
     /// What the last frame counted.
     pub last: FrameWork,
+    /// Pipelines, buffers and dispatches so far.
+    pub made: Made,
 }
 
 impl Gpu {
@@ -173,6 +175,7 @@ impl Gpu {
             retries: chain.retries,
             parts: chain.parts,
             last: chain.last,
+            made: chain.device.made(),
         })
     }
 

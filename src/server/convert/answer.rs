@@ -324,7 +324,7 @@ fn twin_info(twin: &TwinSummary) -> TwinInfo {
 }
 
 fn profile(session: &Session) -> Result<serde_json::Map<String, serde_json::Value>, Fault> {
-    match serde_json::to_value(session.resident().version.manifest.profile) {
+    match serde_json::to_value(session.profile()) {
         Ok(serde_json::Value::Object(profile)) => Ok(profile),
         other => Err(Fault::Internal(format!("the profile is no object: {other:?}"))),
     }

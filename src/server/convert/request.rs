@@ -9,6 +9,7 @@ use crate::geometry::camera::Pinhole;
 use crate::geometry::{Camera, Pose};
 use crate::protocol::message::{self, Request};
 use crate::protocol::unknown_field;
+use crate::scene::ProfileChanges;
 use crate::scene::rig::{Rig, RigCamera, is_name};
 use crate::server::fault::Fault;
 use crate::session::{Encoding, Opening, Outputs, RigChoice, SessionError, Start};
@@ -158,6 +159,7 @@ struct Fields {
     seed: Option<u64>,
     start: Option<message::Start>,
     rig: Option<message::RigChoice>,
+    profile: Option<serde_json::Map<String, serde_json::Value>>,
     outputs: Option<message::Outputs>,
     dt_us: Option<i64>,
     deadline_ms: Option<u64>,
@@ -226,6 +228,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         seed: open.seed,
         start: open.start.map(start_of).transpose()?,
         rig,
+        profile: ProfileChanges::new(open.profile),
         outputs: Outputs { cameras, encoding, depth, opacity },
         dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TypeVar
 
@@ -72,6 +72,7 @@ class Client:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
@@ -86,6 +87,7 @@ class Client:
                 seed=seed,
                 start=start,
                 rig=rig,
+                profile=profile,
                 outputs=outputs,
                 dynamics=dynamics,
                 dt_us=dt_us,

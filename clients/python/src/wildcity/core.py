@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, TypeVar
 
@@ -74,6 +74,7 @@ class Conversation:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
@@ -85,6 +86,7 @@ class Conversation:
             "session": session,
             "start": _start(start),
             "rig": encode(rig),
+            "profile": None if profile is None else dict(profile),
             "dynamics": encode(dynamics),
             "dt_us": dt_us,
             "deadline_ms": deadline_ms,

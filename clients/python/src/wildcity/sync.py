@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TypeVar
 
@@ -71,6 +71,7 @@ class Client:
         seed: int = 0,
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
         dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
@@ -85,6 +86,7 @@ class Client:
                 seed=seed,
                 start=start,
                 rig=rig,
+                profile=profile,
                 outputs=outputs,
                 dynamics=dynamics,
                 dt_us=dt_us,

@@ -1,18 +1,24 @@
 //! A few Gaussians, written by what they are and not by what is stored.
 
 use glam::{DQuat, DVec3};
-use wildcity::render::View;
-use wildcity::scene::{Gaussians, Scene, sh};
 
-use crate::images::look;
+use crate::render::View;
+use crate::report::drawing::look;
+use crate::scene::{Gaussians, Scene, sh};
 
-/// One Gaussian, by default an orange ball of 10 cm, 5 m ahead.
-pub(crate) struct Blob {
-    pub(crate) mean_m: DVec3,
-    pub(crate) rotation: DQuat,
-    pub(crate) sigma_m: DVec3,
-    pub(crate) opacity: f64,
-    pub(crate) rgb: [f64; 3],
+/// One Gaussian, by default an orange ball of 10 cm, 5 m ahead of [`ahead`].
+#[derive(Clone, Copy, Debug)]
+pub struct Blob {
+    /// Centre, in metres.
+    pub mean_m: DVec3,
+    /// Rotation of its own axes.
+    pub rotation: DQuat,
+    /// Standard deviation along each own axis, in metres.
+    pub sigma_m: DVec3,
+    /// Peak opacity, between 0 and 1.
+    pub opacity: f64,
+    /// Linear colour.
+    pub rgb: [f64; 3],
 }
 
 impl Default for Blob {
@@ -28,12 +34,12 @@ impl Default for Blob {
 }
 
 /// The scene that they make.
-pub(crate) fn scene(blobs: &[Blob]) -> Scene {
+pub fn scene(blobs: &[Blob]) -> Scene {
     Scene::from_gaussians(&raw(blobs))
 }
 
 /// Raw columns of SH degree 0.
-pub(crate) fn raw(blobs: &[Blob]) -> Gaussians {
+pub fn raw(blobs: &[Blob]) -> Gaussians {
     let mut g = Gaussians::with_capacity(0, blobs.len());
     for Blob { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
         g.means_m.push(mean_m.to_array());
@@ -46,6 +52,6 @@ pub(crate) fn raw(blobs: &[Blob]) -> Gaussians {
 }
 
 /// A camera at the origin that looks along +z, y down.
-pub(crate) fn ahead(size_px: [u32; 2], focal_px: f64) -> View {
+pub fn ahead(size_px: [u32; 2], focal_px: f64) -> View {
     look(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
 }

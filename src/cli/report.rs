@@ -1,0 +1,232 @@
+//! `wildcity report`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use serde_json::{Map, Value};
+
+use crate::config;
+use crate::render::Backend;
+use crate::render::gpu::Gpu;
+use crate::report::choose::{Recommendation, Wanted, recommend};
+use crate::report::ladder::ladder;
+use crate::report::measure::Bench;
+use crate::report::places::{Sampling, places};
+use crate::report::stress::CASES;
+use crate::report::stress::table::{self, Candidate, Column};
+use crate::report::{Report, ReportError, Subject, needed, page};
+use crate::residency::Cache;
+use crate::scene::{RenderProfile, Rig};
+
+use super::places::{TwinVersion, Twins};
+use super::scene_source::Machine;
+use super::stress::{Name, candidate};
+use super::{demo, output, progress};
+
+/// Measure what each setting of the renderer costs and what it loses, on a twin and on this machine.
+///
+/// Backends, levels of detail, records, antialiasing, alpha cut, stop, image scale and encoding, each
+/// against the f64 reference, at places on the recorded drive and 1, 3 and 5 m beside it (around a twin
+/// that has none). Windows of each image are compared, at full focal length; whole steps are timed. Also
+/// the stress table, and what a scene with and without each feature runs. Writes report.html, which needs
+/// nothing else, report.json and report.csv.
+///
+/// With --at-least-db or --at-most-ms it recommends a setting, verified at places that were not used to
+/// choose it, and writes it as profile.json for `wildcity serve --profile`.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Command {
+    /// The twin, or NAME@NUMBER for an older version; `demo` is the demo street in record f32, built on
+    /// first use, so that all records can be compared.
+    #[arg(value_name = "TWIN", default_value = demo::TWIN)]
+    twin: TwinVersion,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    /// Directory for the report; made if it is missing.
+    #[arg(long, value_name = "DIR", default_value = "wildcity-report")]
+    out: PathBuf,
+
+    /// Recommend the fastest setting with at least this PSNR at every place, in dB.
+    #[arg(long, value_name = "DB")]
+    at_least_db: Option<f64>,
+
+    /// Recommend the most exact setting of which all but one of twenty steps take at most this time.
+    #[arg(long, value_name = "MS", conflicts_with = "at_least_db")]
+    at_most_ms: Option<f64>,
+
+    /// Stations along the drive, or around. The reference takes about a second for each, offset and camera.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=config::REPORT_STATIONS))]
+    stations: u32,
+
+    /// Side of the window that is compared of each image, in pixels.
+    #[arg(long, value_name = "PX", default_value_t = 96, value_parser = clap::value_parser!(u32).range(16..=config::REPORT_WINDOW_PX))]
+    window: u32,
+
+    /// Steps to time at each place, after one that is not counted.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    repeat: u32,
+
+    /// Backends beside the reference, the one that draws all settings first.
+    #[arg(long = "backend", value_name = "NAME", value_delimiter = ',', value_enum, default_values_t = [Name::Cpu, Name::Gpu])]
+    backends: Vec<Name>,
+
+    /// Leave out the stress table.
+    #[arg(long)]
+    no_stress: bool,
+
+    #[command(flatten)]
+    machine: Machine,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity report
+  wildcity report street --at-least-db 40 --out report
+  wildcity report street --backend gpu,cpu --at-most-ms 20 && \\
+    wildcity serve --profile wildcity-report/profile.json";
+
+impl Command {
+    pub(super) fn run(mut self) -> anyhow::Result<()> {
+        if self.twin.name == demo::TWIN {
+            self.twin.name = demo::exact(&self.twins.dir()?)?.manifest.twin;
+        }
+        let (report, unmet) = self.measure()?;
+        output::make_dir(&self.out)?;
+        let mut files = vec![
+            ("report.html", page::html(&report)?),
+            ("report.json", format!("{:#}\n", serde_json::to_value(&report)?)),
+            ("report.csv", report.csv()),
+        ];
+        if let Some(best) = report.recommendations.first() {
+            files.push(("profile.json", format!("{:#}\n", profile_of(best)?)));
+        }
+        let mut out = io::stdout().lock();
+        for (name, text) in files {
+            let path = self.out.join(name);
+            output::write(&path, text.as_bytes())?;
+            writeln!(out, "{}", path.display())?;
+        }
+        for Recommendation { wanted, setting, backend, chosen_by, verified, .. } in
+            &report.recommendations
+        {
+            writeln!(
+                out,
+                "{wanted}: {setting} on {backend}, {chosen_by:.1} where it was chosen, {verified:.1} at \
+                 other places"
+            )?;
+        }
+        // What was measured is on disk: it says why.
+        unmet.map_or(Ok(()), |unmet| Err(unmet.into()))
+    }
+
+    /// The report, and why there is no recommendation in it although one was wanted.
+    fn measure(&self) -> anyhow::Result<(Report, Option<ReportError>)> {
+        let candidates = self.backends.iter().map(|name| candidate(*name, &self.machine));
+        let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
+        let mut backends: Vec<Box<dyn Backend>> = Vec::new();
+        for candidate in candidates {
+            match candidate {
+                Ok(backend) => backends.push(backend),
+                Err((name, why)) => writeln!(io::stderr(), "without {name}: {why}")?,
+            }
+        }
+        ensure!(!backends.is_empty(), "none of the --backend is there");
+        let resident = Cache::new(self.twins.catalog()?).open(&self.twin.name, self.twin.number)?;
+        let manifest = &resident.version.manifest;
+        let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG)).context("no rig")?;
+        let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
+        let places = places(manifest, &rig.cameras, sampling);
+
+        let bench = Bench {
+            resident: &resident,
+            backends: &backends,
+            places: &places,
+            repeat: self.repeat,
+        };
+        let bar = progress::count("reference");
+        bar.set_length(places.len() as u64);
+        let truth = bench.truth(&mut |done| bar.set_position(done as u64))?;
+        bar.finish_and_clear();
+
+        let names: Vec<&str> = backends.iter().map(|backend| backend.name()).collect();
+        let settings = ladder(&manifest.profile, manifest.record, &names);
+        let bar = progress::state();
+        bar.set_length(settings.len() as u64);
+        let mut measured = Vec::new();
+        for setting in &settings {
+            bar.set_message(setting.name.clone());
+            measured.push(bench.measure(setting, &truth)?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+
+        let wanted = (self.at_least_db.map(Wanted::AtLeastDb))
+            .or_else(|| self.at_most_ms.map(Wanted::AtMostMs));
+        let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
+        let recommended = wanted.map(|wanted| recommend(wanted, &measured, &names)).transpose();
+        let (recommendation, unmet) = match recommended {
+            Ok(recommendation) => (recommendation, None),
+            Err(unmet) => (None, Some(unmet)),
+        };
+        let report = Report {
+            subject: Subject {
+                twin: manifest.twin.clone(),
+                version: resident.version.number,
+                version_hash: resident.version.hash.clone(),
+                gaussians: manifest.gaussians(),
+                sh_degree: manifest.sh_degree,
+                record: manifest.record.name(),
+                profile: manifest.profile,
+                cameras: places[0].views.len(),
+                repeat: self.repeat,
+            },
+            backends: backends
+                .iter()
+                .map(|b| Column { backend: b.name(), detail: b.detail() })
+                .collect(),
+            sampling,
+            places: places.iter().map(|place| place.name.clone()).collect(),
+            reference_ms: truth.step_ms,
+            settings: measured,
+            recommendations: recommendation.into_iter().collect(),
+            stress: self.stress()?,
+            needed: needed::rows(&self.machine.cpu()?, &|| self.device())?,
+        };
+        Ok((report, unmet))
+    }
+
+    /// A device that drew nothing yet, if one is wanted and there.
+    fn device(&self) -> Option<Gpu> {
+        if self.backends.contains(&Name::Gpu) { self.machine.gpu().ok() } else { None }
+    }
+
+    /// The stress table on every backend of the report, and on the definition.
+    fn stress(&self) -> anyhow::Result<table::Table> {
+        let names = [Name::Reference].into_iter().chain(self.backends.iter().copied());
+        let names = names.filter(|_| !self.no_stress);
+        let candidates = names.map(|name| candidate(name, &self.machine));
+        let candidates = candidates.collect::<anyhow::Result<Vec<_>>>()?;
+        let cases: Vec<_> = if self.no_stress { Vec::new() } else { CASES.iter().collect() };
+        let bar = progress::state();
+        bar.set_length((cases.len() * candidates.len()) as u64);
+        let table = table::run(&cases, &candidates, false, &mut |done, case| {
+            bar.set_position(done as u64);
+            bar.set_message(case.to_owned());
+        });
+        bar.finish_and_clear();
+        Ok(table)
+    }
+}
+
+/// The fields of the profile that a recommendation changes, as a profile file has them.
+fn profile_of(best: &Recommendation) -> anyhow::Result<Value> {
+    let mut profile = RenderProfile::default();
+    best.profile.iter().try_for_each(|change| profile.set(change))?;
+    let all = serde_json::to_value(profile)?;
+    let keys = best.profile.iter().filter_map(|change| Some(change.split_once('=')?.0));
+    let fields: Map<String, Value> = keys.map(|key| (key.to_owned(), all[key].clone())).collect();
+    Ok(Value::Object(fields))
+}

@@ -1,0 +1,282 @@
+//! Every setting at every place: how far off it is from the definition, and what it costs.
+
+use std::io::Cursor;
+use std::time::Instant;
+
+use image::ImageReader;
+use serde::Serialize;
+
+use super::drawing::{Drawing, draw};
+use super::errors::{Errors, Gathered, Image};
+use super::ladder::{Sent, Setting};
+use super::places::{OFFSETS_M, Place};
+use super::recorded::recorded;
+use super::{Pictures, ReportError, pictures};
+use crate::render::reference::Reference;
+use crate::render::{Backend, Frame, Target, View};
+use crate::residency::{Pinned, Resident};
+use crate::scene::{RenderProfile, Scene};
+use crate::session;
+
+/// What is measured, and on what.
+pub struct Bench<'a> {
+    /// The twin.
+    pub resident: &'a std::sync::Arc<Resident>,
+    /// The backends that [`Setting::backend`] counts through.
+    pub backends: &'a [Box<dyn Backend>],
+    /// Where.
+    pub places: &'a [Place],
+    /// How often a step is timed at each place, after once that is not.
+    pub repeat: u32,
+}
+
+/// A setting, measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct Measured {
+    /// What was measured.
+    #[serde(flatten)]
+    pub setting: Setting,
+    /// Errors at all places.
+    pub errors: Errors,
+    /// PSNR by [`OFFSETS_M`], in dB; one where there is no drive.
+    pub psnr_db_by_offset: Vec<f64>,
+    /// Least PSNR of a place, in dB: of those that choose, and of those that verify.
+    pub least_db: [f64; 2],
+    /// What it costs at all places on the drive.
+    pub cost: Cost,
+    /// The longest of a hundred steps but five, in milliseconds: at places that choose, and at those that
+    /// verify.
+    pub p95_ms: [f64; 2],
+    /// Where it is worst.
+    #[serde(skip)]
+    pub worst: Pictures,
+}
+
+/// What a step costs.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Cost {
+    /// Median time of a step of all cameras, encoding included, in milliseconds.
+    pub step_ms: f64,
+    /// Gaussians that a step draws, the most of all places.
+    pub gaussians: u64,
+    /// Memory that they take in the host, in bytes.
+    pub scene_bytes: u64,
+    /// Bytes of a Gaussian as it is stored, before compression.
+    pub stored_bytes: f64,
+    /// Bytes of a step's images as they are sent.
+    pub sent_bytes: u64,
+}
+
+/// What every setting is compared with: the definition, in full detail, by place and window.
+pub struct Truth {
+    images: Vec<Vec<Image>>,
+    /// Time that a step of all cameras would take, in milliseconds: of the windows, times their share.
+    pub step_ms: f64,
+}
+
+impl Bench<'_> {
+    /// Draws the truth at all places; tells `progress` how many are done.
+    ///
+    /// # Errors
+    /// The twin cannot be read, or a frame cannot be drawn.
+    pub fn truth(&self, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
+        let profile = RenderProfile { tau_px: 0.0, ..self.profile() };
+        let (mut images, mut step_ms) = (Vec::new(), 0.0);
+        for (done, place) in self.places.iter().enumerate() {
+            progress(done);
+            let scene = self.scene(&place.views, &profile)?;
+            let start = Instant::now();
+            let drawings = draw(&Reference, &scene, &profile, &place.windows)?;
+            let pixels = |views: &[View]| views.iter().map(|v| v.camera.pixels()).sum::<usize>();
+            let share = pixels(&place.views) as f64 / pixels(&place.windows) as f64;
+            step_ms += start.elapsed().as_secs_f64() * 1e3 * share / self.places.len() as f64;
+            images.push(place.windows.iter().zip(&drawings).map(|(v, d)| shown(v, d)).collect());
+        }
+        Ok(Truth { images, step_ms })
+    }
+
+    /// Measures one setting.
+    ///
+    /// # Errors
+    /// The twin cannot be read, a frame cannot be drawn, or an image cannot be encoded.
+    pub fn measure(&self, setting: &Setting, truth: &Truth) -> Result<Measured, ReportError> {
+        let profile = setting.apply(self.profile())?;
+        let backend = &*self.backends[setting.backend];
+        let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
+        let mut least_db = [f64::INFINITY; 2];
+        let (mut steps_ms, mut cost) = ([Vec::new(), Vec::new()], Cost::NOTHING);
+        let mut worst = (f64::INFINITY, None);
+        for (place, truths) in self.places.iter().zip(&truth.images) {
+            let own = place.scaled(setting.scale);
+            let needed = self.scene(&own.views, &profile)?;
+            let (stored, stored_bytes) = self.stored(setting, &needed);
+            let scene: &Scene = stored.as_ref().unwrap_or(&needed);
+            let role = usize::from(!place.chooses);
+            let offset = OFFSETS_M.iter().position(|o| *o == place.offset_m).unwrap_or(0);
+
+            let drawings = draw(backend, scene, &profile, &own.windows)?;
+            let mut here = Gathered::default();
+            for ((view, drawing), truth) in own.windows.iter().zip(&drawings).zip(truths) {
+                let image = arrived(setting, view, drawing, truth.size_px)?;
+                let db = here.add(&image, truth);
+                if db < worst.0 {
+                    worst = (db, Some((place.name.clone(), image, truth.clone())));
+                }
+            }
+            let db = here.errors().map_or(f64::INFINITY, |errors| errors.psnr_db);
+            least_db[role] = least_db[role].min(db);
+            by_offset[offset].merge(&here);
+
+            if place.offset_m == 0.0 {
+                let timed = self.time(setting, backend, scene, &profile, &own.views)?;
+                steps_ms[role].extend(timed.steps_ms);
+                cost.gaussians = cost.gaussians.max(scene.gaussians() as u64);
+                cost.scene_bytes = cost.scene_bytes.max(scene.bytes() as u64);
+                cost.sent_bytes = cost.sent_bytes.max(timed.sent_bytes);
+                cost.stored_bytes = stored_bytes;
+            }
+        }
+        let mut all = Gathered::default();
+        by_offset.iter().for_each(|gathered| all.merge(gathered));
+        cost.step_ms = quantile(&steps_ms.concat(), 0.5);
+        let db = |gathered: &Gathered| gathered.errors().map(|errors| errors.psnr_db);
+        let worst = worst.1.map(|(place, image, truth)| pictures::of(place, &image, &truth));
+        Ok(Measured {
+            setting: setting.clone(),
+            errors: all.errors().ok_or(ReportError::NoPlaces)?,
+            psnr_db_by_offset: by_offset.iter().filter_map(db).collect(),
+            least_db,
+            cost,
+            p95_ms: steps_ms.map(|steps_ms| quantile(&steps_ms, 0.95)),
+            worst: worst.transpose()?.unwrap_or_default(),
+        })
+    }
+
+    fn profile(&self) -> RenderProfile {
+        self.resident.version.manifest.profile
+    }
+
+    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
+        Ok(self.resident.scene(&session::eyes(views), profile)?)
+    }
+
+    /// The scene in the setting's record, if it is another one, and bytes of a Gaussian in it.
+    fn stored(&self, setting: &Setting, scene: &Scene) -> (Option<Scene>, f64) {
+        let manifest = &self.resident.version.manifest;
+        match setting.record {
+            None => (None, manifest.record.bits(manifest.sh_degree) as f64 / 8.0),
+            Some(record) => {
+                let coded = recorded(scene, record);
+                let bytes = record.bits(manifest.sh_degree) as f64 / 8.0;
+                (Some(coded.scene), bytes)
+            }
+        }
+    }
+
+    fn time(
+        &self,
+        setting: &Setting,
+        backend: &dyn Backend,
+        scene: &Scene,
+        profile: &RenderProfile,
+        views: &[View],
+    ) -> Result<Timed, ReportError> {
+        let empty = |view: &View| vec![0_u8; 3 * view.camera.pixels()];
+        let mut images: Vec<Vec<u8>> = views.iter().map(empty).collect();
+        let mut timed = Timed { steps_ms: Vec::new(), sent_bytes: 0 };
+        for repeat in 0..=self.repeat {
+            let targets = images.iter_mut();
+            let mut targets: Vec<Target<'_>> =
+                targets.map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
+            let sent = std::sync::Mutex::new(Ok(0));
+            let finished = |view: usize, target: &Target<'_>| {
+                let rgb8 = target.rgb8.as_deref().unwrap_or_default();
+                let bytes = file(setting, &views[view], rgb8).map(|file| match file {
+                    Some(file) => file.len() as u64,
+                    None => rgb8.len() as u64,
+                });
+                let mut sent = sent.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                *sent = match (&*sent, bytes) {
+                    (Ok(sum), Ok(bytes)) => Ok(sum + bytes),
+                    (Ok(_), Err(error)) => Err(error),
+                    (Err(error), _) => Err(error.clone()),
+                };
+            };
+            let start = Instant::now();
+            backend.render(&Frame { scene, profile, views }, &mut targets, &finished)?;
+            // The first one makes room, and is not counted.
+            if repeat > 0 {
+                timed.steps_ms.push(start.elapsed().as_secs_f64() * 1e3);
+            }
+            let sent = sent.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+            timed.sent_bytes = sent.map_err(|reason| ReportError::Encode { reason })?;
+        }
+        Ok(timed)
+    }
+}
+
+struct Timed {
+    steps_ms: Vec<f64>,
+    sent_bytes: u64,
+}
+
+impl Cost {
+    const NOTHING: Self =
+        Self { step_ms: 0.0, gaussians: 0, scene_bytes: 0, stored_bytes: 0.0, sent_bytes: 0 };
+}
+
+/// A JPEG of an image if the setting sends one.
+fn file(setting: &Setting, view: &View, rgb8: &[u8]) -> Result<Option<Vec<u8>>, String> {
+    let (width, height) = (view.camera.width_px, view.camera.height_px);
+    match setting.sent {
+        Some(Sent::Jpeg(quality)) => session::jpeg(rgb8, width, height, quality).map(Some),
+        Some(Sent::Raw) | None => Ok(None),
+    }
+}
+
+/// What arrives of a drawing, at the size of what it is compared with.
+fn arrived(
+    setting: &Setting,
+    view: &View,
+    drawing: &Drawing,
+    size_px: [u32; 2],
+) -> Result<Image, ReportError> {
+    let mut image = shown(view, drawing);
+    if setting.sent.is_some() {
+        let encoded = file(setting, view, &drawing.rgb8);
+        let encoded = encoded.map_err(|reason| ReportError::Encode { reason })?;
+        let bytes = match encoded {
+            None => drawing.rgb8.clone(),
+            Some(file) => decoded(&file)?,
+        };
+        image.rgb = bytes.iter().map(|&byte| f32::from(byte) / 255.0).collect();
+    }
+    Ok(if image.size_px == size_px { image } else { image.resized(size_px) })
+}
+
+fn decoded(file: &[u8]) -> Result<Vec<u8>, ReportError> {
+    let reason = |error: String| ReportError::Encode { reason: error };
+    let reader = ImageReader::new(Cursor::new(file)).with_guessed_format();
+    let reader = reader.map_err(|error| reason(error.to_string()))?;
+    let image = reader.decode().map_err(|error| reason(error.to_string()))?;
+    Ok(image.into_rgb8().into_raw())
+}
+
+/// A drawing as it is shown.
+fn shown(view: &View, drawing: &Drawing) -> Image {
+    let rgba = drawing.rgba.chunks_exact(4);
+    Image {
+        size_px: [view.camera.width_px, view.camera.height_px],
+        rgb: rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect(),
+        depth_m: drawing.depth_m.clone(),
+        opacity: drawing.opacity.clone(),
+    }
+}
+
+/// The value that a share of all keeps below; NaN of none.
+pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().saturating_sub(1);
+    sorted.get((last as f64 * share).round() as usize).copied().unwrap_or(f64::NAN)
+}

@@ -1,0 +1,212 @@
+//! The report as one HTML page that needs nothing else.
+
+use std::fmt::Write as _;
+
+use data_encoding::BASE64;
+
+use super::choose::{Wanted, front};
+use super::ladder::Family;
+use super::measure::Measured;
+use super::pictures::{HEAT_RGB, HEAT_STEPS, Pictures};
+use super::places::OFFSETS_M;
+use super::stress::Verdict;
+use super::{Report, ReportError, needed, plots};
+
+const STYLE: &str = "\
+body{font:15px/1.45 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#111}
+h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
+table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
+td:first-child,th:first-child,td.text{text-align:left}tr.beaten td{color:#999}
+tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#999}
+figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
+img{image-rendering:pixelated;margin-right:3px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}
+.key span{display:inline-block;padding:1px 8px;font-size:12px}";
+
+/// The whole page.
+///
+/// # Errors
+/// A plot cannot be drawn.
+pub fn html(report: &Report) -> Result<String, ReportError> {
+    let mut page = String::new();
+    let subject = &report.subject;
+    let _ = write!(
+        page,
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}: error against run \
+         time</title><style>{STYLE}</style></head><body><h1>{0}: error against run time</h1><p>Twin \
+         {0} version {1}, {2} Gaussians of SH degree {3}, record {4}. Every setting is compared with the \
+         f64 reference at full detail, at {5} places and {6} px of each camera, at full focal length. \
+         Times are of whole steps of {7} cameras, encoding included: medians of {8} each.</p>",
+        text(&subject.twin),
+        subject.version,
+        subject.gaussians,
+        subject.sh_degree,
+        subject.record,
+        report.places.len(),
+        report.sampling.window_px.map(|px| px.to_string()).join(" x "),
+        subject.cameras,
+        subject.repeat,
+    );
+    for column in &report.backends {
+        let _ = write!(page, "<p>{}: {}</p>", text(column.backend), text(&column.detail));
+    }
+    let _ = write!(
+        page,
+        "<p>A whole step of the reference would take {:.0} ms: of what was drawn, scaled to all pixels.</p>",
+        report.reference_ms
+    );
+    recommendations(&mut page, report);
+    page.push_str("<h2>Error against time</h2><p>On the line is what nothing else beats in both; what is \
+                   beaten is grey. Values are compared before they are rounded to 8 bits, which alone \
+                   leaves 59 dB, but for what is as sent.</p>");
+    page.push_str(&plots::error_against_time(&report.settings)?);
+    table(&mut page, &report.settings);
+    beside_the_drive(&mut page, &report.settings)?;
+    worst(&mut page, &report.settings);
+    stress(&mut page, report);
+    only_what_is_needed(&mut page, report);
+    page.push_str("</body></html>\n");
+    Ok(page)
+}
+
+fn recommendations(page: &mut String, report: &Report) {
+    for r in &report.recommendations {
+        let unit = match r.wanted {
+            Wanted::AtLeastDb(_) => "dB",
+            Wanted::AtMostMs(_) => "ms",
+        };
+        let _ = write!(
+            page,
+            "<p><b>{}</b>: {} on {}: {:.1} {unit} where it was chosen, {:.1} {unit} at places that were \
+             not used to choose it.</p>",
+            text(&r.wanted.to_string()),
+            text(&r.setting),
+            text(&r.backend),
+            r.chosen_by,
+            r.verified
+        );
+    }
+}
+
+fn table(page: &mut String, all: &[Measured]) {
+    page.push_str(
+        "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>PSNR, dB</th>\
+         <th>least, dB</th><th>SSIM</th><th>largest</th><th>99.9 %</th><th>depth, m</th>\
+         <th>Gaussians</th><th>MB in memory</th><th>B each, stored</th><th>kB sent</th></tr>",
+    );
+    for (m, is_on) in all.iter().zip(front(all)) {
+        let (e, cost) = (&m.errors, &m.cost);
+        let _ = write!(
+            page,
+            "<tr class=\"{}\"><td>{}</td><td class=\"text\">{}</td><td>{:.1}</td><td>{}</td><td>{}</td>\
+             <td>{:.5}</td><td>{:.5}</td><td>{:.5}</td><td>{:.4}</td><td>{}</td><td>{:.1}</td>\
+             <td>{:.1}</td><td>{}</td></tr>",
+            if is_on { "front" } else { "beaten" },
+            text(&m.setting.name),
+            m.setting.family.name(),
+            cost.step_ms,
+            decibels(e.psnr_db),
+            decibels(m.least_db[0].min(m.least_db[1])),
+            e.ssim,
+            e.max,
+            e.p99_9,
+            e.depth_l1_m,
+            cost.gaussians,
+            cost.scene_bytes as f64 / 1e6,
+            cost.stored_bytes,
+            cost.sent_bytes / 1000,
+        );
+    }
+    page.push_str("</table></div>");
+}
+
+fn beside_the_drive(page: &mut String, all: &[Measured]) -> Result<(), ReportError> {
+    let shown = [Family::AsServed, Family::Detail, Family::Record, Family::Combined];
+    let lines: Vec<&Measured> = all
+        .iter()
+        .filter(|m| {
+            shown.contains(&m.setting.family) && m.psnr_db_by_offset.len() == OFFSETS_M.len()
+        })
+        .collect();
+    if !lines.is_empty() {
+        page.push_str("<h2>Beside the recorded drive</h2>");
+        page.push_str(&plots::error_beside_the_drive(&lines)?);
+    }
+    Ok(())
+}
+
+fn worst(page: &mut String, all: &[Measured]) {
+    page.push_str(
+        "<h2>Where each setting is worst</h2><p>Drawn, by definition, and the largest error of \
+                   a pixel's three values:</p><p class=\"key\">",
+    );
+    for (step, [r, g, b]) in HEAT_STEPS.iter().zip(HEAT_RGB) {
+        let ink = if u32::from(r) + u32::from(g) > 250 { "#000" } else { "#fff" };
+        let _ =
+            write!(page, "<span style=\"background:rgb({r},{g},{b});color:{ink}\">{step}</span>");
+    }
+    page.push_str("</p>");
+    for m in all {
+        let Pictures { place, size_px: [width, height], files } = &m.worst;
+        page.push_str("<figure>");
+        for file in files.iter().filter(|file| !file.is_empty()) {
+            let _ = write!(
+                page,
+                "<img width=\"{width}\" height=\"{height}\" alt=\"\" src=\"data:image/png;base64,{}\">",
+                BASE64.encode(file)
+            );
+        }
+        let name = text(&m.setting.name);
+        let _ = write!(page, "<figcaption>{name}, at {}</figcaption></figure>", text(place));
+    }
+}
+
+fn stress(page: &mut String, report: &Report) {
+    page.push_str("<h2>At the extremes</h2><div class=\"wide\"><table><tr><th>case</th>");
+    for column in &report.stress.backends {
+        let _ = write!(page, "<th>{}</th>", text(column.backend));
+    }
+    page.push_str("<th>what is drawn; what must hold; what came closest to it</th></tr>");
+    for row in &report.stress.rows {
+        let _ = write!(page, "<tr><td>{}</td>", row.case);
+        for outcome in &row.outcomes {
+            let class = match outcome.verdict {
+                Verdict::Held => "",
+                Verdict::Missed => "miss",
+                Verdict::NotRun => "off",
+            };
+            let _ = write!(page, "<td class=\"{class}\">{}</td>", outcome.verdict.word());
+        }
+        let _ = write!(page, "<td class=\"text\">{}<br>{}", text(row.what), text(row.bound));
+        if let Some(tightest) = row.tightest() {
+            let _ = write!(page, "<br><i>{}: {}</i>", tightest.backend, text(&tightest.told));
+        }
+        page.push_str("</td></tr>");
+    }
+    page.push_str("</table></div>");
+}
+
+fn only_what_is_needed(page: &mut String, report: &Report) {
+    page.push_str("<h2>Only what is needed</h2><p>One step of one small street, with and without each \
+                   feature. Counts, so that they are the same on every machine.</p><div class=\"wide\"><table><tr><th>street</th>");
+    for column in needed::COLUMNS {
+        let _ = write!(page, "<th>{}</th>", text(column));
+    }
+    page.push_str("</tr>");
+    for row in &report.needed {
+        let _ = write!(page, "<tr><td>{}</td>", text(row.with));
+        for count in row.counts.texts() {
+            let _ = write!(page, "<td>{}</td>", text(&count));
+        }
+        page.push_str("</tr>");
+    }
+    page.push_str("</table></div>");
+}
+
+fn decibels(db: f64) -> String {
+    if db.is_finite() { format!("{db:.1}") } else { "exact".to_owned() }
+}
+
+/// Text as HTML has it.
+fn text(plain: &str) -> String {
+    plain.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}

@@ -1,0 +1,119 @@
+//! From where a twin is looked at: along its recorded drive and beside it, or around it.
+
+use glam::{DQuat, DVec3};
+
+use super::drawing::{crop, look};
+use super::ladder::scaled;
+use crate::geometry::{Bounds, Pose};
+use crate::render::View;
+use crate::scene::rig::RigCamera;
+use crate::scene::{Manifest, Trajectory};
+
+/// Somewhere that all settings are measured.
+#[derive(Clone, Debug)]
+pub struct Place {
+    /// As `60 m, 3 m left`.
+    pub name: String,
+    /// Metres beside the recorded drive, whichever side; 0 on it, and where there is none.
+    pub offset_m: f64,
+    /// Whether a setting may be chosen by what is seen here. The others verify the choice.
+    pub chooses: bool,
+    /// The cameras in full: what is timed.
+    pub views: Vec<View>,
+    /// A part of each camera's image at full focal length: what is compared.
+    pub windows: Vec<View>,
+}
+
+/// How many places, and how much is compared at each.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Sampling {
+    /// Stations along the drive, or around a capture without one.
+    pub stations: u32,
+    /// Width and height of the part of an image that is compared, in pixels.
+    pub window_px: [u32; 2],
+}
+
+/// How far beside the recorded drive, in metres: on it, in the lane's other half, the next lane, and the
+/// one after it.
+pub const OFFSETS_M: [f64; 4] = [0.0, 1.0, 3.0, 5.0];
+
+/// Places along the twin's first recorded drive with these cameras, or around it if there is none.
+pub fn places(manifest: &Manifest, cameras: &[RigCamera], sampling: Sampling) -> Vec<Place> {
+    match manifest.trajectories.first() {
+        Some(drive) => along(drive, cameras, sampling),
+        None => around(manifest.bounds(), sampling),
+    }
+}
+
+/// Every other station chooses; offsets are to the left and to the right in turn.
+fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<Place> {
+    let mut places = Vec::new();
+    for station in 0..sampling.stations {
+        let share = (f64::from(station) + 0.5) / f64::from(sampling.stations);
+        let station_m = share * drive.length_m();
+        let (sign, side) =
+            if (station / 2).is_multiple_of(2) { (1.0, "left") } else { (-1.0, "right") };
+        for offset_m in OFFSETS_M {
+            // In the rig's axes y is left.
+            let beside = Pose {
+                position_m: DVec3::new(0.0, sign * offset_m, 0.0),
+                rotation: DQuat::IDENTITY,
+            };
+            let views = View::of_rig(cameras, drive.at_station(station_m) * beside);
+            let name = match offset_m {
+                0.0 => format!("{station_m:.0} m"),
+                _ => format!("{station_m:.0} m, {offset_m} m {side}"),
+            };
+            let chooses = station.is_multiple_of(2);
+            places.push(place(name, offset_m, chooses, views, places.len(), sampling));
+        }
+    }
+    places
+}
+
+/// Cameras of 640 x 480 px on a circle around the middle, 20° above it, that see all of it: a capture of
+/// one thing. z is up.
+fn around(bounds: Bounds, sampling: Sampling) -> Vec<Place> {
+    let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
+    // A lens of 600 px sees ±0.53 across and ±0.4 down of what is 1 m away: the box' longest side fits at
+    // 1.2 times its length from its middle.
+    let away_m = 1.2 * bounds.size_m().max_element();
+    let place_at = |station: u32| {
+        let share = f64::from(station) / f64::from(sampling.stations);
+        let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
+        let toward = DVec3::new(cos, sin, 20.0_f64.to_radians().tan()).normalize();
+        let view = look([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
+        let name = format!("{:.0}° around", 360.0 * share);
+        place(name, 0.0, station.is_multiple_of(2), vec![view], station as usize, sampling)
+    };
+    (0..sampling.stations).map(place_at).collect()
+}
+
+fn place(
+    name: String,
+    offset_m: f64,
+    chooses: bool,
+    views: Vec<View>,
+    index: usize,
+    sampling: Sampling,
+) -> Place {
+    let window = |(camera, view): (usize, &View)| {
+        // Spread evenly over the images (Roberts 2018: powers of the plastic number's inverse).
+        let i = (index * 16 + camera + 1) as f64;
+        let size_px = [view.camera.width_px, view.camera.height_px];
+        let own_px = [0, 1].map(|axis| sampling.window_px[axis].min(size_px[axis]));
+        let at = [0.754_877_666_2, 0.569_840_290_99].map(|step: f64| (0.5 + i * step).fract());
+        let at = [0, 1].map(|axis| (at[axis] * f64::from(size_px[axis] - own_px[axis])) as i32);
+        crop(*view, at, own_px)
+    };
+    let windows = views.iter().enumerate().map(window).collect();
+    Place { name, offset_m, chooses, views, windows }
+}
+
+impl Place {
+    /// The same with all images scaled.
+    pub(super) fn scaled(&self, scale: f64) -> Self {
+        let all = |views: &[View]| views.iter().map(|view| scaled(*view, scale)).collect();
+        Self { views: all(&self.views), windows: all(&self.windows), ..self.clone() }
+    }
+}
