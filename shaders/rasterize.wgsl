@@ -8,6 +8,7 @@
 #import layout
 #import math
 #import resolve
+#import SKY
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;
@@ -40,7 +41,8 @@ fn main(
         return;
     }
     let tile = span.first + index;
-    let view = view_of(tile);
+    let view_index = view_of(tile);
+    let view = frame.view[view_index];
     let tile_of_view = tile - view.first_tile;
     let corner = vec2u(tile_of_view % view.columns, tile_of_view / view.columns) * TILE_PX;
     let first_pixel = vec2u(thread % 4u * 4u, thread / 4u);
@@ -114,13 +116,14 @@ fn main(
         atomicAdd(&counters.batches, batches);
         atomicMax(&counters.most_batches, batches);
     }
+    sums = complete(sums, view_index, at_px);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 
-fn view_of(tile: u32) -> FrameView {
+fn view_of(tile: u32) -> u32 {
     var view = 0u;
     while view + 1u < frame.views && frame.view[view + 1u].first_tile <= tile {
         view++;
     }
-    return frame.view[view];
+    return view;
 }

@@ -245,6 +245,13 @@ pub const REPORT_WINDOW_PX: i64 = 256;
 /// Largest camera list: 300 B per camera, so 50,000 cameras.
 pub const CAMERA_LIST_BYTES: u64 = 16 << 20;
 
+/// Largest file of a sky: six faces of 1536 x 1536 pixels of RGB are 42 MB uncompressed. A network's
+/// weights are 50 kB.
+pub const SKY_FILE_BYTES: u64 = 64 << 20;
+
+/// Memory that decoding a sky's image may take: a cross of such faces is 85 MB, or 170 MB with 16 bits.
+pub const SKY_IMAGE_BYTES: u64 = 256 << 20;
+
 /// Memory of all twins in use where the machine does not say how much it has; else they may take
 /// three quarters of it. The demo street is 439,000 Gaussians of 92 bytes, 40 MB.
 pub const RESIDENT_BYTES: u64 = 16 << 30;

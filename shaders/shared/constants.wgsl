@@ -6,6 +6,7 @@ const EXTENT_SLACK_PX: f32 = 2e-3;
 const MAX_SIGMA_PX: f32 = 1e9;
 const DEPTH_BITS: u32 = 28;
 const MAX_VIEWS: u32 = 16;
+const SKY_CUT: f32 = 0.003921568627;
 
 const CLUSTER: u32 = 256;
 const STRIP: u32 = 32;

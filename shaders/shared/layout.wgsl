@@ -29,6 +29,21 @@ struct Frame {
     view: array<FrameView, MAX_VIEWS>,
 }
 
+struct Behind {
+    scale: f32,
+    offset: f32,
+    edge: u32,
+    pad0: u32,
+    sky_from_pixel: array<array<vec4f, 3>, MAX_VIEWS>,
+}
+
+struct Seen {
+    exposure: array<vec4f, 3>,
+    overlay_px: vec2u,
+    first_overlay: u32,
+    exposed: u32,
+}
+
 struct ChunkView {
     camera_from_chunk: array<vec4f, 3>,
     forward_high: vec4f,

@@ -8,14 +8,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use glam::DMat3;
 use serde_json::json;
 
 use crate::client::{Client, Observation, Open, Pose};
 use crate::generate::{self, StreetSettings};
+use crate::ingest::sky;
 use crate::scene::manifest::Provenance;
 use crate::scene::{ProfileChanges, Record, Rig, Trajectory};
 use crate::server::{self, Limits};
-use crate::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use crate::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -203,11 +205,17 @@ fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Versi
     };
     writeln!(io::stderr(), "building the demo twin in {} ({why})", twins.display())?;
     let street = generate::street(&settings)?;
+    let sky = sky::read_bytes(generate::SKY, None)?;
     let bar = progress::count("writing");
     let version = catalog.commit(
         NewVersion {
             rig: Rig::preset("vehicle6"),
             trajectories: vec![street.trajectory],
+            sky: Some(NewSky::Put(SkyBytes {
+                bytes: sky.bytes.into(),
+                image: None,
+                sky_from_world: DMat3::IDENTITY,
+            })),
             storage,
             ..NewVersion::of(name, &street.gaussians, provenance)
         },
@@ -258,5 +266,9 @@ fn is_sound(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<
     bar.finish_and_clear();
     let chunks = &version.manifest.chunks;
     let mut damaged = verified.damaged.iter().map(|damage| &damage.object);
-    Ok(!damaged.any(|object| chunks.iter().any(|chunk| chunk.object == *object)))
+    let sky = version.manifest.sky.as_ref();
+    Ok(!damaged.any(|object| {
+        chunks.iter().any(|chunk| chunk.object == *object)
+            || sky.is_some_and(|sky| sky.object == *object)
+    }))
 }

@@ -11,10 +11,11 @@ use crate::ingest::{self, Axes};
 use crate::scene::manifest::Provenance;
 use crate::scene::rig::is_name;
 use crate::scene::{Record, RenderProfile, Rig, Trajectory};
-use crate::store::{NewVersion, Storage, StoreError};
+use crate::store::{NewSky, NewVersion, Storage, StoreError};
 
 use super::places::Twins;
 use super::progress;
+use super::sky_source::SkySource;
 
 /// Make a twin of a trained scene, or a new version of one.
 ///
@@ -59,9 +60,13 @@ pub(super) struct Import {
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
+    #[command(flatten)]
+    sky: SkySource,
+
     /// How the scene's trainer rendered, where it differs from gsplat; may be given again. Keys:
     /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop; and how much detail is drawn:
-    /// tau_px (0 for all of it), reach_m.
+    /// tau_px (0 for all of it), reach_m; sky_error (0: the sky is evaluated for every pixel, else the
+    /// error of the map that it is baked into); background, as 0.5,0.6,0.8.
     #[arg(long, value_name = "KEY=VALUE")]
     profile: Vec<String>,
 
@@ -122,6 +127,7 @@ impl Import {
         for setting in &self.profile {
             profile.set(setting)?;
         }
+        let sky = self.sky.read(&self.axes)?;
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
@@ -148,6 +154,7 @@ impl Import {
             profile,
             rig,
             trajectories,
+            sky: sky.map(NewSky::Put),
             provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
             storage: Storage { record: self.record, levels: !self.no_lod },
         };

@@ -73,7 +73,7 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
     writeln!(
         out,
         "profile     near={} far={} blur={} antialiased={} alpha_cap={} alpha_cut={} stop={} \
-         tau_px={} reach_m={}",
+         tau_px={} reach_m={} sky_error={} background={}",
         profile.near,
         profile.far,
         profile.blur,
@@ -83,7 +83,18 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
         profile.stop,
         profile.tau_px,
         profile.reach_m.map_or("none".to_owned(), |reach_m| reach_m.to_string()),
+        profile.sky_error,
+        profile.background.map(|c| c.to_string()).join(","),
     )?;
+    if let Some(sky) = &manifest.sky {
+        let image = sky.image.map_or("all".to_owned(), |image| image.to_string());
+        writeln!(
+            out,
+            "sky         {}, {} bytes, appearance of image: {image}",
+            &sky.object[..16],
+            sky.bytes
+        )?;
+    }
     if let Some(rig) = &manifest.rig {
         let names: Vec<_> = rig.cameras.iter().map(|camera| camera.name.as_str()).collect();
         writeln!(out, "rig         {}: {}", rig.name, names.join(", "))?;

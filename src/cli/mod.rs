@@ -19,6 +19,7 @@ mod report;
 mod route;
 mod scene_source;
 mod serve;
+mod sky_source;
 mod stress;
 mod time;
 mod twin;

@@ -7,6 +7,7 @@ mod generate;
 mod list;
 mod log;
 mod rollback;
+mod sky;
 
 /// Keep twins: their versions, and what they take.
 #[derive(Debug, clap::Args)]
@@ -24,6 +25,7 @@ enum What {
     Rollback(rollback::Rollback),
     Gc(gc::Gc),
     Fsck(fsck::Fsck),
+    Sky(sky::Sky),
 }
 
 impl Twin {
@@ -36,6 +38,7 @@ impl Twin {
             What::Rollback(rollback) => rollback.run(),
             What::Gc(gc) => gc.run(),
             What::Fsck(fsck) => fsck.run(),
+            What::Sky(sky) => sky.run(),
         }
     }
 }

@@ -1,7 +1,4 @@
-//! What closes the view: sky, clouds, distant roofs, and the land around.
-//!
-//! The renderer has no sky, and a pixel without Gaussians is black: so the sky is a dome of large,
-//! overlapping Gaussians.
+//! What closes the view below the sky: distant roofs, and the land around.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -9,68 +6,19 @@ use super::random::{Random, noise, smooth};
 use super::route::Route;
 use super::surface::{Paint, Painter};
 
-/// Radius of the dome, in metres: 260 m of driving grow its face ahead by half.
-const DOME_M: f64 = 560.0;
-/// Angle between neighbours on the lower dome, in radians: 1.5°, 47 px in the front camera, which
-/// is what clouds may be made of.
-const LOW_RAD: f64 = 0.026;
-/// The same above 38°, where no camera of a level car looks.
-const HIGH_RAD: f64 = 0.09;
-/// Where the spacing changes, in radians above the horizon.
-const CHANGE_RAD: f64 = 0.66;
-/// The dome begins below the horizon, in radians: -3°.
-const FOOT_RAD: f64 = -0.05;
-
+/// How far the land reaches, in metres.
+const LAND_TO_M: f64 = 560.0;
 /// Land nearer to the centre line than this is painted by others, in metres.
 const LAND_FROM_M: f64 = 27.0;
 
 /// Paints all of it around the middle of the street.
 pub(super) fn paint(painter: &mut Painter, route: &Route, seed: u64) {
     let middle_m = route.at(0.5 * route.driven_m[1]).point_m;
-    sky(painter, middle_m, seed);
     skyline(painter, middle_m, seed);
     land(painter, route, middle_m, seed);
 }
 
-fn sky(painter: &mut Painter, middle_m: DVec3, seed: u64) {
-    let mut elevation_rad = FOOT_RAD;
-    while elevation_rad < std::f64::consts::FRAC_PI_2 {
-        let step_rad = if elevation_rad < CHANGE_RAD { LOW_RAD } else { HIGH_RAD };
-        let (rise, run) = elevation_rad.sin_cos();
-        let around = (std::f64::consts::TAU * run / step_rad).ceil().max(1.0);
-        for i in 0..around as usize {
-            // Every second ring is turned by half a step.
-            let half = if (elevation_rad / step_rad) as i64 % 2 == 0 { 0.5 } else { 0.0 };
-            let azimuth_rad = std::f64::consts::TAU * (i as f64 + half) / around;
-            let (sin, cos) = azimuth_rad.sin_cos();
-            let away = DVec3::new(run * cos, run * sin, rise);
-            let along = DVec3::new(-sin, cos, 0.0);
-            let rotation = DQuat::from_mat3(&DMat3::from_cols(along, away.cross(along), away));
-            // Wider than surfels: 0.75 of the spacing leaves no hole and no pattern.
-            let sigma_m = 0.75 * step_rad * DOME_M;
-            let sigmas_m = DVec3::new(sigma_m, sigma_m, 1.0);
-            let mean_m = middle_m + DOME_M * away;
-            painter.gaussian(mean_m, rotation, sigmas_m, 0.99, sky_rgb(away, seed), DVec3::ZERO);
-        }
-        elevation_rad += step_rad;
-    }
-}
-
-/// Haze on the horizon, blue above, and fair-weather clouds.
-fn sky_rgb(away: DVec3, seed: u64) -> DVec3 {
-    let (haze, zenith) = (DVec3::new(0.86, 0.89, 0.92), DVec3::new(0.30, 0.52, 0.82));
-    let clear = haze.lerp(zenith, smooth((away.z + 0.02) / 0.75).sqrt());
-    // A flat layer of clouds, seen from below.
-    let layer = away.truncate() / (away.z + 0.16);
-    let octave = |scale: f64, seed: u64| noise(seed, scale * layer.x, scale * layer.y);
-    let cover =
-        octave(1.1, seed + 20) + 0.55 * octave(2.6, seed + 21) + 0.3 * octave(6.0, seed + 22);
-    let cloud = smooth((cover - 0.12) / 0.65) * smooth((away.z - 0.02) / 0.12);
-    let lit = DVec3::splat(0.97) - 0.10 * smooth((cover - 0.6) / 0.6) * DVec3::new(1.0, 0.9, 0.75);
-    clear.lerp(lit, 0.88 * cloud)
-}
-
-/// Roofs and towers in the haze, nearer than the dome.
+/// Roofs and towers in the haze.
 fn skyline(painter: &mut Painter, middle_m: DVec3, seed: u64) {
     let mut random = Random::new(seed, "skyline", 0);
     let mut azimuth_rad = 0.0;
@@ -104,7 +52,7 @@ fn skyline(painter: &mut Painter, middle_m: DVec3, seed: u64) {
 fn land(painter: &mut Painter, route: &Route, middle_m: DVec3, seed: u64) {
     let turn = std::f64::consts::TAU / 96.0;
     let mut radius_m = 12.0;
-    while radius_m < DOME_M {
+    while radius_m < LAND_TO_M {
         let step_m = (0.065 * radius_m).max(5.0);
         for i in 0..96 {
             let (sin, cos) = (turn * f64::from(i)).sin_cos();

@@ -15,7 +15,9 @@
 //! | 65 parked cars | 91 | 8 to 16 cm |
 //! | 44 trees | 59 | leaves of 6 cm |
 //! | lamps, lights, signs, bins, planters | 15 | 4 to 40 cm |
-//! | sky, skyline, land | 12 | 1.5° of sky |
+//! | skyline, land | 6 | 4.5 m, and with the distance more |
+//!
+//! Behind them is a sky of its own ([`SKY`]).
 
 mod backdrop;
 mod buildings;
@@ -41,7 +43,11 @@ use serde::{Deserialize, Serialize};
 use crate::scene::{Gaussians, Trajectory};
 
 /// Counts the generator's changes: a demo twin of another revision is built again.
-pub const REVISION: u32 = 2;
+pub const REVISION: u32 = 3;
+
+/// The sky over the streets, as safetensors: a clear day with the sun where their light comes from. Made
+/// by `scenes/sky.py`; world axes.
+pub const SKY: &[u8] = include_bytes!("../../scenes/sky.safetensors");
 
 /// What the street is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

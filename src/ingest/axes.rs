@@ -81,6 +81,11 @@ impl Axes {
         Ok(Self { metres_per_unit, ..self })
     }
 
+    /// Takes directions in the twin to the file's axes: orthonormal.
+    pub fn file_from_twin(&self) -> DMat3 {
+        self.twin_from_file.transpose()
+    }
+
     /// Turns and then scales Gaussians in place. The identity changes no bit.
     ///
     /// A mirror turns each ellipsoid as its rotation `-M` does, for an ellipsoid equals its own

@@ -18,6 +18,7 @@ mod nurec;
 mod parts;
 mod ply;
 mod safetensors;
+pub mod sky;
 mod sog;
 mod splat;
 mod spz;
@@ -31,6 +32,7 @@ use std::path::Path;
 
 use crate::config;
 use crate::scene::Gaussians;
+use crate::scene::sky::SkyError;
 
 pub use axes::Axes;
 pub use file::{FileError, read_whole};
@@ -131,6 +133,9 @@ pub enum IngestError {
     /// Gaussians that no renderer can draw.
     #[error("{0}")]
     Values(BadGaussians),
+    /// A sky that cannot be drawn.
+    #[error("sky: {0}")]
+    Sky(#[from] SkyError),
     /// `--axes` or `--scale` cannot be used.
     #[error("{option} {given:?}: {reason}")]
     Frame {

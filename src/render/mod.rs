@@ -13,8 +13,14 @@ pub mod reference;
 pub mod relay;
 pub mod stage;
 
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2, DVec3};
+
 use crate::geometry::{Camera, Pose};
+use crate::scene::appearance::Appearance;
 use crate::scene::rig::RigCamera;
+use crate::scene::sky::{CubeMap, Drawn, SkyError};
 use crate::scene::{RenderProfile, Rig, Scene};
 
 /// A camera somewhere in the world.
@@ -35,6 +41,28 @@ impl View {
         };
         cameras.iter().map(view).collect()
     }
+
+    /// The direction in which a point of the image looks: of unit length, in world axes. `None` where
+    /// the image shows nothing.
+    pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
+        let p = &self.camera.pinhole;
+        let ray = DVec3::new((at_px.x - p.cx) / p.fx, (at_px.y - p.cy) / p.fy, 1.0);
+        Some((self.world_from_camera.rotation * ray).normalize())
+    }
+
+    /// Rows that take `(x, y, 1)` of the image to a direction in a sky's axes, of any length. As only its
+    /// direction matters, f32 is right to 1e-7 rad.
+    fn sky_from_pixel(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
+        let p = &self.camera.pinhole;
+        let camera_from_pixel = DMat3::from_cols(
+            DVec3::new(1.0 / p.fx, 0.0, 0.0),
+            DVec3::new(0.0, 1.0 / p.fy, 0.0),
+            DVec3::new(-p.cx / p.fx, -p.cy / p.fy, 1.0),
+        );
+        let world_from_camera = self.world_from_camera.rotation_matrix();
+        let rows = (sky_from_world * world_from_camera * camera_from_pixel).transpose();
+        rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
+    }
 }
 
 /// One chain of stages: all views of one step.
@@ -54,7 +82,8 @@ pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 /// Where the pixels of one view go, row by row from the top; what is `None` is not computed.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear premultiplied red, green, blue on black, and opacity.
+    /// `[height, width, 4]`: linear red, green, blue, those of Gaussians premultiplied, on the sky or the
+    /// background; and the opacity of the Gaussians alone.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
     pub rgb8: Option<&'a mut [u8]>,
@@ -62,6 +91,8 @@ pub struct Target<'a> {
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
+    /// What the camera makes of the colours, of `rgba` and `rgb8` alike.
+    pub appearance: Option<&'a Appearance>,
 }
 
 /// Called once per view, as soon as its pixels are final, from a worker thread: the place to
@@ -104,6 +135,16 @@ pub enum RenderError {
         /// The length that the camera asks for.
         wanted: usize,
     },
+    /// An overlay is not of its view's size.
+    #[error("view {view}: the overlay is {given:?} pixels, and the image {wanted:?}")]
+    Overlay {
+        /// Which view.
+        view: usize,
+        /// Width and height of the overlay.
+        given: [u32; 2],
+        /// Width and height of the image.
+        wanted: [u32; 2],
+    },
     /// Not one target for each view.
     #[error("{targets} targets for {views} views; each view needs its own")]
     Targets {
@@ -131,6 +172,18 @@ pub enum RenderError {
         /// What they may take.
         limit_bytes: u64,
     },
+    /// The backend looks skies up in baked maps alone.
+    #[error(
+        "the {backend} backend looks skies up in baked maps, and the profile asks for sky_error=0: use \
+         the cpu or the reference backend, or another sky_error"
+    )]
+    ExactSky {
+        /// Its name.
+        backend: &'static str,
+    },
+    /// The sky cannot be drawn as the profile asks.
+    #[error(transparent)]
+    Sky(#[from] SkyError),
     /// The device failed. It is opened anew for the next frame.
     #[error("{device} failed: {reason}")]
     Device {
@@ -175,6 +228,22 @@ pub trait Backend: Send + Sync {
 }
 
 impl Frame<'_> {
+    /// What is behind the Gaussians, and what takes directions in the world to its axes: the sky, or the
+    /// profile's background as a sky of one colour; `None` if that is black.
+    ///
+    /// # Errors
+    /// [`RenderError::Sky`].
+    pub fn behind(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
+        match &self.scene.sky {
+            Some(sky) => Ok(Some((sky.drawn(self.profile.sky_error)?, sky.sky_from_world()))),
+            None if self.profile.background == [0.0; 3] => Ok(None),
+            None => {
+                let map = CubeMap::plain(DVec3::from_array(self.profile.background));
+                Ok(Some((Drawn::Map(Arc::new(map)), DMat3::IDENTITY)))
+            }
+        }
+    }
+
     /// # Errors
     /// Names the first view whose target does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
@@ -191,6 +260,12 @@ impl Frame<'_> {
                 ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
             ];
+            if let Some(overlay) = target.appearance.and_then(|seen| seen.overlay.as_ref()) {
+                let wanted = [camera.width_px, camera.height_px];
+                if overlay.size_px() != wanted {
+                    return Err(RenderError::Overlay { view, given: overlay.size_px(), wanted });
+                }
+            }
             for (buffer, given, wanted) in lengths {
                 if let Some(given) = given.filter(|&given| given != wanted) {
                     return Err(RenderError::TargetSize { view, buffer, given, wanted });

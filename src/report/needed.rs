@@ -147,6 +147,7 @@ impl Step {
             rgb8: Some(&mut rgb8),
             depth_m: self.depth.then_some(&mut depth_m),
             opacity: self.opacity.then_some(&mut opacity),
+            appearance: None,
         };
         let frame = Frame { scene: &self.scene, profile: &self.profile, views: &[view] };
         Ok(backend.render(&frame, &mut [target], &|_, _| {})?.evaluations)

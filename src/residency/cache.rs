@@ -5,8 +5,8 @@ use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use crate::scene::manifest::{ChunkEntry, Section};
-use crate::scene::{Chunk, Manifest, RenderProfile};
+use crate::scene::manifest::{ChunkEntry, Section, SkyRef};
+use crate::scene::{Chunk, Manifest, RenderProfile, Sky};
 use crate::store::{Catalog, Listing, StoreError, Version};
 
 use super::budget::{Budget, default_bytes};
@@ -24,6 +24,8 @@ pub struct Cache {
     /// By manifest hash and number: a rollback gives an old manifest a new number. The inner lock is
     /// held while opening, so that others wait for the result rather than read again.
     slots: Mutex<BTreeMap<(String, u64), Slot>>,
+    /// The skies of the versions that are open, by what they are and how finely they are baked.
+    skies: Mutex<Vec<((SkyRef, f64), Weak<Sky>)>>,
     /// The version that was opened last stays for the next session: its table has megabytes.
     last: Mutex<Option<Arc<Resident>>>,
 }
@@ -42,6 +44,8 @@ pub(super) struct Shared {
 pub struct Resident {
     /// The version.
     pub version: Arc<Version>,
+    /// What is behind its Gaussians, baked as its profile asks.
+    sky: Option<Arc<Sky>>,
     pub(super) shared: Arc<Shared>,
     index: Index,
     /// Names in the pager's table, chunk after chunk, section after section.
@@ -88,7 +92,8 @@ impl Cache {
         let limit_bytes = limit_bytes.unwrap_or_else(default_bytes);
         let pager = Pager::new(source, limit_bytes);
         let shared = Arc::new(Shared { pager, budget: Mutex::new(Budget::new(limit_bytes)) });
-        Self { catalog, shared, slots: Mutex::default(), last: Mutex::default() }
+        let (slots, skies, last) = Default::default();
+        Self { catalog, shared, slots, skies, last }
     }
 
     /// The twins that can be opened.
@@ -115,7 +120,10 @@ impl Cache {
         let mut held = lock(&slot);
         let resident = match held.upgrade() {
             Some(resident) => resident,
-            None => Arc::new(Resident::new(version, self.shared.clone())),
+            None => {
+                let sky = self.sky(&version)?;
+                Arc::new(Resident::new(version, sky, self.shared.clone()))
+            }
         };
         *held = Arc::downgrade(&resident);
         *lock(&self.last) = Some(resident.clone());
@@ -125,6 +133,26 @@ impl Cache {
     /// What was done so far, and what is held now.
     pub fn stats(&self) -> Stats {
         self.shared.stats()
+    }
+
+    /// The sky of a version, baked as its profile asks; shared by all versions that look at it alike.
+    fn sky(&self, version: &Version) -> Result<Option<Arc<Sky>>, ResidencyError> {
+        let Manifest { sky: Some(named), profile, twin, .. } = &version.manifest else {
+            return Ok(None);
+        };
+        let key = (named.clone(), profile.sky_error);
+        let mut skies = lock(&self.skies);
+        skies.retain(|(_, sky)| sky.strong_count() > 0);
+        let known = skies.iter().find(|(known, _)| *known == key);
+        if let Some(sky) = known.and_then(|(_, sky)| sky.upgrade()) {
+            return Ok(Some(sky));
+        }
+        let Some(sky) = self.catalog.sky(version)? else { return Ok(None) };
+        let baked = sky.drawn(profile.sky_error);
+        baked.map_err(|cause| ResidencyError::Sky { twin: twin.clone(), cause })?;
+        let sky = Arc::new(sky);
+        skies.push((key, Arc::downgrade(&sky)));
+        Ok(Some(sky))
     }
 
     /// The slot of a version. Slots that nobody holds or opens are dropped, so that they do not
@@ -144,7 +172,7 @@ impl Shared {
 }
 
 impl Resident {
-    fn new(version: Version, shared: Arc<Shared>) -> Self {
+    fn new(version: Version, sky: Option<Arc<Sky>>, shared: Arc<Shared>) -> Self {
         let manifest = &version.manifest;
         let (mut keys, mut first) = (Vec::new(), Vec::with_capacity(manifest.chunks.len()));
         for chunk in &manifest.chunks {
@@ -154,13 +182,14 @@ impl Resident {
                 (key(manifest, chunk, section), bytes)
             }));
         }
-        let whole_bytes = keys.iter().map(|(_, bytes)| bytes).sum();
+        let sky_bytes = sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
+        let whole_bytes = sky_bytes + keys.iter().map(|(_, bytes)| bytes).sum::<u64>();
         let ids = shared.pager.with_table(|table| {
             keys.into_iter().map(|(key, bytes)| table.register(key, bytes)).collect()
         });
         let index = Index::new(manifest);
         let (version, worst) = (Arc::new(version), Mutex::default());
-        Self { version, shared, index, ids, first, whole_bytes, worst }
+        Self { version, sky, shared, index, ids, first, whole_bytes, worst }
     }
 
     /// What a frame of these cameras draws; `profile` is the version's unless somebody knows better.
@@ -235,11 +264,17 @@ impl Resident {
         if let Some((_, bytes)) = lock(&self.worst).iter().find(|(known, _)| *known == looks) {
             return *bytes;
         }
-        let bytes = worst_bytes(&self.index, &self.version.manifest, lens, profile);
+        let sky_bytes = self.sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
+        let bytes = sky_bytes + worst_bytes(&self.index, &self.version.manifest, lens, profile);
         let mut worst = lock(&self.worst);
         worst.truncate(crate::config::REMEMBERED_LENSES - 1);
         worst.insert(0, (looks, bytes));
         bytes
+    }
+
+    /// What is behind its Gaussians.
+    pub fn sky(&self) -> Option<&Arc<Sky>> {
+        self.sky.as_ref()
     }
 
     /// Memory that all levels of all of it would take, in bytes.
@@ -264,7 +299,7 @@ impl Resident {
 
     pub(super) fn wanted(&self, needed: Vec<Needed>) -> Wanted {
         let ids = needed.iter().map(|n| self.ids[self.first[n.chunk] + n.section]).collect();
-        Wanted { version: self.version.clone(), needed, ids }
+        Wanted { version: self.version.clone(), sky: self.sky.clone(), needed, ids }
     }
 }
 

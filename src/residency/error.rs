@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use crate::scene::sky::SkyError;
 use crate::store::StoreError;
 
 /// Why a twin cannot be opened, or a frame not be drawn.
@@ -73,6 +74,14 @@ pub enum ResidencyError {
         attempts: u32,
         /// What went wrong the last time.
         cause: String,
+    },
+    /// Its sky cannot be drawn as its profile asks.
+    #[error("the sky of twin {twin:?}: {cause}")]
+    Sky {
+        /// The twin.
+        twin: String,
+        /// Why not.
+        cause: SkyError,
     },
     /// The threads that load cannot be started.
     #[error("cannot start the threads that load twins: {reason}")]

@@ -11,7 +11,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::config;
-use crate::scene::{Chunk, Scene};
+use crate::scene::{Chunk, Scene, Sky};
 use crate::store::{StoreError, Version};
 
 use super::load_times::LoadTimes;
@@ -44,6 +44,7 @@ pub(super) struct Waiting {
 /// Sections of a version.
 pub(super) struct Wanted {
     pub(super) version: Arc<Version>,
+    pub(super) sky: Option<Arc<Sky>>,
     pub(super) needed: Vec<Needed>,
     /// Their names in the table, in the same order.
     pub(super) ids: Vec<Id>,
@@ -562,7 +563,7 @@ impl State {
     ) -> (Done, Result<Pinned, ResidencyError>) {
         let chunks = request.wanted.ids.iter().filter_map(|&id| self.table.get(id).cloned());
         let pinned = Pinned {
-            scene: Scene { chunks: chunks.collect() },
+            scene: Scene { chunks: chunks.collect(), sky: request.wanted.sky.clone() },
             shared: shared.clone(),
             waited_for: frame.waited_for,
             waited: if frame.waited_for == 0 { Duration::ZERO } else { frame.asked.elapsed() },

@@ -13,7 +13,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::{Gaussians, sh};
+use super::{Gaussians, Sky, sh};
 
 /// Edge of a cell, in metres.
 pub const CELL_M: f64 = 64.0;
@@ -415,6 +415,8 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
+    /// What is behind them; black, or the profile's background, if there is none.
+    pub sky: Option<Arc<Sky>>,
 }
 
 impl Scene {
@@ -429,7 +431,7 @@ impl Scene {
             }
             Arc::new(chunk)
         };
-        Self { chunks: partition.cells.par_iter().map(chunk).collect() }
+        Self { chunks: partition.cells.par_iter().map(chunk).collect(), sky: None }
     }
 
     /// Gaussians in all chunks.

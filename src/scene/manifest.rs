@@ -31,6 +31,9 @@ pub struct Manifest {
     /// Recorded drives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trajectories: Vec<Trajectory>,
+    /// What is behind everything, if it has a sky.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sky: Option<SkyRef>,
     /// Where it comes from.
     pub provenance: Provenance,
 }
@@ -90,6 +93,21 @@ pub struct ObjectRef {
     pub bytes: u64,
 }
 
+/// The sky of a twin.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SkyRef {
+    /// BLAKE3 of the object that holds it, 64 lower-case hex digits.
+    pub object: String,
+    /// Its size, in bytes.
+    pub bytes: u64,
+    /// Index of the image whose appearance it is seen with; the mean of all if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image: Option<u32>,
+    /// Rows of the matrix that takes directions in the world to the sky's own axes; orthonormal.
+    pub sky_from_world: [[f64; 3]; 3],
+}
+
 /// Where a version comes from. No clock in it: the same import gives the same identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -121,7 +139,8 @@ impl Manifest {
 
     /// Bytes of all objects but the manifest itself.
     pub fn stored_bytes(&self) -> u64 {
-        self.table.bytes + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
+        let sky = self.sky.as_ref().map_or(0, |sky| sky.bytes);
+        self.table.bytes + sky + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
     }
 
     /// Box of everything; empty without chunks.

@@ -1,5 +1,6 @@
 //! What a city twin is made of: Gaussians in chunks and levels of detail, a rig, recorded trajectories, a manifest.
 
+pub mod appearance;
 pub mod chunk;
 pub mod gaussian;
 pub mod lod;
@@ -9,6 +10,7 @@ pub mod record;
 pub mod rig;
 pub mod route;
 pub mod sh;
+pub mod sky;
 pub mod trajectory;
 
 pub use chunk::{Chunk, Scene};
@@ -17,4 +19,5 @@ pub use manifest::Manifest;
 pub use profile::{ProfileChanges, RenderProfile};
 pub use record::Record;
 pub use rig::Rig;
+pub use sky::Sky;
 pub use trajectory::Trajectory;

@@ -13,7 +13,7 @@ use crate::scene::chunk::cell_at;
 use crate::scene::manifest::Provenance;
 use crate::scene::{Gaussians, RenderProfile};
 use crate::session::{Changed, Engine, HeldLatest};
-use crate::store::{Catalog, Change, Kind, Settings, Storage, StoreError, Version};
+use crate::store::{Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version};
 
 use super::Server;
 use super::fault::Fault;
@@ -351,7 +351,7 @@ fn commit(
     Ok(match base {
         Some(base) if ask.cells != AskedCells::All => {
             let profile = (!ask.profile.is_empty()).then_some(new_profile);
-            let change = Change { profile, rig: None, trajectories: None, provenance };
+            let change = Change { profile, rig: None, trajectories: None, sky: None, provenance };
             commit.change(base.number, change)?
         }
         _ => {
@@ -359,6 +359,7 @@ fn commit(
                 profile: new_profile,
                 rig: was.and_then(|was| was.rig.clone()),
                 trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),
+                sky: was.and_then(|was| was.sky.clone()).map(NewSky::Kept),
                 provenance,
             };
             commit.replace(ask.base, settings)?

@@ -46,7 +46,7 @@ impl Engine {
     /// # Errors
     /// What is there cannot be read, or the backend refuses a frame.
     pub async fn compare(
-        &self,
+        self: &Arc<Self>,
         changed: Changed,
         poses: Option<Vec<Pose>>,
         progress: &(dyn Fn(u64, u64) + Sync),
@@ -62,6 +62,8 @@ impl Engine {
         let gaussians = changed.gaussians.clone();
         let new = tokio::task::spawn_blocking(move || Scene::from_gaussians(&gaussians)).await;
         let mut new = new.map_err(|_| SessionError::Crashed)?;
+        let twin = manifest.twin.clone();
+        let resident = self.resident(twin, Some(changed.before.number)).await?;
         let (mut loaded, mut golden) = (BTreeMap::new(), Vec::new());
         let total = poses.len() as u64;
         for (done, world_from_rig) in (0..).zip(poses) {
@@ -71,9 +73,12 @@ impl Engine {
             let [before, keeping] =
                 [BTreeSet::new(), changed.cells.clone()].map(|without| (without, views.clone()));
             let (version, profile) = (changed.before.clone(), changed.profile);
+            let sky = resident.sky().cloned();
             let scenes = tokio::task::spawn_blocking(move || {
                 let [before, mut after] = [before, keeping].map(|(without, views)| {
-                    scene(&catalog, &version, &profile, (&without, &views), &mut loaded)
+                    let scene =
+                        scene(&catalog, &version, &profile, (&without, &views), &mut loaded);
+                    scene.map(|scene| Scene { sky: sky.clone(), ..scene })
                 });
                 if let Ok(after) = &mut after {
                     after.chunks.extend(new.chunks.iter().cloned());

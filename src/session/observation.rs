@@ -312,7 +312,7 @@ impl Assembly {
                 }
                 &mut scratch[..3 * pixels]
             };
-            targets.push(Target { rgba: None, rgb8: Some(rgb8), depth_m, opacity });
+            targets.push(Target { rgb8: Some(rgb8), depth_m, opacity, ..Target::default() });
         }
         targets
     }

@@ -273,7 +273,9 @@ impl Catalog {
             return Err(damaged(format!("SH degree is {}, not 0 to 3", manifest.sh_degree)));
         }
         let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
-        if let Some(object) = objects.chain([&manifest.table.object]).find(|name| !is_hash(name)) {
+        let sky = manifest.sky.iter().map(|sky| &sky.object);
+        let named = objects.chain(sky).chain([&manifest.table.object]);
+        if let Some(object) = { named }.find(|name| !is_hash(name)) {
             return Err(damaged(format!("{object:?} is not a hash")));
         }
         Ok(manifest)

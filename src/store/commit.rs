@@ -13,6 +13,7 @@ use super::diff::Diff;
 use super::log::{Kind, LogRecord};
 use super::objects::Staging;
 use super::pack::Cells;
+use super::sky::NewSky;
 use super::{Catalog, StoreError, Version, chunk_file, recover};
 
 /// A version in the making. Dropped before it is published, it leaves nothing behind; several of one
@@ -64,6 +65,8 @@ pub struct Settings {
     pub rig: Option<Rig>,
     /// Recorded drives.
     pub trajectories: Vec<Trajectory>,
+    /// What is behind everything.
+    pub sky: Option<NewSky>,
     /// Where it comes from.
     pub provenance: Provenance,
 }
@@ -77,6 +80,8 @@ pub struct Change {
     pub rig: Option<Rig>,
     /// Recorded drives, all of them.
     pub trajectories: Option<Vec<Trajectory>>,
+    /// What is behind everything; `Some(None)` takes the sky away.
+    pub sky: Option<Option<NewSky>>,
     /// Where the new version comes from.
     pub provenance: Provenance,
 }
@@ -159,7 +164,8 @@ impl Commit {
         self.check_clamped()?;
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
         self.publish(base.as_ref().map(|base| base.number), |commit, latest| {
-            let Settings { profile, rig, trajectories, provenance } = settings.clone();
+            let Settings { profile, rig, trajectories, sky, provenance } = settings.clone();
+            let sky = sky.map(|sky| sky.put(&mut commit.staging)).transpose()?;
             let chunks: Vec<_> = commit.chunks.values().cloned().collect();
             let (sh_degree, record) = (commit.sh_degree.unwrap_or(0), commit.storage.record);
             let manifest = Manifest {
@@ -172,6 +178,7 @@ impl Commit {
                 chunks,
                 rig,
                 trajectories,
+                sky,
                 provenance,
             };
             if let (Some(base), Some(latest)) = (&base, latest)
@@ -195,6 +202,9 @@ impl Commit {
         change.check()?;
         self.check_clamped()?;
         let base = self.catalog.version(&self.name, Some(base))?;
+        if let Some(Some(sky)) = &change.sky {
+            sky.check(&change.profile.unwrap_or(base.manifest.profile))?;
+        }
         self.publish(Some(base.number), |commit, latest| match latest {
             Some(latest) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
@@ -219,15 +229,21 @@ impl Commit {
             for chunk in &manifest.chunks {
                 there.objects.check_present(&commit.name, &chunk.object, chunk.bytes)?;
             }
+            if let Some(sky) = &manifest.sky {
+                there.objects.check_present(&commit.name, &sky.object, sky.bytes)?;
+            }
             Ok((manifest, hash))
         })
     }
 
     /// A version with the cells that were put in place of its own, and the table that it had.
-    fn merge(&self, mut manifest: Manifest, change: &Change) -> Result<Manifest, StoreError> {
+    fn merge(&mut self, mut manifest: Manifest, change: &Change) -> Result<Manifest, StoreError> {
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
-        let Change { profile, rig, trajectories, provenance } = change.clone();
+        let Change { profile, rig, trajectories, sky, provenance } = change.clone();
+        if let Some(sky) = sky {
+            manifest.sky = sky.map(|sky| sky.put(&mut self.staging)).transpose()?;
+        }
         manifest.profile = profile.unwrap_or(manifest.profile);
         manifest.rig = rig.or(manifest.rig);
         manifest.trajectories = trajectories.unwrap_or(manifest.trajectories);
@@ -288,7 +304,9 @@ impl Commit {
             let latest = self.catalog.objects.numbers(&self.name)?.last().copied();
             let (manifest, hash) = build(&mut self, latest)?;
             let own = self.chunks.values().map(|chunk| chunk.object.as_str());
-            let objects = own.chain([manifest.table.object.as_str(), hash.as_str()]).collect();
+            let sky = manifest.sky.iter().map(|sky| sky.object.as_str());
+            let named = [manifest.table.object.as_str(), hash.as_str()];
+            let objects = own.chain(sky).chain(named).collect();
             if let Some(number) = latest
                 && let Ok(record) = self.catalog.record(&self.name, number)
                 && record.manifest == hash
@@ -348,7 +366,8 @@ impl Settings {
     /// # Errors
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {
-        check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)
+        check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)?;
+        self.sky.as_ref().map_or(Ok(()), |sky| sky.check(&self.profile))
     }
 }
 

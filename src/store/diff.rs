@@ -14,7 +14,7 @@ pub struct Diff {
     pub cells: Vec<CellDiff>,
     /// Cells that both have alike.
     pub kept: u64,
-    /// Fields of the manifest that differ: of `profile`, `sh_degree`, `record`, `rig`, `trajectories`.
+    /// Fields of the manifest that differ: of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`.
     pub settings: Vec<&'static str>,
 }
 
@@ -75,6 +75,7 @@ impl Diff {
             ("record", before.record != after.record),
             ("rig", before.rig != after.rig),
             ("trajectories", before.trajectories != after.trajectories),
+            ("sky", before.sky != after.sky),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }

@@ -139,7 +139,7 @@ pub enum StoreError {
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// Of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, what both changed.
+        /// Of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`, what both changed.
         settings: Vec<&'static str>,
     },
     /// What is written beside the versions is too large to be read again.

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::scene::manifest::SkyRef;
+
 use super::catalog::check_name;
 use super::gc::Sum;
 use super::{Catalog, StoreError};
@@ -132,6 +134,12 @@ impl Catalog {
                 Ok(mut manifest) => {
                     let table = manifest.table.object.clone();
                     named.insert(table.clone());
+                    if let Some(SkyRef { object, .. }) = manifest.sky.clone()
+                        && named.insert(object.clone())
+                        && let Err(error) = there.objects.start(name, &object, 0)
+                    {
+                        damaged.push(Damage { object, error });
+                    }
                     // Without their table, chunks are still compared with their own hashes.
                     if let Err(error) = there.fill(&mut manifest) {
                         damaged.push(Damage { object: table, error });

@@ -168,7 +168,8 @@ impl Catalog {
     pub(super) fn named_by(&self, name: &str, hash: &str) -> Result<BTreeSet<String>, StoreError> {
         let manifest = self.manifest(name, hash)?;
         let chunks = manifest.chunks.into_iter().map(|chunk| chunk.object);
-        Ok(chunks.chain([manifest.table.object, hash.to_owned()]).collect())
+        let sky = manifest.sky.into_iter().map(|sky| sky.object);
+        Ok(chunks.chain(sky).chain([manifest.table.object, hash.to_owned()]).collect())
     }
 
     /// A note, or an empty one.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! <twins>/<name>/log/0000000001         which manifest version 1 is, since when, and how it came about
-//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables and chunks, named by their BLAKE3
+//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks and skies, named by their BLAKE3
 //! <twins>/<name>/leases/...             versions in use, and until when
 //! <twins>/<name>/gc/candidates          objects that no version needs, and since when
 //! <twins>/<name>/gc/collected           versions whose objects were removed
@@ -32,6 +32,7 @@ mod objects;
 mod pack;
 mod recover;
 mod remote;
+mod sky;
 mod whole;
 
 pub use catalog::{CacheSettings, Catalog, Listing, Version};
@@ -43,4 +44,5 @@ pub use gc::{Collected, Keep, Sum};
 pub use lease::Lease;
 pub use log::{Kind, LogEntry};
 pub use remote::{Patience, Traffic};
+pub use sky::{NewSky, SkyBytes};
 pub use whole::NewVersion;

@@ -5,6 +5,7 @@ use crate::scene::manifest::Provenance;
 use crate::scene::{Gaussians, RenderProfile, Rig, Trajectory};
 
 use super::catalog::check_name;
+use super::sky::NewSky;
 use super::{Catalog, Kind, Settings, Storage, StoreError, Version};
 
 /// What a new version of a twin consists of.
@@ -20,6 +21,8 @@ pub struct NewVersion<'a> {
     pub rig: Option<Rig>,
     /// Recorded drives.
     pub trajectories: Vec<Trajectory>,
+    /// What is behind them.
+    pub sky: Option<NewSky>,
     /// Where they come from.
     pub provenance: Provenance,
     /// How they are stored.
@@ -35,6 +38,7 @@ impl<'a> NewVersion<'a> {
             profile: RenderProfile::DEFAULT,
             rig: None,
             trajectories: Vec::new(),
+            sky: None,
             provenance,
             storage: Storage::default(),
         }
@@ -53,10 +57,11 @@ impl Catalog {
         new: NewVersion<'_>,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
-        let NewVersion { name, gaussians, profile, rig, trajectories, provenance, storage } = new;
+        let NewVersion { name, gaussians, profile, rig, trajectories, sky, provenance, storage } =
+            new;
         check_name(name)?;
         validate::check(gaussians, &Field::twin_name)?;
-        let settings = Settings { profile, rig, trajectories, provenance };
+        let settings = Settings { profile, rig, trajectories, sky, provenance };
         settings.check()?;
         let mut commit = self.begin(name, Kind::Import, storage)?;
         commit.put(gaussians, None, progress)?;

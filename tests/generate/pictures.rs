@@ -1,11 +1,16 @@
-//! What the vehicle's cameras see: daylight without holes.
+//! What the vehicle's cameras see: daylight, houses and ground without holes, and the sky above.
 
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2};
+use wildcity::generate::SKY;
 use wildcity::geometry::Camera;
 use wildcity::geometry::camera::Pinhole;
+use wildcity::ingest;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::render::{Backend, Frame, Target, View};
 use wildcity::scene::rig::RigCamera;
-use wildcity::scene::{RenderProfile, Rig, Scene};
+use wildcity::scene::{RenderProfile, Rig, Scene, Sky};
 
 use super::DEMO;
 
@@ -14,7 +19,10 @@ const SHRINK: u32 = 4;
 
 #[test]
 fn every_camera_sees_daylight_without_holes() {
-    let scene = Scene::from_gaussians(&DEMO.gaussians);
+    let model = ingest::sky::read_bytes(SKY, None).expect("the sky is part of the program").model;
+    let sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
+    let scene = Scene { sky, ..Scene::from_gaussians(&DEMO.gaussians) };
+    let mut seen_sky = 0;
     let rig = Rig::preset("vehicle6").expect("the vehicle is a preset");
     let cpu = Cpu::new(0, Simd::Best).expect("every machine has threads");
     for station_m in [0.0, 60.0, 141.0, 200.0, 280.0] {
@@ -27,14 +35,33 @@ fn every_camera_sees_daylight_without_holes() {
             let rgba = picture(&cpu, &scene, view);
             let what = format!("{name} at {station_m} m");
             let count = rgba.len() as f32;
-            let thinnest = rgba.iter().map(|pixel| pixel[3]).fold(1.0, f32::min);
-            let covered = rgba.iter().map(|pixel| pixel[3]).sum::<f32>() / count;
+            // Where one looks down by more than a degree, there is ground.
+            let width = view.camera.width_px as usize;
+            let down = |pixel: usize| {
+                let at = |k: usize| k as f64 + 0.5;
+                let ray = view.ray_world(DVec2::new(at(pixel % width), at(pixel / width)));
+                ray.is_some_and(|ray| ray.z < -0.02)
+            };
+            let ground = rgba.iter().enumerate().filter(|(pixel, _)| down(*pixel));
+            let (mut thinnest, mut covered, mut pixels) = (1.0_f32, 0.0, 0.0);
+            for (_, pixel) in ground {
+                thinnest = thinnest.min(pixel[3]);
+                covered += pixel[3];
+                pixels += 1.0;
+            }
+            covered /= pixels;
+            assert!(pixels > 0.3 * count, "{what}: {pixels} of the ground");
             assert!(thinnest > 0.6, "{what}: opacity {thinnest} somewhere");
             assert!(covered > 0.985, "{what}: opacity {covered} on average");
+            let dark = rgba.iter().filter(|[r, g, b, _]| r + g + b < 0.02).count();
+            assert!((dark as f32) < 1e-3 * count, "{what}: {dark} pixels are black");
+            seen_sky += rgba.iter().filter(|pixel| pixel[3] < 0.01 && pixel[2] > pixel[0]).count();
             let brightness = rgba.iter().map(|pixel| pixel[1]).sum::<f32>() / count;
             assert!((0.15..0.8).contains(&brightness), "{what}: brightness {brightness}");
         }
     }
+    // Of two million pixels 47,000 show nothing but rather blue sky.
+    assert!(seen_sky > 20_000, "{seen_sky}");
 }
 
 fn shrunk(camera: &Camera) -> Camera {

@@ -8,6 +8,8 @@ mod gpu;
 mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/skies.rs"]
+mod skies;
 #[path = "../support/streets.rs"]
 mod streets;
 #[path = "../support/truths.rs"]
@@ -25,6 +27,7 @@ mod mirror;
 mod overlap;
 mod parity;
 mod parts;
+mod sky;
 mod slips;
 mod stages;
 mod twins;

@@ -40,7 +40,7 @@ fn demo(focal_px: f32) -> Scene {
     let chunks = cells.iter().flat_map(|cell| {
         cell.blocks.iter().map(|(_, run)| block(cell, &order[run.clone()])).collect::<Vec<_>>()
     });
-    Scene { chunks: chunks.collect() }
+    Scene { chunks: chunks.collect(), sky: None }
 }
 
 fn bytes_per_gaussian(scene: &Scene) -> f64 {
@@ -94,7 +94,7 @@ fn what_was_not_drawn_for_longest_makes_room() {
     let (cells, profile) = (route(), RenderProfile::default());
     let window = |at: usize| {
         let chunks = cells[at..at + 3].iter().flat_map(|cell| cell.chunks.iter().cloned());
-        Scene { chunks: chunks.collect() }
+        Scene { chunks: chunks.collect(), sky: None }
     };
     let view = |at: usize| {
         let eye_m = DVec3::new(64.0 * (at + 1) as f64, 0.0, 0.0);
@@ -128,7 +128,7 @@ fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     // Every cell fits alone, and all of them do not.
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
-    let (small, large) = (&cells[0], &Scene { chunks: all.collect() });
+    let (small, large) = (&cells[0], &Scene { chunks: all.collect(), sky: None });
     let limited = gpu_with_limits(Limits { mirror_bytes: 1_000_000, ..Limits::default() });
     let expected = render(&gpu(), small, &profile, &turning_views());
     for _ in 0..2 {

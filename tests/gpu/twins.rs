@@ -8,6 +8,7 @@ use wildcity::render::gpu::layout;
 use wildcity::render::gpu::shaders::Shaders;
 use wildcity::render::{MAX_VIEWS, constants};
 use wildcity::scene::chunk;
+use wildcity::scene::sky::SKY_CUT;
 
 /// The shared files alone: whatever they declare has a twin.
 fn shared() -> Module {
@@ -26,6 +27,7 @@ fn constants_are_the_same() {
         ("MAX_SIGMA_PX", Literal::F32(constants::MAX_SIGMA_PX)),
         ("DEPTH_BITS", Literal::U32(constants::DEPTH_BITS)),
         ("MAX_VIEWS", Literal::U32(MAX_VIEWS as u32)),
+        ("SKY_CUT", Literal::F32(SKY_CUT as f32)),
         ("CLUSTER", Literal::U32(chunk::CLUSTER as u32)),
         ("STRIP", Literal::U32(layout::STRIP)),
         ("GEOMETRY_WORDS", Literal::U32(layout::GEOMETRY_WORDS)),
@@ -77,6 +79,10 @@ fn layouts_are_the_same() {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macros, near_m, far_m,
             blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
         }
+        Behind {
+            scale, offset, edge, pad0, sky_from_pixel,
+        }
+        Seen { exposure, overlay_px, first_overlay, exposed }
         ChunkView {
             camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
         }

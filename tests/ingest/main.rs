@@ -19,6 +19,7 @@ mod hostile;
 mod meshes;
 mod real_scenes;
 mod round_trip;
+mod skies;
 
 use wildcity::ingest::{self, IngestError};
 use wildcity::scene::Gaussians;

@@ -6,13 +6,17 @@ mod data;
 mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/skies.rs"]
+mod skies;
 #[path = "../support/streets.rs"]
 mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod appearance;
 mod determinism;
 mod extremes;
 mod others;
 mod parity;
 mod report;
+mod sky;

@@ -15,8 +15,8 @@ const EXACT: Storage = Storage { record: Record::F32, levels: false };
 
 /// Settings as `street` has them.
 fn settings() -> Settings {
-    let NewVersion { profile, rig, trajectories, provenance, .. } = street(&EMPTY);
-    Settings { profile, rig, trajectories, provenance }
+    let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
+    Settings { profile, rig, trajectories, sky, provenance }
 }
 
 static EMPTY: Gaussians = Gaussians {
@@ -32,7 +32,7 @@ static EMPTY: Gaussians = Gaussians {
 fn change(who: &str) -> Change {
     let mut provenance = settings().provenance;
     provenance.source = who.to_owned();
-    Change { profile: None, rig: None, trajectories: None, provenance }
+    Change { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.

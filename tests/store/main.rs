@@ -17,6 +17,7 @@ mod places;
 mod real_scenes;
 mod remote;
 mod round_trip;
+mod skies;
 
 use std::path::{Path, PathBuf};
 

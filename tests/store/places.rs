@@ -64,7 +64,7 @@ pub(crate) fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
 
 pub(crate) fn cells_alone() -> Change {
     let provenance = street(&gaussians(0, 0, 1.0, 0)).provenance;
-    Change { profile: None, rig: None, trajectories: None, provenance }
+    Change { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }
 
 fn read_all(catalog: &Catalog, version: &Version) -> u64 {
@@ -204,12 +204,12 @@ fn what_cannot_be_used_leaves_nothing() {
 fn settings_are_replaced_whole() {
     everywhere(|place| {
         let catalog = place.catalog();
-        let NewVersion { profile, rig, trajectories, provenance, .. } =
+        let NewVersion { profile, rig, trajectories, sky, provenance, .. } =
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
         let version =
-            commit.replace(None, Settings { profile, rig, trajectories, provenance }).unwrap();
+            commit.replace(None, Settings { profile, rig, trajectories, sky, provenance }).unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));
     });

@@ -20,11 +20,18 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("clap", &["cli"]),
     ("anyhow", &["cli"]),
     ("indicatif", &["cli"]),
-    ("fearless_simd", &["render/cpu"]),
+    ("fearless_simd", &["render/cpu", "scene/sky"]),
     ("wgpu", &["render/gpu"]),
     (
         "rayon",
-        &["render", "scene/chunk.rs", "generate/city.rs", "ingest/validate.rs", "store/pack.rs"],
+        &[
+            "render",
+            "scene/chunk.rs",
+            "scene/sky",
+            "generate/city.rs",
+            "ingest/validate.rs",
+            "store/pack.rs",
+        ],
     ),
     ("tokio", &["server", "client", "session", "cli", "store/remote"]),
     // The catalog is made from one that is open.
@@ -34,7 +41,10 @@ const PACKAGES: &[(&str, &[&str])] = &[
     ("flate2", &["ingest"]),
     ("zip", &["ingest/archive.rs"]),
     ("image_webp", &["ingest/sog"]),
-    ("data_encoding", &["ingest/gltf", "report/page.rs", "server/uploads.rs"]),
+    (
+        "data_encoding",
+        &["ingest/gltf", "report/page.rs", "scene/appearance.rs", "server/uploads.rs"],
+    ),
     ("plotters", &["report/plots.rs"]),
 ];
 

@@ -160,6 +160,32 @@ def test_drivestudio_names_its_models(tmp_path: Path) -> None:
         convert.splats(source, "Sky")
 
 
+def test_a_sky_goes_into_the_same_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    shapes = {"0.weight": (8, 9), "0.bias": (8,), "1.weight": (8, 17), "1.bias": (8,)}
+    shapes |= {"2.weight": (3, 8), "2.bias": (3,)}
+    network = {
+        f"sky_head.layers.{name}": rng.standard_normal(shape).astype("<f4")
+        for name, shape in shapes.items()
+    }
+    network["appearance_embedding.weight"] = rng.standard_normal((4, 3)).astype("<f4")
+    state = {name: Tensor(values) for name, values in network.items()}
+    state["direction_encoding.scales"] = Tensor(np.ones(7, "<f4"))
+    background = {f"_{name}": Tensor(values) for name, values in gaussians().items()}
+    saved = {"models": {"Background": background, "Sky": state}}
+    source = save(tmp_path / "checkpoint_final.pth", saved)
+    found = convert.sky(source)
+    assert found.keys() == network.keys()
+    for name, values in network.items():
+        np.testing.assert_array_equal(found[name], values)
+    assert convert.convert(source, tmp_path / "street.safetensors") == N
+    written = (tmp_path / "street.safetensors").read_bytes()
+    assert b'"sky_head.layers.2.bias"' in written
+    assert network["sky_head.layers.1.weight"].tobytes() in written
+    del state["sky_head.layers.2.bias"]
+    assert convert.sky(save(tmp_path / "half.pth", saved)) == {}
+
+
 def test_splatfacto_and_inria(tmp_path: Path) -> None:
     g = gaussians(rest=8)
     names = {"sh0": "features_dc", "shN": "features_rest"}

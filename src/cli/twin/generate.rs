@@ -94,6 +94,7 @@ impl Generate {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
             trajectories: vec![generate::city_drive(&settings)?],
+            sky: None,
             provenance: Provenance::of(format!(
                 "city {}: {}",
                 generate::REVISION,

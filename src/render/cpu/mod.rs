@@ -3,6 +3,8 @@
 //! Deterministic: what runs in parallel writes to places that do not depend on the schedule, and
 //! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
 
+mod appearance;
+mod behind;
 mod bin;
 mod handover;
 mod lanes;
@@ -19,6 +21,7 @@ use rayon::ThreadPool;
 
 use crate::config;
 
+use self::behind::Behind;
 use super::layout::Cutoffs;
 use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
@@ -173,6 +176,9 @@ impl Backend for Cpu {
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
+        // Outside of the pool: baking waits for threads, and one that waits for its own pool may take up
+        // other work there.
+        let behind = Behind::of(frame)?;
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
@@ -181,7 +187,8 @@ impl Backend for Cpu {
             scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
             let mut clock = Clock::start();
             let Scratch { projected, bins, .. } = scratch;
-            let input = rasterize::Input { projected, bins, views: frame.views, cutoffs: &cutoffs };
+            let (views, behind) = (frame.views, &*behind);
+            let input = rasterize::Input { projected, bins, views, behind, cutoffs: &cutoffs };
             stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
             clock.stage("rasterize", &mut stats);
             Ok(stats)

@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 use fearless_simd::{Level, dispatch, f32x16, i32x16, prelude::*, u16x32};
 use rayon::prelude::*;
 
+use super::appearance;
+use super::behind::Behind;
 use super::bin::{Bins, Grid};
 use super::project::Projected;
 use super::resolve::{self, Band, TileSums};
@@ -28,6 +30,7 @@ pub(super) struct Input<'a> {
     pub(super) projected: &'a Projected,
     pub(super) bins: &'a Bins,
     pub(super) views: &'a [View],
+    pub(super) behind: &'a [Behind],
     pub(super) cutoffs: &'a Cutoffs,
 }
 
@@ -104,11 +107,22 @@ fn rasterize_band<S: Simd>(
     band: &mut Band<'_>,
 ) -> u64 {
     let mut lists = Lists::default();
+    let behind = input.behind.get(view);
+    let mut scratch = behind.and_then(Behind::scratch);
     let mut evaluations = 0;
     for column in 0..columns {
         let tile = input.bins.tile(view, row * columns as usize + column as usize);
         let at = [column * TILE_PX, row as u32 * TILE_PX];
-        evaluations += rasterize_tile(simd, input, tile, at, &mut lists, band);
+        let mut sums = TileSums::default();
+        evaluations +=
+            rasterize_tile(simd, input, tile, at, &mut lists, (&mut sums, band.wants_depth()));
+        if let Some(behind) = behind {
+            behind.add(simd, at, &mut scratch, &mut sums);
+        }
+        if let Some(appearance) = band.appearance {
+            appearance::apply(simd, appearance, at, &mut sums);
+        }
+        resolve::resolve(simd, &sums, at[0], band);
     }
     evaluations
 }
@@ -120,9 +134,8 @@ fn rasterize_tile<S: Simd>(
     tile: &[AtomicU32],
     at_px: [u32; 2],
     lists: &mut Lists,
-    band: &mut Band<'_>,
+    (sums, wants_depth): (&mut TileSums, bool),
 ) -> u64 {
-    let mut sums = TileSums::default();
     let mut live = u16::MAX;
     let mut evaluations = 0;
     for batch in tile.chunks(BATCH) {
@@ -132,10 +145,10 @@ fn rasterize_tile<S: Simd>(
             if touching == 0 || live >> block & 1 == 0 {
                 continue;
             }
-            let (done, count) = if band.wants_depth() {
-                blend::<S, true>(simd, &lists.batch, touching, block, input.cutoffs, &mut sums)
+            let (done, count) = if wants_depth {
+                blend::<S, true>(simd, &lists.batch, touching, block, input.cutoffs, sums)
             } else {
-                blend::<S, false>(simd, &lists.batch, touching, block, input.cutoffs, &mut sums)
+                blend::<S, false>(simd, &lists.batch, touching, block, input.cutoffs, sums)
             };
             live &= !(u16::from(done) << block);
             evaluations += count as u64 * LANES as u64;
@@ -144,7 +157,6 @@ fn rasterize_tile<S: Simd>(
             break;
         }
     }
-    resolve::resolve(simd, &sums, at_px[0], band);
     evaluations
 }
 

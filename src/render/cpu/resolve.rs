@@ -4,6 +4,7 @@ use fearless_simd::{f32x16, prelude::*, u32x16};
 
 use crate::render::constants::{BLOCK_PX, TILE_PX};
 use crate::render::{Target, View};
+use crate::scene::appearance::Appearance;
 use crate::scene::chunk::LANES;
 
 const BLOCKS: usize = 16;
@@ -38,6 +39,8 @@ pub(super) struct Band<'a> {
     rgb8: Option<&'a mut [u8]>,
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
+    /// What the camera makes of the colours.
+    pub(super) appearance: Option<&'a Appearance>,
 }
 
 impl Band<'_> {
@@ -51,6 +54,7 @@ impl Band<'_> {
 pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>> {
     let (width, height) = (view.camera.width_px as usize, view.camera.height_px as usize);
     let pixels = width * TILE_PX as usize;
+    let appearance = target.appearance.filter(|appearance| !appearance.is_plain());
     let mut rgba = target.rgba.as_mut().map(|b| b.chunks_mut(4 * pixels));
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
@@ -64,6 +68,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
             rgb8: rgb8.as_mut().and_then(Iterator::next),
             depth_m: depth_m.as_mut().and_then(Iterator::next),
             opacity: opacity.as_mut().and_then(Iterator::next),
+            appearance,
         })
         .collect()
 }

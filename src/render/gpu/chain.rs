@@ -19,7 +19,7 @@ use super::plan::{Counts, Plan, job};
 use super::project::{Project, Splats, Work};
 use super::rasterize::Rasterize;
 use super::read_back::{Drawn, ReadBack, Ring, TICKS_OFFSET};
-use super::resolve::Planes;
+use super::resolve::{Planes, Wanted};
 use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::{Columns, Sort};
@@ -139,12 +139,13 @@ impl Chain {
     pub(super) fn draw(
         &mut self,
         frame: &Frame<'_>,
-        planes: Planes,
+        wanted: &Wanted,
         cull: &ThreadPool,
     ) -> Result<Drawn, RenderError> {
+        let planes = wanted.planes;
         let start = Instant::now();
         cull.install(|| self.mirror.hold(&self.device, frame.scene))?;
-        let (mut gpu_frame, read_back) = self.begin(frame, planes);
+        let (mut gpu_frame, read_back) = self.begin(frame, wanted)?;
         let mut stats = FrameStats::default();
         add(&mut stats, "prepare", start.elapsed());
         let (subject, rows) = (Subject::of(frame), Rows::of(frame));
@@ -199,13 +200,19 @@ impl Chain {
     }
 
     /// Makes room for the pixels of a frame, of which nothing is drawn yet.
-    fn begin(&mut self, frame: &Frame<'_>, planes: Planes) -> (GpuFrame, ReadBack) {
+    fn begin(
+        &mut self,
+        frame: &Frame<'_>,
+        wanted: &Wanted,
+    ) -> Result<(GpuFrame, ReadBack), RenderError> {
+        let planes = wanted.planes;
+        self.rasterize.hold_behind(&self.device, frame, &wanted.appearances)?;
         let gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
         let mut read_back = self.ring.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
         self.last = FrameWork::new(frame, planes, &gpu_frame);
-        (gpu_frame, read_back)
+        Ok((gpu_frame, read_back))
     }
 
     /// Hands out a frame of which everything is drawn and mapped.

@@ -141,6 +141,36 @@ impl Frame {
     }
 }
 
+/// What is behind the Gaussians of all views (784 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Behind {
+    /// A face's width in values, ...
+    pub scale: f32,
+    /// ... where its first one lies, ...
+    pub offset: f32,
+    /// ... and values along an edge.
+    pub edge: u32,
+    /// Zero.
+    pub pad0: u32,
+    /// By view, rows that take `(x, y, 1)` in pixels to a direction of any length.
+    pub sky_from_pixel: [[[f32; 4]; 3]; MAX_VIEWS],
+}
+
+/// What one camera makes of colours (64 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Seen {
+    /// Rows of the exposure's matrix, each with its offset.
+    pub exposure: [[f32; 4]; 3],
+    /// Size of the overlay; 0 if there is none.
+    pub overlay_px: [u32; 2],
+    /// Its first pixel among those of all views.
+    pub first_overlay: u32,
+    /// 1 if there is an exposure.
+    pub exposed: u32,
+}
+
 /// A pinhole view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

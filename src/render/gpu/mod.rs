@@ -4,6 +4,7 @@
 //! any order commutes. Nothing is read back in mid-frame: a frame that does not fit its buffers is
 //! drawn again in larger ones, and one that does not fit the device is drawn part by part.
 
+mod behind;
 mod bin;
 mod chain;
 mod device;
@@ -38,7 +39,7 @@ pub use traffic::FrameWork;
 use self::chain::Chain;
 use self::device::Device;
 use self::read_back::Drawn;
-use self::resolve::{Pixels, Planes};
+use self::resolve::{Pixels, Wanted};
 use self::shaders::Shaders;
 use self::turns::Turns;
 use super::stage::{Between, Stage};
@@ -202,8 +203,8 @@ impl Gpu {
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, planes| {
-            chain.go_on(between, frame, planes)
+        self.render_with(frame, targets, finished, |chain, wanted| {
+            chain.go_on(between, frame, wanted)
         })
     }
 
@@ -266,16 +267,17 @@ impl Gpu {
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
-        draw: impl FnOnce(&mut Chain, Planes) -> Result<Drawn, RenderError>,
+        draw: impl FnOnce(&mut Chain, &Wanted) -> Result<Drawn, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
-        let planes = Planes::of(targets);
+        let wanted = Wanted::of(targets);
+        let planes = wanted.planes;
         let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
         let asked = Instant::now();
         // Not in a pool: a thread that waits for its own pool may take up another frame there.
         let (drawn, wait_ms) = self.in_turn(|chain| {
             let wait_ms = ms(asked);
-            Ok((draw(chain, planes)?, wait_ms))
+            Ok((draw(chain, &wanted)?, wait_ms))
         })?;
         let start = Instant::now();
         let words: Result<Vec<&[u32]>, _> =
@@ -331,8 +333,8 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, planes| {
-            chain.draw(frame, planes, &self.cull)
+        self.render_with(frame, targets, finished, |chain, wanted| {
+            chain.draw(frame, wanted, &self.cull)
         })
     }
 }

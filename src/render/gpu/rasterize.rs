@@ -3,12 +3,15 @@
 //! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`.
 
 use std::ops::Range;
+use std::sync::Arc;
 
+use glam::{DMat3, DVec3};
 use wgpu::{
     BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass,
     ShaderModule,
 };
 
+use super::behind::Behind;
 use super::bin::Bin;
 use super::device::Device;
 use super::growing::Growing;
@@ -18,6 +21,9 @@ use super::plan::Plan;
 use super::project::Splats;
 use super::resolve::Planes;
 use super::shaders::Shaders;
+use crate::render::{Frame, RenderError};
+use crate::scene::appearance::Appearance;
+use crate::scene::sky::{CubeMap, Drawn};
 
 /// The stage on the device, and its output.
 #[derive(Debug)]
@@ -25,6 +31,14 @@ pub(super) struct Rasterize {
     module: ShaderModule,
     /// By the planes that are wanted, compiled when first asked for.
     kernels: [Option<Kernel>; Planes::VARIANTS],
+    /// For frames with something behind the Gaussians, or cameras that change colours; made with the
+    /// first of them.
+    behind: Option<Behind>,
+    /// What is behind the Gaussians of the latter alone.
+    black: Option<Arc<CubeMap>>,
+    /// Whether the frame at hand is one.
+    has_behind: bool,
+    shaders: Shaders,
     spans: Growing,
     /// Pixels, tile after tile, page after page.
     pages: Vec<Growing>,
@@ -36,9 +50,37 @@ impl Rasterize {
         Self {
             module: module(device, shaders, "rasterize"),
             kernels: [const { None }; Planes::VARIANTS],
+            behind: None,
+            black: None,
+            has_behind: false,
+            shaders: shaders.clone(),
             spans: Growing::new(device, "tile spans", uniform),
             pages: Vec::new(),
         }
+    }
+
+    /// Sends what is behind a frame's Gaussians to the device, and what its cameras make of colours, if
+    /// there is either; `appearances` is empty if they all record what is there.
+    ///
+    /// # Errors
+    /// The sky cannot be drawn as the profile asks, or is larger than a binding.
+    pub(super) fn hold_behind(
+        &mut self,
+        device: &Device,
+        frame: &Frame<'_>,
+        appearances: &[Appearance],
+    ) -> Result<(), RenderError> {
+        let behind = match frame.behind()? {
+            None if !appearances.is_empty() => {
+                let black = self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
+                Some((Drawn::Map(black.clone()), DMat3::IDENTITY))
+            }
+            behind => behind,
+        };
+        self.has_behind = behind.is_some();
+        let Some(drawn) = behind else { return Ok(()) };
+        let held = self.behind.get_or_insert_with(|| Behind::new(device));
+        held.hold(device, frame, drawn, appearances)
     }
 
     /// Makes room for the pixels of all tiles. Returns how many tiles a page holds.
@@ -64,9 +106,19 @@ impl Rasterize {
         (splats, bin): (&Splats, &Bin),
         (planes, tiles, per_page): (Planes, &Range<u32>, u32),
     ) {
-        let module = &self.module;
-        let kernel = self.kernels[planes.variant()]
-            .get_or_insert_with(|| Kernel::new(device, module, "main", &planes.constants()));
+        let (kernel, of_behind) = match self.behind.as_mut().filter(|_| self.has_behind) {
+            Some(behind) => {
+                let (kernel, resources) = behind.kernel(device, &self.shaders, planes);
+                (kernel, Some(resources))
+            }
+            None => {
+                let module = &self.module;
+                let kernel = self.kernels[planes.variant()].get_or_insert_with(|| {
+                    Kernel::new(device, module, "main", &planes.constants())
+                });
+                (&*kernel, None)
+            }
+        };
         let spans = pages(tiles, per_page).map(|(_, tiles)| {
             let mut slot = [0; SLOT_BYTES as usize / 4];
             slot[..2].copy_from_slice(&[tiles.start, tiles.len() as u32]);
@@ -81,7 +133,7 @@ impl Rasterize {
                 offset: first,
                 size: BufferSize::new(bytes),
             };
-            let all = [
+            let mut all = vec![
                 (0, plan.frame().as_entire_binding()),
                 (1, slot(self.spans.buffer(), index as u64, size_of::<Span>())),
                 (2, bin.ranges.bind()),
@@ -91,6 +143,7 @@ impl Rasterize {
                 (6, plan.counters().as_entire_binding()),
                 (7, BindingResource::Buffer(pixels)),
             ];
+            all.extend(of_behind.iter().flatten().cloned());
             kernel.run(device, pass, Groups::Count(tiles.len() as u32), &all);
         }
     }

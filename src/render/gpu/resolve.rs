@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::layout::FrameView;
 use crate::render::Target;
 use crate::render::constants::TILE_PX;
+use crate::scene::appearance::Appearance;
 
 /// Pixels of a tile.
 const PLANE: usize = (TILE_PX * TILE_PX) as usize;
@@ -20,6 +21,25 @@ pub(super) struct Planes {
     rgb: bool,
     opacity: bool,
     depth: bool,
+}
+
+/// What the targets of a frame ask of the device.
+#[derive(Clone, Debug)]
+pub(super) struct Wanted {
+    pub(super) planes: Planes,
+    /// What each camera makes of colours; empty if they all record what is there.
+    pub(super) appearances: Vec<Appearance>,
+}
+
+impl Wanted {
+    /// What these targets ask for.
+    pub(super) fn of(targets: &[Target<'_>]) -> Self {
+        let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
+        let appearances: Vec<Appearance> = appearances.collect();
+        let all_plain = appearances.iter().all(Appearance::is_plain);
+        let appearances = if all_plain { Vec::new() } else { appearances };
+        Self { planes: Planes::of(targets), appearances }
+    }
 }
 
 impl Planes {

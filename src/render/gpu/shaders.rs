@@ -1,5 +1,6 @@
 //! The WGSL of each stage, with its `#import NAME` lines replaced by `shaders/shared/NAME.wgsl`
-//! (`shaders/resolve.wgsl` for `resolve`). That one directive is the whole preprocessor.
+//! (`shaders/resolve.wgsl` for `resolve`, and likewise the skies). That one directive is the whole
+//! preprocessor; `#import SKY` in `rasterize` stands for one of two, each a variant of the stage.
 
 /// The linked sources of all stages.
 #[derive(Clone, Debug)]
@@ -17,10 +18,14 @@ impl Default for Shaders {
             ("bin", include_str!("../../../shaders/bin.wgsl")),
             ("ranges", include_str!("../../../shaders/ranges.wgsl")),
             ("expand", include_str!("../../../shaders/expand.wgsl")),
-            ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
             ("roofline", include_str!("../../../shaders/roofline.wgsl")),
         ];
-        Self { stages: stages.map(|(name, source)| (name, link(source))).to_vec() }
+        let mut stages = stages.map(|(name, source)| (name, link(source))).to_vec();
+        let rasterize = include_str!("../../../shaders/rasterize.wgsl");
+        for (name, sky) in [("rasterize", "plain"), ("rasterize_sky", "sky_map")] {
+            stages.push((name, link(&rasterize.replace("#import SKY", &format!("#import {sky}")))));
+        }
+        Self { stages }
     }
 }
 
@@ -52,7 +57,11 @@ const SHARED: &[(&str, &str)] = &[
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
     ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
+    ("plain", include_str!("../../../shaders/shared/plain.wgsl")),
+    ("appearance", include_str!("../../../shaders/appearance.wgsl")),
+    ("behind", include_str!("../../../shaders/behind.wgsl")),
     ("resolve", include_str!("../../../shaders/resolve.wgsl")),
+    ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
 ];
 
 fn link(stage: &str) -> String {
@@ -60,7 +69,7 @@ fn link(stage: &str) -> String {
         let name = str::strip_prefix(line, "#import ");
         let shared = name.and_then(|name| SHARED.iter().find(|(shared, _)| *shared == name));
         // An unknown name stays, and the shader's compiler says where.
-        format!("{}\n", shared.map_or(line, |(_, source)| *source))
+        shared.map_or_else(|| format!("{line}\n"), |(_, source)| link(source))
     };
     stage.lines().map(source).collect()
 }

@@ -3,14 +3,18 @@
 //! It differentiates the camera numerically and inverts the covariance plainly, so that a slip in
 //! the other backends' hand-derived formulas has nowhere to hide.
 
+mod behind;
 mod blend;
 mod project;
 
 use std::time::Instant;
 
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 pub use project::{Splat, project};
+
+use crate::scene::appearance::{Appearance, Exposure};
 
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
@@ -41,9 +45,17 @@ impl Backend for Reference {
 
             let start = Instant::now();
             let width = view.camera.width_px as usize;
+            let appearance = target.appearance;
             let pixels: Vec<blend::Pixel> = (0..view.camera.height_px)
                 .into_par_iter()
-                .flat_map_iter(|row| blend::row(&splats, row, width, frame.profile))
+                .flat_map_iter(|row| {
+                    let mut pixels = blend::row(&splats, row, width, frame.profile);
+                    behind::add(frame, view, row, &mut pixels);
+                    if let Some(appearance) = appearance {
+                        appear(appearance, row, &mut pixels);
+                    }
+                    pixels
+                })
                 .collect();
             blend_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.evaluations += pixels.len() as u64 * splats.len() as u64;
@@ -52,6 +64,23 @@ impl Backend for Reference {
         }
         stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];
         Ok(stats)
+    }
+}
+
+/// What a camera makes of one row of pixels.
+fn appear(appearance: &Appearance, row: u32, pixels: &mut [blend::Pixel]) {
+    let Appearance { exposure, overlay } = appearance;
+    for (column, pixel) in pixels.iter_mut().enumerate() {
+        if let Some(Exposure { matrix, offset }) = exposure {
+            let exposed = DMat3::from_cols_array_2d(matrix).transpose() * pixel.rgb;
+            pixel.rgb = exposed + DVec3::from_array(*offset);
+        }
+        if let Some(overlay) = overlay {
+            let first = 4 * (row as usize * overlay.size_px()[0] as usize + column);
+            let [r, g, b, alpha] =
+                [0, 1, 2, 3].map(|c| f64::from(overlay.rgba8()[first + c]) / 255.0);
+            pixel.rgb = pixel.rgb.lerp(DVec3::new(r, g, b), alpha);
+        }
     }
 }
 

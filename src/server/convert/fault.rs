@@ -99,7 +99,7 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
                 (Code::Busy, field("twin"))
             }
             ResidencyError::Late { .. } => (Code::DeadlineExceeded, None),
-            ResidencyError::Load { .. } | ResidencyError::Store(_) => {
+            ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
                 (Code::TwinDamaged, field("twin"))
             }
             ResidencyError::Thread { .. } => (Code::Internal, None),

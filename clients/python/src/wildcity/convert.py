@@ -3,7 +3,8 @@
     python -m wildcity.convert ckpt_29999.pt street.safetensors
     python -m wildcity.convert checkpoint_final.pth street.safetensors --model Background
 
-It knows gsplat (`splats`), drivestudio (`models`, of which one is taken), nerfstudio's splatfacto
+A checkpoint's sky network goes into the same file: `wildcity import street.safetensors --sky
+street.safetensors` takes both. It knows gsplat (`splats`), drivestudio (`models`, of which one is taken), nerfstudio's splatfacto
 and INRIA's tuple. It needs numpy and no PyTorch, and runs nothing that is in the file.
 """
 
@@ -23,7 +24,7 @@ import numpy.typing as npt
 
 from .checkpoint import CheckpointError, load
 
-__all__ = ["CheckpointError", "convert", "load", "models", "splats"]
+__all__ = ["CheckpointError", "convert", "load", "models", "sky", "splats"]
 
 _NAMES = {
     "means": ("means", "xyz"),
@@ -35,19 +36,23 @@ _NAMES = {
 }
 """gsplat's names, and what others call the same."""
 
+_SKY = [f"sky_head.layers.{layer}.{part}" for layer in range(3) for part in ("weight", "bias")]
+"""drivestudio's SkyModel, with or without `appearance_embedding.weight`."""
+
 _Arrays = dict[str, npt.NDArray[Any]]
 
 
 def convert(
     source: str | PathLike[str], target: str | PathLike[str], model: str | None = None
 ) -> int:
-    """Writes the Gaussians of a checkpoint as safetensors, and returns how many they are.
+    """Writes the Gaussians of a checkpoint, and its sky if it has one, as safetensors; returns how
+    many Gaussians they are.
 
     `model` chooses one where a checkpoint has several. `target` appears whole or not at all.
     Raises `CheckpointError`.
     """
     tensors = splats(source, model)
-    _write_safetensors(target, tensors)
+    _write_safetensors(target, tensors | sky(source))
     return len(tensors["means"])
 
 
@@ -65,6 +70,32 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
         names = ", ".join(repr(name) for name in found)
         raise CheckpointError(f"{source}: there is no model {model!r}, only {names}")
     return found[model]
+
+
+def sky(source: str | PathLike[str]) -> _Arrays:
+    """The network of a checkpoint's sky, by the names that `wildcity import --sky` reads, as float32;
+    empty if there is none.
+    """
+    for arrays in _mappings(load(source)):
+        prefixes = {key.removesuffix(_SKY[0]) for key in arrays if key.endswith(_SKY[0])}
+        for prefix in sorted(prefixes):
+            names = [*_SKY, "appearance_embedding.weight"]
+            found = {name: arrays.get(prefix + name) for name in names}
+            if all(isinstance(found[name], np.ndarray) for name in _SKY):
+                return {
+                    name: values.astype("<f4")
+                    for name, values in found.items()
+                    if isinstance(values, np.ndarray)
+                }
+    return {}
+
+
+def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
+    """All mappings within others, whose keys are names."""
+    if isinstance(value, Mapping) and depth <= 8:
+        yield {key: item for key, item in value.items() if isinstance(key, str)}
+        for item in value.values():
+            yield from _mappings(item, depth + 1)
 
 
 def models(source: str | PathLike[str]) -> dict[str, _Arrays]:

@@ -11,7 +11,7 @@ use crate::render::gpu::parts::Needs;
 use crate::render::gpu::plan::Counts;
 use crate::render::gpu::project::Work;
 use crate::render::gpu::read_back::{Drawn, ReadBack, TICKS_OFFSET};
-use crate::render::gpu::resolve::Planes;
+use crate::render::gpu::resolve::Wanted;
 use crate::render::layout::{Cutoffs, Splat};
 use crate::render::stage::{Between, Stage, Tiles};
 use crate::render::{Frame, FrameStats, RenderError};
@@ -25,10 +25,11 @@ impl Chain {
         &mut self,
         between: &Between,
         frame: &Frame<'_>,
-        planes: Planes,
+        wanted: &Wanted,
     ) -> Result<Drawn, RenderError> {
         self.expect(between)?;
-        let (mut gpu_frame, read_back) = self.begin(frame, planes);
+        let planes = wanted.planes;
+        let (mut gpu_frame, read_back) = self.begin(frame, wanted)?;
         let (tiles, mut stats) = (0..gpu_frame.tiles, FrameStats::default());
         let output = (planes, &tiles, read_back.tiles_per_page);
         let source = Source::Between(between);

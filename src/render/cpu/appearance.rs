@@ -1,0 +1,68 @@
+//! Exposure and overlay of one camera: a part of stage resolve, for cameras that have them.
+
+use fearless_simd::{f32x16, prelude::*};
+
+use super::lanes::Vec3x16;
+use super::resolve::TileSums;
+use crate::render::constants::BLOCK_PX;
+use crate::scene::appearance::{Appearance, Exposure, Overlay};
+use crate::scene::chunk::LANES;
+
+/// Blocks of a tile.
+const BLOCKS: usize = 16;
+
+/// Turns a tile's colours into those that the camera records; its corner is `at_px`.
+#[inline(always)]
+pub(super) fn apply<S: Simd>(
+    simd: S,
+    appearance: &Appearance,
+    at_px: [u32; 2],
+    sums: &mut TileSums,
+) {
+    for block in 0..BLOCKS {
+        let load = |c: usize| f32x16::load_array_ref(simd, &sums.rgb[c][block]);
+        let mut rgb = Vec3x16 { x: load(0), y: load(1), z: load(2) };
+        if let Some(exposure) = &appearance.exposure {
+            rgb = expose(simd, exposure, rgb);
+        }
+        if let Some(overlay) = &appearance.overlay {
+            let edge = BLOCK_PX;
+            let (left, top) = (block as u32 % edge * edge, block as u32 / edge * edge);
+            rgb = cover(simd, overlay, [at_px[0] + left, at_px[1] + top], rgb);
+        }
+        rgb.x.store_array(&mut sums.rgb[0][block]);
+        rgb.y.store_array(&mut sums.rgb[1][block]);
+        rgb.z.store_array(&mut sums.rgb[2][block]);
+    }
+}
+
+#[inline(always)]
+fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> {
+    let row = |c: usize| {
+        let [r, g, b] = exposure.matrix[c].map(|value| f32x16::splat(simd, value as f32));
+        let offset = f32x16::splat(simd, exposure.offset[c] as f32);
+        r.mul_add(rgb.x, g.mul_add(rgb.y, b.mul_add(rgb.z, offset)))
+    };
+    Vec3x16 { x: row(0), y: row(1), z: row(2) }
+}
+
+/// Lays the overlay over the block whose corner is `at_px`.
+#[inline(always)]
+fn cover<S: Simd>(simd: S, overlay: &Overlay, at_px: [u32; 2], rgb: Vec3x16<S>) -> Vec3x16<S> {
+    let [width, height] = overlay.size_px();
+    let mut over = [[0.0; LANES]; 4];
+    for lane in 0..LANES as u32 {
+        let (x, y) = (at_px[0] + lane % BLOCK_PX, at_px[1] + lane / BLOCK_PX);
+        // Tiles reach beyond the image.
+        if x < width && y < height {
+            let first = 4 * (y as usize * width as usize + x as usize);
+            for c in 0..4 {
+                over[c][lane as usize] = f32::from(overlay.rgba8()[first + c]);
+            }
+        }
+    }
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let load = |c: usize| f32x16::load_array_ref(simd, &over[c]) * splat(1.0 / 255.0);
+    let (alpha, color) = (load(3), Vec3x16 { x: load(0), y: load(1), z: load(2) });
+    rgb.mul_add(splat(1.0) - alpha, color.scale(alpha))
+}

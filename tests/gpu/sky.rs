@@ -1,0 +1,154 @@
+//! Skies on the device, against the cpu backend; and nothing of it without one.
+
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+use wildcity::render::gpu::shaders::Shaders;
+use wildcity::render::gpu::{AdapterChoice, Gpu};
+use wildcity::render::{Backend, RenderError, View};
+use wildcity::scene::sky::{CubeMap, Model};
+use wildcity::scene::{RenderProfile, Scene, Sky};
+
+use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
+use crate::images::{agree, cpu, look, max_difference, render, render_one, try_render};
+use crate::skies::{appearance, demo_model, draw_seen, empty, sky};
+use crate::streets::{street, street_views};
+
+const EXACT: RenderProfile = RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT };
+
+fn all_around() -> Vec<View> {
+    let down = DVec3::new(0.1, 0.1, -1.0);
+    let forwards =
+        [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::new(0.2, 0.1, 1.0), DVec3::NEG_Z];
+    let sizes = [[64, 48], [33, 17], [48, 48], [20, 50], [64, 64], [16, 16]];
+    let views = forwards.into_iter().zip(sizes);
+    views.map(|(forward, size_px)| look(size_px, 20.0, DVec3::ZERO, forward, down)).collect()
+}
+
+/// Largest difference from the cpu backend in all views.
+fn difference(scene: &Scene, profile: &RenderProfile) -> f32 {
+    let images = render(&gpu(), scene, profile, &all_around());
+    let truths = render(&cpu(), scene, profile, &all_around());
+    let pairs = images.iter().zip(&truths);
+    pairs.map(|(a, b)| max_difference(&a.rgba, &b.rgba)).fold(0.0, f32::max)
+}
+
+#[test]
+fn a_baked_sky() {
+    assert!(difference(&empty(sky()), &RenderProfile::DEFAULT) < 2e-5);
+    let scene = empty(Arc::new(Sky::new(demo_model(None), DMat3::IDENTITY)));
+    assert!(difference(&scene, &RenderProfile::DEFAULT) < 2e-5);
+}
+
+/// Skies are looked up: evaluating one is the cpu's.
+#[test]
+fn an_evaluated_sky_is_refused() {
+    let refused = try_render(&gpu(), &empty(sky()), &EXACT, &all_around()[..1]);
+    assert_eq!(refused, Err(RenderError::ExactSky { backend: "gpu" }));
+}
+
+#[test]
+fn images_and_a_background() {
+    // A colour for every direction, so that edges of faces are no seams.
+    let mut rgb8 = Vec::new();
+    for face in 0..6 {
+        for k in 0..81 {
+            let at = |k: usize| (k as f64 + 0.5) / 9.0;
+            let away = CubeMap::direction(face, [at(k % 9), at(k / 9)]).normalize();
+            rgb8.extend((away * 120.0 + 128.0).to_array().map(|c| c as u8));
+        }
+    }
+    let model = Model::cube(CubeMap::from_faces(9, &rgb8).unwrap());
+    let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
+    assert!(difference(&scene, &RenderProfile::DEFAULT) < 5e-3);
+    let background = RenderProfile { background: [0.2, 0.4, 0.9], ..RenderProfile::DEFAULT };
+    assert!(difference(&Scene::default(), &background) < 1e-6);
+    // One sky after another, on one device.
+    let (gpu, views) = (gpu(), all_around());
+    for scene in [empty(sky()), Scene::default(), scene, empty(sky())] {
+        for profile in [RenderProfile::DEFAULT, background] {
+            let images = render(&gpu, &scene, &profile, &views);
+            let truths = render(&cpu(), &scene, &profile, &views);
+            for (image, truth) in images.iter().zip(&truths) {
+                assert!(max_difference(&image.rgba, &truth.rgba) < 5e-3);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_sky_behind_gaussians() {
+    let street = Scene::from_gaussians(&street(20_000, 1, 6));
+    let scene = Scene { sky: Some(sky()), ..street };
+    let gpu = gpu();
+    let images = render(&gpu, &scene, &RenderProfile::DEFAULT, &street_views());
+    let truths = render(&cpu(), &scene, &RenderProfile::DEFAULT, &street_views());
+    for (image, truth) in images.iter().zip(&truths) {
+        agree(image, truth).unwrap();
+    }
+    // In parts, the same bytes.
+    let small = gpu_with_limits(bindings(2 << 20));
+    let at_once = render(&gpu, &scene, &RenderProfile::DEFAULT, &street_views());
+    assert!(render(&small, &scene, &RenderProfile::DEFAULT, &street_views()) == at_once);
+}
+
+#[test]
+fn a_sky_that_no_binding_holds_is_refused() {
+    let view = all_around()[0];
+    let small = gpu_with_limits(bindings(64 << 10));
+    let refused = try_render(&small, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
+    let what = "bytes of a sky in one binding of the GPU";
+    assert_eq!(refused, Err(RenderError::TooMany { what, limit: 64 << 10 }));
+}
+
+#[test]
+fn what_cameras_make_of_colours() {
+    let views = street_views();
+    let street = Scene::from_gaussians(&street(10_000, 1, 4));
+    let gpu = gpu();
+    for scene in [street.clone(), Scene { sky: Some(sky()), ..street }] {
+        for view in views {
+            let seen = appearance(view);
+            let [image, truth] =
+                [&*gpu as &dyn Backend, &cpu()].map(|b| draw_seen(b, &scene, view, &seen));
+            agree(&image, &truth).unwrap();
+            // Without one, none is left over.
+            let plain = render_one(&*gpu, &scene, &RenderProfile::DEFAULT, view);
+            let truth = render_one(&cpu(), &scene, &RenderProfile::DEFAULT, view);
+            agree(&plain, &truth).unwrap();
+        }
+    }
+}
+
+/// What is not compiled cannot fail: the variant of `rasterize` with a sky does not parse here.
+#[test]
+fn without_a_sky_nothing_of_it_is_compiled() {
+    let broken = || {
+        let shaders = Shaders::default();
+        shaders.with_slip("rasterize_sky", "fn sky(away: Away)", "fn sky(away: Nothing)").unwrap()
+    };
+    let view = all_around()[0];
+    render_one(&gpu_with(broken()), &Scene::default(), &RenderProfile::DEFAULT, view);
+    // Nobody listens here: this one is to fail.
+    let gpu = Gpu::with_shaders(&AdapterChoice::Best, 0, broken()).unwrap();
+    let failed = try_render(&gpu, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
+    assert!(matches!(failed, Err(RenderError::Device { .. })), "{failed:?}");
+}
+
+/// A comparison that cannot fail proves nothing.
+#[test]
+fn slips_are_caught() {
+    let views = all_around();
+    for (part, slip) in [
+        ("bits.x >> 16u", "bits.x >> 17u"),
+        ("select(vec4u(3u), vec4u(2u), north)", "vec4u(2u)"),
+        ("v[k] - row[k]", "u[k] - column[k]"),
+        ("rows[1].y * at_px.y", "rows[1].x * at_px.y"),
+    ] {
+        let shaders = Shaders::default().with_slip("rasterize_sky", part, slip).expect(part);
+        let images = render(&gpu_with(shaders), &empty(sky()), &RenderProfile::DEFAULT, &views);
+        let truths = render(&cpu(), &empty(sky()), &RenderProfile::DEFAULT, &views);
+        let off = images.iter().zip(&truths).map(|(a, b)| max_difference(&a.rgba, &b.rgba));
+        assert!(off.fold(0.0, f32::max) > 1e-3, "{part} went unnoticed");
+    }
+}

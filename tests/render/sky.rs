@@ -1,0 +1,272 @@
+//! Skies: against numpy, baked against exact, and behind Gaussians.
+
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2, DVec3};
+use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::render::reference::Reference;
+use wildcity::render::{Backend, Frame, RenderError, Target, View};
+use wildcity::scene::sky::{CubeMap, Drawn, Model, SKY_CUT, SkyError};
+use wildcity::scene::{RenderProfile, Scene, Sky};
+
+use crate::images::{agree, cpu, look, max_difference, render, render_one};
+use crate::scene_files::Random;
+use crate::skies::{demo_model, empty, network, sky};
+use crate::streets::{street, street_views};
+
+/// A sky that is evaluated for every pixel.
+const EXACT: RenderProfile = RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT };
+
+/// One that is baked finely.
+const FINE: RenderProfile = RenderProfile { sky_error: 0.001, ..RenderProfile::DEFAULT };
+
+fn anywhere(random: &mut Random) -> DVec3 {
+    let mut one = || 2.0 * random.unit() - 1.0;
+    loop {
+        let away = DVec3::new(one(), one(), one());
+        if (0.01..1.0).contains(&away.length_squared()) {
+            return away.normalize();
+        }
+    }
+}
+
+fn map_of(drawn: Drawn) -> Arc<CubeMap> {
+    match drawn {
+        Drawn::Map(map) => map,
+        Drawn::Exact(_) => panic!("it is not baked"),
+    }
+}
+
+/// `python scenes/sky.py truths`: a direction, its colour with the mean appearance, and with that of
+/// image 1.
+#[test]
+fn the_network_is_what_numpy_says() {
+    let truths: Vec<[f64; 9]> = serde_json::from_str(include_str!("sky.json")).unwrap();
+    assert!(truths.len() > 40);
+    for (image, first) in [(None, 3), (Some(1), 6)] {
+        let sky = Sky::new(demo_model(image), DMat3::IDENTITY);
+        for truth in &truths {
+            let [x, y, z] = [truth[0], truth[1], truth[2]];
+            let rgb = sky.rgb(DVec3::new(x, y, z));
+            let wanted = DVec3::new(truth[first], truth[first + 1], truth[first + 2]);
+            // Rust's mean of the appearances is rounded to f32.
+            assert!((rgb - wanted).abs().max_element() < 1e-6, "{truth:?}: {rgb}");
+        }
+    }
+}
+
+#[test]
+fn what_backends_evaluate_is_exact() {
+    let scene = empty(Arc::new(Sky::new(demo_model(None), DMat3::IDENTITY)));
+    let forward = DVec3::new(-0.7, -0.5, 0.5);
+    let view = look([96, 80], 60.0, DVec3::new(1e5, 3.0, 2.0), forward, DVec3::NEG_Z);
+    let sky = scene.sky.as_ref().unwrap();
+    let truth: Vec<f32> = (0..96 * 80)
+        .flat_map(|pixel| {
+            let at_px = DVec2::new(f64::from(pixel % 96) + 0.5, f64::from(pixel / 96) + 0.5);
+            let rgb = sky.rgb(view.ray_world(at_px).unwrap()).to_array();
+            [rgb[0] as f32, rgb[1] as f32, rgb[2] as f32, 0.0]
+        })
+        .collect();
+    for simd in [Simd::Best, Simd::Sse42] {
+        let image = render_one(&Cpu::new(0, simd).unwrap(), &scene, &EXACT, view);
+        let off = max_difference(&image.rgba, &truth);
+        assert!(off < 1e-5, "{simd:?}: off by {off}");
+        assert!(image.opacity.iter().all(|&opacity| opacity == 0.0), "a sky covers nothing");
+    }
+    // By definition, whatever the profile asks.
+    let image = render_one(&Reference, &scene, &RenderProfile::DEFAULT, view);
+    assert!(max_difference(&image.rgba, &truth) < 1e-6);
+}
+
+#[test]
+fn networks_of_every_shape() {
+    let view = look([33, 21], 20.0, DVec3::ZERO, DVec3::new(0.2, 1.0, 0.4), DVec3::NEG_Z);
+    for (identity, octaves, appearance, skip) in [
+        (true, 0, 0, true),
+        (true, 1, 0, false),
+        (false, 6, 16, true),
+        (true, 7, 16, true),
+        (true, 10, 3, false),
+    ] {
+        let model = Model::network(network(identity, octaves, appearance, skip));
+        let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
+        let [image, truth] =
+            [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &EXACT, view));
+        let off = max_difference(&image.rgba, &truth.rgba);
+        // 512 times a direction of f32 is off by 3e-5 rad.
+        let most = if octaves == 10 { 3e-4 } else { 1e-5 };
+        assert!(off < most, "{identity} {octaves} {appearance} {skip}: off by {off}");
+    }
+}
+
+#[test]
+fn a_baked_sky_is_within_its_bound_everywhere() {
+    let mut random = Random(8);
+    let mut edges = Vec::new();
+    for wanted in [0.05, 0.005, 0.0005] {
+        let sky = sky();
+        let map = map_of(sky.drawn(wanted).unwrap());
+        assert!(map.error() <= wanted, "{} for {wanted}", map.error());
+        let mut worst: f64 = 0.0;
+        for _ in 0..100_000 {
+            let away = anywhere(&mut random);
+            let exact = sky.rgb(away);
+            worst = worst.max((map.rgb(sky.sky_from_world() * away) - exact).abs().max_element());
+        }
+        assert!(worst <= map.error(), "{worst}, stated {}", map.error());
+        // A bound that is never approached would cost memory for nothing.
+        assert!(worst > 0.1 * map.error(), "{worst}, stated {}", map.error());
+        edges.push(map.edge());
+        assert!(Arc::ptr_eq(&map, &map_of(sky.drawn(wanted).unwrap())), "baked once");
+    }
+    assert!(edges.is_sorted() && edges[0] < edges[2], "{edges:?}");
+}
+
+#[test]
+fn the_demo_sky_is_within_the_default_bound() {
+    let sky = Sky::new(demo_model(None), DMat3::IDENTITY);
+    let map = map_of(sky.drawn(RenderProfile::DEFAULT.sky_error).unwrap());
+    let mut random = Random(9);
+    let mut worst: f64 = 0.0;
+    for _ in 0..20_000 {
+        let away = anywhere(&mut random);
+        worst = worst.max((map.rgb(away) - sky.rgb(away)).abs().max_element());
+    }
+    assert!(
+        worst <= map.error() && map.error() <= RenderProfile::DEFAULT.sky_error,
+        "{worst}, stated {}",
+        map.error()
+    );
+}
+
+#[test]
+fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
+    let mut layers = network(true, 7, 0, false).layers().clone();
+    layers[0].weight.iter_mut().for_each(|weight| *weight *= 40.0);
+    let sharp = wildcity::scene::sky::Network::new(layers, Vec::new()).unwrap();
+    let sky = Arc::new(Sky::new(Model::network(sharp), DMat3::IDENTITY));
+    let error = sky.drawn(1e-4).unwrap_err();
+    assert!(matches!(error, SkyError::Coarse { edge: 1025, .. }), "{error}");
+    assert!(error.to_string().contains("set sky_error to"), "{error}");
+    let scene = empty(sky);
+    let profile = RenderProfile { sky_error: 1e-4, ..RenderProfile::DEFAULT };
+    let view = look([8, 8], 8.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
+    let frame = Frame { scene: &scene, profile: &profile, views: &[view] };
+    let mut image = vec![0.0; 4 * 64];
+    let mut targets = [Target { rgba: Some(&mut image), ..Target::default() }];
+    let refused = cpu().render(&frame, &mut targets, &|_, _| {});
+    assert_eq!(refused, Err(RenderError::Sky(error)));
+    // Evaluated, it is drawn.
+    render_one(&cpu(), &scene, &EXACT, view);
+}
+
+/// Behind a street: what the two backends make of it, and what it adds to the street alone.
+#[test]
+fn a_sky_behind_gaussians() {
+    let mut gaussians = street(20_000, 1, 6);
+    // Before each camera three veils of 0.9, which leave a thousandth.
+    for view in street_views() {
+        for behind in [5.0, 5.1, 5.2] {
+            let axes = view.world_from_camera.rotation_matrix();
+            let mean_m = view.world_from_camera.position_m + behind * axes.z_axis;
+            gaussians.means_m.push(mean_m.to_array());
+            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.ln_scales.push([0.0; 3]);
+            gaussians.logit_opacities.push(0.9_f32.ln() - 0.1_f32.ln());
+            gaussians.sh.extend([0.1; 12]);
+        }
+    }
+    let alone = Scene::from_gaussians(&gaussians);
+    let scene = Scene { sky: Some(sky()), ..alone.clone() };
+    for profile in [FINE, EXACT] {
+        let images = render(&cpu(), &scene, &profile, &street_views());
+        let truths = render(&Reference, &scene, &EXACT, &street_views());
+        let without = render(&cpu(), &alone, &profile, &street_views());
+        for ((image, truth), (without, view)) in
+            images.iter().zip(&truths).zip(without.iter().zip(street_views()))
+        {
+            let db = agree(image, truth).unwrap();
+            assert!(profile != EXACT || db > 75.0, "{db}");
+            assert_eq!((&image.opacity, &image.depth_m), (&without.opacity, &without.depth_m));
+            let sky = scene.sky.as_ref().unwrap();
+            let (mut shown, mut hidden) = (0, 0);
+            for (pixel, (with, alone)) in
+                image.rgba.chunks(4).zip(without.rgba.chunks(4)).enumerate()
+            {
+                let width = view.camera.width_px as usize;
+                let at = |k: usize| k as f64 + 0.5;
+                let at_px = DVec2::new(at(pixel % width), at(pixel / width));
+                let rgb = sky.rgb(view.ray_world(at_px).unwrap());
+                let background = 1.0 - f64::from(alone[3]);
+                // Rounded by 1 - (1 - T).
+                if (background - SKY_CUT).abs() < 1e-6 {
+                    continue;
+                }
+                for c in 0..3 {
+                    let added = f64::from(with[c] - alone[c]);
+                    let wanted = if background > SKY_CUT { background * rgb[c] } else { 0.0 };
+                    assert!((added - wanted).abs() < 2.1e-3, "{added}, not {wanted}");
+                }
+                if background > SKY_CUT { shown += 1 } else { hidden += 1 }
+            }
+            assert!(shown > 100 && hidden > 100, "{shown} {hidden}");
+        }
+    }
+}
+
+/// Infinitely far away: nothing moves when the camera does, and everything when it turns.
+#[test]
+fn a_sky_has_no_parallax() {
+    let scene = empty(sky());
+    let at = |position_m, forward| {
+        let view = look([40, 30], 30.0, position_m, forward, DVec3::NEG_Z);
+        render_one(&cpu(), &scene, &RenderProfile::DEFAULT, view).rgba
+    };
+    let here = at(DVec3::ZERO, DVec3::X);
+    assert_eq!(here, at(DVec3::new(1e6, -3e5, 80.0), DVec3::X));
+    assert!(max_difference(&here, &at(DVec3::ZERO, DVec3::new(1.0, 0.2, 0.0))) > 0.01);
+}
+
+#[test]
+fn images_are_their_own_map() {
+    // Each face a colour of its own, brighter to the right and towards its bottom.
+    let side = 16;
+    let mut rgb8 = Vec::new();
+    for face in 0..6_u8 {
+        for k in 0..side * side {
+            rgb8.extend([40 * face, 8 * (k % side) as u8, 8 * (k / side) as u8]);
+        }
+    }
+    let sky = Sky::new(Model::cube(CubeMap::from_faces(side, &rgb8).unwrap()), DMat3::IDENTITY);
+    let scene = empty(Arc::new(sky));
+    for forward in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::new(0.5, -0.7, 0.9)] {
+        let view = look([64, 48], 24.0, DVec3::ZERO, forward, DVec3::new(0.1, 0.1, -1.0));
+        for profile in [RenderProfile::DEFAULT, EXACT] {
+            let [image, truth] =
+                [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &profile, view));
+            // On the very edge of a face f32 may see the other one: no farther off than their seam.
+            let off = |limit: f32| {
+                let pairs = image.rgba.iter().zip(&truth.rgba);
+                pairs.filter(|(a, b)| !((*a - *b).abs() <= limit)).count()
+            };
+            assert_eq!(off(0.02), 0, "{forward}");
+            assert!(off(1e-4) < image.rgba.len() / 100, "{forward}: {} values", off(1e-4));
+        }
+    }
+}
+
+#[test]
+fn a_background_is_a_sky_of_one_colour() {
+    let mut profile = RenderProfile::default();
+    profile.set("background=0.25,0.5,1").unwrap();
+    let view: View = look([20, 20], 20.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
+    for backend in [&cpu() as &dyn Backend, &Reference] {
+        let image = render_one(backend, &Scene::default(), &profile, view);
+        assert!(image.rgb8.chunks(3).all(|rgb| rgb == [64, 128, 255]), "{:?}", &image.rgb8[..3]);
+        // Where there is a sky, nothing of it is seen.
+        let scene = empty(sky());
+        let with = render_one(backend, &scene, &profile, view);
+        assert_eq!(with, render_one(backend, &scene, &RenderProfile::DEFAULT, view));
+    }
+}

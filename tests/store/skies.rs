@@ -1,0 +1,218 @@
+//! The sky of a version: kept, shared, replaced, taken away, damaged, collected.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::{DMat3, DVec3};
+use wildcity::ingest;
+use wildcity::residency::Cache;
+use wildcity::scene::RenderProfile;
+use wildcity::scene::sky::Model;
+use wildcity::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
+
+use crate::places::{cells_alone, everywhere};
+use crate::scene_files::{Tensor, gaussians, safetensors};
+use crate::{commit, street, wildcity};
+
+/// A small network of gentle weights; another one for every `seed`.
+fn tensors(seed: usize) -> Vec<Tensor> {
+    let tensor = |name: &'static str, shape: &[usize]| {
+        let count: usize = shape.iter().product();
+        let values = (0..count).map(|i| 0.1 * (((i + seed) * 7 % 11) as f64 - 5.0)).collect();
+        (name, shape.to_vec(), values)
+    };
+    vec![
+        tensor("sky_head.layers.0.weight", &[8, 9]),
+        tensor("sky_head.layers.0.bias", &[8]),
+        tensor("sky_head.layers.1.weight", &[8, 17]),
+        tensor("sky_head.layers.1.bias", &[8]),
+        tensor("sky_head.layers.2.weight", &[3, 8]),
+        tensor("sky_head.layers.2.bias", &[3]),
+    ]
+}
+
+fn sky_bytes(seed: usize) -> SkyBytes {
+    let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
+    assert!(matches!(read.model, Model::Network(..)));
+    SkyBytes { bytes: read.bytes.into(), image: None, sky_from_world: DMat3::IDENTITY }
+}
+
+fn with_sky(change: Option<NewSky>) -> Change {
+    Change { sky: Some(change), ..cells_alone() }
+}
+
+/// The storage of twins by `street`.
+fn storage() -> Storage {
+    street(&gaussians(0, 0, 1.0, 1)).storage
+}
+
+#[test]
+fn a_sky_comes_back_and_versions_share_it() {
+    everywhere(|place| {
+        let catalog = place.catalog();
+        let scene = gaussians(300, 1, 10.0, 1);
+        let put = |seed| Some(NewSky::Put(sky_bytes(seed)));
+        let one = NewVersion { sky: put(1), ..street(&scene) };
+        let first = catalog.commit(one.clone(), &mut |_, _| {}).unwrap();
+        assert_eq!(catalog.commit(one, &mut |_, _| {}).unwrap(), first, "the same content");
+        let named = first.manifest.sky.clone().unwrap();
+        assert_eq!(named.bytes, sky_bytes(1).bytes.len() as u64);
+
+        // What a change does not name stays; another one takes its place; and none.
+        let change = |base, change| {
+            let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+            commit.change(base, change).unwrap()
+        };
+        let profile = Some(RenderProfile { near: 0.2, ..RenderProfile::DEFAULT });
+        let second = change(1, Change { profile, ..cells_alone() });
+        assert_eq!(second.manifest.sky, Some(named.clone()));
+        let third = change(2, with_sky(put(2)));
+        assert_ne!(third.manifest.sky, second.manifest.sky);
+        assert_eq!(catalog.diff("street", 2, 3).unwrap().settings, ["sky"]);
+        let fourth = change(3, with_sky(None));
+        assert_eq!(fourth.manifest.sky, None);
+        let fifth = change(4, with_sky(Some(NewSky::Kept(named))));
+        assert_eq!(fifth.manifest.sky, first.manifest.sky);
+
+        let cache = Cache::new(catalog.clone());
+        let open = |number| cache.open("street", Some(number)).unwrap();
+        let [one, two, three, four] = [1, 2, 3, 4].map(open);
+        let direction = DVec3::new(0.6, 0.0, 0.8);
+        let rgb = |seed| {
+            let model = ingest::sky::decode(&sky_bytes(seed).bytes, None).unwrap();
+            wildcity::scene::Sky::new(model, DMat3::IDENTITY).rgb(direction)
+        };
+        assert_eq!(one.sky().unwrap().rgb(direction), rgb(1));
+        assert_eq!(three.sky().unwrap().rgb(direction), rgb(2));
+        assert!(Arc::ptr_eq(one.sky().unwrap(), two.sky().unwrap()), "one sky, one memory");
+        assert!(four.sky().is_none());
+        // What frames draw has it, and its memory counts.
+        let drawn = one.scene(&[], &RenderProfile::DEFAULT).unwrap();
+        assert!(Arc::ptr_eq(drawn.sky.as_ref().unwrap(), one.sky().unwrap()));
+        assert!(four.scene(&[], &RenderProfile::DEFAULT).unwrap().sky.is_none());
+        let bytes = one.sky().unwrap().bytes() as u64;
+        assert!(bytes > 6 * 129 * 129 * 8);
+        assert_eq!(one.whole_bytes(), four.whole_bytes() + bytes);
+    });
+}
+
+#[test]
+fn garbage_collection_and_fsck_know_it() {
+    everywhere(|place| {
+        let catalog = place.catalog();
+        let scene = gaussians(300, 0, 10.0, 1);
+        let put = |seed| Some(NewSky::Put(sky_bytes(seed)));
+        catalog.commit(NewVersion { sky: put(1), ..street(&scene) }, &mut |_, _| {}).unwrap();
+        let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+        commit.change(1, with_sky(put(2))).unwrap();
+        let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+        assert!(checked.is_sound());
+        assert_eq!(checked.unreferenced.objects, 0);
+        // Two manifests, a table, a chunk, and two skies.
+        assert_eq!(checked.verified.objects, 6);
+
+        let keep = Keep { versions: 1, grace: Duration::ZERO };
+        catalog.collect("street", keep, false).unwrap();
+        let removed = catalog.collect("street", keep, false).unwrap().removed;
+        assert_eq!(removed.objects, 2, "a manifest and a sky");
+        let version = catalog.version("street", None).unwrap();
+        assert!(catalog.sky(&version).unwrap().is_some());
+    });
+}
+
+#[test]
+fn a_damaged_sky_is_found_and_healed() {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = gaussians(300, 0, 10.0, 1);
+    let new = || NewVersion { sky: Some(NewSky::Put(sky_bytes(1))), ..street(&scene) };
+    let version = commit(dir.path(), new()).unwrap();
+    let hash = version.manifest.sky.as_ref().unwrap().object.clone();
+    let path = dir.path().join("street/objects").join(&hash[..2]).join(&hash);
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes[200] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    let error = catalog.sky(&version).unwrap_err().to_string();
+    assert!(error.contains(&hash) && error.contains("is damaged"), "{error}");
+    let error = Cache::new(catalog.clone()).open("street", None).unwrap_err().to_string();
+    assert!(error.contains("is damaged"), "{error}");
+    let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+    assert_eq!(checked.verified.damaged.len(), 1);
+    assert_eq!(checked.verified.damaged[0].object, hash);
+    std::fs::remove_file(&path).unwrap();
+    assert_eq!(catalog.fsck("street", &mut |_, _| {}).unwrap().verified.damaged.len(), 1);
+    assert_eq!(commit(dir.path(), new()).unwrap(), version);
+    assert!(catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
+    assert!(catalog.sky(&version).unwrap().is_some());
+}
+
+#[test]
+fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = gaussians(300, 0, 10.0, 1);
+    let mut noise = tensors(1);
+    noise[0].2.iter_mut().for_each(|weight| *weight *= 1e4);
+    let bytes = ingest::sky::read_bytes(&safetensors(&noise, &[]), None).unwrap().bytes;
+    let sharp = SkyBytes { bytes: bytes.into(), ..sky_bytes(1) };
+    let garbage = SkyBytes { bytes: b"no sky".as_slice().into(), ..sky_bytes(1) };
+    let image = SkyBytes { image: Some(0), ..sky_bytes(1) };
+    for (sky, wanted) in [
+        (sharp, "set sky_error to"),
+        (garbage, "it is no safetensors file, no PNG and no JPEG"),
+        (image, "there is no image 0"),
+    ] {
+        let new = NewVersion { sky: Some(NewSky::Put(sky)), ..street(&scene) };
+        let error = commit(dir.path(), new).unwrap_err().to_string();
+        assert!(error.contains(wanted), "{error}");
+        assert_eq!(crate::files(&dir.path().join("street")), Vec::<std::path::PathBuf>::new());
+    }
+}
+
+#[test]
+fn on_the_command_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let run = |arguments: &[&str]| {
+        let output =
+            wildcity().args(arguments).args([Path::new("--twins"), &at("twins")]).output().unwrap();
+        let said = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+        (output.status.code(), said(output.stdout), said(output.stderr))
+    };
+    let scene = gaussians(300, 0, 10.0, 1);
+    let columns = crate::scene_files::inria_columns(0, false);
+    std::fs::write(at("scene.ply"), crate::scene_files::ply(&scene, &columns)).unwrap();
+    std::fs::write(at("sky.safetensors"), safetensors(&tensors(1), &[])).unwrap();
+    let (ply, sky) = (at("scene.ply"), at("sky.safetensors"));
+    let (ply, sky) = (ply.to_str().unwrap(), sky.to_str().unwrap());
+
+    let axes = ["--axes", "y-down-z-forward"];
+    let import = ["import", ply, "--twin", "street", "--sky", sky];
+    let (code, _, error) = run(&[&import[..], &axes].concat());
+    assert_eq!(code, Some(0), "{error}");
+    let catalog = Catalog::open(&at("twins")).unwrap();
+    let version = catalog.version("street", None).unwrap();
+    // A network has the axes of its scene: the world's z, up, is the file's -y.
+    let named = version.manifest.sky.clone().unwrap();
+    assert_eq!(named.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
+    let (_, said, _) = run(&["inspect", "street"]);
+    assert!(said.contains(&format!("sky         {}", &named.object[..16])), "{said}");
+
+    let (code, _, error) = run(&["twin", "sky", "street", "--remove"]);
+    assert_eq!(code, Some(0), "{error}");
+    let without = catalog.version("street", None).unwrap();
+    assert_eq!((without.number, &without.manifest.sky), (2, &None));
+    assert_eq!(without.manifest.chunks, version.manifest.chunks);
+    let (code, said, _) = run(&["twin", "sky", "street", "--sky", sky, "--sky-axes", "identity"]);
+    assert_eq!(code, Some(0));
+    assert!(said.starts_with("twin street version 3: a sky of"), "{said}");
+    let again = catalog.version("street", None).unwrap().manifest.sky.unwrap();
+    assert_eq!(again.object, named.object);
+    assert_eq!(again.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+
+    let (code, _, error) = run(&["twin", "sky", "street"]);
+    assert_eq!(code, Some(2), "neither a sky nor --remove: {error}");
+    let (code, _, error) = run(&["twin", "sky", "street", "--sky", ply]);
+    assert_eq!(code, Some(1));
+    assert!(error.contains("scene.ply: sky header, start: it is no safetensors file"), "{error}");
+}
