@@ -15,7 +15,7 @@ use crate::report::measure::Bench;
 use crate::report::places::{Sampling, places};
 use crate::report::stress::CASES;
 use crate::report::stress::table::{self, Candidate, Column};
-use crate::report::{Report, Subject, needed, page};
+use crate::report::{Report, ReportError, Subject, needed, page};
 use crate::residency::Cache;
 use crate::scene::{RenderProfile, Rig};
 
@@ -93,7 +93,7 @@ impl Command {
         if self.twin.name == demo::TWIN {
             self.twin.name = demo::exact(&self.twins.dir()?)?.manifest.twin;
         }
-        let report = self.measure()?;
+        let (report, unmet) = self.measure()?;
         output::make_dir(&self.out)?;
         let mut files = vec![
             ("report.html", page::html(&report)?),
@@ -118,10 +118,12 @@ impl Command {
                  other places"
             )?;
         }
-        Ok(())
+        // What was measured is on disk: it says why.
+        unmet.map_or(Ok(()), |unmet| Err(unmet.into()))
     }
 
-    fn measure(&self) -> anyhow::Result<Report> {
+    /// The report, and why there is no recommendation in it although one was wanted.
+    fn measure(&self) -> anyhow::Result<(Report, Option<ReportError>)> {
         let candidates = self.backends.iter().map(|name| candidate(*name, &self.machine));
         let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
         let mut backends: Vec<Box<dyn Backend>> = Vec::new();
@@ -164,9 +166,12 @@ impl Command {
         let wanted = (self.at_least_db.map(Wanted::AtLeastDb))
             .or_else(|| self.at_most_ms.map(Wanted::AtMostMs));
         let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
-        let recommendation =
-            wanted.map(|wanted| recommend(wanted, &measured, &names)).transpose()?;
-        Ok(Report {
+        let recommended = wanted.map(|wanted| recommend(wanted, &measured, &names)).transpose();
+        let (recommendation, unmet) = match recommended {
+            Ok(recommendation) => (recommendation, None),
+            Err(unmet) => (None, Some(unmet)),
+        };
+        let report = Report {
             subject: Subject {
                 twin: manifest.twin.clone(),
                 version: resident.version.number,
@@ -189,7 +194,8 @@ impl Command {
             recommendations: recommendation.into_iter().collect(),
             stress: self.stress()?,
             needed: needed::rows(&self.machine.cpu()?, &|| self.device())?,
-        })
+        };
+        Ok((report, unmet))
     }
 
     /// A device that drew nothing yet, if one is wanted and there.

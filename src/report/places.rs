@@ -51,7 +51,8 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<P
     for station in 0..sampling.stations {
         let share = (f64::from(station) + 0.5) / f64::from(sampling.stations);
         let station_m = share * drive.length_m();
-        let (sign, side) = if station / 2 % 2 == 0 { (1.0, "left") } else { (-1.0, "right") };
+        let (sign, side) =
+            if (station / 2).is_multiple_of(2) { (1.0, "left") } else { (-1.0, "right") };
         for offset_m in OFFSETS_M {
             // In the rig's axes y is left.
             let beside = Pose {
@@ -63,7 +64,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<P
                 0.0 => format!("{station_m:.0} m"),
                 _ => format!("{station_m:.0} m, {offset_m} m {side}"),
             };
-            let chooses = station % 2 == 0;
+            let chooses = station.is_multiple_of(2);
             places.push(place(name, offset_m, chooses, views, places.len(), sampling));
         }
     }
@@ -83,7 +84,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<Place> {
         let toward = DVec3::new(cos, sin, 20.0_f64.to_radians().tan()).normalize();
         let view = look([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
         let name = format!("{:.0}° around", 360.0 * share);
-        place(name, 0.0, station % 2 == 0, vec![view], station as usize, sampling)
+        place(name, 0.0, station.is_multiple_of(2), vec![view], station as usize, sampling)
     };
     (0..sampling.stations).map(place_at).collect()
 }

@@ -119,7 +119,7 @@ impl Backend for Faulty {
             Fault::Places => scene = recorded(&scene, Record::Q24).scene,
             Fault::Mirror => views.iter_mut().for_each(|view| {
                 let turned = DQuat::from_rotation_y(std::f64::consts::PI);
-                view.world_from_camera.rotation = view.world_from_camera.rotation * turned;
+                view.world_from_camera.rotation *= turned;
             }),
             Fault::Centred => views.iter_mut().for_each(|view| {
                 let camera = &mut view.camera;
