@@ -12,21 +12,22 @@
 //! | [`store`] | twins on disk or in an object store, versioned, content-addressed | config, geometry, scene, ingest |
 //! | [`residency`] | what is in memory now, what a frame draws | config, geometry, scene, store |
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
-//! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render |
+//! | [`sim`] | what moves: the ego | config, geometry, scene |
+//! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render, sim |
 //! | [`protocol`] | the wire, and only the wire | nothing |
-//! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, session, protocol |
+//! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, sim, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
-//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, session, server, client |
+//! | [`cli`] | one file per subcommand | config, geometry, scene, generate, ingest, store, residency, render, sim, session, server, client |
 //!
 //! Data goes one way: file, ingest, store, residency, render, session, server, agent; an agent's
-//! pose goes server, session. Nothing downstream calls upstream.
+//! pose or action goes server, session, sim, session. Nothing downstream calls upstream.
 //!
 //! # Invariants
 //!
 //! 1. `protocol` is a leaf; only `server` and `client` name it, `server` in `convert.rs`.
 //! 2. Only `store/local` opens files of a twin, only `store/remote` talks to object stores; only `server`
 //!    names axum; only `render/gpu` wgpu.
-//! 3. `render` and `scene` are pure: the same input, the same bytes, whatever the thread count.
+//! 3. `render`, `scene` and `sim` are pure: the same input, the same bytes, whatever the thread count.
 //! 4. Scene data is checked once, at import. Poses and cameras are checked once, at the wire.
 //! 5. An image is a function of (scene version, render profile, poses, cameras).
 //! 6. Every observation names the scene version and the render profile it was made with.
@@ -48,4 +49,5 @@ pub mod residency;
 pub mod scene;
 pub mod server;
 pub mod session;
+pub mod sim;
 pub mod store;

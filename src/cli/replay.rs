@@ -77,6 +77,11 @@ impl Replay {
         for change in &report.changes {
             writeln!(out, "changed     {}: {} -> {}", change.what, change.recorded, change.now)?;
         }
+        match &report.strayed {
+            None => {}
+            Some(strayed) if self.verify => anyhow::bail!("strays at {strayed}"),
+            Some(strayed) => writeln!(out, "strays      {strayed}")?,
+        }
         match &report.difference {
             None => {
                 writeln!(out, "verified    {} images, all as recorded", report.images)?;

@@ -24,7 +24,9 @@ use connection::{Connection, Incoming};
 pub use crate::protocol::http::{
     All, CellReport, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
 };
-pub use crate::protocol::message::{Open, Pose};
+pub use crate::protocol::message::{
+    Action, Dynamics, DynamicsChoice, Model, Open, Pose, TimedPose,
+};
 pub use error::{ClientError, FrameError};
 pub use http::{HttpClient, HttpError};
 pub use observation::{ImageView, Observation};
@@ -45,6 +47,17 @@ pub struct Client {
     session: Option<String>,
     next_seq: u64,
     answer_timeout: Duration,
+}
+
+/// How an ego is to move in one step.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Movement {
+    /// To a pose, `world_from_rig`: of an ego that teleports.
+    Pose(Pose),
+    /// Along poses in the frame of the rig at the step's start.
+    Trajectory(Vec<TimedPose>),
+    /// By acceleration and curvature: of an ego that is driven.
+    Action(Action),
 }
 
 /// Says nothing of itself.
@@ -198,7 +211,7 @@ impl Client {
     /// # Errors
     /// The server refuses, or does not answer.
     pub async fn step(&mut self, pose: Pose) -> Result<Observation, ClientError> {
-        self.observation(&Request::Step { seq: self.next_seq, pose, terminate: false }).await
+        self.drive(Movement::Pose(pose), false).await
     }
 
     /// As [`Client::step`], and the episode ends with it.
@@ -206,7 +219,27 @@ impl Client {
     /// # Errors
     /// The server refuses, or does not answer.
     pub async fn last_step(&mut self, pose: Pose) -> Result<Observation, ClientError> {
-        self.observation(&Request::Step { seq: self.next_seq, pose, terminate: true }).await
+        self.drive(Movement::Pose(pose), true).await
+    }
+
+    /// Moves the ego in any way that the session's dynamics take, and gives what it sees then;
+    /// `terminate` ends the episode with it.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn drive(
+        &mut self,
+        movement: Movement,
+        terminate: bool,
+    ) -> Result<Observation, ClientError> {
+        let (mut pose, mut trajectory, mut action) = (None, None, None);
+        match movement {
+            Movement::Pose(there) => pose = Some(there),
+            Movement::Trajectory(poses) => trajectory = Some(poses),
+            Movement::Action(wanted) => action = Some(wanted),
+        }
+        let seq = self.next_seq;
+        self.observation(&Request::Step { seq, pose, trajectory, action, terminate }).await
     }
 
     /// Gives what would be seen from poses (`world_from_rig`), without moving.

@@ -40,12 +40,20 @@ pub enum Request {
     },
     /// Opens a session on a twin. Answer: `opened`.
     Open(Box<Open>),
-    /// Moves the ego to its next pose, lets `dt_us` pass and renders. Answer: an observation.
+    /// Moves the ego, lets `dt_us` pass and renders. Exactly one of `pose`, `trajectory` and `action` says
+    /// how. Answer: an observation.
     Step {
         /// Number of this request.
         seq: u64,
-        /// `world_from_rig` at the end of the step.
-        pose: Pose,
+        /// `world_from_rig` at the end of the step, of an ego that teleports.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pose: Option<Pose>,
+        /// Where the ego is to be next, 1 to 64 poses in order of time, to beyond the step's end.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        trajectory: Option<Vec<TimedPose>>,
+        /// How the ego is to move, of one that is driven.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        action: Option<Action>,
         /// Whether the episode ends with this step.
         #[serde(default)]
         terminate: bool,
@@ -101,6 +109,51 @@ pub enum Request {
     },
 }
 
+/// A pose of a trajectory that an agent wants to drive.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TimedPose {
+    /// Time since the step's start, in microseconds; above that of the pose before, and above 0.
+    pub time_us: i64,
+    /// The rig then, in the frame of the rig at the step's start.
+    pub pose: Pose,
+}
+
+/// Acceleration and curvature for one step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Action {
+    /// Along the car, in m/s², -9.8 to 9.8.
+    pub acceleration: f64,
+    /// Of the rear axle's way, in 1/m, to the left, -0.2 to 0.2.
+    pub curvature: f64,
+}
+
+/// How the ego moves.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Dynamics {
+    /// The model.
+    pub model: Model,
+    /// Speed at the start of an episode, in m/s.
+    #[serde(default)]
+    pub speed: f64,
+    /// Whether a car that brakes beyond standstill goes backwards; else it stands.
+    #[serde(default)]
+    pub reverse: bool,
+}
+
+/// A model of the ego.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Model {
+    /// Goes to the pose that it is told.
+    Teleport,
+    /// Rolls without slipping, and has acceleration and curvature at once.
+    Kinematic,
+    /// A single track with linear tyres, whose steering and drive lag by 0.1 s.
+    Dynamic,
+}
+
 /// Who is calling.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -137,6 +190,9 @@ pub struct Open {
     /// What each observation holds.
     #[serde(default)]
     pub outputs: Outputs,
+    /// How the ego moves; by teleport if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dynamics: Option<DynamicsChoice>,
     /// Simulated time of a step, in microseconds; the server's default if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dt_us: Option<i64>,
@@ -157,6 +213,7 @@ impl Open {
             start: None,
             rig: None,
             outputs: Outputs::default(),
+            dynamics: None,
             dt_us: None,
             deadline_ms: None,
         }
@@ -190,6 +247,16 @@ pub enum RigChoice {
     Preset(String),
     /// All of them, written out.
     Full(Rig),
+}
+
+/// How the ego moves.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
+#[serde(untagged)]
+pub enum DynamicsChoice {
+    /// A model, from standstill.
+    Model(Model),
+    /// All of it, written out.
+    Full(Dynamics),
 }
 
 /// The cameras of a vehicle.
@@ -449,6 +516,8 @@ pub struct Opened {
     pub seed: u64,
     /// `world_from_rig` at time zero.
     pub start: Pose,
+    /// How the ego moves.
+    pub dynamics: Dynamics,
     /// Simulated time of a step, in microseconds.
     pub dt_us: i64,
     /// How long an answer may take, in milliseconds.

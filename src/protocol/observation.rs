@@ -58,8 +58,16 @@ pub struct Observation {
 pub struct Ego {
     /// `world_from_rig`.
     pub pose: Pose,
-    /// Velocity in world axes over the last step, in m/s; zero at step 0.
+    /// Velocity in world axes, in m/s: now, or of a teleport over the last step, and zero at step 0.
     pub velocity: [f64; 3],
+    /// Change of velocity over the last step per second, in world axes, in m/s²; zero as long as no
+    /// velocity before is known.
+    pub acceleration: [f64; 3],
+    /// Yaw rate about the rig's z axis, to the left, in rad/s: now, or of a teleport over the last step.
+    pub yaw_rate: f64,
+    /// Angle of the front wheels, to the left, in radians; absent of a teleport, which has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steering: Option<f64>,
     /// How many poses of the history, counted from its end, were driven; the earlier ones repeat
     /// the start.
     pub history_count: u64,

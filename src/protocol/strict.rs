@@ -3,11 +3,11 @@
 
 use std::fmt;
 
-use serde::de::{Error, MapAccess, Visitor, value::MapAccessDeserializer};
+use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use super::message::{Pose, Rig, RigChoice, Start};
+use super::message::{Dynamics, DynamicsChoice, Model, Pose, Rig, RigChoice, Start};
 
 /// The first field of a request that was sent and not understood, as `rig.cameras[2].widht`.
 ///
@@ -76,6 +76,29 @@ impl<'de> Deserialize<'de> for RigChoice {
 
             fn visit_map<A: MapAccess<'de>>(self, rig: A) -> Result<RigChoice, A::Error> {
                 Rig::deserialize(MapAccessDeserializer::new(rig)).map(RigChoice::Full)
+            }
+        }
+        deserializer.deserialize_any(Either)
+    }
+}
+
+/// A text is the name of a model, an object has all of it.
+impl<'de> Deserialize<'de> for DynamicsChoice {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = DynamicsChoice;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("the name of a model, or an object with model, speed and reverse")
+            }
+
+            fn visit_str<E: Error>(self, name: &str) -> Result<DynamicsChoice, E> {
+                Model::deserialize(name.into_deserializer()).map(DynamicsChoice::Model)
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, all: A) -> Result<DynamicsChoice, A::Error> {
+                Dynamics::deserialize(MapAccessDeserializer::new(all)).map(DynamicsChoice::Full)
             }
         }
         deserializer.deserialize_any(Either)

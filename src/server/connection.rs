@@ -187,9 +187,9 @@ impl Connection {
                 self.place = Some(place);
                 Ok(Answer::Text(text.into()))
             }
-            Command::Step { pose, terminate } => {
+            Command::Step { movement, terminate } => {
                 let begun = Instant::now();
-                let frame = self.session()?.step(pose, terminate).await?;
+                let frame = self.session()?.step(movement, terminate).await?;
                 let metrics = &self.server.metrics;
                 metrics.steps.inc();
                 metrics.step_seconds.observe(begun.elapsed().as_secs_f64());

@@ -87,7 +87,7 @@ pub(super) enum Fault {
         cause: PoseError,
     },
     /// NaN or infinity where JSON has no number.
-    #[error("{field} is not finite; a pose needs finite numbers")]
+    #[error("{field} is not finite; poses and actions need finite numbers")]
     NotFinite {
         /// The number, as `pose.xyz[0]`.
         field: String,

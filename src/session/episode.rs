@@ -2,13 +2,13 @@
 
 use std::collections::VecDeque;
 
-use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{HISTORY_POSES, HISTORY_STEP_US};
 use crate::geometry::Pose;
 use crate::render::View;
 use crate::scene::rig::RigCamera;
+use crate::sim::{Command, Ego, Ground};
 
 use super::SessionError;
 
@@ -22,7 +22,7 @@ pub struct Episode {
     dt_us: i64,
     step: u64,
     distance_m: f64,
-    velocity_m_s: DVec3,
+    ego: Ego,
     terminated: bool,
     /// World-from-rig by time in microseconds, rising; the last is now. Never empty, and no longer
     /// than the history needs.
@@ -71,54 +71,52 @@ pub struct History {
 }
 
 impl Episode {
-    /// An episode at its start, at time zero. `dt_us` is above zero.
-    pub fn new(seed: u64, start: Pose, dt_us: i64) -> Self {
-        Self {
-            seed,
-            dt_us,
-            step: 0,
-            distance_m: 0.0,
-            velocity_m_s: DVec3::ZERO,
-            terminated: false,
-            track: VecDeque::from([(0, start)]),
-        }
+    /// An episode of an ego at its start, at time zero. `dt_us` is above zero.
+    pub fn new(seed: u64, ego: Ego, dt_us: i64) -> Self {
+        let track = VecDeque::from([(0, ego.world_from_rig())]);
+        Self { seed, dt_us, step: 0, distance_m: 0.0, ego, terminated: false, track }
     }
 
-    /// The episode after one more step that ends at a pose (`world_from_rig`). `self` stays as it
-    /// is, so that a step whose rendering fails has not happened.
+    /// The episode after one more step. `self` stays as it is, so that a step whose rendering fails has
+    /// not happened.
     ///
     /// # Errors
-    /// [`SessionError::EpisodeOver`] after the last step.
-    pub fn stepped(&self, world_from_rig: Pose, terminate: bool) -> Result<Self, SessionError> {
+    /// [`SessionError::EpisodeOver`] after the last step, [`SessionError::Ego`] if the ego cannot do
+    /// what it is told.
+    pub fn stepped(
+        &self,
+        command: &Command,
+        ground: &Ground<'_>,
+        terminate: bool,
+    ) -> Result<Self, SessionError> {
         if self.terminated {
             return Err(SessionError::EpisodeOver { steps: self.step });
         }
-        let mut next = self.moved(world_from_rig);
+        let mut next = self.clone();
+        next.ego = self.ego.stepped(command, self.dt_us, ground)?;
         next.terminated = terminate;
+        next.arrive(next.ego.world_from_rig());
         Ok(next)
     }
 
-    /// The same of whoever knows that it goes on.
-    pub(super) fn moved(&self, world_from_rig: Pose) -> Self {
-        let mut next = self.clone();
-        let moved_m = world_from_rig.position_m - self.world_from_rig().position_m;
-        let time_us = self.time_us() + self.dt_us;
-        next.step += 1;
-        next.distance_m += moved_m.length();
-        next.velocity_m_s = moved_m * (1e6 / self.dt_us as f64);
-        next.track.push_back((time_us, world_from_rig));
+    /// Counts a step that has led to a pose.
+    pub(super) fn arrive(&mut self, world_from_rig: Pose) {
+        let (last_us, last) = self.track[self.track.len() - 1];
+        let time_us = last_us + self.dt_us;
+        self.step += 1;
+        self.distance_m += (world_from_rig.position_m - last.position_m).length();
+        self.track.push_back((time_us, world_from_rig));
         // One pose at or before the history's begin must stay, to interpolate from.
-        while next.track.len() > 2 && next.track[1].0 <= time_us - HISTORY_US {
-            next.track.pop_front();
+        while self.track.len() > 2 && self.track[1].0 <= time_us - HISTORY_US {
+            self.track.pop_front();
         }
-        next
     }
 
     /// A rig's cameras somewhere, moving as the ego has just moved: so a rolling shutter sees from any
     /// place what it would see if the ego had come there as it came to where it is. At the start of an
     /// episode it stands.
     pub(super) fn views(&self, cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
-        let now = self.world_from_rig();
+        let (_, now) = self.track[self.track.len() - 1];
         View::of_moving_rig(cameras, world_from_rig, &|age_us| {
             let then = self.at(self.time_us() - age_us);
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
@@ -142,12 +140,12 @@ impl Episode {
 
     /// Where the ego is.
     pub fn world_from_rig(&self) -> Pose {
-        self.track[self.track.len() - 1].1
+        self.ego.world_from_rig()
     }
 
-    /// Velocity over the last step along world axes, in m/s; zero at the start.
-    pub fn velocity_m_s(&self) -> DVec3 {
-        self.velocity_m_s
+    /// How the ego stands and moves.
+    pub fn ego(&self) -> &Ego {
+        &self.ego
     }
 
     /// Whether it has ended.
@@ -199,15 +197,24 @@ mod tests {
     use super::*;
     use crate::geometry::Camera;
     use crate::geometry::camera::{Pinhole, Rolls, Shutter};
-    use glam::DQuat;
+    use crate::sim::Dynamics;
+    use glam::{DQuat, DVec3};
 
     fn at(x_m: f64, yaw_rad: f64) -> Pose {
         Pose { position_m: DVec3::new(x_m, 0.0, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) }
     }
 
+    fn begun(start: Pose, dt_us: i64) -> Episode {
+        Episode::new(7, Ego::new(Dynamics::default(), start), dt_us)
+    }
+
+    fn moved(episode: &Episode, pose: Pose, terminate: bool) -> Result<Episode, SessionError> {
+        episode.stepped(&Command::Pose(pose), &Ground::of(&[]), terminate)
+    }
+
     fn driven(steps: u32, dt_us: i64, metres_per_step: f64) -> Episode {
-        (1..=steps).fold(Episode::new(7, at(0.0, 0.0), dt_us), |episode, i| {
-            episode.stepped(at(f64::from(i) * metres_per_step, 0.0), false).unwrap()
+        (1..=steps).fold(begun(at(0.0, 0.0), dt_us), |episode, i| {
+            moved(&episode, at(f64::from(i) * metres_per_step, 0.0), false).unwrap()
         })
     }
 
@@ -227,10 +234,9 @@ mod tests {
     fn the_history_is_in_the_frame_of_the_rig_now() {
         // A quarter turn to the left on the spot, then one metre forward, which is +y.
         let quarter = std::f64::consts::FRAC_PI_2;
-        let episode = Episode::new(0, at(0.0, 0.0), 100_000).stepped(at(0.0, quarter), false);
+        let turned = moved(&begun(at(0.0, 0.0), 100_000), at(0.0, quarter), false).unwrap();
         let forward = Pose { position_m: DVec3::Y, ..at(0.0, quarter) };
-        let History { xyz_m, rotation, .. } =
-            episode.unwrap().stepped(forward, false).unwrap().history();
+        let History { xyz_m, rotation, .. } = moved(&turned, forward, false).unwrap().history();
         assert_eq!(xyz_m[15], [0.0; 3]);
         assert!((xyz_m[14][0] + 1.0).abs() < 1e-6, "one metre behind: {:?}", xyz_m[14]);
         // Two steps ago the rig looked along what is now to its right: row 1 (left) of x is -1.
@@ -254,7 +260,7 @@ mod tests {
     fn rolling_shutters_see_from_where_the_ego_was() {
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
         let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
-        let still = Episode::new(7, at(0.0, 0.0), 100_000);
+        let still = begun(at(0.0, 0.0), 100_000);
         let driven = driven(3, 100_000, 3.0);
         assert_eq!(driven.views(&[camera.clone()], at(9.0, 0.0))[0].rolling, None, "global");
         camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
@@ -266,20 +272,20 @@ mod tests {
             let first = view.rolling.unwrap().world_from_camera_first;
             assert!((first.position_m.x - first_m).abs() < 1e-9, "{first:?}");
         }
-        let stopped = driven.stepped(at(9.0, 0.0), false).unwrap();
+        let stopped = moved(&driven, at(9.0, 0.0), false).unwrap();
         assert_eq!(stopped.views(&[camera], at(9.0, 0.0))[0].rolling, None, "it stands again");
     }
 
     #[test]
     fn velocity_distance_and_the_end() {
         let episode = driven(3, 50_000, 0.5);
-        assert_eq!(episode.velocity_m_s(), DVec3::new(10.0, 0.0, 0.0));
-        let over = episode.stepped(at(1.5, 0.0), true).unwrap();
+        assert!((episode.ego().velocity_m_s() - DVec3::X * 10.0).length() < 1e-12);
+        let over = moved(&episode, at(1.5, 0.0), true).unwrap();
         let summary = over.summary(Outcome::AgentLost);
         let expected =
             Summary { outcome: Outcome::Completed, steps: 4, time_us: 200_000, distance_m: 1.5 };
         assert_eq!(summary, expected);
-        let refused = over.stepped(at(2.0, 0.0), false);
+        let refused = moved(&over, at(2.0, 0.0), false);
         assert!(matches!(refused, Err(SessionError::EpisodeOver { steps: 4 })));
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::render::RenderError;
 use crate::residency::ResidencyError;
+use crate::sim::EgoError;
 use crate::store::StoreError;
 
 use super::record::RecordError;
@@ -65,6 +66,9 @@ pub enum SessionError {
         /// What fits.
         limit: u64,
     },
+    /// The ego does not do as it is told.
+    #[error(transparent)]
+    Ego(#[from] EgoError),
     /// The episode was ended by its agent.
     #[error("the episode ended with step {steps}; send reset")]
     EpisodeOver {

@@ -18,6 +18,7 @@ mod observation;
 mod opening;
 mod record;
 mod replay;
+mod retrace;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -30,6 +31,7 @@ use crate::geometry::Pose;
 use crate::render::View;
 use crate::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
 use crate::scene::rig::{Rig, RigCamera};
+use crate::sim::{Command, Dynamics, Ego, Ground};
 
 pub use buffer::Buffer;
 pub use encode::Encoding;
@@ -44,9 +46,11 @@ pub use observation::{
 };
 pub use opening::{ImagePart, Opening, Outputs, RigChoice, Start};
 pub use record::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedOutputs, RecordedVersion,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedCommand, RecordedOutputs,
+    RecordedVersion,
 };
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
+pub use retrace::StrayedStep;
 
 use ahead::{Ahead, Route};
 use lookout::Lookout;
@@ -65,6 +69,7 @@ pub struct Session {
     profile_hash: blake3::Hash,
     rig_name: String,
     layout: Arc<Layout>,
+    dynamics: Dynamics,
     start: Pose,
     dt_us: i64,
     deadline: Duration,
@@ -114,6 +119,8 @@ impl Session {
             Some(start) => resolve_start(&resident, start)?,
             None => manifest.trajectories.first().map_or(Pose::IDENTITY, |log| log.at_station(0.0)),
         };
+        let dynamics = opening.dynamics;
+        let start = dynamics.start(start, &Ground::of(&manifest.trajectories));
         let named = match &opening.start {
             Some(Start::Station { trajectory, .. }) => Some(trajectory),
             _ => None,
@@ -126,10 +133,11 @@ impl Session {
             profile_hash: record::profile_hash(&manifest.profile),
             rig_name,
             layout: Arc::new(layout),
+            dynamics,
             start,
             dt_us,
             deadline,
-            episode: Episode::new(opening.seed, start, dt_us),
+            episode: Episode::new(opening.seed, Ego::new(dynamics, start), dt_us),
             episode_number: 0,
             recorder: None,
             switched: false,
@@ -148,15 +156,24 @@ impl Session {
         Ok(session)
     }
 
-    /// Moves the ego to its next pose (`world_from_rig`), lets `dt_us` pass and renders.
+    /// Moves the ego as it is told, lets `dt_us` pass and renders.
     ///
     /// # Errors
     /// Nothing has changed then, and the step can be tried again. Dropping the future may record
     /// the step but never takes it.
-    pub async fn step(&mut self, pose: Pose, terminate: bool) -> Result<Frame, SessionError> {
-        let next = self.episode.stepped(pose, terminate)?;
+    pub async fn step(
+        &mut self,
+        command: impl Into<Command>,
+        terminate: bool,
+    ) -> Result<Frame, SessionError> {
+        let command = command.into();
+        let ground = Ground::of(&self.resident().version.manifest.trajectories);
+        let next = self.episode.stepped(&command, &ground, terminate)?;
+        let pose = next.world_from_rig();
         let frame = self.draw(&next, vec![pose]).await?;
-        self.record(FrameRequest::Step, &next, &[pose], &frame).await?;
+        let mut line = frame_line(FrameRequest::Step, &next, &[pose], &frame);
+        line.command = RecordedCommand::of(&command);
+        self.record(line).await?;
         self.episode = next;
         self.look_ahead();
         Ok(frame)
@@ -173,7 +190,7 @@ impl Session {
         }
         let episode = self.episode.clone();
         let frame = self.draw(&episode, poses.clone()).await?;
-        self.record(FrameRequest::Observe, &episode, &poses, &frame).await?;
+        self.record(frame_line(FrameRequest::Observe, &episode, &poses, &frame)).await?;
         Ok(frame)
     }
 
@@ -183,13 +200,16 @@ impl Session {
     /// As [`Session::step`]: the old episode goes on.
     pub async fn reset(&mut self, seed: u64, start: Option<Start>) -> Result<Frame, SessionError> {
         let start = match &start {
-            Some(start) => resolve_start(self.resident(), start)?,
+            Some(start) => {
+                let ground = Ground::of(&self.resident().version.manifest.trajectories);
+                self.dynamics.start(resolve_start(self.resident(), start)?, &ground)
+            }
             None => self.start,
         };
-        let next = Episode::new(seed, start, self.dt_us);
+        let next = Episode::new(seed, Ego::new(self.dynamics, start), self.dt_us);
         let frame = self.draw(&next, vec![start]).await?;
         let line = frame_line(FrameRequest::Reset, &next, &[start], &frame);
-        let (recorder, number) = self.begin_recording(&next, line).await?;
+        let (recorder, number) = self.begin_recording(&next, Line::Frame(line)).await?;
         self.finish(Outcome::Completed).await;
         (self.recorder, self.episode_number, self.switched) = (Some(recorder), number, false);
         self.episode = next;
@@ -292,6 +312,11 @@ impl Session {
         self.layout.depth_and_opacity()
     }
 
+    /// How the ego moves.
+    pub fn dynamics(&self) -> Dynamics {
+        self.dynamics
+    }
+
     /// `world_from_rig` where episodes start unless `reset` says otherwise.
     pub fn start(&self) -> Pose {
         self.start
@@ -352,7 +377,7 @@ impl Session {
         let steps = ahead.as_secs_f64() / self.frame_took.as_secs_f64().max(1e-3);
         Ahead {
             now: self.episode.world_from_rig(),
-            last_step_m: self.episode.velocity_m_s() * (self.dt_us as f64 * 1e-6),
+            last_step_m: self.episode.ego().velocity_m_s() * (self.dt_us as f64 * 1e-6),
             steps: (steps.ceil() as usize).min(config::STEPS_AHEAD),
             route: self.route.as_deref(),
             hint: &self.hint,
@@ -391,14 +416,8 @@ impl Session {
     }
 
     /// Writes what was rendered to the episode's file, which begins with its first frame.
-    async fn record(
-        &mut self,
-        request: FrameRequest,
-        episode: &Episode,
-        poses: &[Pose],
-        frame: &Frame,
-    ) -> Result<(), SessionError> {
-        let line = frame_line(request, episode, poses, frame);
+    async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
+        let line = Line::Frame(frame);
         match self.recorder.clone() {
             Some(recorder) => {
                 let version = self.switched.then(|| self.version_line());
@@ -448,6 +467,7 @@ impl Session {
             rig: Rig { name: self.rig_name.clone(), cameras },
             outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity },
             seed: episode.seed(),
+            dynamics: self.dynamics,
             start: episode.world_from_rig(),
             dt_us: self.dt_us,
         };
@@ -484,14 +504,20 @@ async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError
     Ok(appended.map_err(|_| SessionError::Crashed)??)
 }
 
-fn frame_line(request: FrameRequest, episode: &Episode, poses: &[Pose], frame: &Frame) -> Line {
-    Line::Frame(FrameRecord {
+fn frame_line(
+    request: FrameRequest,
+    episode: &Episode,
+    poses: &[Pose],
+    frame: &Frame,
+) -> FrameRecord {
+    FrameRecord {
         request,
         step: episode.step(),
         time_us: episode.time_us(),
         poses: poses.to_vec(),
+        command: None,
         terminated: episode.terminated(),
         frame_hash: frame.frame_hash.to_hex().to_string(),
         images: frame.images.iter().map(|image| image.hash.to_hex().to_string()).collect(),
-    })
+    }
 }

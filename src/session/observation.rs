@@ -28,7 +28,7 @@ use super::{Episode, History, SessionError};
 /// The length of the header, little-endian, stands before it.
 pub const HEADER_PREFIX_BYTES: usize = 8;
 
-/// Room for what the header says once: names of at most 64 bytes, hashes of 64, the ego's 10
+/// Room for what the header says once: names of at most 64 bytes, hashes of 64, the ego's 15
 /// numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 

@@ -7,6 +7,7 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::residency::Resident;
 use crate::scene::rig::{Rig, RigCamera};
+use crate::sim::Dynamics;
 
 use super::{Encoding, SessionError};
 
@@ -25,6 +26,8 @@ pub struct Opening {
     pub rig: Option<RigChoice>,
     /// What each observation holds.
     pub outputs: Outputs,
+    /// How the ego moves.
+    pub dynamics: Dynamics,
     /// Simulated time of a step, in microseconds.
     pub dt_us: Option<i64>,
     /// How long one answer may take.

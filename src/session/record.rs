@@ -21,6 +21,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose;
 use crate::scene::{RenderProfile, Rig};
+use crate::sim::ego::{Action, TimedPose};
+use crate::sim::{Command, Dynamics};
 
 use super::{Encoding, Summary};
 
@@ -58,6 +60,9 @@ pub struct EpisodeHeader {
     pub outputs: RecordedOutputs,
     /// Seed of the episode.
     pub seed: u64,
+    /// How the ego moved.
+    #[serde(default)]
+    pub dynamics: Dynamics,
     /// `world_from_rig` at time zero.
     pub start: Pose,
     /// Simulated time of a step, in microseconds.
@@ -88,12 +93,25 @@ pub struct FrameRecord {
     pub time_us: i64,
     /// What was rendered, `world_from_rig`.
     pub poses: Vec<Pose>,
+    /// What moved the ego there, if the pose itself does not say so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub command: Option<RecordedCommand>,
     /// Whether the episode ended with it.
     pub terminated: bool,
     /// BLAKE3 of the images' hashes, in hex.
     pub frame_hash: String,
     /// BLAKE3 of each image's pixels, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
+}
+
+/// What an ego was told but for a pose.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecordedCommand {
+    /// To accelerate and turn.
+    Action(Action),
+    /// To follow poses.
+    Trajectory(Vec<TimedPose>),
 }
 
 /// Another version of the twin, from here on.
@@ -153,6 +171,17 @@ pub struct RecordError {
 pub(super) struct Recorder {
     file: Arc<File>,
     path: Arc<Path>,
+}
+
+impl RecordedCommand {
+    /// What of a command goes on record.
+    pub(super) fn of(command: &Command) -> Option<Self> {
+        match command {
+            Command::Pose(_) => None,
+            Command::Path(path) => Some(Self::Trajectory(path.poses().to_vec())),
+            Command::Action(action) => Some(Self::Action(*action)),
+        }
+    }
 }
 
 impl EpisodeHeader {

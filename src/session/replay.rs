@@ -1,4 +1,4 @@
-//! Replay: renders a recorded episode again and compares every image.
+//! Replay: drives and renders a recorded episode again, and compares every pose and image.
 
 use std::fs::File;
 use std::io::{self, BufRead as _, BufReader, Read as _};
@@ -6,13 +6,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
+use crate::geometry::Pose;
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::rig::{RigCamera, RigError};
+use crate::sim::{Ego, EgoError, Ground};
 
 use super::record::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,
 };
+use super::retrace::{Retrace, StrayedStep};
 use super::{Episode, Summary, observation};
 
 /// A recorded episode.
@@ -35,6 +38,8 @@ pub struct Report {
     pub images: u64,
     /// What is not as it was when the episode was recorded.
     pub changes: Vec<Change>,
+    /// The first step whose command does not lead where it did.
+    pub strayed: Option<StrayedStep>,
     /// The first image that differs.
     pub difference: Option<Difference>,
 }
@@ -44,7 +49,7 @@ pub struct Report {
 pub enum Extent {
     /// To the end, whatever differs.
     Whole,
-    /// To the first image that differs.
+    /// To the first image that differs, or the first step that strays.
     FirstDifference,
 }
 
@@ -130,6 +135,14 @@ pub enum ReplayError {
         /// Why.
         cause: ResidencyError,
     },
+    /// What is on record is no command for the episode's ego.
+    #[error("step {step}: {cause}")]
+    Ego {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: EgoError,
+    },
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
     Render {
@@ -207,11 +220,11 @@ impl Recording {
         Ok(Self { header: header.ok_or_else(empty)?, frames, versions, end })
     }
 
-    /// Renders the episode again, from the versions of its twin that `open` gives. Each image is
+    /// Drives and renders the episode again, on the versions of its twin that `open` gives. Each image is
     /// shown to `visit` before it is compared.
     ///
     /// # Errors
-    /// A version cannot be had, the backend refuses a frame, or `visit` fails.
+    /// A version cannot be had, a command is none, the backend refuses a frame, or `visit` fails.
     pub fn replay(
         &self,
         open: &mut dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError>,
@@ -220,26 +233,39 @@ impl Recording {
         visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
     ) -> Result<Report, ReplayError> {
         let mut resident = open(self.header.version)?;
-        let mut report =
-            Report { images: 0, changes: self.changes(&resident, backend), difference: None };
+        let changes = self.changes(&resident, backend);
+        let mut report = Report { images: 0, changes, strayed: None, difference: None };
+        let mut retrace = Retrace::new(&self.header);
         let mut switches = self.versions.iter().peekable();
         let mut lines_before = 2;
         let cameras = &self.header.rig.cameras;
         let mut pixels: Vec<Vec<u8>> =
             cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
-        let EpisodeHeader { seed, start, dt_us, .. } = self.header;
-        let mut episode = Episode::new(seed, start, dt_us);
+        // Where the ego was, as recorded: what rolling shutters see follows from it.
+        let EpisodeHeader { seed, start, dt_us, dynamics, .. } = self.header;
+        let standing = |start: Pose| Episode::new(seed, Ego::new(dynamics, start), dt_us);
+        let mut episode = standing(start);
         for (index, frame) in self.frames.iter().enumerate() {
-            episode = match (frame.request, frame.poses.first()) {
-                (FrameRequest::Reset, Some(start)) => Episode::new(seed, *start, dt_us),
-                (FrameRequest::Step, Some(pose)) => episode.moved(*pose),
-                _ => episode,
-            };
+            match (frame.request, frame.poses.first()) {
+                (FrameRequest::Reset, Some(start)) => episode = standing(*start),
+                (FrameRequest::Step, Some(pose)) => episode.arrive(*pose),
+                _ => {}
+            }
             while let Some((_, to)) = switches.next_if(|(before, _)| *before <= index) {
                 resident = open(to.version)?;
                 lines_before += 1;
                 let recorded = (&*to.version_hash, &*to.profile_hash);
                 report.changes.extend(scene_changes(recorded, &resident));
+            }
+            let ground = Ground::of(&resident.version.manifest.trajectories);
+            let strayed = retrace
+                .follow(frame, index + lines_before, &ground)
+                .map_err(|cause| ReplayError::Ego { step: frame.step, cause })?;
+            if report.strayed.is_none() && strayed.is_some() {
+                report.strayed = strayed;
+                if extent == Extent::FirstDifference {
+                    return Ok(report);
+                }
             }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {

@@ -226,6 +226,9 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> Observation 
         ego: Ego {
             pose: Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] },
             velocity: [1.4, 4.8, 0.0],
+            acceleration: [0.5, -0.25, 0.0],
+            yaw_rate: 0.125,
+            steering: Some(-0.0625),
             history_count: 3,
         },
         images,

@@ -142,6 +142,22 @@ fn requests() -> Vec<(&'static str, Request)> {
     };
     let preset =
         Open { seq: 1, rig: Some(RigChoice::Preset("vehicle6".into())), ..Open::twin("street") };
+    let dynamics = Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true };
+    let driven =
+        Open { seq: 1, dynamics: Some(DynamicsChoice::Full(dynamics)), ..Open::twin("street") };
+    let model = Some(DynamicsChoice::Model(Model::Kinematic));
+    let model = Open { seq: 1, dynamics: model, ..Open::twin("street") };
+    let step = |seq, pose, trajectory, action, terminate| Request::Step {
+        seq,
+        pose,
+        trajectory,
+        action,
+        terminate,
+    };
+    let ahead =
+        |time_us, x_m| TimedPose { time_us, pose: pose([x_m, 0.5, 0.0], [1.0, 0.0, 0.0, 0.0]) };
+    let way = vec![ahead(100_000, 1.5), ahead(200_000, 3.25)];
+    let action = Action { acceleration: -1.5, curvature: 0.025 };
     let there = pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]);
     let above = pose([12.5, -3.25, 30.0], [1.0, 0.0, 0.0, 0.0]);
     let start = Start::Pose { pose: there };
@@ -151,8 +167,12 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("hello", Request::Hello { seq: 0, client, protocols }),
         ("open", Request::Open(Box::new(open))),
         ("open_preset", Request::Open(Box::new(preset))),
-        ("step", Request::Step { seq: 3, pose: there, terminate: false }),
-        ("step_terminate", Request::Step { seq: 4, pose: there, terminate: true }),
+        ("open_dynamics", Request::Open(Box::new(driven))),
+        ("open_model", Request::Open(Box::new(model))),
+        ("step", step(3, Some(there), None, None, false)),
+        ("step_terminate", step(4, Some(there), None, None, true)),
+        ("step_trajectory", step(3, None, Some(way), None, false)),
+        ("step_action", step(3, None, None, Some(action), false)),
         ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
         ("prefetch", Request::Prefetch { seq: 6, poses: vec![there, above] }),
         ("reset", Request::Reset { seq: 2, seed: 7, start: None }),
@@ -205,6 +225,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         backend: "cpu".into(),
         seed: 42,
         start: pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]),
+        dynamics: Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true },
         dt_us: 100_000,
         deadline_ms: 20_000,
         cameras: vec![front(), rear()],

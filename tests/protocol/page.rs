@@ -19,7 +19,7 @@ fn every_json_example_is_a_message() {
         ("observation", parses::<Observation>),
     ];
     // Each request but the two of `open` once, each answer once.
-    assert_eq!(counted(page, kinds), [10, 7, 1]);
+    assert_eq!(counted(page, kinds), [12, 7, 1]);
     let kinds: [Kind; 6] = [
         ("new upload", parses::<http::NewUpload>),
         ("upload", parses::<http::Upload>),
@@ -60,8 +60,8 @@ fn the_hex_example_is_the_golden_frame() {
             bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
         assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
     }
-    assert!(page.contains("(3,312 bytes) has N = 0x8e0 = 2,272"));
-    assert_eq!((frame.len(), &frame[..8]), (3312, &2272_u64.to_le_bytes()[..]));
+    assert!(page.contains("(3,288 bytes) has N = 0x8c8 = 2,248"));
+    assert_eq!((frame.len(), &frame[..8]), (3288, &2248_u64.to_le_bytes()[..]));
 }
 
 /// Every code is explained, and no other.
@@ -92,6 +92,17 @@ fn limits_are_those_of_the_configuration() {
         format!("| `ego.history_rot` | F32 [{poses}, 3, 3] |"),
         format!("| poses of one `observe` | {} |", config::OBSERVE_POSES),
         format!("| poses of one `prefetch` | {} |", config::PREFETCH_POSES),
+        format!("| poses of one `trajectory` | {} |", config::PATH_POSES),
+        format!("| time of a `trajectory` | {} s |", config::PATH_US / 1_000_000),
+        format!(
+            "±{} m/s², and curvature of the rear axle's way, ±{} 1/m",
+            config::EGO_ACCELERATION_M_S2,
+            config::EGO_CURVATURE_1_M
+        ),
+        format!("by at most {:.2} rad", config::EGO_STEERING_RAD),
+        format!("Both go {} m/s at most", config::EGO_SPEED_M_S),
+        format!("go back, {} m/s at most", config::EGO_REVERSE_M_S),
+        format!("recorded drive within {} m", config::GROUND_NEAR_M),
         format!("| cameras of a rig | {} |", wildcity::scene::Rig::MAX_CAMERAS),
         format!("| message to the server | {} MiB |", config::INBOUND_MESSAGE_BYTES >> 20),
         format!("| `hello` after connecting | {} s |", seconds(config::HELLO_TIMEOUT)),

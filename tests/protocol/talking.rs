@@ -49,7 +49,7 @@ async fn a_whole_conversation() {
 
     let requests = server.requests().await.remove(0);
     assert_eq!(seqs(&requests), [0, 1, 2, 3, 4, 5, 6, 7]);
-    assert!(matches!(requests[3], Request::Step { pose: HERE, terminate: false, .. }));
+    assert!(matches!(requests[3], Request::Step { pose: Some(HERE), terminate: false, .. }));
     assert!(matches!(requests[4], Request::Step { terminate: true, .. }));
 }
 

@@ -183,6 +183,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
                 depth: false,
                 opacity: false,
             },
+            dynamics: wildcity::sim::Dynamics::default(),
             dt_us: None,
             deadline: None,
         };

@@ -62,6 +62,7 @@ impl Bench {
             start: Some(wildcity::session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
             outputs,
+            dynamics: wildcity::sim::Dynamics::default(),
             dt_us: None,
             deadline,
         };

@@ -116,6 +116,50 @@ async fn memory_is_flat_over_ten_thousand_steps() {
     assert!(after < before + (4 << 20), "{before} bytes grew to {after}");
 }
 
+/// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as in the
+/// first, the same bytes seen, and a clock that is exact.
+async fn two_laps(steps: u64) {
+    let served = Served::start();
+    let mut agent = Agent::connect(served.address).await;
+    agent.hello().await;
+    let dynamics = json!({ "model": "dynamic", "speed": 5.0 });
+    agent.open(json!({ "dynamics": dynamics, "outputs": { "encoding": "raw" } })).await;
+    let (mut laps, mut early_bytes) = (Vec::new(), None);
+    for _ in 0..2 {
+        agent.look(json!({ "type": "reset" })).await;
+        let mut lap = blake3::Hasher::new();
+        for step in 1..=steps {
+            let phase = step as f64;
+            let (acceleration, curvature) =
+                (2.0 * (phase / 7.0).sin(), 0.03 * (phase / 11.0).sin());
+            let action = json!({ "acceleration": acceleration, "curvature": curvature });
+            let seen = agent.look(json!({ "type": "step", "action": action })).await;
+            assert_eq!(seen.meta["time_us"], 100_000 * step);
+            lap.update(seen.frame_hash().as_bytes());
+            lap.update(seen.meta["ego"].to_string().as_bytes());
+            if step == steps / 2 {
+                early_bytes.get_or_insert_with(|| served.rss());
+            }
+        }
+        laps.push(lap.finalize());
+    }
+    assert_eq!(laps[0], laps[1], "what is driven twice is the same");
+    let (early, late) = (early_bytes.unwrap(), served.rss());
+    eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
+    assert!(late < early + (4 << 20), "{early} bytes grew to {late}");
+}
+
+#[tokio::test]
+async fn a_lap_driven_twice_is_the_same_in_the_same_memory() {
+    two_laps(2_000).await;
+}
+
+#[tokio::test]
+#[ignore = "takes minutes"]
+async fn a_lap_of_50_000_steps_driven_twice_is_the_same_in_the_same_memory() {
+    two_laps(50_000).await;
+}
+
 #[tokio::test]
 async fn a_thousand_connections_at_once() {
     let served = Served::start();

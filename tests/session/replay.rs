@@ -31,7 +31,11 @@ async fn recorded() -> (TestServer, PathBuf) {
     (server, path)
 }
 
-fn replay(server: &TestServer, path: &Path, backend: &dyn Backend) -> Result<Report, ReplayError> {
+pub(crate) fn replay(
+    server: &TestServer,
+    path: &Path,
+    backend: &dyn Backend,
+) -> Result<Report, ReplayError> {
     let recording = Recording::read(path)?;
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let mut open = |version| cache.open(&recording.header.twin, Some(version));
@@ -55,7 +59,7 @@ fn tamper(path: &Path, line: usize, image: usize) {
 async fn what_was_recorded_is_rendered_again() {
     let (server, path) = recorded().await;
     let report = replay(&server, &path, &Painter::default()).unwrap();
-    assert_eq!(report, Report { images: 24, changes: vec![], difference: None });
+    assert_eq!(report, Report { images: 24, changes: vec![], strayed: None, difference: None });
 }
 
 #[tokio::test]

@@ -18,7 +18,20 @@ from typing import Any
 import numpy as np
 import pytest
 import wildcity
-from wildcity import Camera, Disconnected, Observation, Outputs, Pose, Refused, Rig, Station
+from wildcity import (
+    Action,
+    Camera,
+    Disconnected,
+    Dynamics,
+    Observation,
+    Outputs,
+    Pose,
+    Refused,
+    Rig,
+    Station,
+    TimedPose,
+    Trajectory,
+)
 
 Connect = Callable[..., Any]
 
@@ -91,6 +104,25 @@ def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
             summary = session.close()
             assert (summary.outcome, summary.steps) == ("completed", 20)
             assert summary.distance_m == pytest.approx(5.0)
+
+
+def test_drives_a_car(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client:
+        dynamics = Dynamics("dynamic", speed=5.0)
+        start = Station("log", 2.0)
+        with client.open(
+            "corridor", rig=PAIR, outputs=RAW, start=start, dynamics=dynamics
+        ) as session:
+            assert session.opened.dynamics == dynamics
+            ahead = [TimedPose(100_000 * k, Pose((0.5 * k, 0.0, 0.0))) for k in range(1, 65)]
+            seen = session.step(Trajectory(tuple(ahead)))
+            assert seen.ego.pose.xyz == pytest.approx((2.5, 0.0, 0.0), abs=1e-3)
+            seen = session.step(Action(acceleration=1.0, curvature=0.05))
+            assert seen.ego.pose.xyz[0] > 2.95 and seen.ego.pose.xyz[1] > 1e-4
+            assert seen.ego.steering is not None and 0.05 < seen.ego.steering < 0.16
+            assert seen.ego.yaw_rate > 0.0
+            with pytest.raises(Refused, match="action or trajectory"):
+                session.step(Pose())
 
 
 def test_the_example_of_the_front_page_runs(server: Server) -> None:

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from conftest import PROTOCOL, frame, vector
 from wildcity import (
+    Action,
     BadFrame,
     Camera,
     Code,
+    Dynamics,
     ImagePart,
     Lens,
     Observation,
@@ -24,12 +26,17 @@ from wildcity import (
     Rig,
     Shutter,
     Station,
+    TimedPose,
+    Trajectory,
 )
 from wildcity.core import Conversation
 from wildcity.protocol import ANSWERS, decode_answer, encode
 
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
+WAY = Trajectory(
+    (TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0))))
+)
 LOG = Station("log", 12.5)
 FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
 REAR = dataclasses.replace(
@@ -61,6 +68,10 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
         deadline_ms=20_000,
     ),
     "open_preset": lambda c: c.open("street", rig="vehicle6"),
+    "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
+    "open_model": lambda c: c.open("street", dynamics="kinematic"),
+    "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
+    "step_trajectory": lambda c: c.step(WAY, False),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),

@@ -19,6 +19,7 @@ use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
 use crate::scene::{Manifest, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use crate::sim::Dynamics;
 
 use report::{Report, Row};
 
@@ -195,6 +196,7 @@ impl Drive {
                 depth: false,
                 opacity: false,
             },
+            dynamics: Dynamics::default(),
             dt_us: None,
             deadline: None,
         }

@@ -20,6 +20,7 @@ use crate::session::{
     DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, Session, Summary, TensorKind,
     TrajectorySummary, TwinSummary,
 };
+use crate::sim::{Dynamics, Model};
 use crate::store::Version;
 
 use super::SUBPROTOCOL;
@@ -74,6 +75,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
         backend: session.backend().to_owned(),
         seed: session.episode().seed(),
         start: pose(&session.start()),
+        dynamics: dynamics(session.dynamics()),
         dt_us: session.dt_us(),
         deadline_ms: session.deadline().as_millis() as u64,
         cameras: session.cameras().iter().map(camera).collect(),
@@ -293,7 +295,10 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
         frame_hash: frame.frame_hash.to_hex().to_string(),
         ego: Ego {
             pose: pose(&episode.world_from_rig()),
-            velocity: episode.velocity_m_s().to_array(),
+            velocity: episode.ego().velocity_m_s().to_array(),
+            acceleration: episode.ego().acceleration_m_s2().to_array(),
+            yaw_rate: episode.ego().yaw_rate_rad_s(),
+            steering: episode.ego().steering_rad(),
             history_count: frame.history_count as u64,
         },
         images: frame.images.iter().zip(image_names).map(image).collect(),
@@ -310,6 +315,16 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             waited_us: frame.residency.waited.as_micros() as u64,
         },
     }
+}
+
+fn dynamics(dynamics: Dynamics) -> message::Dynamics {
+    let Dynamics { model, speed_m_s, reverse } = dynamics;
+    let model = match model {
+        Model::Teleport => message::Model::Teleport,
+        Model::Kinematic => message::Model::Kinematic,
+        Model::Dynamic => message::Model::Dynamic,
+    };
+    message::Dynamics { model, speed: speed_m_s, reverse }
 }
 
 fn twin_info(twin: &TwinSummary) -> TwinInfo {

@@ -7,6 +7,7 @@ use crate::residency::ResidencyError;
 use crate::scene::rig::RigError;
 use crate::server::fault::{Fault, is_content, is_full};
 use crate::session::SessionError;
+use crate::sim::EgoError;
 use crate::store::StoreError;
 
 /// The code of a fault, and the field at fault where one is.
@@ -31,7 +32,11 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
             };
             (code, Some(format!("{field}.{}", cause.field())))
         }
-        Fault::NotFinite { field } => (Code::PoseNotFinite, Some(field.clone())),
+        Fault::NotFinite { field } => {
+            // The list of codes is closed, and an action is no pose.
+            let of_action = field.starts_with("action");
+            (if of_action { Code::OutOfRange } else { Code::PoseNotFinite }, Some(field.clone()))
+        }
         Fault::Camera { field, cause } => {
             (Code::CameraInvalid, Some(format!("{field}.{}", cause.field())))
         }
@@ -115,6 +120,13 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
             (Code::AnswerTooLarge, None)
         }
         SessionError::EpisodeOver { .. } => (Code::SessionState, None),
+        SessionError::Ego(error) => match error {
+            EgoError::Command { .. } => (Code::SessionState, Some(error.field())),
+            EgoError::Range { .. }
+            | EgoError::PathCount { .. }
+            | EgoError::PathTime { .. }
+            | EgoError::PathShort { .. } => (Code::OutOfRange, Some(error.field())),
+        },
         SessionError::Busy { .. } => (Code::Busy, None),
         SessionError::Render(RenderError::DeviceMemory { .. }) => (Code::Busy, field("twin")),
         SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),

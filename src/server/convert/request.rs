@@ -11,7 +11,9 @@ use crate::protocol::message::{self, Request};
 use crate::protocol::unknown_field;
 use crate::scene::rig::{Rig, RigCamera, is_name};
 use crate::server::fault::Fault;
-use crate::session::{Encoding, ImagePart, Opening, Outputs, RigChoice, Start};
+use crate::session::{Encoding, ImagePart, Opening, Outputs, RigChoice, SessionError, Start};
+use crate::sim::ego::{Action, Path, TimedPose};
+use crate::sim::{self, Dynamics, Model};
 
 use super::SUBPROTOCOL;
 use super::camera::{lens_of, shutter_of, windshield_of};
@@ -45,10 +47,10 @@ pub(in crate::server) enum Command {
         /// The rest.
         opening: Box<Opening>,
     },
-    /// A step to a pose.
+    /// A step.
     Step {
-        /// `world_from_rig`.
-        pose: Pose,
+        /// How the ego is to move.
+        movement: sim::Command,
         /// Whether it is the last.
         terminate: bool,
     },
@@ -161,6 +163,9 @@ struct Fields {
     dt_us: Option<i64>,
     deadline_ms: Option<u64>,
     pose: Option<message::Pose>,
+    trajectory: Option<Vec<message::TimedPose>>,
+    action: Option<message::Action>,
+    dynamics: Option<message::DynamicsChoice>,
     poses: Option<Vec<message::Pose>>,
     terminate: Option<bool>,
     last_seq: Option<u64>,
@@ -177,9 +182,9 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, command)
         }
         Request::Open(open) => (open.seq, open_command(*open)),
-        Request::Step { seq, pose, terminate } => {
-            let command = pose_of("pose", &pose).map(|pose| Command::Step { pose, terminate });
-            (seq, command)
+        Request::Step { seq, pose, trajectory, action, terminate } => {
+            let movement = movement_of(pose, trajectory, action);
+            (seq, movement.map(|movement| Command::Step { movement, terminate }))
         }
         Request::Observe { seq, poses } => {
             let poses = poses_of(&poses, config::OBSERVE_POSES);
@@ -230,10 +235,54 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             depth,
             opacity,
         },
+        dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
     };
     Ok(Command::Open { name, opening: Box::new(opening) })
+}
+
+fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
+    let message::Dynamics { model, speed, reverse } = match choice {
+        message::DynamicsChoice::Full(dynamics) => dynamics,
+        message::DynamicsChoice::Model(model) => {
+            message::Dynamics { model, speed: 0.0, reverse: false }
+        }
+    };
+    let model = match model {
+        message::Model::Teleport => Model::Teleport,
+        message::Model::Kinematic => Model::Kinematic,
+        message::Model::Dynamic => Model::Dynamic,
+    };
+    Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
+}
+
+fn movement_of(
+    pose: Option<message::Pose>,
+    trajectory: Option<Vec<message::TimedPose>>,
+    action: Option<message::Action>,
+) -> Result<sim::Command, Fault> {
+    match (pose, trajectory, action) {
+        (Some(pose), None, None) => pose_of("pose", &pose).map(sim::Command::Pose),
+        (None, Some(poses), None) => {
+            // One more than is accepted tells the check that there are too many.
+            let poses = poses.iter().take(config::PATH_POSES + 1).enumerate();
+            let timed = |(index, timed): (usize, &message::TimedPose)| {
+                let start_from_rig = pose_of(&format!("trajectory[{index}].pose"), &timed.pose)?;
+                Ok(TimedPose { time_us: timed.time_us, start_from_rig })
+            };
+            let path = Path::checked(poses.map(timed).collect::<Result<_, Fault>>()?);
+            Ok(sim::Command::Path(path.map_err(SessionError::from)?))
+        }
+        (None, None, Some(message::Action { acceleration, curvature })) => {
+            let action = Action::checked(acceleration, curvature);
+            Ok(sim::Command::Action(action.map_err(SessionError::from)?))
+        }
+        _ => {
+            let reason = "a step has exactly one of pose, trajectory and action".to_owned();
+            Err(Fault::InvalidRequest { field: Some("pose".to_owned()), reason })
+        }
+    }
 }
 
 fn start_of(start: message::Start) -> Result<Start, Fault> {
@@ -326,6 +375,14 @@ fn not_finite(text: &str) -> Option<(Option<u64>, String)> {
     };
     let field = single
         .or_else(|| of_list("/poses", "poses", ""))
+        .or_else(|| of_list("/trajectory", "trajectory", ".pose"))
+        .or_else(|| {
+            let parts = ["acceleration", "curvature"];
+            let is_null = |part: &&str| {
+                value.pointer(&format!("/action/{part}")).is_some_and(serde_json::Value::is_null)
+            };
+            parts.into_iter().find(is_null).map(|part| format!("action.{part}"))
+        })
         .or_else(|| of_list("/rig/cameras", "rig.cameras", ".camera_to_rig"))?;
     Some((seq, field))
 }

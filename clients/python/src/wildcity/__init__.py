@@ -19,7 +19,9 @@ from .errors import (
 )
 from .observation import Observation, View
 from .protocol import (
+    Action,
     Camera,
+    Dynamics,
     Ego,
     ImageInfo,
     ImagePart,
@@ -34,6 +36,8 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    TimedPose,
+    Trajectory,
     TrajectoryInfo,
     TwinInfo,
     Welcome,
@@ -45,12 +49,14 @@ from .sync import Client, Session, connect
 __version__ = _version("wildcity")
 
 __all__ = [
+    "Action",
     "BadFrame",
     "Camera",
     "Client",
     "Code",
     "ConnectFailed",
     "Disconnected",
+    "Dynamics",
     "Ego",
     "ImageInfo",
     "ImagePart",
@@ -73,6 +79,8 @@ __all__ = [
     "Summary",
     "Switched",
     "TimedOut",
+    "TimedPose",
+    "Trajectory",
     "TrajectoryInfo",
     "TwinInfo",
     "View",

@@ -16,6 +16,9 @@ from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
     PROTOCOL,
+    Action,
+    Dynamics,
+    Model,
     Opened,
     Outputs,
     Pose,
@@ -24,6 +27,7 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    Trajectory,
     Welcome,
 )
 
@@ -69,6 +73,7 @@ class Client:
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
         outputs: Outputs | None = None,
+        dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
     ) -> Session:
@@ -82,6 +87,7 @@ class Client:
                 start=start,
                 rig=rig,
                 outputs=outputs,
+                dynamics=dynamics,
                 dt_us=dt_us,
                 deadline_ms=deadline_ms,
             )
@@ -170,9 +176,14 @@ class Session:
             raise WildCityError("this session was opened by another client")
         return self._opened
 
-    async def step(self, pose: Pose, *, terminate: bool = False) -> Observation:
-        """Moves the ego to its next `world_from_rig`; `terminate` ends the episode with it."""
-        return await self._client._run(self._conversation.step(pose, terminate))
+    async def step(
+        self, movement: Pose | Trajectory | Action, *, terminate: bool = False
+    ) -> Observation:
+        """Moves the ego; `terminate` ends the episode with it.
+
+        To its next `world_from_rig`, if it teleports; by an action, if it is a car; along a trajectory in either case.
+        """
+        return await self._client._run(self._conversation.step(movement, terminate))
 
     async def observe(self, poses: Sequence[Pose]) -> Observation:
         """What would be seen from poses, without moving: one view for each."""

@@ -20,7 +20,10 @@ from .observation import Observation
 from .protocol import (
     OBSERVATION_BYTES,
     PROTOCOL,
+    Action,
     Closed,
+    Dynamics,
+    Model,
     Ok,
     Opened,
     Outputs,
@@ -31,6 +34,7 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    Trajectory,
     Welcome,
     decode_answer,
     encode,
@@ -71,6 +75,7 @@ class Conversation:
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
         outputs: Outputs | None = None,
+        dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
     ) -> Exchange[Opened]:
@@ -80,6 +85,7 @@ class Conversation:
             "session": session,
             "start": _start(start),
             "rig": encode(rig),
+            "dynamics": encode(dynamics),
             "dt_us": dt_us,
             "deadline_ms": deadline_ms,
         }
@@ -89,9 +95,9 @@ class Conversation:
         self.session = opened.session
         return opened
 
-    def step(self, pose: Pose, terminate: bool) -> Exchange[Observation]:
+    def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
         """Moves."""
-        fields = {"pose": encode(pose), "terminate": terminate}
+        fields = {**_movement(movement), "terminate": terminate}
         return (yield from self._next("step", Observation, fields))
 
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
@@ -194,6 +200,12 @@ def translated(error: BaseException, timeout: float) -> WildCityError | None:
     if isinstance(error, (ConnectionClosed, OSError)):
         return Disconnected(str(error))
     return None
+
+
+def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
+    if isinstance(movement, Trajectory):
+        return {"trajectory": encode(movement.poses)}
+    return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
 
 
 def _start(start: Pose | Station | None) -> Any:

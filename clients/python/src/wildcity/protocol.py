@@ -45,6 +45,41 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class TimedPose:
+    """A pose of a trajectory: the rig `time_us` after the step's start, in its frame there."""
+
+    time_us: int
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the ego is to be next: 1 to 64 poses in order of time, to the step's end or beyond."""
+
+    poses: tuple[TimedPose, ...]
+
+
+@dataclass(frozen=True)
+class Action:
+    """Acceleration along the car (m/s²) and curvature of its way (1/m, to the left), for one step."""
+
+    acceleration: float
+    curvature: float
+
+
+Model = Literal["teleport", "kinematic", "dynamic"]
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """How the ego moves: its model, its speed (m/s) at the start, and whether braking ends in reverse."""
+
+    model: Model
+    speed: float = 0.0
+    reverse: bool = False
+
+
+@dataclass(frozen=True)
 class Station:
     """A place along a recorded trajectory, `station_m` metres from its start."""
 
@@ -207,6 +242,7 @@ class Opened:
     backend: str
     seed: int
     start: Pose
+    dynamics: Dynamics
     dt_us: int
     deadline_ms: int
     cameras: tuple[Camera, ...]
@@ -275,14 +311,19 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Ego:
-    """The ego vehicle: `world_from_rig`, velocity in world axes in m/s.
+    """The ego vehicle: `world_from_rig`, velocity (m/s) and acceleration (m/s²) in world axes.
 
-    The last `history_count` poses of the history were driven; earlier ones repeat the start.
+    `yaw_rate` is in rad/s, `steering` the angle of the front wheels in radians, both to the left; an ego that
+    teleports has no wheels. The last `history_count` poses of the history were driven; earlier ones repeat the
+    start.
     """
 
     pose: Pose
     velocity: Vector
+    acceleration: Vector
+    yaw_rate: float
     history_count: int
+    steering: float | None = None
 
 
 @dataclass(frozen=True)

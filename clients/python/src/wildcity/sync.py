@@ -18,6 +18,9 @@ from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
     PROTOCOL,
+    Action,
+    Dynamics,
+    Model,
     Opened,
     Outputs,
     Pose,
@@ -26,6 +29,7 @@ from .protocol import (
     Station,
     Summary,
     Switched,
+    Trajectory,
     Welcome,
 )
 
@@ -68,6 +72,7 @@ class Client:
         start: Pose | Station | None = None,
         rig: str | Rig | None = None,
         outputs: Outputs | None = None,
+        dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
     ) -> Session:
@@ -81,6 +86,7 @@ class Client:
                 start=start,
                 rig=rig,
                 outputs=outputs,
+                dynamics=dynamics,
                 dt_us=dt_us,
                 deadline_ms=deadline_ms,
             )
@@ -184,9 +190,14 @@ class Session:
             raise WildCityError("this session was opened by another client")
         return self._opened
 
-    def step(self, pose: Pose, *, terminate: bool = False) -> Observation:
-        """Moves the ego to its next `world_from_rig`; `terminate` ends the episode with it."""
-        return self._client._run(self._conversation.step(pose, terminate))
+    def step(
+        self, movement: Pose | Trajectory | Action, *, terminate: bool = False
+    ) -> Observation:
+        """Moves the ego; `terminate` ends the episode with it.
+
+        To its next `world_from_rig`, if it teleports; by an action, if it is a car; along a trajectory in either case.
+        """
+        return self._client._run(self._conversation.step(movement, terminate))
 
     def observe(self, poses: Sequence[Pose]) -> Observation:
         """What would be seen from poses, without moving: one view for each."""

@@ -1,0 +1,116 @@
+//! Sideways while speed changes. There is no closed form then: the state is a polynomial that satisfies
+//! `|v| dz/dt = G(v) z + v steer δ` at five points of a piece (Radau IIA, order 9, Hairer and Wanner,
+//! "Solving Ordinary Differential Equations II", IV.5). The equation is linear, so one solution of ten
+//! linear equations gives it; the last point is the piece's end, so stiffness damps instead of exciting,
+//! and nothing is divided by v.
+
+use std::sync::LazyLock;
+
+use glam::DVec2;
+
+use super::vehicle::Tyres;
+
+/// Points of a piece.
+pub(super) const POINTS: usize = 5;
+
+/// Where they lie in it: the zeros of Radau's right polynomial of degree 5.
+pub(super) const NODES: [f64; POINTS] = [
+    0.057_104_196_114_517_68,
+    0.276_843_013_638_123_8,
+    0.583_590_432_368_916_8,
+    0.860_240_135_656_219_5,
+    1.0,
+];
+
+/// Integrals from the piece's start to each point, as weights of the values at the points. The last row
+/// is the quadrature over the piece: exact for polynomials of degree 8.
+pub(super) static INTEGRALS: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
+    // What is right for every power: sum_j a_ij c_j^k = c_i^(k + 1) / (k + 1).
+    let powers: [[f64; POINTS]; POINTS] =
+        std::array::from_fn(|k| NODES.map(|node| node.powi(k as i32)));
+    NODES.map(|node| {
+        let wanted = std::array::from_fn(|k| node.powi(k as i32 + 1) / (k + 1) as f64);
+        solved(powers, wanted)
+    })
+});
+
+/// Derivatives at the points, as weights of the change since the piece's start at each.
+static DERIVATIVES: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
+    // What is right for every power: sum_j d_ij c_j^(k + 1) = (k + 1) c_i^k.
+    let powers: [[f64; POINTS]; POINTS] =
+        std::array::from_fn(|k| NODES.map(|node| node.powi(k as i32 + 1)));
+    NODES.map(|node| {
+        let wanted = std::array::from_fn(|k| (k + 1) as f64 * node.powi(k as i32));
+        solved(powers, wanted)
+    })
+});
+
+/// Lateral velocity (m/s) and yaw rate (rad/s) at the points of a piece that begins with `sideways` and
+/// lasts `piece_s`, by the speeds (m/s, of one sign) and steering angles (rad) there.
+pub(super) fn solve(
+    tyres: &Tyres,
+    piece_s: f64,
+    speeds_m_s: &[f64; POINTS],
+    angles_rad: &[f64; POINTS],
+    sideways: DVec2,
+) -> [DVec2; POINTS] {
+    let derivatives = &*DERIVATIVES;
+    let mut rows = [[0.0; 2 * POINTS]; 2 * POINTS];
+    let mut right = [0.0; 2 * POINTS];
+    // The unknowns are the changes since the start: |v| D y - G y = G z + v steer δ.
+    for point in 0..POINTS {
+        let (speed, angle) = (speeds_m_s[point], angles_rad[point]);
+        let matrix = tyres.matrix(speed);
+        let pull = matrix * sideways + tyres.steer * (speed * angle);
+        let rate = speed.abs() / piece_s;
+        for other in 0..POINTS {
+            rows[2 * point][2 * other] = rate * derivatives[point][other];
+            rows[2 * point + 1][2 * other + 1] = rate * derivatives[point][other];
+        }
+        for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            rows[2 * point + row][2 * point + column] -= matrix.col(column)[row];
+        }
+        (right[2 * point], right[2 * point + 1]) = (pull.x, pull.y);
+    }
+    let changes = solved(rows, right);
+    std::array::from_fn(|point| sideways + DVec2::new(changes[2 * point], changes[2 * point + 1]))
+}
+
+/// The solution of linear equations, by Gauss with the largest pivot of each column.
+fn solved<const N: usize>(mut rows: [[f64; N]; N], mut right: [f64; N]) -> [f64; N] {
+    for column in 0..N {
+        let larger =
+            |a: &usize, b: &usize| rows[*a][column].abs().total_cmp(&rows[*b][column].abs());
+        let pivot = (column..N).max_by(larger).unwrap_or(column);
+        rows.swap(column, pivot);
+        right.swap(column, pivot);
+        let above = rows[column];
+        for row in column + 1..N {
+            let factor = rows[row][column] / above[column];
+            for (number, pivotal) in rows[row].iter_mut().zip(above).skip(column) {
+                *number -= factor * pivotal;
+            }
+            right[row] -= factor * right[column];
+        }
+    }
+    for row in (0..N).rev() {
+        let known: f64 = (row + 1..N).map(|k| rows[row][k] * right[k]).sum();
+        right[row] = (right[row] - known) / rows[row][row];
+    }
+    right
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_quadrature_is_exact_to_degree_eight() {
+        for degree in 0..=9 {
+            let sum: f64 =
+                NODES.iter().zip(INTEGRALS[POINTS - 1]).map(|(x, w)| w * x.powi(degree)).sum();
+            let error = (sum - 1.0 / f64::from(degree + 1)).abs();
+            assert!((error < 1e-15) == (degree <= 8), "degree {degree}: {error}");
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! A trajectory that an agent wants to drive: where it wants to be, and when.
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::config;
+use crate::geometry::Pose;
+
+use super::EgoError;
+
+/// Where to be at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TimedPose {
+    /// Time since the step's start, in microseconds.
+    pub time_us: i64,
+    /// `rig(start)_from_rig`: the pose in the frame of the rig as it is when the step starts.
+    pub start_from_rig: Pose,
+}
+
+/// 1 to [`config::PATH_POSES`] poses in order of time; it begins where the rig is, at time 0.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Path {
+    poses: Vec<TimedPose>,
+}
+
+/// What the path wants at a time, in the plane of the rig as it is when the step starts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Wanted {
+    /// Where, in metres.
+    pub(super) position_m: DVec2,
+    /// Heading, in radians.
+    pub(super) yaw_rad: f64,
+    /// Speed along the heading, in m/s; below 0 backwards.
+    pub(super) speed_m_s: f64,
+    /// How speed changes, in m/s².
+    pub(super) acceleration_m_s2: f64,
+    /// Yaw rate, in rad/s.
+    pub(super) yaw_rate_rad_s: f64,
+}
+
+/// The path's poses in the plane, with the speeds that they imply.
+#[derive(Debug)]
+pub(super) struct Wishes {
+    knots: Vec<(f64, Wanted)>,
+}
+
+impl Path {
+    /// A path from outside.
+    ///
+    /// # Errors
+    /// There are no poses or too many, or their times do not rise from above 0 to at most
+    /// [`config::PATH_US`].
+    pub fn checked(poses: Vec<TimedPose>) -> Result<Self, EgoError> {
+        if !(1..=config::PATH_POSES).contains(&poses.len()) {
+            return Err(EgoError::PathCount { count: poses.len(), limit: config::PATH_POSES });
+        }
+        let mut before_us = 0;
+        for (index, pose) in poses.iter().enumerate() {
+            let time_us = pose.time_us;
+            if time_us <= before_us || time_us > config::PATH_US {
+                let limit_us = config::PATH_US;
+                return Err(EgoError::PathTime { index, time_us, before_us, limit_us });
+            }
+            before_us = time_us;
+        }
+        Ok(Self { poses })
+    }
+
+    /// Its poses.
+    pub fn poses(&self) -> &[TimedPose] {
+        &self.poses
+    }
+
+    /// When it ends, in microseconds.
+    pub fn end_us(&self) -> i64 {
+        self.poses.last().map_or(0, |pose| pose.time_us)
+    }
+
+    /// `rig(start)_from_rig` at a time within the path: linear between its poses.
+    pub(super) fn at(&self, time_us: i64) -> Pose {
+        let mut before = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
+        for pose in &self.poses {
+            if time_us <= pose.time_us {
+                let t = (time_us - before.time_us) as f64 / (pose.time_us - before.time_us) as f64;
+                return match pose.time_us == time_us {
+                    true => pose.start_from_rig,
+                    false => before.start_from_rig.interpolate(&pose.start_from_rig, t),
+                };
+            }
+            before = *pose;
+        }
+        before.start_from_rig
+    }
+
+    /// What it wants in the plane, by its own poses: where the rig is counts only beside a single one. Else
+    /// a rig that is behind would find a path that begins fast and brakes.
+    pub(super) fn wishes(&self) -> Wishes {
+        let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
+        let start = (self.poses.len() == 1).then_some(start);
+        let places: Vec<(f64, DVec2, f64)> = start
+            .iter()
+            .chain(&self.poses)
+            .map(|pose| {
+                let forward = pose.start_from_rig.rotation * DVec3::X;
+                let position_m = pose.start_from_rig.position_m.truncate();
+                (pose.time_us as f64 * 1e-6, position_m, forward.y.atan2(forward.x))
+            })
+            .collect();
+        let last = places.len() - 1;
+        // Differences across each pose; at the ends those of the first and the last stretch.
+        let moved = |k: usize| {
+            let (from, to) = (places[k.saturating_sub(1)], places[(k + 1).min(last)]);
+            let (way_m, seconds) = (to.1 - from.1, to.0 - from.0);
+            let speed_m_s = way_m.dot(DVec2::from_angle(places[k].2)) / seconds;
+            (speed_m_s, wrapped(to.2 - from.2) / seconds)
+        };
+        let moves: Vec<(f64, f64)> = (0..places.len()).map(moved).collect();
+        let knot = |k: usize| {
+            let (from, to) = (k.saturating_sub(1), (k + 1).min(last));
+            let (time_s, position_m, yaw_rad) = places[k];
+            let (speed_m_s, yaw_rate_rad_s) = moves[k];
+            let acceleration_m_s2 = (moves[to].0 - moves[from].0) / (places[to].0 - places[from].0);
+            (time_s, Wanted { position_m, yaw_rad, speed_m_s, acceleration_m_s2, yaw_rate_rad_s })
+        };
+        Wishes { knots: (0..places.len()).map(knot).collect() }
+    }
+}
+
+impl Wishes {
+    /// What is wanted at a time in seconds: before the first pose as it would have come there, after the
+    /// last what is wanted there.
+    pub(super) fn at(&self, time_s: f64) -> Wanted {
+        let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
+        let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };
+        let Some((from_s, from)) = after.checked_sub(1).map(|before| &self.knots[before]) else {
+            return to.before(to_s - time_s);
+        };
+        let t = (time_s - from_s) / (to_s - from_s);
+        let between = |from: f64, to: f64| from + t * (to - from);
+        Wanted {
+            position_m: from.position_m.lerp(to.position_m, t),
+            yaw_rad: from.yaw_rad + t * wrapped(to.yaw_rad - from.yaw_rad),
+            speed_m_s: between(from.speed_m_s, to.speed_m_s),
+            acceleration_m_s2: between(from.acceleration_m_s2, to.acceleration_m_s2),
+            yaw_rate_rad_s: between(from.yaw_rate_rad_s, to.yaw_rate_rad_s),
+        }
+    }
+}
+
+impl Wanted {
+    /// The same some seconds earlier, at constant acceleration and yaw rate.
+    fn before(&self, seconds: f64) -> Self {
+        let speed_m_s = self.speed_m_s - seconds * self.acceleration_m_s2;
+        let yaw_rad = self.yaw_rad - seconds * self.yaw_rate_rad_s;
+        let way_m = seconds * 0.5 * (speed_m_s + self.speed_m_s);
+        let between = DVec2::from_angle(0.5 * (yaw_rad + self.yaw_rad));
+        Self { position_m: self.position_m - way_m * between, yaw_rad, speed_m_s, ..*self }
+    }
+}
+
+/// An angle from -π to π, in radians.
+pub(super) fn wrapped(angle_rad: f64) -> f64 {
+    let turns = (angle_rad / std::f64::consts::TAU).round();
+    angle_rad - turns * std::f64::consts::TAU
+}

@@ -1,0 +1,144 @@
+//! The ground under the ego, as far as recorded drives tell of it.
+//!
+//! A rig's origin is on the ground under its rear axle and its z axis stands on it, so every keyframe is
+//! a piece of ground: a plane through its origin across its z axis. That needs nothing but the manifest
+//! and holds for any twin with a drive; the Gaussians themselves have no ground, only what lies on it.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::config;
+use crate::geometry::Pose;
+use crate::scene::Trajectory;
+
+/// What drives tell of the ground.
+#[derive(Clone, Copy, Debug)]
+pub struct Ground<'a> {
+    drives: &'a [Trajectory],
+}
+
+/// A plane through a point.
+struct Plane {
+    point_m: DVec3,
+    up: DVec3,
+}
+
+impl<'a> Ground<'a> {
+    /// Of recorded drives.
+    pub fn of(drives: &'a [Trajectory]) -> Self {
+        Self { drives }
+    }
+
+    /// A pose (`world_from_rig`) set on the ground: straight down or up onto it, level with it, heading
+    /// as it did. A pose that no drive comes within [`config::GROUND_NEAR_M`] of stays as it is.
+    ///
+    /// The nearest drive counts, in space and not in the plane: a bridge is not the street below it.
+    /// Between keyframes the plane is between theirs. Every keyframe is looked at: 170,000 take a
+    /// millisecond.
+    pub fn settle(&self, world_from_rig: Pose) -> Pose {
+        match self.under(world_from_rig.position_m) {
+            Some(plane) => plane.settle(world_from_rig),
+            None => world_from_rig,
+        }
+    }
+
+    fn under(&self, point_m: DVec3) -> Option<Plane> {
+        let mut nearest_m = config::GROUND_NEAR_M;
+        let mut under = None;
+        for drive in self.drives {
+            let poses = drive.keyframes.iter().map(|keyframe| &keyframe.world_from_rig);
+            let before = poses.clone().take(1).chain(poses.clone());
+            for (from, to) in before.zip(poses) {
+                let way_m = to.position_m - from.position_m;
+                let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
+                let t = t.clamp(0.0, 1.0);
+                let distance_m = (from.position_m + t * way_m).distance(point_m);
+                if distance_m < nearest_m {
+                    nearest_m = distance_m;
+                    under = Some((from, to, t));
+                }
+            }
+        }
+        let (from, to, t) = under?;
+        let pose = from.interpolate(to, t);
+        Some(Plane { point_m: pose.position_m, up: pose.rotation * DVec3::Z })
+    }
+}
+
+impl Plane {
+    fn settle(&self, world_from_rig: Pose) -> Pose {
+        let Self { point_m, up } = *self;
+        // A drive on its side, or upside down, is no ground.
+        if up.z < config::GROUND_UP {
+            return world_from_rig;
+        }
+        let mut position_m = world_from_rig.position_m;
+        let aside_m = position_m - point_m;
+        position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
+        let forward = world_from_rig.rotation * DVec3::X;
+        // Heading straight up there is none; the rig stays as it is.
+        let Some(forward) = forward.reject_from_normalized(up).try_normalize() else {
+            return world_from_rig;
+        };
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(forward, up.cross(forward), up));
+        Pose { position_m, rotation: rotation.normalize() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::trajectory::Keyframe;
+
+    /// Uphill along x by a tenth, above a level street along y.
+    fn drives() -> Vec<Trajectory> {
+        let drive = |name: &str, pose: &dyn Fn(i64) -> Pose| {
+            let keyframe = |i| Keyframe { time_us: i, world_from_rig: pose(i) };
+            Trajectory { name: name.into(), keyframes: (0..=10).map(keyframe).collect() }
+        };
+        let slope_rad = 0.1f64.atan();
+        let bridge = |i: i64| {
+            let x_m = 5.0 * i as f64;
+            let rotation = DQuat::from_rotation_y(-slope_rad);
+            Pose { position_m: DVec3::new(x_m, 0.0, 8.0 + 0.1 * x_m), rotation }
+        };
+        let street = |i: i64| Pose {
+            position_m: DVec3::new(25.0, 5.0 * i as f64 - 25.0, 0.0),
+            rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
+        };
+        vec![drive("bridge", &bridge), drive("street", &street)]
+    }
+
+    #[test]
+    fn the_rig_stands_level_on_the_slope_beside_the_drive() {
+        let drives = drives();
+        let at = |position_m| Pose { position_m, rotation: DQuat::from_rotation_z(0.3) };
+        let settled = Ground::of(&drives).settle(at(DVec3::new(12.0, 3.0, 9.0)));
+        assert!((settled.position_m - DVec3::new(12.0, 3.0, 9.2)).length() < 1e-12, "{settled:?}");
+        let up = settled.rotation * DVec3::Z;
+        let wanted = DVec3::new(-0.1, 0.0, 1.0).normalize();
+        assert!((up - wanted).length() < 1e-12, "{up}");
+        let forward = settled.rotation * DVec3::X;
+        assert!((forward.y.atan2(forward.x) - 0.3).abs() < 0.01, "{forward}");
+        // Settled again it stays: what a step leaves is what the next begins with.
+        let again = Ground::of(&drives).settle(settled);
+        assert!((again.position_m - settled.position_m).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_bridge_is_not_the_street_below_it() {
+        let drives = drives();
+        let height_m = |z_m| {
+            let position_m = DVec3::new(25.0, 0.0, z_m);
+            Ground::of(&drives).settle(Pose { position_m, ..Pose::IDENTITY }).position_m.z
+        };
+        assert!((height_m(9.0) - 10.5).abs() < 1e-12 && height_m(1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn far_from_every_drive_nothing_is_known() {
+        let drives = drives();
+        let far = Pose { position_m: DVec3::new(0.0, 500.0, 3.0), ..Pose::IDENTITY };
+        assert_eq!(Ground::of(&drives).settle(far), far);
+        assert_eq!(Ground::of(&[]).settle(far), far);
+    }
+}
