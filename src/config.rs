@@ -25,7 +25,7 @@ pub const OBSERVATION_BYTES: usize = 3 << 29;
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
-/// of at most 3 kB, together 0.8 MB.
+/// of at most 3.5 kB, together 0.9 MB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
 /// Connections at once, WebSocket and HTTP together.
@@ -70,6 +70,17 @@ pub const HISTORY_POSES: usize = 16;
 
 /// Spacing of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
+
+/// Last frames of each camera in one observation: 1.5 s at 10 Hz, as far as the ego history reaches.
+pub const BUNDLE_FRAMES: usize = HISTORY_POSES;
+
+/// Longest time between two frames of a camera, or two decisions, in microseconds: unless a step is
+/// longer.
+pub const BUNDLE_PERIOD_US: i64 = 10_000_000;
+
+/// Longest warm-up, in microseconds: sixteen frames of a second each, and more than twice what any
+/// agent reads. Of a log at 100 Hz these are 2,000 poses.
+pub const WARM_UP_US: i64 = 20_000_000;
 
 /// Shortest simulated time of a step, in microseconds: at 1 kHz the ego history needs 1,500 poses.
 pub const DT_MIN_US: i64 = 1_000;

@@ -187,7 +187,8 @@ impl Import {
     }
 }
 
-fn read_rig(path: &Path) -> anyhow::Result<Rig> {
+/// Reads a vehicle's cameras from their JSON, and checks them.
+pub(super) fn read_rig(path: &Path) -> anyhow::Result<Rig> {
     let rig: Rig = read_json(path)?;
     rig.check().with_context(|| format!("{}", path.display()))?;
     Ok(rig)

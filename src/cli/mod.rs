@@ -16,6 +16,7 @@ mod push;
 mod render;
 mod replay;
 mod report;
+mod rig;
 mod route;
 mod scene_source;
 mod serve;
@@ -45,6 +46,7 @@ enum Command {
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
+    Rig(rig::RigCommand),
     Route(route::Route),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
@@ -66,6 +68,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),

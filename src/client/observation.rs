@@ -77,6 +77,18 @@ impl Observation {
         self.metadata.images.iter().map(|metadata| ImageView { observation: self, metadata })
     }
 
+    /// The last frames of a camera, oldest first: as many as `outputs.frames` asked for, fewer at an
+    /// episode's start, none between two decisions.
+    pub fn frames(&self, camera: &str) -> Vec<ImageView<'_>> {
+        let metadata = &self.metadata;
+        let newest_first = metadata.images.iter().filter(|image| image.pose == 0);
+        let of_camera = newest_first.chain(&metadata.history).filter(|i| i.camera == camera);
+        let mut frames: Vec<_> =
+            of_camera.map(|metadata| ImageView { observation: self, metadata }).collect();
+        frames.sort_by_key(|frame| std::cmp::Reverse(frame.metadata.back));
+        frames
+    }
+
     /// Past positions of the rig, in metres in the rig frame of now: `[16, 3]`, oldest first, 0.1 s
     /// apart, the last one zero.
     pub fn history_xyz_m(&self) -> Cow<'_, [f32]> {
@@ -89,17 +101,17 @@ impl Observation {
     }
 
     /// Compares the frame hash with the images' hashes, and each lossless image's pixels with its
-    /// hash. A JPEG's pixels are not those that were hashed, so they are left out.
+    /// hash, those of earlier frames too. A JPEG's pixels are not those that were hashed, so they are left out.
     ///
     /// # Errors
     /// Names the first hash that differs, or the first image that cannot be decoded.
     pub fn verify(&self) -> Result<(), FrameError> {
         let mut frame_hasher = blake3::Hasher::new();
+        for metadata in &self.metadata.history {
+            ImageView { observation: self, metadata }.verify()?;
+        }
         for image in self.images() {
-            if image.metadata.encoding != Encoding::Jpeg {
-                let found = blake3::hash(&image.rgb()?).to_hex().to_string();
-                compare_hashes(&image.metadata.tensor, found, &image.metadata.hash)?;
-            }
+            image.verify()?;
             // A hash that is no hash differs from every frame hash.
             let hash = blake3::Hash::from_hex(&image.metadata.hash).map_err(|_| {
                 let (name, expected) = (image.metadata.tensor.clone(), "64 hex digits".to_owned());
@@ -115,7 +127,9 @@ impl Observation {
     fn check(&self) -> Result<(), FrameError> {
         self.expect(HISTORY_XYZ, Dtype::F32, &[config::HISTORY_POSES, 3])?;
         self.expect(HISTORY_ROT, Dtype::F32, &[config::HISTORY_POSES, 3, 3])?;
-        for image in self.images() {
+        let history = self.metadata.history.iter();
+        let history = history.map(|metadata| ImageView { observation: self, metadata });
+        for image in self.images().chain(history) {
             let wire::Image { tensor, width, height, .. } = image.metadata;
             let side = |px: u64| usize::try_from(px).unwrap_or(usize::MAX);
             let size = [side(*height), side(*width)];
@@ -168,6 +182,15 @@ impl<'a> ImageView<'a> {
     /// The image as it travelled: raw pixels, or a JPEG or PNG file.
     pub fn encoded(&self) -> &'a [u8] {
         self.observation.tensor_bytes(&self.metadata.tensor)
+    }
+
+    /// Compares lossless pixels with their hash.
+    fn verify(&self) -> Result<(), FrameError> {
+        if self.metadata.encoding == Encoding::Jpeg {
+            return Ok(());
+        }
+        let found = blake3::hash(&self.rgb()?).to_hex().to_string();
+        compare_hashes(&self.metadata.tensor, found, &self.metadata.hash)
     }
 
     /// Pixels, u8 `[height, width, 3]`: raw ones in place, others decoded.

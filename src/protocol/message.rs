@@ -203,6 +203,14 @@ pub struct Open {
     /// How long an answer may take, in milliseconds; the server's limit if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<u64>,
+    /// Time between two decisions of the agent, in simulated microseconds, whole steps: only those
+    /// observations have images. Every one if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub decision_us: Option<i64>,
+    /// How much of the recorded drive lies before the start, in microseconds: its poses are the ego's
+    /// history, and its frames are in the first bundle. 0 if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warm_up_us: Option<i64>,
 }
 
 impl Open {
@@ -221,6 +229,8 @@ impl Open {
             dynamics: None,
             dt_us: None,
             deadline_ms: None,
+            decision_us: None,
+            warm_up_us: None,
         }
     }
 }
@@ -326,6 +336,16 @@ pub struct Outputs {
     pub depth: bool,
     /// Whether to add `opacity`, f32 `[height, width]`: the validity of depth and colour.
     pub opacity: bool,
+    /// How many last frames of each camera an observation holds; 1 if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames: Option<u64>,
+    /// Whether to say how far each image may be believed; false if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trust: Option<bool>,
+    /// Time between two frames by camera, in simulated microseconds, whole steps; every step takes one
+    /// if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub period_us: Option<BTreeMap<String, i64>>,
 }
 
 impl Default for Outputs {
@@ -337,6 +357,9 @@ impl Default for Outputs {
             quality: None,
             depth: false,
             opacity: false,
+            frames: None,
+            trust: None,
+            period_us: None,
         }
     }
 }
@@ -527,6 +550,10 @@ pub struct Opened {
     pub dt_us: i64,
     /// How long an answer may take, in milliseconds.
     pub deadline_ms: u64,
+    /// Time between two observations with images, in microseconds.
+    pub decision_us: i64,
+    /// How much of the recorded drive lies before the start, in microseconds.
+    pub warm_up_us: i64,
     /// Cameras in the order of the images, with intrinsics as sent.
     pub cameras: Vec<RigCamera>,
     /// What each observation holds.

@@ -8,7 +8,8 @@
 //! then per image `camera/<name>/depth` f32 and `camera/<name>/opacity` f32 where asked for, then
 //! per image `camera/<name>/rgb` u8. The header's length is a multiple of 8 and floats come first,
 //! so that they lie on multiples of 4 and can be read in place. With several poses (`observe`)
-//! image names start with `pose/<k>/`.
+//! image names start with `pose/<k>/`. Last come earlier frames, where asked for:
+//! `camera/<name>/history/<back>/rgb` u8.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -45,8 +46,12 @@ pub struct Observation {
     pub frame_hash: String,
     /// The ego at this time.
     pub ego: Ego,
-    /// The images, in order.
+    /// The images, in order; none between two decisions.
     pub images: Vec<Image>,
+    /// Earlier frames of the same cameras, camera by camera, the newest first; absent if there are
+    /// none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub history: Vec<Image>,
     /// What it cost.
     pub timings: Timings,
     /// What of it had to be loaded.
@@ -82,6 +87,9 @@ pub struct Image {
     pub index: u64,
     /// Which of the request's poses: 0 but for `observe`.
     pub pose: u64,
+    /// How many frames of this camera ago; absent, for 0, in `images`.
+    #[serde(default, skip_serializing_if = "is_now")]
+    pub back: u64,
     /// Name of the colour tensor; `depth` and `opacity` replace `rgb` at its end.
     pub tensor: String,
     /// How the colour image travels.
@@ -116,6 +124,28 @@ pub struct Image {
     pub shutter_end_us: i64,
     /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
     pub hash: String,
+    /// How far it may be believed, if asked for; not of earlier frames.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trust: Option<Trust>,
+}
+
+/// How far an image may be believed, and why.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Trust {
+    /// 1 where and as it was recorded, 0 where nothing is known.
+    pub value: f64,
+    /// From the rig to the nearest recorded keyframe, in metres.
+    pub distance_m: f64,
+    /// Between the rig's axes there and here, in radians.
+    pub angle_rad: f64,
+    /// Share of pixels of less than half opacity, of those that look down at the ground.
+    pub low_coverage: f64,
+    /// Share of rays that meet no block of the twin, of those that look down.
+    pub outside: f64,
+}
+
+fn is_now(back: &u64) -> bool {
+    *back == 0
 }
 
 /// What an observation cost, in milliseconds of wall time.

@@ -79,7 +79,10 @@ pub enum RigError {
 }
 
 /// Rigs that come with the program, by name: the JSON of `scenes/rigs`.
-const PRESETS: [(&str, &str); 1] = [("vehicle6", include_str!("../../scenes/rigs/vehicle6.json"))];
+const PRESETS: [(&str, &str); 2] = [
+    ("vehicle6", include_str!("../../scenes/rigs/vehicle6.json")),
+    ("surround6", include_str!("../../scenes/rigs/surround6.json")),
+];
 
 impl Rig {
     /// Names of the rigs that come with the program, for [`Rig::preset`].

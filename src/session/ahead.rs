@@ -4,9 +4,10 @@
 use glam::DVec3;
 
 use crate::config;
-use crate::geometry::Pose;
+use crate::geometry::{Bounds, Pose};
 use crate::residency::Urgency;
 use crate::scene::Trajectory;
+use crate::scene::route::Boxes;
 
 /// A recorded drive that the ego may follow.
 #[derive(Debug)]
@@ -14,6 +15,8 @@ pub(super) struct Route {
     poses: Vec<Pose>,
     /// Distance of each pose along the drive, in metres.
     stations_m: Vec<f64>,
+    /// The ways from each pose to the next; of one pose, that pose.
+    ways: Boxes,
 }
 
 /// What is known of where the ego goes.
@@ -129,23 +132,31 @@ impl Route {
             way_m += pose.position_m.distance(before.position_m);
             stations_m.push(way_m);
         }
-        Self { poses, stations_m }
+        let way = |index: usize| {
+            let mut bounds = Bounds::EMPTY;
+            for pose in &poses[index..poses.len().min(index + 2)] {
+                bounds.add(pose.position_m, DVec3::ZERO);
+            }
+            bounds
+        };
+        let count = poses.len().saturating_sub(1).max(poses.len().min(1));
+        let ways: Vec<Bounds> = (0..count).map(way).collect();
+        Self { poses, stations_m, ways: Boxes::new(&ways) }
     }
 
     /// The place along the drive that is nearest to a point, and how near: both in metres.
     fn nearest(&self, point_m: DVec3) -> Option<(f64, f64)> {
-        let first = self.poses.first()?.position_m;
-        let mut best = (0.0, first.distance(point_m));
-        for (pair, &start_m) in self.poses.windows(2).zip(&self.stations_m) {
-            let way_m = pair[1].position_m - pair[0].position_m;
-            let to_point_m = point_m - pair[0].position_m;
+        // How far along a way the nearest place is, and how near.
+        let on_way = |index: usize| {
+            let from_m = self.poses[index].position_m;
+            let to_m = self.poses.get(index + 1).map_or(from_m, |next| next.position_m);
+            let (way_m, to_point_m) = (to_m - from_m, point_m - from_m);
             let t = (to_point_m.dot(way_m) / way_m.length_squared().max(1e-12)).clamp(0.0, 1.0);
-            let distance_m = (to_point_m - t * way_m).length();
-            if distance_m < best.1 {
-                best = (start_m + t * way_m.length(), distance_m);
-            }
-        }
-        Some(best)
+            (t * way_m.length(), (to_point_m - t * way_m).length())
+        };
+        // No less than the distance to the way's box but for rounding, which may prefer an equal one.
+        let (index, distance_m) = self.ways.cheapest(point_m, |index| on_way(index).1)?;
+        Some((self.stations_m[index] + on_way(index).0, distance_m))
     }
 
     /// The pose at a distance along the drive, in metres. It goes straight on beyond its end.

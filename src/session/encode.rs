@@ -6,6 +6,8 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
+use super::Trust;
+
 /// How colour images travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -24,6 +26,8 @@ pub(super) struct Drawn {
     pub(super) hash: blake3::Hash,
     /// The file, unless the pixels are in the buffer already.
     pub(super) file: Vec<u8>,
+    /// How far it may be believed, if that was asked for.
+    pub(super) trust: Option<Trust>,
     /// CPU time that this took.
     pub(super) took: Duration,
 }
@@ -43,7 +47,7 @@ pub(super) fn encode(
         Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
         Encoding::Png => png(rgb8, width, height)?,
     };
-    Ok(Drawn { hash, file, took: started.elapsed() })
+    Ok(Drawn { hash, file, trust: None, took: started.elapsed() })
 }
 
 /// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.

@@ -25,8 +25,10 @@ pub struct Episode {
     ego: Ego,
     terminated: bool,
     /// World-from-rig by time in microseconds, rising; the last is now. Never empty, and no longer
-    /// than the history needs.
+    /// than the history needs, or the frames before the first step.
     track: VecDeque<(i64, Pose)>,
+    /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
+    begin_us: i64,
 }
 
 /// Why an episode ended.
@@ -66,15 +68,23 @@ pub struct History {
     pub xyz_m: [[f32; 3]; HISTORY_POSES],
     /// Rotation matrices `[16, 3, 3]`, row by row.
     pub rotation: [[[f32; 3]; 3]; HISTORY_POSES],
-    /// How many, from the end, were driven; the earlier ones repeat the start.
+    /// How many, from the end, were driven, in the warm-up too; the earlier ones repeat the first.
     pub count: usize,
 }
 
 impl Episode {
     /// An episode of an ego at its start, at time zero. `dt_us` is above zero.
     pub fn new(seed: u64, ego: Ego, dt_us: i64) -> Self {
-        let track = VecDeque::from([(0, ego.world_from_rig())]);
-        Self { seed, dt_us, step: 0, distance_m: 0.0, ego, terminated: false, track }
+        Self::warmed_up(seed, ego, &[], dt_us)
+    }
+
+    /// The same behind a warm-up: where the rig was (`world_from_rig`) by time in microseconds, rising
+    /// and below 0.
+    pub(super) fn warmed_up(seed: u64, ego: Ego, warm_up: &[(i64, Pose)], dt_us: i64) -> Self {
+        let now = (0, ego.world_from_rig());
+        let track: VecDeque<_> = warm_up.iter().copied().chain([now]).collect();
+        let begin_us = track[0].0;
+        Self { seed, dt_us, step: 0, distance_m: 0.0, ego, terminated: false, track, begin_us }
     }
 
     /// The episode after one more step. `self` stays as it is, so that a step whose rendering fails has
@@ -101,8 +111,10 @@ impl Episode {
         next.distance_m += moved_m.length();
         next.terminated = terminate;
         next.track.push_back((time_us, world_from_rig));
-        // One pose at or before the history's begin must stay, to interpolate from.
-        while next.track.len() > 2 && next.track[1].0 <= time_us - HISTORY_US {
+        // One pose at or before the history's begin must stay, to interpolate from. The first step may
+        // still draw frames of the warm-up.
+        let reach_us = HISTORY_US.max(self.dt_us - self.begin_us);
+        while next.track.len() > 2 && next.track[1].0 <= time_us - reach_us {
             next.track.pop_front();
         }
         Ok(next)
@@ -114,7 +126,7 @@ impl Episode {
     pub(super) fn views(&self, cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
         let now = self.world_from_rig();
         View::of_moving_rig(cameras, world_from_rig, &|age_us| {
-            let then = self.at(self.time_us() - age_us);
+            let then = self.at((self.time_us() - age_us).max(0));
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         })
     }
@@ -137,6 +149,11 @@ impl Episode {
     /// Where the ego is.
     pub fn world_from_rig(&self) -> Pose {
         self.ego.world_from_rig()
+    }
+
+    /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
+    pub(super) fn begin_us(&self) -> i64 {
+        self.begin_us
     }
 
     /// How the ego stands and moves.
@@ -168,17 +185,19 @@ impl Episode {
             xyz_m[k] = rig_from_past.position_m.as_vec3().to_array();
             rotation[k] = rig_from_past.rotation_matrix().transpose().as_mat3().to_cols_array_2d();
         }
-        let steps_back = self.time_us() / HISTORY_STEP_US;
+        let steps_back = (self.time_us() - self.begin_us) / HISTORY_STEP_US;
         let count = usize::try_from(steps_back).unwrap_or(0).min(HISTORY_POSES - 1) + 1;
         History { xyz_m, rotation, count }
     }
 
     /// `world_from_rig` at a time, between the poses of the track.
-    fn at(&self, time_us: i64) -> Pose {
+    pub(super) fn at(&self, time_us: i64) -> Pose {
         let after = self.track.partition_point(|&(t, _)| t < time_us);
         let Some(&(after_us, to)) = self.track.get(after) else { return self.world_from_rig() };
         match after.checked_sub(1) {
             None => to,
+            // Not even rounded.
+            Some(_) if after_us == time_us => to,
             Some(before) => {
                 let (before_us, from) = self.track[before];
                 let t = (time_us - before_us) as f64 / (after_us - before_us) as f64;
@@ -270,6 +289,21 @@ mod tests {
         }
         let stopped = moved(&driven, at(9.0, 0.0), false).unwrap();
         assert_eq!(stopped.views(&[camera], at(9.0, 0.0))[0].rolling, None, "it stands again");
+    }
+
+    #[test]
+    fn the_history_reaches_into_the_warm_up() {
+        // Ten metres a second for half a second, and on from there.
+        let warm_up: Vec<_> = (-5..0).map(|k| (k * 100_000, at(k as f64, 0.0))).collect();
+        let ego = Ego::new(Dynamics::default(), at(0.0, 0.0));
+        let start = Episode::warmed_up(1, ego, &warm_up, 100_000);
+        assert_eq!((start.step(), start.time_us(), start.history().count), (0, 0, 6));
+        let xs_m = |episode: &Episode| episode.history().xyz_m.map(|p| p[0]);
+        assert_eq!(xs_m(&start)[8..], [-5.0, -5.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
+        let next = moved(&start, at(1.0, 0.0), false).unwrap();
+        assert_eq!(xs_m(&next)[8..], [-6.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
+        assert_eq!((next.history().count, next.summary(Outcome::Completed).distance_m), (7, 1.0));
+        assert_eq!(next.at(-500_000), at(-5.0, 0.0), "still there for the first step's frames");
     }
 
     #[test]

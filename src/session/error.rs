@@ -3,6 +3,7 @@
 use crate::render::RenderError;
 use crate::residency::ResidencyError;
 use crate::scene::profile::ProfileError;
+use crate::scene::route::RouteError;
 use crate::sim::EgoError;
 use crate::store::StoreError;
 
@@ -28,13 +29,16 @@ pub enum SessionError {
     /// The rig has no camera of this name.
     #[error("the rig has no camera {name:?}; it has {}", known.join(", "))]
     UnknownCamera {
-        /// Which name of `outputs.cameras`.
-        index: usize,
+        /// Where it was asked for, as it is called on the wire.
+        field: String,
         /// The name asked for.
         name: String,
         /// The cameras there are.
         known: Vec<String>,
     },
+    /// A recorded drive of the twin cannot be driven along.
+    #[error(transparent)]
+    Route(#[from] RouteError),
     /// A camera was asked for twice.
     #[error("camera {name:?} is asked for twice; name each camera once")]
     CameraTwice {

@@ -5,11 +5,13 @@
 //! happened, and the request can be sent again.
 
 mod ahead;
+mod album;
 mod buffer;
 mod encode;
 mod engine;
 mod episode;
 mod error;
+mod frame;
 mod golden;
 mod leases;
 mod listing;
@@ -19,6 +21,8 @@ mod opening;
 mod record;
 mod replay;
 mod retrace;
+mod schedule;
+mod trust;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -40,11 +44,10 @@ pub(crate) use encode::{jpeg, png};
 pub use engine::{Engine, EngineSettings, HeldLatest};
 pub use episode::{Episode, History, Outcome, Summary};
 pub use error::SessionError;
+pub use frame::{DType, Frame, Image, PastImage, Residency, Tensor, TensorKind, Timings};
 pub use golden::{Changed, Golden};
 pub use listing::{TrajectorySummary, TwinSummary};
-pub use observation::{
-    DType, Frame, HEADER_PREFIX_BYTES, Image, Residency, Tensor, TensorKind, Timings,
-};
+pub use observation::HEADER_PREFIX_BYTES;
 pub use opening::{ImagePart, Opening, Outputs, RigChoice, Start};
 pub use record::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedCommand, RecordedOutputs,
@@ -52,13 +55,16 @@ pub use record::{
 };
 pub use replay::{Change, Difference, Extent, Recording, Redrawn, ReplayError, Report};
 pub use retrace::StrayedStep;
+pub use trust::{Trained, Trust};
 
 use ahead::{Ahead, Route};
+use album::Album;
 use lookout::Lookout;
 pub(crate) use observation::eyes;
-use observation::{Assembly, Layout};
-use opening::{choose_cameras, resolve_start};
+use observation::{Assembly, Drawing, Layout, Shot};
+use opening::{Track, choose_cameras, resolve_start};
 use record::{Line, Recorder};
+use schedule::Schedule;
 
 /// One agent's session on a twin: on one version of it, until the agent asks for another.
 #[derive(Debug)]
@@ -74,10 +80,14 @@ pub struct Session {
     rig_name: String,
     layout: Arc<Layout>,
     dynamics: Dynamics,
-    start: Pose,
+    /// How episodes get to their start unless `reset` says otherwise.
+    start: Track,
+    warm_up_us: i64,
     dt_us: i64,
     deadline: Duration,
     episode: Episode,
+    /// The episode's frames that later observations show again.
+    album: Album,
     /// Number of the current episode's file, and the file once something was rendered.
     episode_number: u64,
     recorder: Option<Recorder>,
@@ -85,6 +95,8 @@ pub struct Session {
     switched: bool,
     /// The recorded drive that the agent may follow, and where it says that it goes.
     route: Option<Arc<Route>>,
+    /// Where the twin was recorded, if observations say how far they may be believed.
+    trained: Option<Arc<Trained>>,
     hint: Vec<Pose>,
     /// When the last frame was ready, and how long after the one before.
     last_frame: Instant,
@@ -116,15 +128,12 @@ impl Session {
         let resident = engine.resident(opening.twin, opening.version).await?;
         let manifest = &resident.version.manifest;
         let (rig_name, cameras) = choose_cameras(&resident, opening.rig, &opening.outputs)?;
-        let Outputs { encoding, depth, opacity, .. } = opening.outputs;
+        let Outputs { encoding, depth, opacity, frames, periods_us, trust, .. } = opening.outputs;
         let lens = lens(&cameras);
-        let layout = Layout::new(cameras, encoding, depth, opacity)?;
-        let start = match &opening.start {
-            Some(start) => resolve_start(&resident, start)?,
-            None => manifest.trajectories.first().map_or(Pose::IDENTITY, |log| log.at_station(0.0)),
-        };
-        let dynamics = opening.dynamics;
-        let start = dynamics.start(start, &Ground::of(&manifest.trajectories));
+        let schedule = Schedule::new(&cameras, dt_us, frames, &periods_us, opening.decision_us)?;
+        let layout = Layout::new(cameras, encoding, (depth, opacity), schedule)?;
+        let (dynamics, warm_up_us) = (opening.dynamics, opening.warm_up_us);
+        let start = settled(&resident, opening.start.as_ref(), warm_up_us, dynamics)?;
         let named = match &opening.start {
             Some(Start::Station { trajectory, .. }) => Some(trajectory),
             _ => None,
@@ -134,6 +143,10 @@ impl Session {
         let route = route.map(|log| Arc::new(Route::new(log)));
         let changes = opening.profile;
         let profile = changes.apply(manifest.profile)?;
+        let trained = match trust {
+            true => Some(trained(&resident).await?),
+            false => None,
+        };
         let reservation = Engine::reserve(resident.clone(), lens, profile).await?;
         let session = Self {
             profile_hash: record::profile_hash(&profile),
@@ -141,11 +154,13 @@ impl Session {
             profile,
             rig_name,
             layout: Arc::new(layout),
+            episode: episode(opening.seed, &start, dynamics, dt_us),
             dynamics,
             start,
+            warm_up_us,
             dt_us,
             deadline,
-            episode: Episode::new(opening.seed, Ego::new(dynamics, start), dt_us),
+            album: Album::default(),
             episode_number: 0,
             recorder: None,
             switched: false,
@@ -154,13 +169,14 @@ impl Session {
             reservation,
             name,
             route,
+            trained,
             hint: Vec::new(),
             last_frame: Instant::now(),
             // As fast as the clock, until it is known.
             frame_took: Duration::from_micros(dt_us.unsigned_abs()),
         };
         // The first look is likely to be at the start: it is loaded while the agent thinks.
-        session.expect(vec![(Urgency::Imminent, start)]);
+        session.expect(vec![(Urgency::Imminent, session.start())]);
         Ok(session)
     }
 
@@ -177,14 +193,14 @@ impl Session {
         let command = command.into();
         let ground = Ground::of(&self.resident().version.manifest.trajectories);
         let next = self.episode.stepped(&command, &ground, terminate)?;
-        let pose = next.world_from_rig();
-        let frame = self.draw(&next, vec![pose]).await?;
-        let mut line = frame_line(FrameRequest::Step, &next, &[pose], &frame);
+        let shots = self.layout.shots(&next, &self.album);
+        let drawing = self.draw(&next, shots, Some(self.album.clone())).await?;
+        let mut line = self.frame_line(FrameRequest::Step, &next, &drawing);
         line.command = RecordedCommand::of(&command);
         self.record(line).await?;
-        self.episode = next;
+        (self.episode, self.album) = (next, drawing.album);
         self.look_ahead();
-        Ok(frame)
+        Ok(drawing.frame)
     }
 
     /// Renders 1 to `config::OBSERVE_POSES` poses (`world_from_rig`) without moving.
@@ -197,9 +213,10 @@ impl Session {
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
         let episode = self.episode.clone();
-        let frame = self.draw(&episode, poses.clone()).await?;
-        self.record(frame_line(FrameRequest::Observe, &episode, &poses, &frame)).await?;
-        Ok(frame)
+        let shots = self.layout.looks(&episode, poses);
+        let drawing = self.draw(&episode, shots, None).await?;
+        self.record(self.frame_line(FrameRequest::Observe, &episode, &drawing)).await?;
+        Ok(drawing.frame)
     }
 
     /// Starts a new episode at `start`, or where the session started, and renders it.
@@ -208,22 +225,20 @@ impl Session {
     /// As [`Session::step`]: the old episode goes on.
     pub async fn reset(&mut self, seed: u64, start: Option<Start>) -> Result<Frame, SessionError> {
         let start = match &start {
-            Some(start) => {
-                let ground = Ground::of(&self.resident().version.manifest.trajectories);
-                self.dynamics.start(resolve_start(self.resident(), start)?, &ground)
-            }
-            None => self.start,
+            Some(_) => settled(self.resident(), start.as_ref(), self.warm_up_us, self.dynamics)?,
+            None => self.start.clone(),
         };
-        let next = Episode::new(seed, Ego::new(self.dynamics, start), self.dt_us);
-        let frame = self.draw(&next, vec![start]).await?;
-        let line = frame_line(FrameRequest::Reset, &next, &[start], &frame);
+        let next = episode(seed, &start, self.dynamics, self.dt_us);
+        let shots = self.layout.shots(&next, &Album::default());
+        let drawing = self.draw(&next, shots, Some(Album::default())).await?;
+        let line = self.frame_line(FrameRequest::Reset, &next, &drawing);
         let (recorder, number) = self.begin_recording(&next, Line::Frame(line)).await?;
         self.finish(Outcome::Completed).await;
         (self.recorder, self.episode_number, self.switched) = (Some(recorder), number, false);
-        self.episode = next;
+        (self.episode, self.album) = (next, drawing.album);
         self.hint.clear();
         self.look_ahead();
-        Ok(frame)
+        Ok(drawing.frame)
     }
 
     /// Loads what is seen from 1 to `config::PREFETCH_POSES` poses (`world_from_rig`), and between
@@ -255,8 +270,13 @@ impl Session {
         let lens = lens(self.layout.cameras());
         let profile = self.changes.apply(resident.version.manifest.profile)?;
         let bytes = Engine::worst_bytes(resident.clone(), lens, profile).await?;
+        let trained = match &self.trained {
+            Some(_) => Some(trained(&resident).await?),
+            None => None,
+        };
         // From here on, nothing waits: the switch happens as a whole.
         self.reservation.exchange(resident, bytes)?;
+        self.trained = trained;
         (self.profile, self.profile_hash) = (profile, record::profile_hash(&profile));
         self.switched = true;
         let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
@@ -326,6 +346,11 @@ impl Session {
         self.layout.depth_and_opacity()
     }
 
+    /// Whether observations say how far they may be believed.
+    pub fn trust(&self) -> bool {
+        self.trained.is_some()
+    }
+
     /// How the ego moves.
     pub fn dynamics(&self) -> Dynamics {
         self.dynamics
@@ -333,7 +358,27 @@ impl Session {
 
     /// `world_from_rig` where episodes start unless `reset` says otherwise.
     pub fn start(&self) -> Pose {
-        self.start
+        self.start.last().map_or(Pose::IDENTITY, |&(_, start)| start)
+    }
+
+    /// How much of the recorded drive lies before the start, in microseconds.
+    pub fn warm_up_us(&self) -> i64 {
+        self.warm_up_us
+    }
+
+    /// Last frames of each camera that an observation holds.
+    pub fn frames(&self) -> usize {
+        self.layout.schedule().frames()
+    }
+
+    /// Time between two frames of a camera, by its index, in microseconds.
+    pub fn period_us(&self, camera: usize) -> i64 {
+        self.layout.schedule().period_us(camera)
+    }
+
+    /// Time between two observations with images, in microseconds.
+    pub fn decision_us(&self) -> i64 {
+        self.layout.schedule().decision_us()
     }
 
     /// Simulated time of a step, in microseconds.
@@ -351,13 +396,23 @@ impl Session {
         &self.episode
     }
 
-    /// Renders poses one after the other, each in its turn among the other sessions' frames.
-    async fn draw(&self, episode: &Episode, poses: Vec<Pose>) -> Result<Frame, SessionError> {
+    /// Renders shots one after the other, each in its turn among the other sessions' frames.
+    async fn draw(
+        &self,
+        episode: &Episode,
+        shots: Vec<Shot>,
+        album: Option<Album>,
+    ) -> Result<Drawing, SessionError> {
         let deadline = Instant::now() + self.deadline;
-        let mut assembly =
-            Assembly::new(self.layout.clone(), self.engine.answers(), episode, poses.len())?;
-        for world_from_rig in poses {
-            let views = episode.views(self.layout.cameras(), world_from_rig);
+        let answers = self.engine.answers();
+        let mut assembly = Assembly::new(self.layout.clone(), answers, episode, &shots)?;
+        assembly.judge(self.trained.clone());
+        for shot in shots {
+            if shot.cameras.is_empty() {
+                assembly.add_shot(shot);
+                continue;
+            }
+            let views = self.layout.views(episode, &shot);
             // Before the job is queued: no render thread waits for a disk.
             let pinned = self.pin(deadline, eyes(&views)).await?;
             let (waited_for, waited) = (pinned.waited_for, pinned.waited);
@@ -365,7 +420,9 @@ impl Session {
             let (drawn, queued) = self
                 .engine
                 .run(deadline, move |scratch, backend| {
-                    assembly.draw(&pinned, &profile, backend, &views, scratch).map(|()| assembly)
+                    let drawn = assembly.draw(&pinned, &profile, backend, (&shot, &views), scratch);
+                    assembly.add_shot(shot);
+                    drawn.map(|()| assembly)
                 })
                 .await?;
             assembly = drawn?;
@@ -373,7 +430,7 @@ impl Session {
             assembly.add_waiting(waited_for, waited);
         }
         let (held_bytes, limit_bytes) = self.resident().memory();
-        assembly.finish(held_bytes, limit_bytes)
+        assembly.finish(album, held_bytes, limit_bytes)
     }
 
     /// Loads what the next steps will need, while the agent thinks.
@@ -446,6 +503,32 @@ impl Session {
         Ok(())
     }
 
+    /// Says what was rendered.
+    fn frame_line(
+        &self,
+        request: FrameRequest,
+        episode: &Episode,
+        drawing: &Drawing,
+    ) -> FrameRecord {
+        let Drawing { frame, shots, hashes, .. } = drawing;
+        let all = self.layout.cameras().len();
+        let mut cameras: Vec<_> = shots.iter().map(|shot| shot.cameras.clone()).collect();
+        if cameras.iter().all(|of_pose| of_pose.len() == all) {
+            cameras.clear();
+        }
+        FrameRecord {
+            request,
+            step: episode.step(),
+            time_us: episode.time_us(),
+            poses: shots.iter().map(|shot| shot.world_from_rig).collect(),
+            cameras,
+            command: None,
+            terminated: episode.terminated(),
+            frame_hash: frame.frame_hash.to_hex().to_string(),
+            images: hashes.iter().map(|hash| hash.to_hex().to_string()).collect(),
+        }
+    }
+
     /// Says that what follows is of this version.
     fn version_line(&self) -> Line {
         let version = &self.resident().version;
@@ -513,25 +596,40 @@ fn lens(cameras: &[RigCamera]) -> Lens {
     }
 }
 
+/// A start where the ego stands on the ground, and how it gets there.
+fn settled(
+    resident: &Resident,
+    start: Option<&Start>,
+    warm_up_us: i64,
+    dynamics: Dynamics,
+) -> Result<Track, SessionError> {
+    let mut track = resolve_start(resident, start, warm_up_us)?;
+    let ground = Ground::of(&resident.version.manifest.trajectories);
+    if let Some((_, start)) = track.last_mut() {
+        *start = dynamics.start(*start, &ground);
+    }
+    Ok(track)
+}
+
+/// An episode at its start.
+fn episode(seed: u64, track: &[(i64, Pose)], dynamics: Dynamics, dt_us: i64) -> Episode {
+    let (start, warm_up) = track.split_last().map_or((Pose::IDENTITY, track), |(s, w)| (s.1, w));
+    Episode::warmed_up(seed, Ego::new(dynamics, start), warm_up, dt_us)
+}
+
+/// Where a twin was recorded and trained.
+async fn trained(resident: &Arc<Resident>) -> Result<Arc<Trained>, SessionError> {
+    let resident = resident.clone();
+    // Half a million keyframes and blocks of a long drive take a while.
+    let built = tokio::task::spawn_blocking(move || Trained::new(&resident.version.manifest));
+    let trained = built.await.map_err(|_| SessionError::Crashed)?;
+    trained.map(Arc::new).ok_or_else(|| {
+        let must = "true, and the twin has no recorded drive to compare with".to_owned();
+        SessionError::OutOfRange { field: "outputs.trust", must }
+    })
+}
+
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
     let appended = tokio::task::spawn_blocking(move || recorder.append(&lines)).await;
     Ok(appended.map_err(|_| SessionError::Crashed)??)
-}
-
-fn frame_line(
-    request: FrameRequest,
-    episode: &Episode,
-    poses: &[Pose],
-    frame: &Frame,
-) -> FrameRecord {
-    FrameRecord {
-        request,
-        step: episode.step(),
-        time_us: episode.time_us(),
-        poses: poses.to_vec(),
-        command: None,
-        terminated: episode.terminated(),
-        frame_hash: frame.frame_hash.to_hex().to_string(),
-        images: frame.images.iter().map(|image| image.hash.to_hex().to_string()).collect(),
-    }
 }

@@ -1,29 +1,34 @@
 //! An observation: one buffer that goes to the socket as it is.
 //!
 //! ```text
-//! | header | ego.history_xyz, ego.history_rot | depth, opacity per image | colour per image |
+//! | header | ego.history_xyz, ego.history_rot | depth, opacity per image | colour per image | colour
+//! of earlier frames |
 //! ```
 //!
 //! The renderer writes depth, opacity and raw colour where they stay; JPEGs and PNGs, whose length
 //! is known last, are appended. The header's room is reserved for `server`, which knows the wire.
 //! Floats come before bytes, so that every float tensor starts at a multiple of 4.
 
+use std::collections::BTreeMap;
 use std::mem;
-use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use crate::config;
+use crate::geometry::Pose;
 use crate::geometry::camera::Field;
 use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
 use crate::residency::Eye;
 use crate::scene::rig::{Rig, RigCamera};
 use crate::scene::{RenderProfile, Scene};
 
+use super::album::{Album, Shown};
 use super::buffer::Buffer;
 use super::encode::{Drawn, Encoding, encode};
 use super::engine::{Answers, Scratch};
-use super::{Episode, History, SessionError};
+use super::frame::{DType, Frame, Image, PastImage, Residency, Tensor, TensorKind, Timings};
+use super::schedule::Schedule;
+use super::{Episode, History, SessionError, Trained, Trust};
 
 /// The length of the header, little-endian, stands before it.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -32,13 +37,14 @@ pub const HEADER_PREFIX_BYTES: usize = 8;
 /// numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 
-/// Room for what the header says per image: three tensors of at most 190 bytes, and 12 numbers of
-/// at most 24 digits, two names and a hash with their escaped keys, below 1,400 bytes; a lens of 12
+/// Room for what the header says per image: three tensors of at most 190 bytes, and 16 numbers of
+/// at most 24 digits, two names and a hash with their escaped keys, below 1,700 bytes; a lens of 12
 /// numbers and a windshield of 42, with their keys below 1,600.
-const HEADER_IMAGE_BYTES: usize = 3072;
+const HEADER_IMAGE_BYTES: usize = 3328;
 
-/// Images of one answer at most.
+/// Images of one answer at most, of as many poses or frames.
 const IMAGES: usize = config::OBSERVE_POSES * Rig::MAX_CAMERAS;
+const _: () = assert!(config::BUNDLE_FRAMES <= config::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer draws every rig in one frame.
 const _: () = assert!(
@@ -55,99 +61,29 @@ pub(super) struct Layout {
     encoding: Encoding,
     depth: bool,
     opacity: bool,
+    schedule: Schedule,
 }
 
-/// A finished observation.
-#[derive(Debug)]
-pub struct Frame {
-    /// The bytes of all tensors, behind the reserved header.
-    pub buffer: Buffer,
-    /// What is where in the buffer, in order and without gaps.
-    pub tensors: Vec<Tensor>,
-    /// The images, pose by pose, camera by camera.
-    pub images: Vec<Image>,
-    /// BLAKE3 of the images' hashes, 32 bytes each, in order.
-    pub frame_hash: blake3::Hash,
-    /// How many poses of the ego history were driven.
-    pub history_count: usize,
-    /// What it cost.
-    pub timings: Timings,
-    /// What of it had to be loaded.
-    pub residency: Residency,
+/// What is drawn at once: cameras at one place.
+#[derive(Clone, Debug)]
+pub(super) struct Shot {
+    /// Where the rig stands.
+    pub(super) world_from_rig: Pose,
+    /// When, in microseconds since the episode's start.
+    pub(super) time_us: i64,
+    /// Indices of the cameras; there may be none.
+    pub(super) cameras: Vec<usize>,
+    /// Whether its images are the observation's; else they are only kept for a bundle.
+    pub(super) shown: bool,
 }
 
-/// Memory behind an observation.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Residency {
-    /// Bytes of Gaussians in memory, of all twins.
-    pub held_bytes: u64,
-    /// Bytes that there may be.
-    pub limit_bytes: u64,
-    /// Sections that were not in memory when it was asked for.
-    pub waited_for: usize,
-    /// How long it took until they were.
-    pub waited: Duration,
-}
-
-/// One image of a [`Frame`].
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Image {
-    /// Index of the camera among [`super::Session::cameras`].
-    pub camera: usize,
-    /// Which of the request's poses.
-    pub pose: usize,
-    /// BLAKE3 of the pixels, `[height, width, 3]`.
-    pub hash: blake3::Hash,
-}
-
-/// One tensor of a [`Frame`].
-#[derive(Clone, Debug, PartialEq)]
-pub struct Tensor {
-    /// What it holds.
-    pub kind: TensorKind,
-    /// Type of its elements.
-    pub dtype: DType,
-    /// Its shape, row-major.
-    pub shape: Vec<usize>,
-    /// Where its bytes are, from the end of the header.
-    pub bytes: Range<usize>,
-}
-
-/// What a tensor holds; images by their index in [`Frame::images`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TensorKind {
-    /// Positions of the ego history, in metres: `[16, 3]`.
-    HistoryXyz,
-    /// Rotations of the ego history: `[16, 3, 3]`.
-    HistoryRotation,
-    /// Expected camera z in metres: `[height, width]`.
-    Depth(usize),
-    /// Accumulated opacity: `[height, width]`.
-    Opacity(usize),
-    /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
-    Rgb(usize),
-}
-
-/// Type of a tensor's elements.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DType {
-    /// 32-bit float, little-endian.
-    F32,
-    /// Byte.
-    U8,
-}
-
-/// What an observation cost.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Timings {
-    /// Waiting for other sessions' frames.
-    pub queue: Duration,
-    /// Rendering, with the encoding that ran beside it.
-    pub render: Duration,
-    /// CPU time of encoding and hashing.
-    pub encode: Duration,
-    /// Wall time per render stage, in milliseconds, in the order of the chain.
-    pub stages_ms: Vec<(&'static str, f64)>,
+/// A finished observation, and what it leaves for later ones.
+pub(super) struct Drawing {
+    pub(super) frame: Frame,
+    pub(super) album: Album,
+    /// What was drawn, in order, and the hashes of its images.
+    pub(super) shots: Vec<Shot>,
+    pub(super) hashes: Vec<blake3::Hash>,
 }
 
 /// A frame in the making.
@@ -156,7 +92,12 @@ pub(super) struct Assembly {
     answers: Answers,
     buffer: Buffer,
     history_count: usize,
-    poses: usize,
+    /// Where the next shown image's floats and raw pixels go, from the buffer's start.
+    floats_at: usize,
+    raw_at: usize,
+    trained: Option<Arc<Trained>>,
+    shots: Vec<Shot>,
+    /// Of all shots so far, camera by camera.
     drawn: Vec<Drawn>,
     timings: Timings,
     residency: Residency,
@@ -164,12 +105,12 @@ pub(super) struct Assembly {
 
 impl Layout {
     /// # Errors
-    /// The quality is not one.
+    /// The quality is not one, or the images of one observation are too large.
     pub(super) fn new(
         cameras: Vec<RigCamera>,
         encoding: Encoding,
-        depth: bool,
-        opacity: bool,
+        (depth, opacity): (bool, bool),
+        schedule: Schedule,
     ) -> Result<Self, SessionError> {
         if let Encoding::Jpeg(quality) = encoding
             && !(1..=100).contains(&quality)
@@ -181,8 +122,8 @@ impl Layout {
             Field::of(camera).map(|field| field.share(camera))
         };
         let seen = cameras.iter().map(seen).collect();
-        let layout = Self { cameras, seen, encoding, depth, opacity };
-        layout.check_size(1)?;
+        let layout = Self { cameras, seen, encoding, depth, opacity, schedule };
+        layout.check_size(layout.schedule.frames())?;
         Ok(layout)
     }
 
@@ -203,28 +144,70 @@ impl Layout {
         (self.depth, self.opacity)
     }
 
-    fn check_size(&self, poses: usize) -> Result<(), SessionError> {
+    pub(super) fn schedule(&self) -> &Schedule {
+        &self.schedule
+    }
+
+    /// What is drawn for an observation at the end of an episode, beside what an album has: the frames
+    /// that it shows or a later one will, those of one time together, the last those of now.
+    pub(super) fn shots(&self, episode: &Episode, album: &Album) -> Vec<Shot> {
+        let now_us = episode.time_us();
+        let mut times = BTreeMap::from([(now_us, Vec::new())]);
+        for camera in 0..self.cameras.len() {
+            for time_us in self.schedule.wanted(camera, now_us) {
+                if time_us >= episode.begin_us() && album.find(camera, time_us).is_none() {
+                    times.entry(time_us).or_default().push(camera);
+                }
+            }
+        }
+        let shot = |(time_us, cameras)| Shot {
+            world_from_rig: episode.at(time_us),
+            time_us,
+            cameras,
+            shown: time_us == now_us && self.schedule.decides(now_us),
+        };
+        times.into_iter().map(shot).collect()
+    }
+
+    /// All cameras from poses that the ego need not be at.
+    pub(super) fn looks(&self, episode: &Episode, poses: Vec<Pose>) -> Vec<Shot> {
+        let cameras: Vec<usize> = (0..self.cameras.len()).collect();
+        let shot = |world_from_rig| Shot {
+            world_from_rig,
+            time_us: episode.time_us(),
+            cameras: cameras.clone(),
+            shown: true,
+        };
+        poses.into_iter().map(shot).collect()
+    }
+
+    /// The views of a shot. Those of a warm-up are as of a vehicle that stood while they were exposed.
+    pub(super) fn views(&self, episode: &Episode, shot: &Shot) -> Vec<View> {
+        let all = match shot.time_us == episode.time_us() {
+            true => episode.views(&self.cameras, shot.world_from_rig),
+            false => View::of_rig(&self.cameras, shot.world_from_rig),
+        };
+        shot.cameras.iter().map(|&camera| all[camera]).collect()
+    }
+
+    fn check_size(&self, times: usize) -> Result<(), SessionError> {
         let pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
-        let (pixels, limit) = (pixels * poses as u64, config::ANSWER_PIXELS);
+        let (pixels, limit) = (pixels * times as u64, config::ANSWER_PIXELS);
         if pixels > limit {
             return Err(SessionError::AnswerTooLarge { pixels, limit });
         }
         Ok(())
     }
 
-    /// Bytes of one image's floats, and of its pixels where they are in the buffer.
-    fn image_bytes(&self, camera: &RigCamera) -> (usize, usize) {
-        let pixels = camera.camera.pixels();
+    /// Bytes of the floats of a shot's images, and of their pixels where they are in the buffer.
+    fn bytes_of(&self, shot: &Shot) -> (usize, usize) {
+        if !shot.shown {
+            return (0, 0);
+        }
+        let cameras = shot.cameras.iter().map(|&camera| self.cameras[camera].camera.pixels());
+        let pixels: usize = cameras.sum();
         let floats = usize::from(self.depth) + usize::from(self.opacity);
         (4 * pixels * floats, if self.encoding == Encoding::Raw { 3 * pixels } else { 0 })
-    }
-
-    /// The same for all images of one pose.
-    fn pose_bytes(&self) -> (usize, usize) {
-        self.cameras.iter().fold((0, 0), |(floats, raw), camera| {
-            let (more_floats, more_raw) = self.image_bytes(camera);
-            (floats + more_floats, raw + more_raw)
-        })
     }
 }
 
@@ -234,49 +217,75 @@ impl Assembly {
         layout: Arc<Layout>,
         answers: &Answers,
         episode: &Episode,
-        poses: usize,
+        shots: &[Shot],
     ) -> Result<Self, SessionError> {
-        layout.check_size(poses)?;
-        let images = poses * layout.cameras.len();
-        let header = HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES;
-        let (floats, raw) = layout.pose_bytes();
+        layout.check_size(shots.iter().filter(|shot| shot.shown).count())?;
+        let images = shots.iter().map(|shot| shot.cameras.len()).sum::<usize>();
+        // Of a bundle, more is shown than is drawn.
+        let named = images.max(layout.schedule.frames() * layout.cameras.len());
+        let header = HEADER_BASE_BYTES + named * HEADER_IMAGE_BYTES;
+        let bytes = shots.iter().map(|shot| layout.bytes_of(shot));
+        let (floats, raw) = bytes.fold((0, 0), |sum, shot| (sum.0 + shot.0, sum.1 + shot.1));
         let History { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let history = history.concat();
-        let len = header + history.len() + poses * (floats + raw);
-        let mut buffer = Buffer::zeroed(answers, len, header)?;
-        buffer.bytes_mut()[header..header + history.len()].copy_from_slice(&history);
+        let floats_at = header + history.len();
+        let mut buffer = Buffer::zeroed(answers, floats_at + floats + raw, header)?;
+        buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
         Ok(Self {
             layout,
             answers: answers.clone(),
             buffer,
             history_count: count,
-            poses,
+            floats_at,
+            raw_at: floats_at + floats,
+            trained: None,
+            shots: Vec::with_capacity(shots.len()),
             drawn: Vec::with_capacity(images),
             timings: Timings::default(),
             residency: Residency::default(),
         })
     }
 
-    /// Renders the next pose.
+    /// Renders a shot that has cameras; shots come in order.
     pub(super) fn draw(
         &mut self,
         scene: &Scene,
         profile: &RenderProfile,
         backend: &dyn Backend,
-        views: &[View],
+        (shot, views): (&Shot, &[View]),
         scratch: &mut Scratch,
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
-        let mut targets = self.targets(scratch);
+        let trained = self.trained.clone().filter(|_| shot.shown);
+        // Seen by nobody else: coverage is a part of trust.
+        let mut coverage: Vec<Vec<f32>> = match trained.is_some() && !layout.opacity {
+            true => views.iter().map(|view| vec![0.0; view.camera.pixels()]).collect(),
+            false => Vec::new(),
+        };
+        let mut targets = self.targets(shot, scratch);
+        for (target, opacity) in targets.iter_mut().zip(&mut coverage) {
+            target.opacity = Some(opacity);
+        }
         let slots: Vec<OnceLock<Result<Drawn, String>>> =
             views.iter().map(|_| OnceLock::new()).collect();
         let finished = |view: usize, target: &Target<'_>| {
-            let camera = &layout.cameras[view].camera;
+            let index = shot.cameras[view];
+            let camera = &layout.cameras[index].camera;
             let pixels = target.rgb8.as_deref().unwrap_or_default();
-            let drawn = encode(pixels, camera.width_px, camera.height_px, layout.encoding);
+            let mut drawn = encode(pixels, camera.width_px, camera.height_px, layout.encoding);
+            if let Ok(drawn) = &mut drawn
+                && layout.encoding == Encoding::Raw
+                && layout.outlives(shot, index)
+            {
+                drawn.file = pixels.to_vec();
+            }
+            if let (Ok(drawn), Some(trained)) = (&mut drawn, &trained) {
+                let opacity = target.opacity.as_deref().unwrap_or_default();
+                drawn.trust = Some(trained.of(&shot.world_from_rig, &views[view], opacity));
+            }
             // A backend calls this once per view.
             let _ = slots[view].set(drawn);
         };
@@ -290,10 +299,10 @@ impl Assembly {
                 None => self.timings.stages_ms.push((stage, ms)),
             }
         }
-        for (slot, camera) in slots.into_iter().zip(&layout.cameras) {
+        for (slot, &camera) in slots.into_iter().zip(&shot.cameras) {
             let drawn = slot.into_inner().unwrap_or_else(|| Err("it was never finished".into()));
             let drawn = drawn.map_err(|reason| {
-                let camera = camera.name.clone();
+                let camera = layout.cameras[camera].name.clone();
                 SessionError::Encode { camera, reason }
             })?;
             self.timings.encode += drawn.took;
@@ -302,22 +311,23 @@ impl Assembly {
         Ok(())
     }
 
-    /// Where the renderer puts the next pose's images.
-    fn targets<'a>(&'a mut self, scratch: &'a mut Scratch) -> Vec<Target<'a>> {
+    /// Where the renderer puts a shot's images.
+    fn targets<'a>(&'a mut self, shot: &Shot, scratch: &'a mut Scratch) -> Vec<Target<'a>> {
         let layout = &self.layout;
-        let pose = self.drawn.len() / layout.cameras.len();
-        let (floats, raw) = layout.pose_bytes();
-        let tail = self.buffer.bytes().len() - self.poses * (floats + raw);
-        let (float_part, raw_part) =
-            self.buffer.bytes_mut()[tail..].split_at_mut(self.poses * floats);
-        let mut float_part = &mut float_part[pose * floats..(pose + 1) * floats];
-        let mut raw_part = &mut raw_part[pose * raw..(pose + 1) * raw];
-        let mut targets = Vec::with_capacity(layout.cameras.len());
-        for (camera, scratch) in layout.cameras.iter().zip(scratch) {
-            let pixels = camera.camera.pixels();
-            let depth_m = layout.depth.then(|| floats_of(take(&mut float_part, 4 * pixels)));
-            let opacity = layout.opacity.then(|| floats_of(take(&mut float_part, 4 * pixels)));
-            let rgb8 = if layout.encoding == Encoding::Raw {
+        let (floats, raw) = layout.bytes_of(shot);
+        let (floats_at, raw_at) = (self.floats_at, self.raw_at);
+        (self.floats_at, self.raw_at) = (floats_at + floats, raw_at + raw);
+        let (float_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
+        let mut float_part = &mut float_part[floats_at..floats_at + floats];
+        let mut raw_part = &mut raw_part[..raw];
+        let mut targets = Vec::with_capacity(shot.cameras.len());
+        for (&camera, scratch) in shot.cameras.iter().zip(scratch) {
+            let pixels = layout.cameras[camera].camera.pixels();
+            let mut floats = |wanted: bool| {
+                (wanted && shot.shown).then(|| floats_of(take(&mut float_part, 4 * pixels)))
+            };
+            let (depth_m, opacity) = (floats(layout.depth), floats(layout.opacity));
+            let rgb8 = if layout.encoding == Encoding::Raw && shot.shown {
                 take(&mut raw_part, 3 * pixels)
             } else {
                 if scratch.len() < 3 * pixels {
@@ -330,6 +340,15 @@ impl Assembly {
         targets
     }
 
+    /// Says of the images how far they may be believed.
+    pub(super) fn judge(&mut self, trained: Option<Arc<Trained>>) {
+        self.trained = trained;
+    }
+
+    pub(super) fn add_shot(&mut self, shot: Shot) {
+        self.shots.push(shot);
+    }
+
     pub(super) fn add_queue_time(&mut self, queued: Duration) {
         self.timings.queue += queued;
     }
@@ -339,25 +358,46 @@ impl Assembly {
         self.residency.waited += waited;
     }
 
-    /// Appends what was encoded and names every tensor.
+    /// Appends what was encoded, and what an album still has of a bundle, and names every tensor. The
+    /// album is that of all frames before; a look without one is `None` of it, and shows no bundle.
     pub(super) fn finish(
         mut self,
+        album: Option<Album>,
         held_bytes: u64,
         limit_bytes: u64,
-    ) -> Result<Frame, SessionError> {
+    ) -> Result<Drawing, SessionError> {
         let layout = self.layout;
-        let files: Vec<&[u8]> = self.drawn.iter().map(|drawn| &drawn.file[..]).collect();
-        self.buffer.append(&self.answers, &files)?;
+        let hashes: Vec<blake3::Hash> = self.drawn.iter().map(|drawn| drawn.hash).collect();
+        let trusts: Vec<Option<Trust>> = self.drawn.iter().map(|drawn| drawn.trust).collect();
+        let mut files: Vec<Vec<u8>> = self.drawn.into_iter().map(|drawn| drawn.file).collect();
+        let (mut taken, mut images, mut shown_files) = (Vec::new(), Vec::new(), Vec::new());
+        let mut pose = 0;
+        for shot in &self.shots {
+            for &camera in &shot.cameras {
+                let (index, time_us) = (taken.len(), shot.time_us);
+                if shot.shown {
+                    let (hash, trust) = (hashes[index], trusts[index]);
+                    images.push(Image { camera, pose, time_us, hash, trust });
+                    shown_files.push(index);
+                }
+                taken.push((shot, camera));
+            }
+            pose += usize::from(shot.shown);
+        }
+        let appended: Vec<&[u8]> = match layout.encoding {
+            Encoding::Raw => Vec::new(),
+            Encoding::Jpeg(_) | Encoding::Png => {
+                shown_files.iter().map(|&index| &files[index][..]).collect()
+            }
+        };
+        self.buffer.append(&self.answers, &appended)?;
 
         let mut tensors = Tensors { list: Vec::new(), end: 0 };
         let poses = config::HISTORY_POSES;
         tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
         tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
-        let mut images = Vec::with_capacity(self.drawn.len());
-        for (index, drawn) in self.drawn.iter().enumerate() {
-            let (pose, camera) = (index / layout.cameras.len(), index % layout.cameras.len());
-            images.push(Image { camera, pose, hash: drawn.hash });
-            let [height, width] = size(&layout.cameras[camera]);
+        for (index, image) in images.iter().enumerate() {
+            let [height, width] = size(&layout.cameras[image.camera]);
             if layout.depth {
                 tensors.push(TensorKind::Depth(index), DType::F32, vec![height, width]);
             }
@@ -365,24 +405,73 @@ impl Assembly {
                 tensors.push(TensorKind::Opacity(index), DType::F32, vec![height, width]);
             }
         }
-        for (index, (drawn, image)) in self.drawn.iter().zip(&images).enumerate() {
-            let [height, width] = size(&layout.cameras[image.camera]);
-            let shape = match layout.encoding {
-                Encoding::Raw => vec![height, width, 3],
-                Encoding::Jpeg(_) | Encoding::Png => vec![drawn.file.len()],
-            };
+        for (index, (image, &file)) in images.iter().zip(&shown_files).enumerate() {
+            let shape = layout.shape(image.camera, files[file].len());
             tensors.push(TensorKind::Rgb(index), DType::U8, shape);
         }
+
+        let bundled = album.is_some();
+        let (mut album, mut history) = (album.unwrap_or_default(), Vec::new());
+        if bundled && let Some(now_us) = self.shots.last().map(|shot| shot.time_us) {
+            for (index, &(shot, camera)) in taken.iter().enumerate() {
+                if layout.outlives(shot, camera) {
+                    let file = mem::take(&mut files[index]);
+                    album.add(&self.answers, (camera, shot.time_us), hashes[index], file)?;
+                }
+            }
+            if layout.schedule.decides(now_us) {
+                let earlier = layout.earlier(&album, now_us);
+                let parts: Vec<&[u8]> = earlier.iter().map(|(_, shown)| &shown.bytes[..]).collect();
+                self.buffer.append(&self.answers, &parts)?;
+                for (index, (back, shown)) in earlier.iter().enumerate() {
+                    let Shown { camera, time_us, hash, bytes, .. } = &***shown;
+                    let (camera, time_us, hash) = (*camera, *time_us, *hash);
+                    let shape = layout.shape(camera, bytes.len());
+                    tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
+                    history.push(PastImage { camera, back: *back, time_us, hash });
+                }
+            }
+            album.forget(&layout.schedule, now_us);
+        }
         let frame_hash = frame_hash(images.iter().map(|image| image.hash));
-        Ok(Frame {
+        let frame = Frame {
             buffer: self.buffer,
             tensors: tensors.list,
             images,
+            history,
             frame_hash,
             history_count: self.history_count,
             timings: self.timings,
             residency: Residency { held_bytes, limit_bytes, ..self.residency },
-        })
+        };
+        Ok(Drawing { frame, album, shots: self.shots, hashes })
+    }
+}
+
+impl Layout {
+    /// Whether a frame is looked at once more, or for the first time, beside the images of its shot.
+    fn outlives(&self, shot: &Shot, camera: usize) -> bool {
+        !shot.shown || self.schedule.kept(camera, shot.time_us, shot.time_us)
+    }
+
+    /// The frames of an album that a decision looks at beside those of its own time, camera by camera,
+    /// the newest first, and how many frames ago each is.
+    fn earlier<'a>(&self, album: &'a Album, now_us: i64) -> Vec<(usize, &'a Arc<Shown>)> {
+        let of_camera = |camera| {
+            let seen = self.schedule.seen(camera, now_us).filter(|&time_us| time_us < now_us);
+            let there = seen.filter_map(move |time_us| album.find(camera, time_us));
+            there.enumerate().map(|(index, shown)| (index + 1, shown))
+        };
+        (0..self.cameras.len()).flat_map(of_camera).collect()
+    }
+
+    /// Shape of an image's tensor that travels as so many bytes.
+    fn shape(&self, camera: usize, file_bytes: usize) -> Vec<usize> {
+        let [height, width] = size(&self.cameras[camera]);
+        match self.encoding {
+            Encoding::Raw => vec![height, width, 3],
+            Encoding::Jpeg(_) | Encoding::Png => vec![file_bytes],
+        }
     }
 }
 
@@ -417,15 +506,6 @@ impl Tensors {
         let start = self.end;
         self.end += bytes;
         self.list.push(Tensor { kind, dtype, shape, bytes: start..self.end });
-    }
-}
-
-impl DType {
-    fn bytes(self) -> usize {
-        match self {
-            Self::F32 => 4,
-            Self::U8 => 1,
-        }
     }
 }
 

@@ -7,7 +7,9 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::residency::Resident;
 use crate::scene::ProfileChanges;
+use crate::scene::Trajectory;
 use crate::scene::rig::{Rig, RigCamera};
+use crate::scene::route::Route;
 use crate::sim::Dynamics;
 
 use super::{Encoding, SessionError};
@@ -33,8 +35,33 @@ pub struct Opening {
     pub dynamics: Dynamics,
     /// Simulated time of a step, in microseconds.
     pub dt_us: Option<i64>,
+    /// Time between two decisions of the agent, in microseconds: it looks at images only then. A
+    /// step if absent.
+    pub decision_us: Option<i64>,
+    /// What lies before the start, in microseconds: poses and frames of the recorded drive.
+    pub warm_up_us: i64,
     /// How long one answer may take.
     pub deadline: Option<Duration>,
+}
+
+impl Opening {
+    /// The latest version of a twin, and every default.
+    pub fn twin(twin: impl Into<String>, outputs: Outputs) -> Self {
+        Self {
+            twin: twin.into(),
+            version: None,
+            seed: 0,
+            start: None,
+            rig: None,
+            profile: ProfileChanges::default(),
+            outputs,
+            dynamics: Dynamics::default(),
+            dt_us: None,
+            decision_us: None,
+            warm_up_us: 0,
+            deadline: None,
+        }
+    }
 }
 
 /// Where an episode starts.
@@ -73,6 +100,28 @@ pub struct Outputs {
     pub depth: bool,
     /// Whether to add opacity.
     pub opacity: bool,
+    /// How many last frames of each camera; 1 if absent.
+    pub frames: Option<u64>,
+    /// Whether to say how far each image may be believed.
+    pub trust: bool,
+    /// Time between two frames, in microseconds, of cameras that do not take one with every step.
+    pub periods_us: BTreeMap<String, i64>,
+}
+
+impl Outputs {
+    /// Colour of all cameras, at every step.
+    pub fn colour(encoding: Encoding) -> Self {
+        Self {
+            cameras: None,
+            images: BTreeMap::new(),
+            encoding,
+            depth: false,
+            opacity: false,
+            frames: None,
+            trust: false,
+            periods_us: BTreeMap::new(),
+        }
+    }
 }
 
 /// What is drawn of a camera's image.
@@ -139,7 +188,8 @@ fn whole_cameras(
     for (index, name) in names.iter().enumerate() {
         let camera = rig.cameras.iter().find(|camera| camera.name == *name).ok_or_else(|| {
             let known = rig.cameras.iter().map(|camera| camera.name.clone()).collect();
-            SessionError::UnknownCamera { index, name: name.clone(), known }
+            let field = format!("outputs.cameras[{index}]");
+            SessionError::UnknownCamera { field, name: name.clone(), known }
         })?;
         if chosen.contains(camera) {
             return Err(SessionError::CameraTwice { index, name: name.clone() });
@@ -149,21 +199,65 @@ fn whole_cameras(
     Ok((rig.name, chosen))
 }
 
-/// A start as a pose, `world_from_rig`.
-pub(super) fn resolve_start(resident: &Resident, start: &Start) -> Result<Pose, SessionError> {
-    let (name, station_m) = match start {
-        Start::Pose(pose) => return Ok(*pose),
-        Start::Station { trajectory, station_m } => (trajectory, *station_m),
-    };
+/// Where the rig was (`world_from_rig`) by time in microseconds, rising to an episode's start at 0.
+pub(super) type Track = Vec<(i64, Pose)>;
+
+/// How an episode gets to its start: the start alone, or `warm_up_us` of the recorded drive before it.
+/// Without a start, it is at the first drive's begin, or where that has driven for `warm_up_us`.
+pub(super) fn resolve_start(
+    resident: &Resident,
+    start: Option<&Start>,
+    warm_up_us: i64,
+) -> Result<Track, SessionError> {
     let logs = &resident.version.manifest.trajectories;
-    let log = logs.iter().find(|log| log.name == *name).ok_or_else(|| {
-        let known = logs.iter().map(|log| log.name.clone()).collect();
-        SessionError::UnknownTrajectory { name: name.clone(), known }
-    })?;
-    let length_m = log.length_m();
-    if !(0.0..=length_m).contains(&station_m) {
-        let must = format!("{station_m} m; {name:?} is from 0 to {length_m} m long");
-        return Err(SessionError::OutOfRange { field: "start.station_m", must });
+    let limits_us = 0..=config::WARM_UP_US;
+    if !limits_us.contains(&warm_up_us) {
+        return Err(no_warm_up(format!("{warm_up_us} µs; {limits_us:?} µs are accepted")));
     }
-    Ok(log.at_station(station_m))
+    match start {
+        Some(Start::Pose(pose)) if warm_up_us == 0 => Ok(vec![(0, *pose)]),
+        Some(Start::Pose(_)) => {
+            let must = format!("{warm_up_us} µs; only a start along a trajectory has a before");
+            Err(no_warm_up(must))
+        }
+        Some(Start::Station { trajectory: name, station_m }) => {
+            let log = logs.iter().find(|log| log.name == *name).ok_or_else(|| {
+                let known = logs.iter().map(|log| log.name.clone()).collect();
+                SessionError::UnknownTrajectory { name: name.clone(), known }
+            })?;
+            let length_m = log.length_m();
+            if !(0.0..=length_m).contains(station_m) {
+                let must = format!("{station_m} m; {name:?} is from 0 to {length_m} m long");
+                return Err(SessionError::OutOfRange { field: "start.station_m", must });
+            }
+            if warm_up_us == 0 {
+                return Ok(vec![(0, log.at_station(*station_m))]);
+            }
+            warm_up(log, Route::new(log)?.at(*station_m).time_us, warm_up_us)
+        }
+        None => match logs.first() {
+            None if warm_up_us == 0 => Ok(vec![(0, Pose::IDENTITY)]),
+            None => Err(no_warm_up(format!("{warm_up_us} µs; the twin has no trajectory"))),
+            Some(log) if warm_up_us == 0 => Ok(vec![(0, log.at_station(0.0))]),
+            Some(log) => {
+                let first_us = log.keyframes.first().map_or(0, |first| first.time_us);
+                warm_up(log, first_us.saturating_add(warm_up_us), warm_up_us)
+            }
+        },
+    }
+}
+
+/// The last `warm_up_us` of a drive before one of its times, in microseconds.
+fn warm_up(log: &Trajectory, now_us: i64, warm_up_us: i64) -> Result<Track, SessionError> {
+    let route = Route::new(log)?;
+    let from_us = now_us.saturating_sub(warm_up_us);
+    let poses = route.pose_at(from_us).and_then(|from| Ok((from, route.pose_at(now_us)?)));
+    let (from, now) = poses.map_err(|cause| no_warm_up(format!("{warm_up_us} µs; {cause}")))?;
+    let between = log.keyframes.iter().filter(|key| (from_us + 1..now_us).contains(&key.time_us));
+    let between = between.map(|key| (key.time_us - now_us, key.world_from_rig));
+    Ok(std::iter::once((-warm_up_us, from)).chain(between).chain([(0, now)]).collect())
+}
+
+fn no_warm_up(must: String) -> SessionError {
+    SessionError::OutOfRange { field: "warm_up_us", must }
 }

@@ -91,8 +91,11 @@ pub struct FrameRecord {
     pub step: u64,
     /// Simulated time, in microseconds.
     pub time_us: i64,
-    /// What was rendered, `world_from_rig`.
+    /// What was rendered, `world_from_rig`; the last of a reset or a step is where the ego is.
     pub poses: Vec<Pose>,
+    /// Which cameras of each pose, by their index; absent if all were.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<Vec<usize>>,
     /// What moved the ego there, if the pose itself does not say so.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub command: Option<RecordedCommand>,

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
-use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
+use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::RenderProfile;
 use crate::scene::rig::{RigCamera, RigError};
@@ -200,11 +200,7 @@ impl Recording {
                 }
                 Line::Frame(frame) if line > 1 => {
                     let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
-                    let (poses, images) = (frame.poses.len(), frame.images.len());
-                    if images != poses * cameras {
-                        let what = format!("{images} images of {poses} poses, {cameras} cameras");
-                        return Err(wrong(what));
-                    }
+                    check_images(&frame, cameras).map_err(wrong)?;
                     frames.push(frame);
                 }
                 Line::Version(version) if line > 1 => versions.push((frames.len(), version)),
@@ -239,9 +235,9 @@ impl Recording {
         let mut retrace = Retrace::new(&self.header);
         let mut switches = self.versions.iter().peekable();
         let mut lines_before = 2;
-        let cameras = &self.header.rig.cameras;
+        let all = &self.header.rig.cameras;
         let mut pixels: Vec<Vec<u8>> =
-            cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
+            all.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect();
         for (index, frame) in self.frames.iter().enumerate() {
             while let Some((_, to)) = switches.next_if(|(before, _)| *before <= index) {
                 resident = open(to.version)?;
@@ -262,15 +258,25 @@ impl Recording {
             }
             let mut recorded = frame.images.iter();
             for (pose, world_from_rig) in frame.poses.iter().enumerate() {
-                let (views, step) = (retrace.episode().views(cameras, *world_from_rig), frame.step);
+                let cameras = frame.cameras_of(pose, all.len());
+                if cameras.is_empty() {
+                    continue;
+                }
+                let step = frame.step;
+                // What is drawn before the last pose of a step is of a warm-up.
+                let moves = frame.request == FrameRequest::Observe || pose + 1 == frame.poses.len();
+                let views = match moves {
+                    true => retrace.episode().views(all, *world_from_rig),
+                    false => View::of_rig(all, *world_from_rig),
+                };
+                let views: Vec<View> = cameras.iter().map(|&camera| views[camera]).collect();
                 let scene = resident.scene(&observation::eyes(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
                 let to_draw = RenderFrame { scene: &scene, profile, views: &views };
-                let hashes = redraw(backend, &to_draw, &mut pixels)
+                redraw(backend, &to_draw, &cameras, &mut pixels)
                     .map_err(|cause| ReplayError::Render { step, cause })?;
-                for (((camera, rgb8), hash), recorded) in
-                    cameras.iter().zip(&pixels).zip(hashes).zip(&mut recorded)
-                {
+                for (&camera, recorded) in cameras.iter().zip(&mut recorded) {
+                    let (camera, rgb8) = (&all[camera], &*pixels[camera]);
                     let FrameRecord { request, step, .. } = *frame;
                     visit(&Redrawn { frame: index, request, step, pose, camera, rgb8 }).map_err(
                         |reason| {
@@ -279,7 +285,7 @@ impl Recording {
                         },
                     )?;
                     report.images += 1;
-                    let now = hash.to_hex().to_string();
+                    let now = blake3::hash(rgb8).to_hex().to_string();
                     if now != *recorded && report.difference.is_none() {
                         report.difference = Some(Difference {
                             line: index + lines_before,
@@ -351,14 +357,41 @@ impl std::fmt::Display for Difference {
     }
 }
 
-/// Renders the colour images of one pose, and hashes them.
+/// Renders the colour images of some cameras, in rising order, of one pose into their places.
 fn redraw(
     backend: &dyn Backend,
     frame: &RenderFrame<'_>,
+    cameras: &[usize],
     pixels: &mut [Vec<u8>],
-) -> Result<Vec<blake3::Hash>, RenderError> {
+) -> Result<(), RenderError> {
+    let wanted = pixels.iter_mut().enumerate().filter(|(camera, _)| cameras.contains(camera));
     let mut targets: Vec<Target<'_>> =
-        pixels.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
+        wanted.map(|(_, rgb8)| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
     backend.render(frame, &mut targets, &|_, _| {})?;
-    Ok(pixels.iter().map(|rgb8| blake3::hash(rgb8)).collect())
+    Ok(())
+}
+
+/// What keeps a frame from being rendered again, if anything does.
+fn check_images(frame: &FrameRecord, cameras: usize) -> Result<(), String> {
+    let (poses, images) = (frame.poses.len(), frame.images.len());
+    if !frame.cameras.is_empty() && frame.cameras.len() != poses {
+        return Err(format!("cameras of {} poses, of {poses}", frame.cameras.len()));
+    }
+    for of_pose in &frame.cameras {
+        if !of_pose.is_sorted_by(|a, b| a < b) || of_pose.last().is_some_and(|&c| c >= cameras) {
+            return Err(format!("cameras {of_pose:?}; the rig has {cameras}, each once, in order"));
+        }
+    }
+    let wanted: usize = (0..poses).map(|pose| frame.cameras_of(pose, cameras).len()).sum();
+    if images != wanted {
+        return Err(format!("{images} images of {poses} poses, {wanted} cameras in all"));
+    }
+    Ok(())
+}
+
+impl FrameRecord {
+    /// The cameras of a pose, of a rig of so many.
+    fn cameras_of(&self, pose: usize, all: usize) -> Vec<usize> {
+        self.cameras.get(pose).cloned().unwrap_or_else(|| (0..all).collect())
+    }
 }

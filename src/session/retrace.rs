@@ -46,7 +46,8 @@ impl Retrace {
         line: usize,
         ground: &Ground<'_>,
     ) -> Result<Option<StrayedStep>, SessionError> {
-        let (FrameRequest::Step, [recorded]) = (frame.request, &frame.poses[..]) else {
+        // Others before it are of frames that a later observation shows.
+        let (FrameRequest::Step, Some(recorded)) = (frame.request, frame.poses.last()) else {
             return Ok(None);
         };
         let command = match &frame.command {

@@ -29,6 +29,8 @@ pub(crate) struct Recipe {
     pub(crate) poses: u64,
     pub(crate) cameras: usize,
     pub(crate) depth: bool,
+    /// Earlier frames of each camera.
+    pub(crate) history: u64,
 }
 
 /// Colour of a pixel. JPEG blurs, so its pixels are grey and change slowly.
@@ -84,7 +86,24 @@ impl Frame {
             }
         }
         let frame_hash = hashes.finalize().to_hex().to_string();
-        Self { metadata: observation(seq, images, frame_hash), tensors }
+        let mut history = Vec::new();
+        for (index, camera) in cameras[..recipe.cameras].iter().enumerate() {
+            for back in 1..=recipe.history {
+                let pixels = pixels(recipe, (images.len() + history.len()) as u64, camera);
+                let hash = blake3::hash(&pixels).to_hex().to_string();
+                let stem = format!("camera/{}/history/{back}", camera.name);
+                tensors.push(color_tensor(recipe, &stem, camera, pixels));
+                let tensor = format!("{stem}/rgb");
+                let time_us = 200_000 - 100_000 * back as i64;
+                history.push(Image {
+                    back,
+                    shutter_start_us: time_us,
+                    shutter_end_us: time_us,
+                    ..image(recipe, camera, index as u64, 0, tensor, hash)
+                });
+            }
+        }
+        Self { metadata: Observation { history, ..observation(seq, images, frame_hash) }, tensors }
     }
 
     /// The frame's bytes.
@@ -191,6 +210,7 @@ fn image(
         camera: name,
         index,
         pose,
+        back: 0,
         tensor,
         encoding: recipe.encoding,
         width,
@@ -206,6 +226,7 @@ fn image(
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
         hash,
+        trust: None,
     }
 }
 
@@ -232,6 +253,7 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> Observation 
             history_count: 3,
         },
         images,
+        history: Vec::new(),
         timings: Timings {
             queue_ms: 0.5,
             render_ms: 12.25,

@@ -52,13 +52,13 @@ fn answers_with_unknown_fields_are_the_same_answers() {
     }
 }
 
-/// Adds a field to every object but a profile, whose fields are all known as none is.
+/// Adds a field to every object but a profile and times by camera, whose fields are all known as none is.
 pub(crate) fn add_unknown_fields(value: &mut Value) {
     match value {
         Value::Object(fields) => {
             fields
                 .iter_mut()
-                .filter(|(name, _)| *name != "profile")
+                .filter(|(name, _)| !["profile", "period_us"].contains(&name.as_str()))
                 .for_each(|(_, inner)| add_unknown_fields(inner));
             fields.insert("since_next_year".to_owned(), json!([1, "x"]));
         }
@@ -135,9 +135,14 @@ fn requests() -> Vec<(&'static str, Request)> {
             quality: Some(85),
             depth: true,
             opacity: true,
+            frames: Some(4),
+            trust: Some(true),
+            period_us: Some([("rear".to_owned(), 200_000)].into()),
         },
         dt_us: Some(100_000),
         deadline_ms: Some(20_000),
+        decision_us: Some(500_000),
+        warm_up_us: Some(1_600_000),
         ..Open::twin("street")
     };
     let preset = Open {
@@ -232,11 +237,16 @@ fn answers() -> Vec<(&'static str, Answer)> {
         dynamics: Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true },
         dt_us: 100_000,
         deadline_ms: 20_000,
+        decision_us: 500_000,
+        warm_up_us: 1_600_000,
         cameras: vec![front(), rear()],
         outputs: Outputs {
             encoding: Encoding::Raw,
             depth: true,
             opacity: true,
+            frames: Some(4),
+            trust: Some(true),
+            period_us: Some([("front".to_owned(), 100_000), ("rear".to_owned(), 200_000)].into()),
             ..Outputs::default()
         },
         trajectories: vec![trajectory],

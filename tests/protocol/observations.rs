@@ -8,12 +8,13 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames; `seq` is that of the request vector that it answers.
-fn golden() -> [(&'static str, u64, Recipe); 4] {
-    let raw = Recipe { encoding: Encoding::Raw, poses: 1, cameras: 2, depth: true };
+fn golden() -> [(&'static str, u64, Recipe); 5] {
+    let raw = Recipe { encoding: Encoding::Raw, poses: 1, cameras: 2, depth: true, history: 0 };
     [
         ("raw", 3, raw),
         ("png", 3, Recipe { encoding: Encoding::Png, depth: false, ..raw }),
         ("jpeg", 3, Recipe { encoding: Encoding::Jpeg, cameras: 1, ..raw }),
+        ("bundle", 3, Recipe { cameras: 1, depth: false, history: 2, ..raw }),
         ("two_poses", 5, Recipe { poses: 2, cameras: 1, depth: false, ..raw }),
     ]
 }
@@ -53,6 +54,29 @@ fn golden_frames_decode_to_what_went_in() {
             check_image(&image, recipe, number as u64);
         }
     }
+}
+
+#[test]
+fn the_last_frames_of_a_camera_are_in_the_order_they_were_taken() {
+    let (_, seq, recipe) = golden()[3];
+    let observation = Observation::decode(read("vectors/observations/bundle.bin")).unwrap();
+    assert_eq!(observation.metadata(), &Frame::new(seq, recipe).metadata);
+    let frames = observation.frames("front");
+    let times: Vec<_> = frames.iter().map(|frame| frame.metadata().shutter_end_us).collect();
+    assert_eq!(times, [0, 100_000, 200_000]);
+    // The image of now is number 0, those before it 1 and 2.
+    for (frame, number) in frames.iter().zip([2, 1, 0]) {
+        assert_eq!(frame.rgb().unwrap()[..3], frames::color(recipe, number, 0, 0).as_slice()[..3]);
+    }
+    assert!(observation.frames("roof").is_empty());
+
+    let mut wrong = Frame::new(seq, recipe);
+    wrong.tensors.last_mut().unwrap().bytes[0] ^= 1;
+    let found = Observation::decode(wrong.bytes()).unwrap().verify();
+    assert!(matches!(found, Err(FrameError::Hash { name, .. }) if name.contains("history/2")));
+    wrong.tensors.pop();
+    let found = Observation::decode(wrong.bytes());
+    assert!(matches!(found, Err(FrameError::Missing { name }) if name.contains("history/2")));
 }
 
 #[test]

@@ -9,7 +9,6 @@ use serde_json::json;
 use wildcity::client::PushState;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
-use wildcity::scene::ProfileChanges;
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Extent, Opening, Outputs, Recording, Session,
 };
@@ -171,24 +170,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     });
     let engine = engine.unwrap();
     let latest = async || {
-        let opening = Opening {
-            twin: "test".to_owned(),
-            version: None,
-            seed: 0,
-            start: None,
-            rig: None,
-            profile: ProfileChanges::default(),
-            outputs: Outputs {
-                cameras: None,
-                images: BTreeMap::new(),
-                encoding: Encoding::Raw,
-                depth: false,
-                opacity: false,
-            },
-            dynamics: wildcity::sim::Dynamics::default(),
-            dt_us: None,
-            deadline: None,
-        };
+        let opening = Opening::twin("test", Outputs::colour(Encoding::Raw));
         let session = Session::open(engine.clone(), "a".to_owned(), opening).await.unwrap();
         session.resident().version.number
     };

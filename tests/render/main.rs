@@ -23,4 +23,6 @@ mod models;
 mod others;
 mod parity;
 mod report;
+mod rigs;
 mod sky;
+mod trust;

@@ -1,6 +1,5 @@
 //! Sessions that drive: through the engine, with a small budget, and over what breaks.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,7 +7,6 @@ use glam::{DQuat, DVec3};
 use wildcity::config;
 use wildcity::geometry::Pose;
 use wildcity::residency::{Cache, Needed, ResidencyError, Resident};
-use wildcity::scene::ProfileChanges;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
@@ -49,24 +47,11 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let outputs = Outputs {
-            cameras: None,
-            images: BTreeMap::new(),
-            encoding: Encoding::Raw,
-            depth: false,
-            opacity: false,
-        };
         let opening = Opening {
-            twin: "demo".to_owned(),
-            version: None,
-            seed: 0,
             start: Some(wildcity::session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
-            profile: ProfileChanges::default(),
-            outputs,
-            dynamics: wildcity::sim::Dynamics::default(),
-            dt_us: None,
             deadline,
+            ..Opening::twin("demo", Outputs::colour(Encoding::Raw))
         };
         Session::open(self.engine.clone(), name.to_owned(), opening).await
     }

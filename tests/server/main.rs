@@ -3,6 +3,7 @@
 #[path = "../support/server.rs"]
 mod support;
 
+mod bundles;
 mod http;
 mod leases;
 mod load;

@@ -48,6 +48,7 @@ async fn nothing_of_what_was_opened_is_implicit() {
     let outputs = json!({
         "cameras": ["front", "rear"], "encoding": "jpeg", "quality": 90,
         "depth": false, "opacity": false,
+        "frames": 1, "trust": false, "period_us": { "front": 100_000, "rear": 100_000 },
     });
     assert_eq!(opened["outputs"], outputs);
     assert!(opened["reserved_bytes"].as_u64().unwrap() > 64 * 11 * 4);
@@ -141,6 +142,29 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
         assert_eq!(answer["field"], "outputs.images");
     }
     server.still_serves().await;
+}
+
+#[tokio::test]
+async fn how_far_images_may_be_believed_is_said_if_asked_for() {
+    let server = TestServer::start().await;
+    let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
+    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the
+    // horizon. What is looked at of the small rear image is above it.
+    let seen = agent.step(20.0).await;
+    for (image, low_coverage) in seen.meta["images"].as_array().unwrap().iter().zip([1.0, 0.0]) {
+        let trust = &image["trust"];
+        assert_eq!((&trust["distance_m"], &trust["angle_rad"]), (&json!(11.0), &json!(0.0)));
+        assert_eq!(trust["low_coverage"], json!(low_coverage));
+        let value = (-11.0_f64 / 5.0).exp() * (1.0 - low_coverage);
+        assert!((trust["value"].as_f64().unwrap() - value).abs() < 1e-9, "{trust}");
+    }
+    assert!(!seen.tensors().names().iter().any(|name| name.ends_with("opacity")), "not asked for");
+    let looks = agent.look(json!({ "type": "observe", "poses": [pose(9.0), pose(12.0)] })).await;
+    let images = looks.meta["images"].as_array().unwrap();
+    let distances_m: Vec<_> = images.iter().map(|image| &image["trust"]["distance_m"]).collect();
+    assert_eq!(distances_m, [0.0, 0.0, 3.0, 3.0].map(|m| json!(m)).iter().collect::<Vec<_>>());
+    let seen = open(&server, json!({})).await.step(1.0).await;
+    assert_eq!(seen.meta["images"][0].get("trust"), None);
 }
 
 #[tokio::test]

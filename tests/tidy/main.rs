@@ -45,7 +45,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
         "data_encoding",
         &["ingest/gltf", "report/page.rs", "scene/appearance.rs", "server/uploads.rs"],
     ),
-    ("plotters", &["report/plots.rs"]),
+    ("plotters", &["cli/rig/draw.rs", "report/plots.rs"]),
 ];
 
 /// Who may touch files: those of a twin only `store/local`; the others scenes and settings of the user,

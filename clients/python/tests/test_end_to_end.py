@@ -106,6 +106,24 @@ def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
             assert summary.distance_m == pytest.approx(5.0)
 
 
+def test_frames_of_the_log_and_of_the_way(connect: Connect, server: Server) -> None:
+    outputs = Outputs(encoding="raw", frames=3, trust=True, period_us={"rear": 200_000})
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR, outputs=outputs, warm_up_us=500_000) as session:
+            first = session.reset()
+            then = {camera: first.frames(camera) for camera in ("front", "rear")}
+            times = [info.shutter_end_us for info in first.frame_infos("rear")]
+            assert times == [-400_000, -200_000, 0]
+            assert first.ego.history_count == 6
+            seen = session.step(Pose((3.0, 1.0, 0.0)))
+    assert np.array_equal(seen.frames("front")[:2], then["front"][1:])
+    assert np.array_equal(seen.frames("rear"), then["rear"])
+    on_it, beside = (o.metadata.images[0].trust for o in (first, seen))
+    assert on_it is not None and beside is not None
+    assert on_it.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
+    assert beside.value < on_it.value <= 1.0
+
+
 def test_drives_a_car(connect: Connect, server: Server) -> None:
     with connect(server.url) as client:
         dynamics = Dynamics("dynamic", speed=5.0)
@@ -127,7 +145,7 @@ def test_drives_a_car(connect: Connect, server: Server) -> None:
 
 def test_the_example_of_the_front_page_runs(server: Server) -> None:
     page = (Path(__file__).resolve().parents[3] / "README.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    example, bundles = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     example = example.replace("ws://127.0.0.1:8080/v1/session", server.url)
     example = example.replace('client.open("demo")', "client.open('corridor')")
     example = example.replace("range(100)", "range(3)")
@@ -140,6 +158,12 @@ def test_the_example_of_the_front_page_runs(server: Server) -> None:
 
     exec(example, {"my_agent": my_agent})
     assert shapes == [(928, 1440, 3)] * 3
+    with wildcity.connect(server.url) as client:
+        names: dict[str, Any] = {"client": client, "wildcity": wildcity}
+        exec(bundles.replace('client.open("demo"', 'client.open("corridor"'), names)
+        opened = names["session"].opened
+        assert (opened.outputs.frames, opened.outputs.trust, opened.decision_us) == (4, True, 10**6)
+        assert opened.start.xyz == pytest.approx((8.0, 0.0, 0.0))
 
 
 def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:

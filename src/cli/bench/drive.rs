@@ -2,7 +2,6 @@
 
 mod report;
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,9 +16,8 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::residency::{Cache, Stats};
 use crate::scene::route::Route;
-use crate::scene::{Manifest, ProfileChanges, Rig};
+use crate::scene::{Manifest, Rig};
 use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
-use crate::sim::Dynamics;
 
 use report::{Report, Row};
 
@@ -183,23 +181,11 @@ impl Drive {
     fn opening(&self, manifest: &Manifest) -> Opening {
         let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
         let rig = rig.map(|rig| cropped(rig, self.crop));
+        let outputs = Outputs::colour(Encoding::Jpeg(config::JPEG_QUALITY));
         Opening {
-            twin: self.twin.name.clone(),
             version: self.twin.number,
-            seed: 0,
-            start: None,
             rig: rig.map(RigChoice::Full),
-            profile: ProfileChanges::default(),
-            outputs: Outputs {
-                cameras: None,
-                images: BTreeMap::new(),
-                encoding: Encoding::Jpeg(config::JPEG_QUALITY),
-                depth: false,
-                opacity: false,
-            },
-            dynamics: Dynamics::default(),
-            dt_us: None,
-            deadline: None,
+            ..Opening::twin(&self.twin.name, outputs)
         }
     }
 }

@@ -4,6 +4,7 @@
 
 mod clock;
 mod cut;
+mod near;
 
 use std::ops::Range;
 
@@ -12,6 +13,7 @@ use super::trajectory::{Keyframe, TrajectoryError};
 
 pub use clock::{Association, Pair, associate};
 pub use cut::{Cut, MAX_CUTS, cuts, label};
+pub use near::Boxes;
 
 /// Distance between keyframes of a route, in metres.
 pub const KEYFRAME_M: f64 = 0.5;

@@ -12,13 +12,13 @@ use crate::protocol::http::Refusal;
 use crate::protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use crate::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
+use crate::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
 use crate::scene::Rig;
 use crate::server::Limits as ServerLimits;
 use crate::server::fault::Fault;
 use crate::session::{
-    DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, Session, Summary, TensorKind,
-    TrajectorySummary, TwinSummary,
+    self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, PastImage, Session, Summary,
+    TensorKind, TrajectorySummary, TwinSummary,
 };
 use crate::sim::{Dynamics, Model};
 use crate::store::Version;
@@ -63,7 +63,19 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let (depth, opacity) = session.depth_and_opacity();
-    let names = session.cameras().iter().map(|camera| camera.name.clone()).collect();
+    let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
+    let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
+    let outputs = message::Outputs {
+        encoding,
+        quality,
+        depth,
+        opacity,
+        frames: Some(session.frames() as u64),
+        trust: Some(session.trust()),
+        period_us: Some(names.iter().enumerate().map(period_us).collect()),
+        cameras: Some(names),
+        images: BTreeMap::new(),
+    };
     text(&Answer::Opened(Box::new(Opened {
         seq,
         session: session.name().to_owned(),
@@ -78,15 +90,10 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
         dynamics: dynamics(session.dynamics()),
         dt_us: session.dt_us(),
         deadline_ms: session.deadline().as_millis() as u64,
+        decision_us: session.decision_us(),
+        warm_up_us: session.warm_up_us(),
         cameras: session.cameras().iter().map(camera).collect(),
-        outputs: message::Outputs {
-            cameras: Some(names),
-            images: BTreeMap::new(),
-            encoding,
-            quality,
-            depth,
-            opacity,
-        },
+        outputs,
         trajectories: manifest
             .trajectories
             .iter()
@@ -193,6 +200,7 @@ pub(in crate::server) fn observation(
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Rgb(image) => format!("{}/rgb", image_names[image]),
+            TensorKind::PastRgb(image) => past_tensor(session, &frame.history[image]),
         };
         let dtype = match tensor.dtype {
             DType::F32 => "F32",
@@ -247,20 +255,27 @@ fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
     frame.images.iter().map(name).collect()
 }
 
+fn past_tensor(session: &Session, past: &PastImage) -> String {
+    format!("camera/{}/history/{}/rgb", session.cameras()[past.camera].name, past.back)
+}
+
 fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> Observation {
     let (episode, version) = (session.episode(), &session.resident().version);
-    let (time_us, (encoding, _)) = (episode.time_us(), encoding(session.encoding()));
-    let image = |(drawn, name): (&crate::session::Image, &String)| {
-        let mounted = &session.cameras()[drawn.camera];
+    let time_us = episode.time_us();
+    let (encoding, _) = encoding(session.encoding());
+    // Of `images`, and of `history` alike.
+    let image = |index: usize, tensor: String, time_us: i64, hash: &blake3::Hash| {
+        let mounted = &session.cameras()[index];
         let Pinhole { fx, fy, cx, cy } = mounted.camera.pinhole;
         let RigCamera { name: camera, width, height, lens, windshield, camera_to_rig, .. } =
             camera(mounted);
         let exposed_us = mounted.shutter.map_or(0, |shutter| shutter.duration_us);
         Image {
             camera,
-            index: drawn.camera as u64,
-            pose: drawn.pose as u64,
-            tensor: format!("{name}/rgb"),
+            index: index as u64,
+            pose: 0,
+            back: 0,
+            tensor,
             encoding,
             width,
             height,
@@ -270,12 +285,23 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             cy,
             lens,
             windshield,
-            seen: session.seen(drawn.camera),
+            seen: session.seen(index),
             camera_to_rig,
             shutter_start_us: time_us - exposed_us,
             shutter_end_us: time_us,
-            hash: drawn.hash.to_hex().to_string(),
+            hash: hash.to_hex().to_string(),
+            trust: None,
         }
+    };
+    let drawn = |(drawn, name): (&crate::session::Image, &String)| {
+        let tensor = format!("{name}/rgb");
+        let pose = drawn.pose as u64;
+        let trust = drawn.trust.map(trust);
+        Image { pose, trust, ..image(drawn.camera, tensor, drawn.time_us, &drawn.hash) }
+    };
+    let past = |past: &PastImage| {
+        let back = past.back as u64;
+        Image { back, ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash) }
     };
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
@@ -301,7 +327,8 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             steering: episode.ego().steering_rad(),
             history_count: frame.history_count as u64,
         },
-        images: frame.images.iter().zip(image_names).map(image).collect(),
+        images: frame.images.iter().zip(image_names).map(drawn).collect(),
+        history: frame.history.iter().map(past).collect(),
         timings: Timings {
             queue_ms: ms(timings.queue),
             render_ms: ms(timings.render),
@@ -315,6 +342,11 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             waited_us: frame.residency.waited.as_micros() as u64,
         },
     }
+}
+
+fn trust(trust: session::Trust) -> Trust {
+    let session::Trust { value, distance_m, angle_rad, low_coverage, outside } = trust;
+    Trust { value, distance_m, angle_rad, low_coverage, outside }
 }
 
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {

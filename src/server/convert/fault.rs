@@ -104,11 +104,9 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
             }
             ResidencyError::Thread { .. } => (Code::Internal, None),
         },
-        SessionError::Twin(_) => (Code::TwinDamaged, field("twin")),
+        SessionError::Twin(_) | SessionError::Route(_) => (Code::TwinDamaged, field("twin")),
         SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
-        SessionError::UnknownCamera { index, .. } => {
-            (Code::UnknownCamera, Some(format!("outputs.cameras[{index}]")))
-        }
+        SessionError::UnknownCamera { field, .. } => (Code::UnknownCamera, Some(field.clone())),
         SessionError::CameraTwice { index, .. } => {
             (Code::OutOfRange, Some(format!("outputs.cameras[{index}]")))
         }

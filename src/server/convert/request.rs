@@ -164,6 +164,8 @@ struct Fields {
     outputs: Option<message::Outputs>,
     dt_us: Option<i64>,
     deadline_ms: Option<u64>,
+    decision_us: Option<i64>,
+    warm_up_us: Option<i64>,
     pose: Option<message::Pose>,
     trajectory: Option<Vec<message::TimedPose>>,
     action: Option<message::Action>,
@@ -217,8 +219,19 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         Some(message::RigChoice::Preset(name)) => Some(RigChoice::Preset(name)),
         Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(rig_of(rig)?)),
     };
-    let message::Outputs { cameras, images, encoding, quality, depth, opacity } = open.outputs;
+    let message::Outputs {
+        cameras,
+        images,
+        encoding,
+        quality,
+        depth,
+        opacity,
+        frames,
+        trust,
+        period_us,
+    } = open.outputs;
     let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
+    let (trust, periods_us) = (trust.unwrap_or(false), period_us.unwrap_or_default());
     let encoding = match encoding {
         message::Encoding::Jpeg => Encoding::Jpeg(quality.unwrap_or(config::JPEG_QUALITY)),
         message::Encoding::Png => Encoding::Png,
@@ -237,10 +250,15 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             encoding,
             depth,
             opacity,
+            frames,
+            trust,
+            periods_us,
         },
         dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
+        decision_us: open.decision_us,
+        warm_up_us: open.warm_up_us.unwrap_or(0),
     };
     Ok(Command::Open { name, opening: Box::new(opening) })
 }

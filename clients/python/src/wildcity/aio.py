@@ -77,6 +77,8 @@ class Client:
         dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
+        decision_us: int | None = None,
+        warm_up_us: int | None = None,
     ) -> Session:
         """Opens a session on a twin; what is left out is the server's or the twin's default."""
         opened = await self._run(
@@ -92,6 +94,8 @@ class Client:
                 dynamics=dynamics,
                 dt_us=dt_us,
                 deadline_ms=deadline_ms,
+                decision_us=decision_us,
+                warm_up_us=warm_up_us,
             )
         )
         return Session(self, opened)

@@ -79,6 +79,8 @@ class Conversation:
         dynamics: Model | Dynamics | None = None,
         dt_us: int | None = None,
         deadline_ms: int | None = None,
+        decision_us: int | None = None,
+        warm_up_us: int | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
         optional = {
@@ -90,6 +92,8 @@ class Conversation:
             "profile": None if profile is None else dict(profile),
             "dt_us": dt_us,
             "deadline_ms": deadline_ms,
+            "decision_us": decision_us,
+            "warm_up_us": warm_up_us,
         }
         fields = {name: value for name, value in optional.items() if value is not None}
         fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}

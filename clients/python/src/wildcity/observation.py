@@ -75,6 +75,23 @@ class Observation:
         """Accumulated opacity by camera."""
         return self.views[0].opacity
 
+    def frames(self, camera: str) -> NDArray[np.uint8]:
+        """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
+
+        As many as `Outputs.frames` asked for, fewer at an episode's start. `frame_infos` says when
+        each was taken.
+        """
+        frames = [_decode_image(self, image) for image in self.frame_infos(camera)]
+        if not frames:
+            raise KeyError(f"{camera!r} has no frames in this observation")
+        return np.stack(frames)
+
+    def frame_infos(self, camera: str) -> tuple[ImageInfo, ...]:
+        """What is known of each of `frames`: index of the camera, times, hash."""
+        every = (*self.metadata.images, *self.metadata.history)
+        infos = (image for image in every if image.camera == camera and image.pose == 0)
+        return tuple(sorted(infos, key=lambda image: -image.back))
+
     def tensor(self, name: str) -> NDArray[Any]:
         """A tensor of the frame as it came, without a copy."""
         tensor = self._tensors[name]
@@ -95,7 +112,7 @@ class Observation:
     def _check(self) -> None:
         self._expect("ego.history_xyz", "F32", (HISTORY_POSES, 3))
         self._expect("ego.history_rot", "F32", (HISTORY_POSES, 3, 3))
-        for image in self.metadata.images:
+        for image in (*self.metadata.images, *self.metadata.history):
             size = (image.height, image.width)
             if image.encoding == "raw":
                 self._expect(image.tensor, "U8", (*size, 3))

@@ -164,6 +164,8 @@ class Outputs:
     """What each observation holds: which cameras (all if absent), how encoded, with what.
 
     `images` are other parts and sizes than the rig's, by the camera's name.
+    `frames` is how many last frames of each camera, 1 if absent; `period_us` is the time between two
+    frames of a camera that does not take one with every step; `trust` says how far each image may be believed.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -172,6 +174,9 @@ class Outputs:
     depth: bool = False
     opacity: bool = False
     images: dict[str, ImagePart] | None = None
+    frames: int | None = None
+    trust: bool | None = None
+    period_us: dict[str, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -245,6 +250,8 @@ class Opened:
     dynamics: Dynamics
     dt_us: int
     deadline_ms: int
+    decision_us: int
+    warm_up_us: int
     cameras: tuple[Camera, ...]
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
@@ -327,11 +334,27 @@ class Ego:
 
 
 @dataclass(frozen=True)
+class Trust:
+    """How far an image may be believed: `value` is 1 as recorded, 0 where nothing is known.
+
+    Its parts: metres and radians to the nearest recorded keyframe; of what looks down, the shares of pixels
+    with less than half opacity and of rays that meet nothing of the twin.
+    """
+
+    value: float
+    distance_m: float
+    angle_rad: float
+    low_coverage: float
+    outside: float
+
+
+@dataclass(frozen=True)
 class ImageInfo:
     """One image: its camera, the request's pose it shows, size, intrinsics, times, hash.
 
-    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding. `seen` is the
-    share of it that the lens sees, where that is not all: the rest is 0.
+    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding. `back` counts
+    frames of this camera back from the newest, which is 0. `seen` is the share of it that the lens sees,
+    where that is not all: the rest is 0.
     """
 
     camera: str
@@ -352,6 +375,8 @@ class ImageInfo:
     lens: Lens | None = None
     windshield: Windshield | None = None
     seen: float | None = None
+    back: int = 0
+    trust: Trust | None = None
 
 
 @dataclass(frozen=True)
@@ -402,6 +427,7 @@ class Metadata:
     images: tuple[ImageInfo, ...]
     timings: Timings
     residency: Residency
+    history: tuple[ImageInfo, ...] = ()
 
 
 ANSWERS: dict[str, type[Any]] = {

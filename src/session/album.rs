@@ -1,0 +1,52 @@
+//! Frames of an episode that later observations show again.
+
+use std::sync::Arc;
+
+use super::SessionError;
+use super::engine::{Answers, Hold};
+use super::schedule::Schedule;
+
+/// What cameras took and a decision still looks at, in the order in which it was taken. What is
+/// common to two albums is in memory once.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Album(Vec<Arc<Shown>>);
+
+/// A frame of a camera.
+#[derive(Debug)]
+pub(super) struct Shown {
+    /// Index of the camera.
+    pub(super) camera: usize,
+    /// When it was taken, in microseconds since the episode's start.
+    pub(super) time_us: i64,
+    /// BLAKE3 of its pixels.
+    pub(super) hash: blake3::Hash,
+    /// As it travels: a file, or its pixels.
+    pub(super) bytes: Vec<u8>,
+    /// Its part of the budget for answers.
+    _hold: Hold,
+}
+
+impl Album {
+    /// Puts a frame in, which counts against the budget for answers from now on.
+    pub(super) fn add(
+        &mut self,
+        answers: &Answers,
+        (camera, time_us): (usize, i64),
+        hash: blake3::Hash,
+        bytes: Vec<u8>,
+    ) -> Result<(), SessionError> {
+        let _hold = answers.hold(bytes.len() as u64)?;
+        self.0.push(Arc::new(Shown { camera, time_us, hash, bytes, _hold }));
+        Ok(())
+    }
+
+    /// The frame of a camera of a time, in microseconds.
+    pub(super) fn find(&self, camera: usize, time_us: i64) -> Option<&Arc<Shown>> {
+        self.0.iter().find(|shown| (shown.camera, shown.time_us) == (camera, time_us))
+    }
+
+    /// Throws out what no decision after a time looks at.
+    pub(super) fn forget(&mut self, schedule: &Schedule, time_us: i64) {
+        self.0.retain(|shown| schedule.kept(shown.camera, shown.time_us, time_us));
+    }
+}
