@@ -198,7 +198,7 @@ fn picture(bytes: &[u8]) -> Result<RgbImage, IngestError> {
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(config::SKY_IMAGE_BYTES);
     reader.limits(limits);
-    Ok(reader.decode().map(DynamicImage::into_rgb8).map_err(unreadable)?)
+    reader.decode().map(DynamicImage::into_rgb8).map_err(unreadable)
 }
 
 /// The faces of an image of any of the shapes, as a strip.

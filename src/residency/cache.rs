@@ -25,12 +25,15 @@ pub struct Cache {
     /// held while opening, so that others wait for the result rather than read again.
     slots: Mutex<BTreeMap<(String, u64), Slot>>,
     /// The skies of the versions that are open, by what they are and how finely they are baked.
-    skies: Mutex<Vec<((SkyRef, f64), Weak<Sky>)>>,
+    skies: Mutex<Vec<(SkyKey, Weak<Sky>)>>,
     /// The version that was opened last stays for the next session: its table has megabytes.
     last: Mutex<Option<Arc<Resident>>>,
 }
 
 type Slot = Arc<Mutex<Weak<Resident>>>;
+
+/// A sky, and the error that it is baked for.
+type SkyKey = (SkyRef, f64);
 
 /// What all versions share.
 #[derive(Debug)]

@@ -56,8 +56,9 @@ fn cover<S: Simd>(simd: S, overlay: &Overlay, at_px: [u32; 2], rgb: Vec3x16<S>) 
         // Tiles reach beyond the image.
         if x < width && y < height {
             let first = 4 * (y as usize * width as usize + x as usize);
-            for c in 0..4 {
-                over[c][lane as usize] = f32::from(overlay.rgba8()[first + c]);
+            let pixel = &overlay.rgba8()[first..first + 4];
+            for (channel, &value) in over.iter_mut().zip(pixel) {
+                channel[lane as usize] = f32::from(value);
             }
         }
     }

@@ -202,7 +202,7 @@ fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
     let whole = x.mul_add(splat(std::f32::consts::FRAC_1_PI), splat(0.5 - quarter)).floor();
     let turns = -(whole + splat(quarter));
     let r = turns.mul_add(splat(3.140_625), x);
-    let r = turns.mul_add(splat(9.677_410_125_7e-4), r);
+    let r = turns.mul_add(splat(9.677_41e-4), r);
     let r = turns.mul_add(splat(-8.742_278e-8), r);
     let square = r * r;
     let fit = square

@@ -29,8 +29,11 @@ pub struct Sky {
     /// Takes world axes to the model's: a rotation, perhaps with a mirror.
     sky_from_world: DMat3,
     /// For which error it was baked last, and what came of it.
-    baked: Mutex<Option<(f64, Result<Arc<CubeMap>, SkyError>)>>,
+    baked: Mutex<Option<Baked>>,
 }
+
+/// An error that was asked for, and the map that has it or why there is none.
+type Baked = (f64, Result<Arc<CubeMap>, SkyError>);
 
 /// What a sky is made of.
 #[derive(Clone, Debug)]

@@ -168,8 +168,8 @@ impl Layer {
 }
 
 fn check_values(tensor: &'static str, values: &[f32]) -> Result<(), SkyError> {
-    let is_bad = |value: &f32| !(value.abs() <= Network::MAX_WEIGHT);
-    match values.iter().position(is_bad) {
+    let limits = -Network::MAX_WEIGHT..=Network::MAX_WEIGHT;
+    match values.iter().position(|value| !limits.contains(value)) {
         Some(index) => Err(SkyError::Value { tensor, index, value: values[index] }),
         None => Ok(()),
     }
