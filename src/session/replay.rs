@@ -141,7 +141,7 @@ pub enum ReplayError {
         /// The step.
         step: u64,
         /// Why.
-        cause: SessionError,
+        cause: Box<SessionError>,
     },
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
@@ -249,7 +249,7 @@ impl Recording {
             let ground = Ground::of(&resident.version.manifest.trajectories);
             let strayed = retrace
                 .follow(frame, index + lines_before, &ground)
-                .map_err(|cause| ReplayError::Ego { step: frame.step, cause })?;
+                .map_err(|cause| ReplayError::Ego { step: frame.step, cause: Box::new(cause) })?;
             if report.strayed.is_none() && strayed.is_some() {
                 report.strayed = strayed;
                 if extent == Extent::FirstDifference {

@@ -28,7 +28,7 @@ enum Looks {
     /// Rows that take `(x, y, 1)` in pixels to a direction of any length.
     Ideal([[f32; 3]; 3]),
     /// Pixel by pixel, as the lens and the shutter have it; the matrix is `sky_from_world`.
-    Bent(View, DMat3),
+    Bent(Box<(View, DMat3)>),
 }
 
 impl Behind {
@@ -41,7 +41,7 @@ impl Behind {
         let of_view = |view: &View| {
             let looks = match view.is_ideal() {
                 true => Looks::Ideal(view.sky_from_pixel(axes)),
-                false => Looks::Bent(*view, axes),
+                false => Looks::Bent(Box::new((*view, axes))),
             };
             Self { drawn: drawn.clone(), looks }
         };
@@ -95,8 +95,9 @@ fn add_sky<S: Simd>(
             let row = |[a, b, c]: [f32; 3]| x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
             Vec3x16 { x: row(*first), y: row(*second), z: row(*third) }
         }
-        Looks::Bent(view, sky_from_world) => {
-            let [x, y, z] = bent(view, *sky_from_world, &x.to_array(), &y.to_array());
+        Looks::Bent(bent) => {
+            let (view, sky_from_world) = &**bent;
+            let [x, y, z] = directions(view, *sky_from_world, &x.to_array(), &y.to_array());
             let load = |values| f32x16::load_array_ref(simd, values);
             Vec3x16 { x: load(&x), y: load(&y), z: load(&z) }
         }
@@ -119,7 +120,7 @@ fn add_sky<S: Simd>(
 }
 
 /// Where 16 pixels look. What the lens does not see looks ahead: it is masked when the image is done.
-fn bent(
+fn directions(
     view: &View,
     sky_from_world: DMat3,
     x_px: &[f32; LANES],
