@@ -60,8 +60,8 @@ fn the_hex_example_is_the_golden_frame() {
             bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
         assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
     }
-    assert!(page.contains("(3,288 bytes) has N = 0x8c8 = 2,248"));
-    assert_eq!((frame.len(), &frame[..8]), (3288, &2248_u64.to_le_bytes()[..]));
+    assert!(page.contains("(3,384 bytes) has N = 0x928 = 2,344"));
+    assert_eq!((frame.len(), &frame[..8]), (3384, &2344_u64.to_le_bytes()[..]));
 }
 
 /// Every code is explained, and no other.
