@@ -79,9 +79,11 @@ pub enum RigError {
 }
 
 /// Rigs that come with the program, by name: the JSON of `scenes/rigs`.
-const PRESETS: [(&str, &str); 2] = [
+const PRESETS: [(&str, &str); 4] = [
     ("vehicle6", include_str!("../../scenes/rigs/vehicle6.json")),
     ("surround6", include_str!("../../scenes/rigs/surround6.json")),
+    ("alpamayo1", include_str!("../../scenes/rigs/alpamayo1.json")),
+    ("alpamayo2", include_str!("../../scenes/rigs/alpamayo2.json")),
 ];
 
 impl Rig {
