@@ -10,9 +10,10 @@
 //! limits     what is not run here, and why                          T22 to T25
 //! ```
 
+mod actors;
 pub mod blobs;
 
-mod limits;
+mod lenses;
 mod opacities;
 mod order;
 mod places;
@@ -77,10 +78,10 @@ pub static CASES: [Case; 28] = [
     opacities::T19,
     order::T20,
     order::T21,
-    limits::T22,
-    limits::T23,
-    limits::T24,
-    limits::T25,
+    lenses::T22,
+    lenses::T23,
+    lenses::T24,
+    actors::T25,
     shapes::T26,
     order::T27,
     opacities::T28,

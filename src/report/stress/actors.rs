@@ -1,4 +1,4 @@
-//! Actors; and what is not drawn here, and why.
+//! Actors.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -8,27 +8,6 @@ use super::{Case, Run, Trial};
 use crate::render::RenderError;
 use crate::report::drawing::max_difference;
 use crate::scene::{Gaussians, RenderProfile, Scene, sh};
-
-pub(super) const T22: Case = Case {
-    number: "T22",
-    what: "weights of the unscented transform",
-    bound: "compared with Monte Carlo",
-    run: Run::Limit("every camera is a pinhole, which is linearised: there is no such transform"),
-};
-
-pub(super) const T23: Case = Case {
-    number: "T23",
-    what: "distortion that folds over, rays beyond 90°",
-    bound: "masked, never wrapped around",
-    run: Run::Limit("every camera is a pinhole: nothing distorts"),
-};
-
-pub(super) const T24: Case = Case {
-    number: "T24",
-    what: "rolling shutter at 30 m/s and 30 ms",
-    bound: "as rendered row by row",
-    run: Run::Limit("every shutter is global"),
-};
 
 pub(super) const T25: Case = Case {
     number: "T25",
