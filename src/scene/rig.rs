@@ -267,7 +267,7 @@ mod tests {
                 r#""fx":50,"fy":50,"lens":{"model":"fisheye","k":[-9,0,0,0],"max_angle":9}"#,
                 "max_angle",
             ),
-            (r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[-1e6,0,0,0,0,0]}"#, "an eighth"),
+            (r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[-1e6,0,0,0,0,0]}"#, "folds back"),
             (r#""lens":{"model":"fisheye","k":[0,0,0,0]}"#, "fx is missing"),
             (
                 r#""fx":50,"fy":50,"shutter":{"direction":"top_to_bottom","duration_us":0}"#,

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::geometry::Bounds;
 
-/// Items in the order of a drive, in boxes of [`BOX_ITEMS`] that follow each other.
+/// Items in the order of a drive, in boxes of `BOX_ITEMS` that follow each other.
 ///
 /// A search looks at every box, and into few: of 84 km at 0.5 m, 2,600 boxes and some hundred of
 /// 168,000 keyframes.
