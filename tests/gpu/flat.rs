@@ -16,6 +16,11 @@ use crate::streets::street;
 /// What one step may leave behind is 4 MiB / 10,000 = 419 B; a bind group or a buffer is more.
 const GROWTH_BYTES: u64 = 4 << 20;
 
+/// Which frames the buffers that are read back have seen is a matter of when threads get their turn: each
+/// of three may grow by 8 KiB when it first sees the widest. A buffer per step, of 256 B at least, would be
+/// 250 KiB.
+const DEVICE_GROWTH_BYTES: u64 = 64 << 10;
+
 #[test]
 fn memory_is_flat_over_ten_thousand_steps() {
     in_its_own_process("flat::ten_thousand_steps");
@@ -111,7 +116,8 @@ fn assert_flat(
 ) {
     assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
     assert!(device_before.is_some_and(|bytes| bytes > 0), "the device does not count its memory");
-    assert_eq!(device_before, device_after);
+    let grown = device_after.zip(device_before).map(|(after, before)| after.saturating_sub(before));
+    assert!(grown.is_some_and(|bytes| bytes <= DEVICE_GROWTH_BYTES), "the device: {grown:?} B");
 }
 
 /// A size of /proc/self/status.
