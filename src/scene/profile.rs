@@ -47,8 +47,7 @@ pub struct RenderProfile {
     /// Distance from the nearest camera beyond which a block is not drawn, in metres; none, and
     /// everything is.
     pub reach_m: Option<f64>,
-    /// How Gaussians become pixels. Not written unless it is said, so that profiles from before keep
-    /// their hashes.
+    /// How Gaussians become pixels. Not written unless it is said.
     #[serde(skip_serializing_if = "Rays::is_splats")]
     pub rays: Rays,
     /// Largest error of a baked sky anywhere, in colour from 0 to 1; 0 evaluates the sky for every pixel.

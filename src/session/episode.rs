@@ -120,15 +120,24 @@ impl Episode {
         Ok(next)
     }
 
-    /// A rig's cameras somewhere, moving as the ego has just moved: so a rolling shutter sees from any
-    /// place what it would see if the ego had come there as it came to where it is. At the start of an
-    /// episode it stands.
-    pub(super) fn views(&self, cameras: &[RigCamera], world_from_rig: Pose) -> Vec<View> {
+    /// Some of a rig's cameras, by their indices, where the rig stands somewhere. If it `moves`, as the ego
+    /// has just moved: so a rolling shutter sees from any place what it would see if the ego had come
+    /// there as it came to where it is. At the start of an episode it stands, and in a warm-up.
+    pub(super) fn views(
+        &self,
+        (cameras, which): (&[RigCamera], &[usize]),
+        world_from_rig: Pose,
+        moves: bool,
+    ) -> Vec<View> {
         let now = self.world_from_rig();
-        View::of_moving_rig(cameras, world_from_rig, &|age_us| {
+        let all = View::of_moving_rig(cameras, world_from_rig, &|age_us| {
+            if !moves {
+                return world_from_rig;
+            }
             let then = self.at((self.time_us() - age_us).max(0));
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
-        })
+        });
+        which.iter().map(|&camera| all[camera]).collect()
     }
 
     /// Seed of the episode.
@@ -273,22 +282,25 @@ mod tests {
 
     #[test]
     fn rolling_shutters_see_from_where_the_ego_was() {
+        let views = |episode: &Episode, camera: &RigCamera, x_m: f64| {
+            episode.views((std::slice::from_ref(camera), &[0]), at(x_m, 0.0), true)
+        };
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
         let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
         let still = begun(at(0.0, 0.0), 100_000);
         let driven = driven(3, 100_000, 3.0);
-        assert_eq!(driven.views(&[camera.clone()], at(9.0, 0.0))[0].rolling, None, "global");
+        assert_eq!(views(&driven, &camera, 9.0)[0].rolling, None, "global");
         camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
-        assert_eq!(still.views(&[camera.clone()], at(0.0, 0.0))[0].rolling, None, "it stands");
+        assert_eq!(views(&still, &camera, 0.0)[0].rolling, None, "it stands");
         // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
         for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {
-            let view = driven.views(&[camera.clone()], at(x_m, 0.0))[0];
+            let view = views(&driven, &camera, x_m)[0];
             assert!((view.world_from_camera.position_m.x - x_m - 1.5).abs() < 1e-9);
             let first = view.rolling.unwrap().world_from_camera_first;
             assert!((first.position_m.x - first_m).abs() < 1e-9, "{first:?}");
         }
         let stopped = moved(&driven, at(9.0, 0.0), false).unwrap();
-        assert_eq!(stopped.views(&[camera], at(9.0, 0.0))[0].rolling, None, "it stands again");
+        assert_eq!(views(&stopped, &camera, 9.0)[0].rolling, None, "it stands again");
     }
 
     #[test]

@@ -183,11 +183,8 @@ impl Layout {
 
     /// The views of a shot. Those of a warm-up are as of a vehicle that stood while they were exposed.
     pub(super) fn views(&self, episode: &Episode, shot: &Shot) -> Vec<View> {
-        let all = match shot.time_us == episode.time_us() {
-            true => episode.views(&self.cameras, shot.world_from_rig),
-            false => View::of_rig(&self.cameras, shot.world_from_rig),
-        };
-        shot.cameras.iter().map(|&camera| all[camera]).collect()
+        let moves = shot.time_us == episode.time_us();
+        episode.views((&self.cameras, &shot.cameras), shot.world_from_rig, moves)
     }
 
     fn check_size(&self, times: usize) -> Result<(), SessionError> {

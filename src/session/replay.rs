@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::EPISODE_LINE_BYTES;
-use crate::render::{Backend, Frame as RenderFrame, RenderError, Target, View};
+use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::RenderProfile;
 use crate::scene::rig::{RigCamera, RigError};
@@ -265,11 +265,7 @@ impl Recording {
                 let step = frame.step;
                 // What is drawn before the last pose of a step is of a warm-up.
                 let moves = frame.request == FrameRequest::Observe || pose + 1 == frame.poses.len();
-                let views = match moves {
-                    true => retrace.episode().views(all, *world_from_rig),
-                    false => View::of_rig(all, *world_from_rig),
-                };
-                let views: Vec<View> = cameras.iter().map(|&camera| views[camera]).collect();
+                let views = retrace.episode().views((all, &cameras), *world_from_rig, moves);
                 let scene = resident.scene(&observation::eyes(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
                 let to_draw = RenderFrame { scene: &scene, profile, views: &views };

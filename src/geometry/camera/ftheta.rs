@@ -1,6 +1,7 @@
 //! NVIDIA's f-theta: a polynomial between the angle off the axis and the distance in pixels.
 
 use glam::{DMat2, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
 use super::CameraError;
 use super::fisheye::{at_angle, radial};
@@ -21,7 +22,8 @@ pub struct FTheta {
 }
 
 /// Which way the exact polynomial goes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Reference {
     /// From radians off the axis to pixels from the principal point.
     AngleToPixel,

@@ -56,7 +56,7 @@ pub enum LensFields {
     /// NVIDIA's f-theta.
     Ftheta {
         /// Which way the polynomial goes.
-        reference: ReferenceField,
+        reference: Reference,
         /// Coefficients of powers 0 to 5.
         polynomial: [f64; 6],
         /// `[c, d, e]` of `[[c, d], [e, 1]]`.
@@ -66,36 +66,16 @@ pub enum LensFields {
     },
 }
 
-/// Which way an f-theta polynomial goes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ReferenceField {
-    /// From radians to pixels.
-    AngleToPixel,
-    /// From pixels to radians.
-    PixelToAngle,
-}
-
 /// A windshield.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WindshieldFields {
     /// Which way the polynomials go.
-    pub reference: WindshieldReferenceField,
+    pub reference: WindshieldReference,
     /// Coefficients of the angle to the right.
     pub horizontal: Vec<f64>,
     /// Coefficients of the angle downwards.
     pub vertical: Vec<f64>,
-}
-
-/// Which way a windshield's polynomials go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum WindshieldReferenceField {
-    /// From the world's rays to the lens'.
-    Forward,
-    /// From the lens' rays to the world's.
-    Backward,
 }
 
 impl Intrinsics {
@@ -139,10 +119,6 @@ impl LensFields {
             Self::Opencv { k, p, s } => Lens::opencv(OpenCv::new(k, p, s)),
             Self::Fisheye { k, max_angle } => Lens::Fisheye(Fisheye::new(k, max_angle)),
             Self::Ftheta { reference, polynomial, linear_cde, max_angle } => {
-                let reference = match reference {
-                    ReferenceField::AngleToPixel => Reference::AngleToPixel,
-                    ReferenceField::PixelToAngle => Reference::PixelToAngle,
-                };
                 Lens::FTheta(FTheta::new(reference, polynomial, linear_cde, max_angle))
             }
         }
@@ -154,10 +130,7 @@ impl LensFields {
             Lens::OpenCv(lens) => Self::Opencv { k: lens.k(), p: lens.p(), s: lens.s() },
             Lens::Fisheye(lens) => Self::Fisheye { k: lens.k(), max_angle: lens.max_angle_rad() },
             Lens::FTheta(lens) => Self::Ftheta {
-                reference: match lens.reference() {
-                    Reference::AngleToPixel => ReferenceField::AngleToPixel,
-                    Reference::PixelToAngle => ReferenceField::PixelToAngle,
-                },
+                reference: lens.reference(),
                 polynomial: lens.polynomial(),
                 linear_cde: lens.linear_cde(),
                 max_angle: lens.max_angle_rad(),
@@ -168,21 +141,14 @@ impl LensFields {
 
 impl WindshieldFields {
     fn windshield(&self) -> Result<Windshield, CameraError> {
-        let reference = match self.reference {
-            WindshieldReferenceField::Forward => WindshieldReference::Forward,
-            WindshieldReferenceField::Backward => WindshieldReference::Backward,
-        };
         let horizontal = Bivariate::new("windshield.horizontal", &self.horizontal)?;
         let vertical = Bivariate::new("windshield.vertical", &self.vertical)?;
-        Ok(Windshield::new(reference, horizontal, vertical))
+        Ok(Windshield::new(self.reference, horizontal, vertical))
     }
 
     fn of(windshield: &Windshield) -> Self {
         Self {
-            reference: match windshield.reference() {
-                WindshieldReference::Forward => WindshieldReferenceField::Forward,
-                WindshieldReference::Backward => WindshieldReferenceField::Backward,
-            },
+            reference: windshield.reference(),
             horizontal: windshield.horizontal().coefficients().to_vec(),
             vertical: windshield.vertical().coefficients().to_vec(),
         }

@@ -1,6 +1,7 @@
 //! A windshield before the lens: it turns rays by what two polynomials of their angles say.
 
 use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
 use super::CameraError;
 
@@ -19,7 +20,8 @@ pub struct Windshield {
 }
 
 /// Which way the exact polynomials go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum WindshieldReference {
     /// From the world's rays to the lens'.
     Forward,

@@ -1,9 +1,9 @@
 //! Cameras, both ways.
 
-use crate::geometry::camera::json::{
-    Intrinsics, LensFields, ReferenceField, WindshieldFields, WindshieldReferenceField,
+use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
+use crate::geometry::camera::{
+    Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
 };
-use crate::geometry::camera::{Camera, CameraError, Rolls, Shutter};
 use crate::protocol::camera as wire;
 
 /// Wire to lens.
@@ -13,8 +13,8 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
         wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                wire::Reference::AngleToPixel => ReferenceField::AngleToPixel,
-                wire::Reference::PixelToAngle => ReferenceField::PixelToAngle,
+                wire::Reference::AngleToPixel => Reference::AngleToPixel,
+                wire::Reference::PixelToAngle => Reference::PixelToAngle,
             };
             LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
@@ -25,8 +25,8 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
 pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     let wire::Windshield { reference, horizontal, vertical } = windshield;
     let reference = match reference {
-        wire::WindshieldReference::Forward => WindshieldReferenceField::Forward,
-        wire::WindshieldReference::Backward => WindshieldReferenceField::Backward,
+        wire::WindshieldReference::Forward => WindshieldReference::Forward,
+        wire::WindshieldReference::Backward => WindshieldReference::Backward,
     };
     WindshieldFields { reference, horizontal, vertical }
 }
@@ -68,8 +68,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
         LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
         LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                ReferenceField::AngleToPixel => wire::Reference::AngleToPixel,
-                ReferenceField::PixelToAngle => wire::Reference::PixelToAngle,
+                Reference::AngleToPixel => wire::Reference::AngleToPixel,
+                Reference::PixelToAngle => wire::Reference::PixelToAngle,
             };
             wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
@@ -79,8 +79,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
 fn windshield_to(windshield: WindshieldFields) -> wire::Windshield {
     let WindshieldFields { reference, horizontal, vertical } = windshield;
     let reference = match reference {
-        WindshieldReferenceField::Forward => wire::WindshieldReference::Forward,
-        WindshieldReferenceField::Backward => wire::WindshieldReference::Backward,
+        WindshieldReference::Forward => wire::WindshieldReference::Forward,
+        WindshieldReference::Backward => wire::WindshieldReference::Backward,
     };
     wire::Windshield { reference, horizontal, vertical }
 }
