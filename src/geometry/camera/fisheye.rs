@@ -43,6 +43,11 @@ impl Fisheye {
         self.radius.end()
     }
 
+    /// How far from the principal point an angle off the axis lands, in focal lengths.
+    pub fn radius_at(&self, angle_rad: f64) -> f64 {
+        self.radius.at(angle_rad)
+    }
+
     pub(super) fn check(&self) -> Result<(), CameraError> {
         super::check_numbers("lens.k", &self.k)?;
         super::check_max_angle(self.max_angle_rad)?;
