@@ -2,17 +2,17 @@
 //! the lens and all of them are within its field 16 Gaussians at a time in f32, else one by one in f64, where
 //! [`Bent`] says where each lands.
 
-use fearless_simd::{f32x16, f64x8, prelude::*};
+use fearless_simd::{f32x16, f64x8, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
 use super::optics::{Landed, Optics};
 use super::project::{Ellipse, LOG2_UNIT, SplatLanes, color, rotation_columns, shown};
-use crate::geometry::camera::Lens;
+use crate::geometry::camera::{Lens, WIDEST_RAD};
 use crate::render::View;
 use crate::render::constants::EXTENT_SLACK_PX;
 use crate::render::layout::Cutoffs;
-use crate::render::unscented::{Bent, Footprint};
+use crate::render::unscented::{Bent, Beside, Footprint};
 use crate::scene::Chunk;
 use crate::scene::chunk::{LANES, Lanes, column};
 
@@ -27,6 +27,7 @@ pub(super) struct BentView<'a> {
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
+    beside: Beside,
     /// Whether depth is distance, and not z.
     by_distance: bool,
 }
@@ -52,6 +53,7 @@ impl<'a> BentView<'a> {
             camera_from_chunk: [0, 1, 2].map(row),
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
+            beside: bent.beside(),
             by_distance: matches!(view.camera.lens, Lens::Fisheye(_) | Lens::FTheta(_)),
         }
     }
@@ -110,11 +112,12 @@ fn project_lanes<S: Simd>(
     let in_range = depth_m.simd_ge(splat(cutoffs.near_m))
         & depth_m.simd_le(splat(cutoffs.far_m))
         & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
+    let in_range = in_range & !beside(simd, center, x.max(y).max(z), &view.beside);
     if in_range.all_false() {
         return (SplatLanes::default(), 0);
     }
     let own = rotation_columns(simd, columns);
-    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
     let [right, down, forward] =
         view.camera_from_chunk.map(|[x, y, z, _]| [x as f32, y as f32, z as f32]);
     let right = Vec3x16::splat(simd, right);
@@ -160,6 +163,35 @@ fn project_lanes<S: Simd>(
     let drawn = (mean_x, mean_y, depth_m);
     let lanes = shown(simd, drawn, log2_opacity, &ellipse, inside, view.size_px, cutoffs);
     (lanes, in_range.to_bitmask() & !inside.to_bitmask())
+}
+
+/// Which Gaussians surely are not seen from a camera at rest: see [`Beside`].
+#[inline(always)]
+fn beside<S: Simd>(
+    simd: S,
+    center_m: Vec3x16<S>,
+    sigma_m: f32x16<S>,
+    bound: &Beside,
+) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
+    let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
+    // Half the angle: atan t for t up to 1 is t (π/4 + 0.273 (1 - t)) within 0.004, and π/2 less that of
+    // 1/t beyond.
+    let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
+    let steep = t.simd_gt(splat(1.0));
+    let low = steep.select(splat(1.0) / t, t);
+    let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+    let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+    let (least_rad, most_rad) = (half + half - splat(0.01), half + half + splat(0.01));
+    // asin s is at most 1.0472 s up to a half.
+    let share = splat(3.0_f64.sqrt()) * sigma_m / distance_m;
+    let spread_rad = share.mul_add(splat(1.0472), splat(bound.turned_rad));
+    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
+    let out_px =
+        (least_rad - splat(bound.turned_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
+    let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
+    share.simd_lt(splat(0.5)) & (out | least_rad.simd_gt(splat(bound.widest_rad)))
 }
 
 /// Centres in the camera's frame, and their depth, in metres: computed in f64 and rounded once, since
