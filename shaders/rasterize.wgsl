@@ -8,7 +8,7 @@
 #import layout
 #import math
 #import resolve
-#import SKY
+#import BEHIND
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;

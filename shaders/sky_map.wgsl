@@ -1,7 +1,5 @@
 // A sky that was baked: `CubeMap` in `src/scene/sky/cube.rs`.
 
-#import behind
-
 // Red in the lower and green in the upper 16 bits, and blue.
 @group(0) @binding(9) var<storage, read> texels: array<vec2u>;
 

@@ -1,7 +1,7 @@
 // A sky that is evaluated: `Folded` in `src/scene/sky/folded.rs`, four directions at once. Up to 575
 // vectors lie in private memory, which is slow, and exact.
 
-#import behind
+#import angle
 
 // Layer by layer: for each group of eight outputs their biases, and then eight weights per input.
 @group(0) @binding(9) var<storage, read> weights: array<vec4f>;
@@ -23,7 +23,7 @@ fn sky(away: Away) -> array<vec4f, 3> {
     for (var cosine = 0u; cosine < 2u; cosine++) {
         for (var octave = 0u; octave < behind.octaves; octave++) {
             for (var axis = 0u; axis < 3u; axis++) {
-                values[next] = sine(directions[axis] * f32(1u << octave), cosine);
+                values[next] = sine(directions[axis] * f32(1u << octave), 0.5 * f32(cosine));
                 next++;
             }
         }
@@ -75,19 +75,4 @@ fn group(at: u32, source: u32, inputs: u32) -> Outputs {
 
 fn outer(weight: vec4f, value: vec4f) -> mat4x4f {
     return mat4x4f(weight.x * value, weight.y * value, weight.z * value, weight.w * value);
-}
-
-// As in `src/scene/sky/folded.rs`: WGSL's own sine may be 2^-11 off. Products with the first two parts
-// of pi are exact, so that it does not matter whether sums are fused with them.
-fn sine(x: vec4f, cosine: u32) -> vec4f {
-    let quarter = 0.5 * f32(cosine);
-    let whole = floor(x * 0.31830988618 + (0.5 - quarter));
-    let turns = whole + quarter;
-    let r = ((x - turns * 3.140625) - turns * 9.6774101257e-4) + turns * 8.742278e-8;
-    let square = r * r;
-    let fit = ((2.6000546e-6 * square - 1.9806615e-4) * square + 8.333017e-3) * square
-        - 1.6666657e-1;
-    let value = r + fit * square * r;
-    let odd = (vec4i(whole) + i32(cosine)) & vec4i(1);
-    return select(value, -value, odd != vec4i(0));
 }

@@ -44,7 +44,7 @@ pub(crate) const SLIPS: &[Slip] = &[
         "let clamped = slope * 0.9;",
         PROJECT,
     ),
-    slip("project", "let l1 = -(b * l2)", "let l1 = (b * l2)", PROJECT),
+    slip("project", "-(foot.covariance.y * l2)", "(foot.covariance.y * l2)", PROJECT),
     slip("project", "x.y + turn.z", "x.y - turn.z", PROJECT),
     slip("project", "(high & 0xFFu) << 12u", "(high & 0xFFu) << 11u", PROJECT),
     slip("project", "2.890611442640554", "2.0", PROJECT),

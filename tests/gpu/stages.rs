@@ -297,8 +297,8 @@ fn a_slip_fails_its_own_stage_alone_and_the_bisection_names_it() {
 #[test]
 fn depths_that_are_not_rounded_once_are_seen() {
     let truth = &*TRUTH;
-    let part = "return sum + lost;";
-    let broken = gpu_with(Shaders::default().with_slip("project", part, "return sum;").unwrap());
+    let broken = Shaders::default().with_slip("project", "exact_m.x + exact_m.y", "exact_m.x");
+    let broken = gpu_with(broken.unwrap());
     let wrong = truth.wrong(&broken);
     let [("project", twins)] = &wrong[..] else { panic!("{wrong:?}") };
     assert!(twins.iter().all(Option::is_some), "{wrong:?}");

@@ -38,6 +38,11 @@ impl Fisheye {
         self.max_angle_rad
     }
 
+    /// The distance from the axis in focal lengths, by the angle off it in radians.
+    pub fn radius(&self) -> &Rising {
+        &self.radius
+    }
+
     /// How far off the axis it sees.
     pub fn limit_rad(&self) -> f64 {
         self.radius.end()

@@ -84,6 +84,49 @@ impl Folded {
         }
     }
 
+    /// Outputs of a hidden layer, a multiple of 8.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Octaves of sines and cosines.
+    pub fn octaves(&self) -> usize {
+        self.octaves
+    }
+
+    /// Values of a direction and its octaves.
+    pub fn encoded(&self) -> usize {
+        self.encoded
+    }
+
+    /// Whether the direction itself is one of them.
+    pub fn identity(&self) -> bool {
+        self.identity
+    }
+
+    /// Whether the second layer reads them again, behind the first one's outputs.
+    pub fn skip(&self) -> bool {
+        self.skip
+    }
+
+    /// All numbers, layer by layer: for each group of 8 outputs their biases, and then 8 weights per input.
+    pub fn weights(&self) -> Vec<[f32; GROUP]> {
+        let of_layer = |layer: &Dense| {
+            let groups = layer.weight.chunks_exact(layer.inputs).zip(&layer.bias);
+            let with_bias = |(weights, bias): (&[[f32; GROUP]], &[f32; GROUP])| {
+                [std::slice::from_ref(bias), weights].concat()
+            };
+            groups.flat_map(with_bias).collect::<Vec<_>>()
+        };
+        self.layers.iter().flat_map(of_layer).collect()
+    }
+
+    /// Memory of its numbers, in bytes.
+    pub fn bytes(&self) -> usize {
+        let of_layer = |layer: &Dense| (layer.weight.len() + layer.bias.len()) * 4 * GROUP;
+        self.layers.iter().map(of_layer).sum()
+    }
+
     /// Room for evaluations.
     pub fn scratch(&self) -> Scratch {
         let zero = |len| vec![Lanes([0.0; LANES]); len];

@@ -53,6 +53,25 @@ pub enum Drawn {
     Map(Arc<CubeMap>),
 }
 
+impl Drawn {
+    /// Whether it is the very same.
+    pub fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Exact(own), Self::Exact(other)) => Arc::ptr_eq(own, other),
+            (Self::Map(own), Self::Map(other)) => Arc::ptr_eq(own, other),
+            _ => false,
+        }
+    }
+
+    /// Memory of what is looked up or multiplied, in bytes.
+    pub fn bytes(&self) -> usize {
+        match self {
+            Self::Exact(network) => network.bytes(),
+            Self::Map(map) => map.bytes(),
+        }
+    }
+}
+
 /// Why a sky was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SkyError {
