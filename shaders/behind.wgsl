@@ -8,23 +8,18 @@
 
 @group(0) @binding(8) var<uniform> behind: Behind;
 
-fn complete(sums: Sums, view: u32, at_px: vec2f) -> Sums {
-    return appear(add_behind(sums, view, at_px), view, at_px);
-}
-
-// Adds what shows through four pixels of a row, the first one's centre at `at_px`.
-fn add_behind(gathered: Sums, view: u32, at_px: vec2f) -> Sums {
+// Adds what shows through four pixels of a row, the first one's centre at `at_px`. All threads of a tile
+// call it.
+fn complete(gathered: Sums, view: u32, at_px: vec2f, thread: u32) -> Sums {
     var sums = gathered;
     let shows = sums.transmittance >= vec4f(SKY_CUT);
-    if !any(shows) {
-        return sums;
-    }
-    let rgb = sky(look(view, at_px));
+    let on_image = all(at_px < vec2f(frame.view[view].size_px));
+    let rgb = sky(view, at_px, any(shows) && on_image, thread);
     let weight = select(vec4f(0.0), sums.transmittance, shows);
     sums.red += weight * rgb[0];
     sums.green += weight * rgb[1];
     sums.blue += weight * rgb[2];
-    return sums;
+    return appear(sums, view, at_px);
 }
 
 // Where four pixels of a pinhole at rest look.

@@ -116,7 +116,7 @@ fn main(
         atomicAdd(&counters.batches, batches);
         atomicMax(&counters.most_batches, batches);
     }
-    sums = complete(sums, view_index, at_px);
+    sums = complete(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 

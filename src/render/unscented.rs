@@ -9,8 +9,8 @@
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{Rolling, View};
-use crate::geometry::{Camera, Pose};
 use crate::geometry::camera::{Cone, WIDEST_RAD};
+use crate::geometry::{Camera, Pose};
 use crate::scene::RenderProfile;
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole

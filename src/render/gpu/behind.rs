@@ -155,6 +155,22 @@ impl Behind {
         (kernel, resources)
     }
 
+    /// Iterations of loops that it takes of a thread, at most: four pixels' way back through a lens, 40 and
+    /// 26 each, and of a network all of a tile's 64 times four, four inputs each.
+    pub(super) fn iterations(&self) -> u64 {
+        let look = if self.is_bent() { 4 * (1 + 40 + 26) } else { 0 };
+        let sky = match &self.held {
+            Some(Drawn::Exact(network)) => {
+                let (width, encoded) = (network.width() as u64, network.encoded() as u64);
+                let rows = width.div_ceil(64);
+                let hidden = rows * (2 + encoded.div_ceil(4) + (width + encoded).div_ceil(4));
+                64 * (1 + hidden + width / 4 + 3)
+            }
+            _ => 4,
+        };
+        look + sky
+    }
+
     /// Whether the frame has views of lenses or rolling shutters.
     pub(super) fn is_bent(&self) -> bool {
         self.variant >= 2

@@ -254,7 +254,7 @@ impl Chain {
             self.time(stats, &stages, &ticks, submitted.elapsed());
             let (needs, fits) = self.learn(&counters, frame);
             if fits {
-                let limit = self.device.tile_splats();
+                let limit = self.device.tile_splats(self.rasterize.iterations_behind());
                 if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
                     let what = "visible splats in one tile (of a device in software)";
                     return Err(RenderError::TooMany { what, limit });
@@ -373,7 +373,13 @@ impl Chain {
 
         if let Source::Gaussians(work) = source {
             let mut pass = recorder.stage("project");
-            self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), (splats, lenses));
+            self.project.run(
+                device,
+                &mut pass,
+                (work, &self.mirror),
+                (plan, scan),
+                (splats, lenses),
+            );
         }
 
         let mut sorted = 0;

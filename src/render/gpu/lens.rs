@@ -110,7 +110,8 @@ impl Lens {
             WindshieldReference::Forward => 1,
             WindshieldReference::Backward => 2,
         };
-        for (axis, polynomial) in [windshield.horizontal(), windshield.vertical()].iter().enumerate()
+        for (axis, polynomial) in
+            [windshield.horizontal(), windshield.vertical()].iter().enumerate()
         {
             let mut place = 0;
             for j in 0..=5 {
@@ -134,9 +135,8 @@ impl Lens {
             if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
         };
         let (columns, rows) = (along(width_px), along(height_px));
-        let from_end = |[slope, start]: [f64; 2], size_px: u32| {
-            [-slope, start + slope * f64::from(size_px)]
-        };
+        let from_end =
+            |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
         let (x, y) = match direction {
             Rolls::TopToBottom => ([0.0; 2], rows),
             Rolls::BottomToTop => ([0.0; 2], from_end(rows, height_px)),

@@ -16,9 +16,9 @@ use super::mirror::Mirror;
 use super::plan::{Plan, job};
 use super::scan::Scan;
 use super::shaders::Shaders;
+use crate::render::layout::{ChunkView as CpuChunkView, Frustum};
 use crate::render::unscented::Bent;
 use crate::render::{Frame, View};
-use crate::render::layout::{ChunkView as CpuChunkView, Frustum};
 use crate::scene::Chunk;
 use crate::scene::chunk::Cluster;
 

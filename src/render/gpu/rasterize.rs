@@ -84,6 +84,12 @@ impl Rasterize {
         held.hold(device, frame, drawn, appearances)
     }
 
+    /// Iterations of loops that what is behind the Gaussians takes of a thread, at most.
+    pub(super) fn iterations_behind(&self) -> u64 {
+        let behind = self.behind.as_ref().filter(|_| self.has_behind);
+        behind.map_or(0, Behind::iterations)
+    }
+
     /// Makes room for the pixels of all tiles. Returns how many tiles a page holds.
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32) -> u32 {
         let tile_bytes = planes.tile_bytes();

@@ -133,7 +133,9 @@ fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) 
     let center = view.land(mean_world, 1.0);
     let depth_m = view.camera.depth_m(center.point_m);
     let off_axis_rad = center.point_m.angle_between(DVec3::Z);
-    let in_range = depth_m >= profile.near && depth_m <= profile.far && off_axis_rad <= widest_rad(&view.camera);
+    let in_range = depth_m >= profile.near
+        && depth_m <= profile.far
+        && off_axis_rad <= widest_rad(&view.camera);
     if !in_range {
         return None;
     }

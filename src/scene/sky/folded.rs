@@ -109,16 +109,21 @@ impl Folded {
         self.skip
     }
 
-    /// All numbers, layer by layer: for each group of 8 outputs their biases, and then 8 weights per input.
-    pub fn weights(&self) -> Vec<[f32; GROUP]> {
-        let of_layer = |layer: &Dense| {
-            let groups = layer.weight.chunks_exact(layer.inputs).zip(&layer.bias);
-            let with_bias = |(weights, bias): (&[[f32; GROUP]], &[f32; GROUP])| {
-                [std::slice::from_ref(bias), weights].concat()
-            };
-            groups.flat_map(with_bias).collect::<Vec<_>>()
-        };
-        self.layers.iter().flat_map(of_layer).collect()
+    /// All numbers, layer by layer and output by output: the bias, and then the weights of inputs, four by
+    /// four, those of the encoded direction filled up with zeros.
+    pub fn weights(&self) -> Vec<[f32; 4]> {
+        let mut rows = Vec::new();
+        for (layer, outputs) in self.layers.iter().zip([self.width, self.width, 3]) {
+            for output in 0..outputs {
+                let (group, k) = (output / GROUP, output % GROUP);
+                rows.push([layer.bias[group][k], 0.0, 0.0, 0.0]);
+                let weights = &layer.weight[group * layer.inputs..][..layer.inputs];
+                rows.extend(weights.chunks(4).map(|four| {
+                    std::array::from_fn(|i| four.get(i).map_or(0.0, |weight| weight[k]))
+                }));
+            }
+        }
+        rows
     }
 
     /// Memory of its numbers, in bytes.
