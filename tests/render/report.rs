@@ -207,6 +207,41 @@ fn the_margin_is_what_places_differ_by() {
 }
 
 #[test]
+fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
+    let Some(path) = crate::data::real("scenes/skull/skull.ply") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let skull = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
+    let new = NewVersion {
+        storage: Storage { record: Record::F32, levels: false },
+        ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new, &mut |_, _| {}).unwrap();
+    let resident = Cache::new(catalog).open("skull", None).unwrap();
+    let tried = ["as served", "stop=0.004", "stop=0.016", "alpha_cut=0.008", "alpha_cut=0.032"];
+    let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
+    let (all, _) = measured(&resident, &rig(), &keep);
+    let names = ["cpu".to_owned()];
+    // One exact and slow, the others as fast as each other: whichever is taken must hold.
+    let mut met = Vec::new();
+    for fastest in tried {
+        let mut all = all.clone();
+        for m in &mut all {
+            m.cost.step_ms = if m.setting.name == fastest { 1.0 } else { 2.0 };
+        }
+        match recommend(Wanted::AtLeastDb(35.0), &all, &names) {
+            Ok(best) if best.setting == fastest => met.push(fastest),
+            Ok(best) => assert!(best.verified >= 35.0, "{best:?}"),
+            Err(refused) => panic!("{fastest}: {refused}"),
+        }
+    }
+    assert!(met.contains(&"as served") && met.contains(&"stop=0.004"), "{met:?}");
+    assert!(!met.contains(&"alpha_cut=0.032"), "{met:?}");
+    let refused = recommend(Wanted::AtLeastDb(150.0), &all, &names).unwrap_err();
+    assert!(matches!(refused, ReportError::OutOfReach { .. }), "{refused}");
+}
+
+#[test]
 fn a_sky_and_lenses_have_rungs_of_their_own() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
