@@ -113,7 +113,8 @@ const FEATURES: [Feature; 16] = [
     }),
     ("hood", |step| {
         let rgba8 = [20, 20, 25, 255].repeat(step.view.camera.pixels());
-        step.appearance.overlay = Overlay::new(step.view.camera.width_px, rgba8).map(Arc::new);
+        // Whole rows: it is one.
+        step.appearance.overlay = Overlay::new(step.view.camera.width_px, rgba8).ok().map(Arc::new);
     }),
     ("depth", |step| step.depth = true),
     ("depth and opacity", |step| (step.depth, step.opacity) = (true, true)),
