@@ -11,6 +11,10 @@ pub const SERVER_URL: &str = "http://127.0.0.1:8080";
 /// Simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
+/// An episode with an observation whose images are believed less than this, on average, left the model:
+/// 11.5 m beside what was recorded, two lanes behind the next.
+pub const OFF_MODEL_TRUST: f64 = 0.1;
+
 /// JPEG quality unless the session asks for another.
 pub const JPEG_QUALITY: u8 = 90;
 
@@ -18,10 +22,10 @@ pub const JPEG_QUALITY: u8 = 90;
 pub const INBOUND_MESSAGE_BYTES: usize = 1 << 20;
 
 /// Largest observation a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are
-/// 1,476 MB. Six raw 1440x928 images with depth and opacity are 88 MB.
+/// 1,476 MB; with normals, 12 bytes a pixel more, half as many fit. Six raw 1440x928 images with depth and opacity are 88 MB.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
-/// Bytes of a pixel at most: raw colour, f32 depth and opacity.
+/// Bytes of a pixel without normals at most: raw colour, f32 depth and opacity.
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
@@ -119,8 +123,12 @@ pub const LINGER: Duration = Duration::from_secs(2);
 pub const KEEPALIVE: (Duration, Duration, u32) =
     (Duration::from_secs(20), Duration::from_secs(5), 3);
 
-/// Longest line of an episode file: 256 image hashes of `observe` take 17 kB.
+/// Longest line of an episode file but the first: 256 image hashes of `observe` take 17 kB.
 pub const EPISODE_LINE_BYTES: usize = 1 << 20;
+
+/// Longest first line, which has the rig: its overlays, 2^24 pixels of 4 bytes which no PNG makes smaller,
+/// are 90 MB in base64.
+pub const EPISODE_HEAD_BYTES: usize = 96 << 20;
 
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;

@@ -9,28 +9,32 @@ use serde_json::{Map, Value};
 use crate::config;
 use crate::render::Backend;
 use crate::render::gpu::Gpu;
+use crate::report::believed::believed;
 use crate::report::choose::{Recommendation, Wanted, recommend};
-use crate::report::ladder::ladder;
-use crate::report::measure::Bench;
+use crate::report::ladder::{Family, Ladder, LeftOut, Traits, ladder};
+use crate::report::measure::{Bench, Truth};
 use crate::report::places::{Sampling, places};
 use crate::report::stress::CASES;
 use crate::report::stress::table::{self, Candidate, Column};
+use crate::report::timing::at_one_speed;
 use crate::report::{Report, ReportError, Subject, needed, page};
 use crate::residency::Cache;
-use crate::scene::{RenderProfile, Rig};
+use crate::scene::{Rays, RenderProfile, Rig};
 
 use super::places::{TwinVersion, Twins};
+use super::rig::rig_of;
 use super::scene_source::Machine;
 use super::stress::{Name, candidate};
 use super::{demo, output, progress};
 
 /// Measure what each setting of the renderer costs and what it loses, on a twin and on this machine.
 ///
-/// Backends, levels of detail, records, antialiasing, alpha cut, stop, image scale and encoding, each
-/// against the f64 reference, at places on the recorded drive and 1, 3 and 5 m beside it (around a twin
-/// that has none). Windows of each image are compared, at full focal length; whole steps are timed. Also
-/// the stress table, and what a scene with and without each feature runs. Writes report.html, which needs
-/// nothing else, report.json and report.csv.
+/// Backends, levels of detail, records, antialiasing, alpha cut, stop, the sky, lenses, image scale and
+/// encoding, each against the f64 reference, at places on the recorded drive and 1, 3 and 5 m beside it
+/// (around a twin that has none). Windows of each image are compared, at full focal length; whole steps
+/// are timed. What the twin cannot feel is left out, and named. Also how far images may be believed beside
+/// the drive, the stress table, and what a scene with and without each feature runs. Writes report.html,
+/// which needs nothing else, report.json and report.csv.
 ///
 /// With --at-least-db or --at-most-ms it recommends a setting, verified at places that were not used to
 /// choose it, and writes it as profile.json for `wildcity serve --profile`.
@@ -57,7 +61,8 @@ pub(super) struct Command {
     #[arg(long, value_name = "MS", conflicts_with = "at_least_db")]
     at_most_ms: Option<f64>,
 
-    /// Stations along the drive, or around. The reference takes about a second for each, offset and camera.
+    /// Stations along the drive, each on it and 1, 3 and 5 m beside; around a twin without a drive, four
+    /// times as many places. The reference takes about a second for each place and camera.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=config::REPORT_STATIONS))]
     stations: u32,
 
@@ -68,6 +73,10 @@ pub(super) struct Command {
     /// Steps to time at each place, after one that is not counted.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
+
+    /// Cameras to look with instead of the twin's own: a preset (see `wildcity rig show`) or a file.
+    #[arg(long, value_name = "RIG")]
+    rig: Option<String>,
 
     /// Backends beside the reference, the one that draws all settings first.
     #[arg(long = "backend", value_name = "NAME", value_delimiter = ',', value_enum, default_values_t = [Name::Cpu, Name::Gpu])]
@@ -85,6 +94,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity report
   wildcity report street --at-least-db 40 --out report
+  wildcity report street --rig alpamayo2
   wildcity report street --backend gpu,cpu --at-most-ms 20 && \\
     wildcity serve --profile wildcity-report/profile.json";
 
@@ -109,13 +119,16 @@ impl Command {
             output::write(&path, text.as_bytes())?;
             writeln!(out, "{}", path.display())?;
         }
-        for Recommendation { wanted, setting, backend, chosen_by, verified, .. } in
+        for LeftOut { what, why } in &report.left_out {
+            writeln!(out, "not compared: {what} ({why})")?;
+        }
+        for Recommendation { wanted, setting, backend, chosen_by, margin, verified, .. } in
             &report.recommendations
         {
             writeln!(
                 out,
-                "{wanted}: {setting} on {backend}, {chosen_by:.1} where it was chosen, {verified:.1} at \
-                 other places"
+                "{wanted}: {setting} on {backend}, {chosen_by:.1} at worst where it was chosen, with a \
+                 margin of {margin:.1}, and {verified:.1} at worst at other places"
             )?;
         }
         // What was measured is on disk: it says why.
@@ -126,17 +139,19 @@ impl Command {
     fn measure(&self) -> anyhow::Result<(Report, Option<ReportError>)> {
         let candidates = self.backends.iter().map(|name| candidate(*name, &self.machine));
         let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
-        let mut backends: Vec<Box<dyn Backend>> = Vec::new();
+        let (mut backends, mut absent): (Vec<Box<dyn Backend>>, _) = (Vec::new(), Vec::new());
         for candidate in candidates {
             match candidate {
                 Ok(backend) => backends.push(backend),
-                Err((name, why)) => writeln!(io::stderr(), "without {name}: {why}")?,
+                Err((name, why)) => absent.push(LeftOut::new(format!("backend {name}"), why)),
             }
         }
         ensure!(!backends.is_empty(), "none of the --backend is there");
         let resident = Cache::new(self.twins.catalog()?).open(&self.twin.name, self.twin.number)?;
         let manifest = &resident.version.manifest;
-        let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG)).context("no rig")?;
+        let named = self.rig.as_deref().map(rig_of).transpose()?;
+        let own = || manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+        let rig = named.or_else(own).context("no rig")?;
         let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
         let places = places(manifest, &rig.cameras, sampling);
 
@@ -146,22 +161,42 @@ impl Command {
             places: &places,
             repeat: self.repeat,
         };
-        let bar = progress::count("reference");
-        bar.set_length(places.len() as u64);
-        let truth = bench.truth(&mut |done| bar.set_position(done as u64))?;
-        bar.finish_and_clear();
+        let truth = |rays: Rays, label| -> anyhow::Result<Truth> {
+            let bar = progress::count(label);
+            bar.set_length(places.len() as u64);
+            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64))?;
+            bar.finish_and_clear();
+            Ok(truth)
+        };
+        let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+        let splats = truth(Rays::Splats, "reference")?;
+        let rays = twin.bent.then(|| truth(Rays::Exact, "reference, every ray")).transpose()?;
 
         let names: Vec<&str> = backends.iter().map(|backend| backend.name()).collect();
-        let settings = ladder(&manifest.profile, manifest.record, &names);
+        let Ladder { settings, mut left_out } = ladder(&twin, &names);
+        left_out.extend(absent);
         let bar = progress::state();
         bar.set_length(settings.len() as u64);
         let mut measured = Vec::new();
         for setting in &settings {
             bar.set_message(setting.name.clone());
-            measured.push(bench.measure(setting, &truth)?);
+            let truth = match (setting.against, &rays) {
+                (Rays::Exact, Some(rays)) => rays,
+                // A ladder has nothing against rays unless a camera is bent.
+                (Rays::Splats | Rays::Exact, _) => &splats,
+            };
+            match bench.measure(setting, truth) {
+                Ok(one) => measured.push(one),
+                // A map that would be too large, or a backend that only looks skies up.
+                Err(ReportError::Render(why)) if setting.family == Family::Sky => {
+                    left_out.push(LeftOut::new(setting.name.clone(), why.to_string()));
+                }
+                Err(error) => return Err(error.into()),
+            }
             bar.inc(1);
         }
         bar.finish_and_clear();
+        at_one_speed(&mut measured);
 
         let wanted = (self.at_least_db.map(Wanted::AtLeastDb))
             .or_else(|| self.at_most_ms.map(Wanted::AtMostMs));
@@ -189,8 +224,11 @@ impl Command {
                 .collect(),
             sampling,
             places: places.iter().map(|place| place.name.clone()).collect(),
-            reference_ms: truth.step_ms,
+            reference_ms: splats.step_ms,
             settings: measured,
+            left_out,
+            exact_rays_ms: rays.map(|rays| rays.step_ms),
+            believed: believed(&resident, &*backends[0], &places)?,
             recommendations: recommendation.into_iter().collect(),
             stress: self.stress()?,
             needed: needed::rows(&self.machine.cpu()?, &|| self.device())?,

@@ -41,7 +41,7 @@ impl RigCommand {
 }
 
 /// A preset, or else a file.
-fn rig_of(name: &str) -> anyhow::Result<Rig> {
+pub(super) fn rig_of(name: &str) -> anyhow::Result<Rig> {
     if let Some(rig) = Rig::preset(name) {
         return Ok(rig);
     }

@@ -137,9 +137,12 @@ impl Observation {
                 Encoding::Raw => self.expect(tensor, Dtype::U8, &[size[0], size[1], 3])?,
                 Encoding::Jpeg | Encoding::Png => self.expect_file(tensor)?,
             }
-            for name in ["depth", "opacity"].map(|output| image.sibling(output)) {
+            let maps =
+                [("depth", &size[..]), ("opacity", &size), ("normals", &[size[0], size[1], 3])];
+            for (output, shape) in maps {
+                let name = image.sibling(output);
                 if self.tensors.info(&name).is_some() {
-                    self.expect(&name, Dtype::F32, &size)?;
+                    self.expect(&name, Dtype::F32, shape)?;
                 }
             }
         }
@@ -234,6 +237,12 @@ impl<'a> ImageView<'a> {
         let name = self.sibling(output);
         self.observation.tensors.info(&name)?;
         Some(floats(self.observation.tensor_bytes(&name)))
+    }
+
+    /// Unit normals of what is seen, in the camera's axes, f32 `[height, width, 3]`, 0 where there is no
+    /// depth; if asked for.
+    pub fn normals(&self) -> Option<Cow<'a, [f32]>> {
+        self.floats("normals")
     }
 
     /// Name of the tensor beside the colour: `camera/front/rgb` and `depth` give

@@ -49,6 +49,21 @@ pub enum Reference {
     PixelToAngle,
 }
 
+/// What a camera makes of colours: `matrix * rgb + offset`, linear red, green, blue from 0 to 1. The matrix,
+/// or a gain per channel; answers have the matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Exposure {
+    /// Row by row.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub matrix: Option<[[f64; 3]; 3]>,
+    /// Of red, green and blue, in its place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain: Option<[f64; 3]>,
+    /// Added to each channel.
+    #[serde(default)]
+    pub offset: [f64; 3],
+}
+
 /// A windshield before the lens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Windshield {

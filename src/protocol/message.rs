@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::camera::{Lens, Shutter, Windshield};
+use super::camera::{Exposure, Lens, Shutter, Windshield};
 use super::error::Code;
 
 /// A rigid transform: position in metres, unit quaternion (w, x, y, z).
@@ -312,6 +312,13 @@ pub struct RigCamera {
     /// How its rows are exposed one after the other; all at once if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shutter: Option<Shutter>,
+    /// What it makes of colours; they are as they are if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure: Option<Exposure>,
+    /// What of its own car it sees: a PNG with opacity, of the image's size, laid over it, as
+    /// `data:image/png;base64,..`. Answers do not repeat it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub overlay: Option<String>,
     /// `rig_from_camera`: camera axes are x right, y down, z forward.
     pub camera_to_rig: Pose,
 }
@@ -336,6 +343,9 @@ pub struct Outputs {
     pub depth: bool,
     /// Whether to add `opacity`, f32 `[height, width]`: the validity of depth and colour.
     pub opacity: bool,
+    /// Whether to add `normals`, f32 `[height, width, 3]`: unit vectors in the camera's axes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub normals: Option<bool>,
     /// How many last frames of each camera an observation holds; 1 if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames: Option<u64>,
@@ -357,6 +367,7 @@ impl Default for Outputs {
             quality: None,
             depth: false,
             opacity: false,
+            normals: None,
             frames: None,
             trust: None,
             period_us: None,
@@ -575,6 +586,9 @@ pub struct Summary {
     pub time_us: i64,
     /// Distance driven, in metres.
     pub distance_m: f64,
+    /// The least mean trust of an observation's images; with `outputs.trust`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least_trust: Option<f64>,
 }
 
 /// Why an episode ended.
@@ -583,6 +597,9 @@ pub struct Summary {
 pub enum Outcome {
     /// The agent closed it, or ended it with `terminate`.
     Completed,
+    /// The same, and an observation's images had a trust below 0.1 on average: the agent left what was
+    /// recorded. Told only with `outputs.trust`.
+    OffModel,
     /// The agent broke the protocol beyond repair.
     AgentError,
     /// The agent was silent for too long.

@@ -5,7 +5,7 @@
 //! strings there.
 //!
 //! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
-//! then per image `camera/<name>/depth` f32 and `camera/<name>/opacity` f32 where asked for, then
+//! then per image `camera/<name>/depth` f32 and `camera/<name>/opacity` f32 and `camera/<name>/normals` f32 where asked for, then
 //! per image `camera/<name>/rgb` u8. The header's length is a multiple of 8 and floats come first,
 //! so that they lie on multiples of 4 and can be read in place. With several poses (`observe`)
 //! image names start with `pose/<k>/`. Last come earlier frames, where asked for:
@@ -90,7 +90,7 @@ pub struct Image {
     /// How many frames of this camera ago; absent, for 0, in `images`.
     #[serde(default, skip_serializing_if = "is_now")]
     pub back: u64,
-    /// Name of the colour tensor; `depth` and `opacity` replace `rgb` at its end.
+    /// Name of the colour tensor; `depth`, `opacity` and `normals` replace `rgb` at its end.
     pub tensor: String,
     /// How the colour image travels.
     pub encoding: Encoding,

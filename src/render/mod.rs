@@ -8,6 +8,7 @@ pub mod constants;
 pub mod cpu;
 pub mod gpu;
 pub mod layout;
+mod normals;
 pub mod psnr;
 pub mod reference;
 pub mod relay;
@@ -54,11 +55,22 @@ pub struct Target<'a> {
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
+    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which must be there, too: in the
+    /// camera's axes, on the side that is seen; 0 where there is no depth.
+    pub normals: Option<&'a mut [f32]>,
     /// What the camera makes of the colours, of `rgba` and `rgb8` alike.
     pub appearance: Option<&'a Appearance>,
 }
 
 impl Target<'_> {
+    /// What every backend does with a view's pixels in the end.
+    fn finish(&mut self, view: &View) {
+        self.mask(&view.camera);
+        if let (Some(depth_m), Some(normals)) = (&self.depth_m, &mut self.normals) {
+            normals::write(view, depth_m, normals);
+        }
+    }
+
     /// Zeroes what a camera's lens does not see: nothing, where it is a pinhole.
     fn mask(&mut self, camera: &Camera) {
         let Some(field) = Field::of(camera) else { return };
@@ -122,6 +134,12 @@ pub enum RenderError {
         given: usize,
         /// The length that the camera asks for.
         wanted: usize,
+    },
+    /// Normals without the depth that they are computed of.
+    #[error("view {view}: normals are computed of depth: give depth_m a buffer, too")]
+    Normals {
+        /// Which view.
+        view: usize,
     },
     /// An overlay is not of its view's size.
     #[error("view {view}: the overlay is {given:?} pixels, and the image {wanted:?}")]
@@ -238,7 +256,11 @@ impl Frame<'_> {
                 ("rgb8", target.rgb8.as_ref().map(|b| b.len()), 3 * pixels),
                 ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
+                ("normals", target.normals.as_ref().map(|b| b.len()), 3 * pixels),
             ];
+            if target.normals.is_some() && target.depth_m.is_none() {
+                return Err(RenderError::Normals { view });
+            }
             if let Some(overlay) = target.appearance.and_then(|seen| seen.overlay.as_ref()) {
                 let wanted = [camera.width_px, camera.height_px];
                 if overlay.size_px() != wanted {

@@ -3,7 +3,8 @@
 use serde::Serialize;
 
 use super::ReportError;
-use super::measure::Measured;
+use super::ladder::Family;
+use super::measure::{AtPlace, Measured};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -26,30 +27,40 @@ pub struct Recommendation {
     pub profile: Vec<String>,
     /// The backend's name.
     pub backend: String,
-    /// What was measured where it was chosen: dB or milliseconds, whichever was wanted.
+    /// The worst that was measured where it was chosen: dB or milliseconds, whichever was wanted.
     pub chosen_by: f64,
-    /// The same at places that were not used to choose it.
+    /// How much better than wanted that had to be, in the same unit: what places differ by.
+    pub margin: f64,
+    /// The worst at places that were not used to choose it.
     pub verified: f64,
 }
 
-/// How much better than wanted a setting is chosen, so that it holds elsewhere: 1 dB, ...
+/// Least margin: 1 dB, ...
 const MARGIN_DB: f64 = 1.0;
 /// ... or a tenth of the time.
-const MARGIN_MS: f64 = 0.9;
+const MARGIN_MS: f64 = 0.1;
+/// Where nothing differs PSNR has no end, and means need one: steps of f32 below 1 leave 20 log10(2^24).
+const MOST_DB: f64 = 144.5;
 
-/// Which of them no other one beats, in time and in error at once.
+/// Which of them no other one beats, in time and in error at once. What is compared with rays is another
+/// question, and neither beats nor is beaten.
 pub fn front(all: &[Measured]) -> Vec<bool> {
+    let is_asked = |m: &&Measured| m.setting.family != Family::Rays;
     let point = |m: &Measured| (m.cost.step_ms, m.errors.psnr_db);
     let beaten = |(ms, db): (f64, f64)| {
         let better = |(other_ms, other_db)| {
             (other_ms < ms && other_db >= db) || (other_ms <= ms && other_db > db)
         };
-        all.iter().any(|other| better(point(other)))
+        all.iter().filter(is_asked).any(|other| better(point(other)))
     };
-    all.iter().map(|m| !beaten(point(m))).collect()
+    all.iter().map(|m| is_asked(&m) && !beaten(point(m))).collect()
 }
 
 /// The setting for what is wanted, of those that a server can be told to use.
+///
+/// The worst of the places that choose must be better than wanted by the deviation of their worse half: the
+/// worst of eight values of a normal distribution lies 1.4 deviations from its mean on average, so
+/// what is wanted then lies 2.4 away, where one of 120 others falls. It is verified all the same.
 ///
 /// # Errors
 /// None is good enough where settings are chosen; or the best one is not where it is verified.
@@ -58,27 +69,28 @@ pub fn recommend(
     all: &[Measured],
     backends: &[String],
 ) -> Result<Recommendation, ReportError> {
-    let servable = || all.iter().filter(|m| m.setting.can_be_served());
+    let servable = all.iter().filter(|m| m.setting.can_be_served());
+    let judged = servable.map(|m| (m, wanted.judge(m)));
+    let judged: Vec<(&Measured, Judged)> = judged.collect();
+    let meets = judged.iter().filter(|(_, judged)| wanted.holds(judged.assured));
     let best = match wanted {
-        Wanted::AtLeastDb(db) => servable()
-            .filter(|m| m.least_db[0] >= db + MARGIN_DB)
-            .min_by(|a, b| a.cost.step_ms.total_cmp(&b.cost.step_ms)),
-        Wanted::AtMostMs(ms) => servable()
-            .filter(|m| m.p95_ms[0] <= MARGIN_MS * ms)
-            .max_by(|a, b| a.least_db[0].total_cmp(&b.least_db[0])),
+        Wanted::AtLeastDb(_) => {
+            meets.min_by(|(a, _), (b, _)| a.cost.step_ms.total_cmp(&b.cost.step_ms))
+        }
+        Wanted::AtMostMs(_) => {
+            let db = |m: &Measured| Wanted::AtLeastDb(0.0).judge(m).worst;
+            meets.max_by(|(a, _), (b, _)| db(a).total_cmp(&db(b)))
+        }
     };
-    let Some(best) = best else {
+    let Some((best, Judged { worst, margin, verified, .. })) = best.copied() else {
+        let assured = judged.iter().map(|(_, judged)| judged.assured);
         let reached = match wanted {
-            Wanted::AtLeastDb(_) => servable().map(|m| m.least_db[0]).fold(0.0, f64::max),
-            Wanted::AtMostMs(_) => servable().map(|m| m.p95_ms[0]).fold(f64::INFINITY, f64::min),
+            Wanted::AtLeastDb(_) => assured.fold(f64::NEG_INFINITY, f64::max),
+            Wanted::AtMostMs(_) => assured.fold(f64::INFINITY, f64::min),
         };
         return Err(ReportError::OutOfReach { wanted: wanted.to_string(), reached });
     };
-    let (chosen_by, verified, holds) = match wanted {
-        Wanted::AtLeastDb(db) => (best.least_db[0], best.least_db[1], best.least_db[1] >= db),
-        Wanted::AtMostMs(ms) => (best.p95_ms[0], best.p95_ms[1], best.p95_ms[1] <= ms),
-    };
-    if !holds {
+    if !wanted.holds(verified) {
         let (setting, wanted) = (best.setting.name.clone(), wanted.to_string());
         return Err(ReportError::NotVerified { setting, wanted, verified });
     }
@@ -87,9 +99,73 @@ pub fn recommend(
         setting: best.setting.name.clone(),
         profile: best.setting.profile.clone(),
         backend: backends[best.setting.backend].clone(),
-        chosen_by,
+        chosen_by: worst,
+        margin,
         verified,
     })
+}
+
+/// What the places say of a setting, in dB or milliseconds.
+#[derive(Clone, Copy)]
+struct Judged {
+    /// The worst of those that choose.
+    worst: f64,
+    /// What they differ by.
+    margin: f64,
+    /// What can be counted on elsewhere.
+    assured: f64,
+    /// The worst of the others.
+    verified: f64,
+}
+
+impl Wanted {
+    fn holds(self, value: f64) -> bool {
+        match self {
+            Self::AtLeastDb(db) => value >= db,
+            Self::AtMostMs(ms) => value <= ms,
+        }
+    }
+
+    fn judge(self, m: &Measured) -> Judged {
+        let value = |place: &AtPlace| match self {
+            Self::AtLeastDb(_) => Some(place.psnr_db.min(MOST_DB)),
+            Self::AtMostMs(_) => place.p95_ms,
+        };
+        let of = |chooses: bool| {
+            let places = m.by_place.iter().filter(move |place| place.chooses == chooses);
+            places.filter_map(value).collect::<Vec<f64>>()
+        };
+        let (choosing, verifying) = (of(true), of(false));
+        // NaN of no place, which holds nothing.
+        let (least, most) = (
+            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::min),
+            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max),
+        );
+        match self {
+            Self::AtLeastDb(_) => {
+                let (worst, margin) = (least(&choosing), spread(&choosing, f64::lt).max(MARGIN_DB));
+                Judged { worst, margin, assured: worst - margin, verified: least(&verifying) }
+            }
+            Self::AtMostMs(_) => {
+                let worst = most(&choosing);
+                let margin = spread(&choosing, f64::gt).max(MARGIN_MS * worst);
+                Judged { worst, margin, assured: worst + margin, verified: most(&verifying) }
+            }
+        }
+    }
+}
+
+/// Standard deviation of the worse half: from the median, so that places which are much better than others
+/// do not count against a setting. 0 where none is worse.
+fn spread(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().saturating_sub(1);
+    let middle = |at: usize| sorted.get(at).copied().unwrap_or(f64::NAN);
+    let median = 0.5 * (middle(last / 2) + middle(last.div_ceil(2)));
+    let worse: Vec<f64> = sorted.into_iter().filter(|value| is_worse(value, &median)).collect();
+    let squares: f64 = worse.iter().map(|value| (value - median).powi(2)).sum();
+    (squares / worse.len().max(1) as f64).sqrt()
 }
 
 impl std::fmt::Display for Wanted {

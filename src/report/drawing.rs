@@ -47,7 +47,7 @@ pub fn draw(
         rgb8: Some(rgb8),
         depth_m: Some(depth_m),
         opacity: Some(opacity),
-        appearance: None,
+        ..Target::default()
     });
     let mut targets: Vec<Target<'_>> = targets.collect();
     backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;

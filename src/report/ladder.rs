@@ -5,7 +5,8 @@ use serde::Serialize;
 use crate::geometry::CameraError;
 use crate::render::View;
 use crate::scene::profile::ProfileError;
-use crate::scene::{Record, RenderProfile};
+use crate::scene::sky::{Model, Sky};
+use crate::scene::{Manifest, Rays, Record, RenderProfile};
 
 /// One way to draw a twin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -24,6 +25,59 @@ pub struct Setting {
     pub scale: f64,
     /// How images are sent; if absent, values are compared before they are rounded to 8 bits.
     pub sent: Option<Sent>,
+    /// What it is compared with: all but those of [`Family::Rays`] with splats, as they are.
+    pub against: Rays,
+}
+
+/// What a ladder is of: what decides which settings can be felt.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Traits {
+    /// How the twin is drawn.
+    pub profile: RenderProfile,
+    /// How it is stored.
+    pub stored: Record,
+    /// Whether it has levels of detail.
+    pub levels: bool,
+    /// What is behind it.
+    pub behind: Behind,
+    /// Whether some camera has a lens, a windshield or a rolling shutter while it moves.
+    pub bent: bool,
+}
+
+/// What is behind a twin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Behind {
+    /// Nothing, or a background of one colour.
+    Nothing,
+    /// A network, which is evaluated or baked.
+    Network,
+    /// Images, which are their own map.
+    Images,
+}
+
+/// Settings to compare, and what is not among them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ladder {
+    /// The twin as it is served first; names are unique.
+    pub settings: Vec<Setting>,
+    /// What this twin, or this build, cannot feel.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// What is not compared.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct LeftOut {
+    /// The setting or family.
+    pub what: String,
+    /// Why.
+    pub why: String,
+}
+
+impl LeftOut {
+    /// Something that is not compared, and why.
+    pub fn new(what: impl Into<String>, why: impl Into<String>) -> Self {
+        Self { what: what.into(), why: why.into() }
+    }
 }
 
 /// How an image is sent.
@@ -54,6 +108,10 @@ pub enum Family {
     AlphaCut,
     /// Where a pixel ends.
     Stop,
+    /// How exactly a sky is looked up.
+    Sky,
+    /// Splats of bent cameras, against every pixel's own ray.
+    Rays,
     /// The size of the images.
     Scale,
     /// How images are sent.
@@ -64,7 +122,7 @@ pub enum Family {
 
 impl Family {
     /// All of them, in the order of the report.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::AsServed,
         Self::Backend,
         Self::Detail,
@@ -72,6 +130,8 @@ impl Family {
         Self::Antialiasing,
         Self::AlphaCut,
         Self::Stop,
+        Self::Sky,
+        Self::Rays,
         Self::Scale,
         Self::Sent,
         Self::Combined,
@@ -87,6 +147,8 @@ impl Family {
             Self::Antialiasing => "antialiasing",
             Self::AlphaCut => "alpha cut",
             Self::Stop => "stop",
+            Self::Sky => "sky",
+            Self::Rays => "rays",
             Self::Scale => "image scale",
             Self::Sent => "as sent",
             Self::Combined => "combined",
@@ -100,14 +162,21 @@ const TAUS_PX: [f64; 5] = [0.0, 0.5, 1.0, 2.0, 4.0];
 const CUTS: [f64; 3] = [0.008, 0.016, 0.032];
 /// Transmittances that end a pixel, beside the profile's own 1e-4.
 const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
+/// Errors of a baked sky; 0 evaluates it for every pixel.
+const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
 /// Sides of the images.
 const SCALES: [f64; 2] = [0.5, 0.25];
 /// Qualities of JPEG; 90 is the server's.
 const QUALITIES: [u8; 4] = [50, 75, 90, 98];
 
-/// Every setting, the twin as it is served first: `backends` many backends, of which the first draws all;
-/// `stored` is the twin's record, and only coarser ones are compared with it.
-pub fn ladder(profile: &RenderProfile, stored: Record, backends: &[&str]) -> Vec<Setting> {
+/// Tiles are no rung: why.
+const TILE: &str = "16 x 16 px by construction: sixteen vectors of 4 x 4 on the cpu, the pixels of a workgroup on \
+                    the gpu; a macro tile has 8 x 4 of them, the bits of a word. The image is the same with any";
+
+/// Every setting that the twin can feel: `backends` many backends, of which the first draws all; only
+/// coarser records than the twin's own are compared with it.
+pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
+    let profile = &twin.profile;
     let served = Setting {
         name: "as served".to_owned(),
         family: Family::AsServed,
@@ -116,6 +185,7 @@ pub fn ladder(profile: &RenderProfile, stored: Record, backends: &[&str]) -> Vec
         profile: Vec::new(),
         scale: 1.0,
         sent: None,
+        against: Rays::Splats,
     };
     let changed = |family, changes: &[String]| Setting {
         name: changes.join(" "),
@@ -124,14 +194,23 @@ pub fn ladder(profile: &RenderProfile, stored: Record, backends: &[&str]) -> Vec
         ..served.clone()
     };
     let mut all = vec![served.clone()];
+    let mut left_out = vec![LeftOut::new("tile size", TILE)];
     for (backend, name) in backends.iter().enumerate().skip(1) {
         let (name, family) = ((*name).to_owned(), Family::Backend);
         all.push(Setting { name, family, backend, ..served.clone() });
     }
     let tau = |tau_px: f64| format!("tau_px={tau_px}");
-    let taus = TAUS_PX.into_iter().filter(|tau_px| *tau_px != profile.tau_px);
-    all.extend(taus.map(|tau_px| changed(Family::Detail, &[tau(tau_px)])));
-    let coarser = Record::ALL.into_iter().skip_while(|record| *record != stored).skip(1);
+    if twin.levels {
+        let taus = TAUS_PX.into_iter().filter(|tau_px| *tau_px != profile.tau_px);
+        all.extend(taus.map(|tau_px| changed(Family::Detail, &[tau(tau_px)])));
+    } else {
+        left_out.push(LeftOut::new("tau_px", "the twin has no levels of detail"));
+    }
+    let mut coarser =
+        Record::ALL.into_iter().skip_while(|record| *record != twin.stored).skip(1).peekable();
+    if coarser.peek().is_none() {
+        left_out.push(LeftOut::new("record", "the twin's own is the coarsest"));
+    }
     all.extend(coarser.map(|record| Setting {
         name: format!("record {record}"),
         family: Family::Record,
@@ -146,6 +225,25 @@ pub fn ladder(profile: &RenderProfile, stored: Record, backends: &[&str]) -> Vec
     let stop = |stop: f64| format!("stop={stop}");
     let stops = STOPS.into_iter().filter(|stop| *stop > profile.stop);
     all.extend(stops.map(|left| changed(Family::Stop, &[stop(left)])));
+    match twin.behind {
+        Behind::Nothing => left_out.push(LeftOut::new("sky_error", "the twin has no sky")),
+        Behind::Images => {
+            left_out.push(LeftOut::new("sky_error", "the sky is images: they are their own map"));
+        }
+        Behind::Network => {
+            let others = SKY_ERRORS.into_iter().filter(|error| *error != profile.sky_error);
+            all.extend(others.map(|e| changed(Family::Sky, &[format!("sky_error={e}")])));
+        }
+    }
+    match twin.bent {
+        false => left_out.push(LeftOut::new("rays", "every camera is a pinhole at rest")),
+        true => all.push(Setting {
+            name: "against every pixel's own ray".to_owned(),
+            family: Family::Rays,
+            against: Rays::Exact,
+            ..served.clone()
+        }),
+    }
     all.extend(SCALES.map(|scale| Setting {
         name: format!("scale {scale}"),
         family: Family::Scale,
@@ -157,9 +255,34 @@ pub fn ladder(profile: &RenderProfile, stored: Record, backends: &[&str]) -> Vec
     all.push(sent(Sent::Raw, "8 bits".to_owned()));
     all.extend(QUALITIES.map(|quality| sent(Sent::Jpeg(quality), format!("jpeg {quality}"))));
     for (tau_px, alpha) in [(2.0, CUTS[0]), (2.0, CUTS[1]), (4.0, CUTS[1]), (4.0, CUTS[2])] {
-        all.push(changed(Family::Combined, &[tau(tau_px), cut(alpha), stop(STOPS[1])]));
+        let mut changes = vec![cut(alpha), stop(STOPS[1])];
+        if twin.levels {
+            changes.insert(0, tau(tau_px));
+        }
+        let combined = changed(Family::Combined, &changes);
+        if all.iter().all(|other| other.name != combined.name) {
+            all.push(combined);
+        }
     }
-    all
+    Ladder { settings: all, left_out }
+}
+
+impl Traits {
+    /// Of a version of a twin, with the sky that it has, and what looks at it.
+    pub fn of(manifest: &Manifest, sky: Option<&Sky>, views: &[View]) -> Self {
+        let sections = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
+        Self {
+            profile: manifest.profile,
+            stored: manifest.record,
+            levels: sections.into_iter().any(|section| section.level > 0),
+            behind: match sky.map(Sky::model) {
+                None => Behind::Nothing,
+                Some(Model::Network(..)) => Behind::Network,
+                Some(Model::Cube(_)) => Behind::Images,
+            },
+            bent: views.iter().any(|view| !view.is_ideal()),
+        }
+    }
 }
 
 impl Setting {
@@ -174,7 +297,8 @@ impl Setting {
 
     /// Whether a server can be told to draw so without the twin being stored anew.
     pub fn can_be_served(&self) -> bool {
-        self.record.is_none() && self.scale == 1.0 && self.sent.is_none()
+        let as_drawn = self.scale == 1.0 && self.sent.is_none() && self.against == Rays::Splats;
+        self.record.is_none() && as_drawn
     }
 }
 

@@ -1,6 +1,7 @@
 //! Every setting at every place: how far off it is from the definition, and what it costs.
 
 use std::io::Cursor;
+use std::sync::Arc;
 use std::time::Instant;
 
 use image::ImageReader;
@@ -8,20 +9,22 @@ use serde::Serialize;
 
 use super::drawing::{Drawing, draw};
 use super::errors::{Errors, Gathered, Image};
-use super::ladder::{Sent, Setting};
+use super::ladder::Setting;
 use super::places::{OFFSETS_M, Place};
 use super::recorded::recorded;
+use super::timing::{Step, Timed, file};
 use super::{Pictures, ReportError, pictures};
 use crate::render::reference::Reference;
-use crate::render::{Backend, Frame, Target, View};
+use crate::render::{Backend, RenderError, View};
 use crate::residency::{Pinned, Resident};
-use crate::scene::{RenderProfile, Scene};
+use crate::scene::sky::{Drawn, Sky};
+use crate::scene::{Rays, RenderProfile, Scene};
 use crate::session;
 
 /// What is measured, and on what.
 pub struct Bench<'a> {
     /// The twin.
-    pub resident: &'a std::sync::Arc<Resident>,
+    pub resident: &'a Arc<Resident>,
     /// The backends that [`Setting::backend`] counts through.
     pub backends: &'a [Box<dyn Backend>],
     /// Where.
@@ -40,16 +43,27 @@ pub struct Measured {
     pub errors: Errors,
     /// PSNR by [`OFFSETS_M`], in dB; one where there is no drive.
     pub psnr_db_by_offset: Vec<f64>,
-    /// Least PSNR of a place, in dB: of those that choose, and of those that verify.
-    pub least_db: [f64; 2],
+    /// The same place by place.
+    pub by_place: Vec<AtPlace>,
     /// What it costs at all places on the drive.
     pub cost: Cost,
-    /// The longest of a hundred steps but five, in milliseconds: at places that choose, and at those that
-    /// verify.
-    pub p95_ms: [f64; 2],
+    /// Median time of a step of the twin as served, timed in turn with this one, in milliseconds.
+    pub served_ms: f64,
     /// Where it is worst.
     #[serde(skip)]
     pub worst: Pictures,
+}
+
+/// A setting at one place.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct AtPlace {
+    /// Whether a setting may be chosen by it.
+    pub chooses: bool,
+    /// PSNR in dB.
+    pub psnr_db: f64,
+    /// The longest of a hundred steps but five, in milliseconds; none beside the drive, where no step is
+    /// timed.
+    pub p95_ms: Option<f64>,
 }
 
 /// What a step costs.
@@ -59,7 +73,7 @@ pub struct Cost {
     pub step_ms: f64,
     /// Gaussians that a step draws, the most of all places.
     pub gaussians: u64,
-    /// Memory that they take in the host, in bytes.
+    /// Memory that they and a baked sky take in the host, in bytes.
     pub scene_bytes: u64,
     /// Bytes of a Gaussian as it is stored, before compression.
     pub stored_bytes: f64,
@@ -67,7 +81,7 @@ pub struct Cost {
     pub sent_bytes: u64,
 }
 
-/// What every setting is compared with: the definition, in full detail, by place and window.
+/// What a setting is compared with: the definition, in full detail, by place and window.
 pub struct Truth {
     images: Vec<Vec<Image>>,
     /// Time that a step of all cameras would take, in milliseconds: of the windows, times their share.
@@ -75,12 +89,12 @@ pub struct Truth {
 }
 
 impl Bench<'_> {
-    /// Draws the truth at all places; tells `progress` how many are done.
+    /// Draws the truth at all places, of splats or ray by ray; tells `progress` how many are done.
     ///
     /// # Errors
     /// The twin cannot be read, or a frame cannot be drawn.
-    pub fn truth(&self, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
-        let profile = RenderProfile { tau_px: 0.0, ..self.profile() };
+    pub fn truth(&self, rays: Rays, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
+        let profile = RenderProfile { tau_px: 0.0, rays, ..self.profile() };
         let (mut images, mut step_ms) = (Vec::new(), 0.0);
         for (done, place) in self.places.iter().enumerate() {
             progress(done);
@@ -102,16 +116,24 @@ impl Bench<'_> {
     pub fn measure(&self, setting: &Setting, truth: &Truth) -> Result<Measured, ReportError> {
         let profile = setting.apply(self.profile())?;
         let backend = &*self.backends[setting.backend];
+        // A sky keeps the map that was looked at last, and the twin as served is timed in turn.
+        let own_sky = (profile.sky_error != self.profile().sky_error)
+            .then(|| self.resident.sky())
+            .flatten()
+            .map(|sky| Arc::new(Sky::new(sky.model().clone(), sky.sky_from_world())));
         let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
-        let mut least_db = [f64::INFINITY; 2];
-        let (mut steps_ms, mut cost) = ([Vec::new(), Vec::new()], Cost::NOTHING);
+        let mut by_place = Vec::new();
+        let (mut steps_ms, mut served_ms, mut cost) = (Vec::new(), Vec::new(), Cost::NOTHING);
         let mut worst = (f64::INFINITY, None);
         for (place, truths) in self.places.iter().zip(&truth.images) {
             let own = place.scaled(setting.scale)?;
             let needed = self.scene(&own.views, &profile)?;
             let (stored, stored_bytes) = self.stored(setting, &needed);
-            let scene: &Scene = stored.as_ref().unwrap_or(&needed);
-            let role = usize::from(!place.chooses);
+            let mut scene = stored.unwrap_or_else(|| (*needed).clone());
+            if let Some(sky) = &own_sky {
+                scene.sky = Some(sky.clone());
+            }
+            let scene = &scene;
             let offset = OFFSETS_M.iter().position(|o| *o == place.offset_m).unwrap_or(0);
 
             let drawings = draw(backend, scene, &profile, &own.windows)?;
@@ -123,33 +145,54 @@ impl Bench<'_> {
                     worst = (db, Some((place.name.clone(), image, truth.clone())));
                 }
             }
-            let db = here.errors().map_or(f64::INFINITY, |errors| errors.psnr_db);
-            least_db[role] = least_db[role].min(db);
+            let psnr_db = here.errors().map_or(f64::INFINITY, |errors| errors.psnr_db);
             by_offset[offset].merge(&here);
 
+            let mut p95_ms = None;
             if place.offset_m == 0.0 {
-                let timed = self.time(setting, backend, scene, &profile, &own.views)?;
-                steps_ms[role].extend(timed.steps_ms);
+                let timed = self.time(setting, scene, &profile, &own.views, place)?;
+                p95_ms = Some(quantile(&timed.steps_ms, 0.95));
+                steps_ms.extend(timed.steps_ms);
+                served_ms.extend(timed.served_ms);
                 cost.gaussians = cost.gaussians.max(scene.gaussians() as u64);
-                cost.scene_bytes = cost.scene_bytes.max(scene.bytes() as u64);
+                let bytes = scene.bytes() as u64 + sky_bytes(scene, &profile)?;
+                cost.scene_bytes = cost.scene_bytes.max(bytes);
                 cost.sent_bytes = cost.sent_bytes.max(timed.sent_bytes);
                 cost.stored_bytes = stored_bytes;
             }
+            by_place.push(AtPlace { chooses: place.chooses, psnr_db, p95_ms });
         }
         let mut all = Gathered::default();
         by_offset.iter().for_each(|gathered| all.merge(gathered));
-        cost.step_ms = quantile(&steps_ms.concat(), 0.5);
+        cost.step_ms = quantile(&steps_ms, 0.5);
         let db = |gathered: &Gathered| gathered.errors().map(|errors| errors.psnr_db);
         let worst = worst.1.map(|(place, image, truth)| pictures::of(place, &image, &truth));
         Ok(Measured {
             setting: setting.clone(),
             errors: all.errors().ok_or(ReportError::NoPlaces)?,
             psnr_db_by_offset: by_offset.iter().filter_map(db).collect(),
-            least_db,
+            by_place,
             cost,
-            p95_ms: steps_ms.map(|steps_ms| quantile(&steps_ms, 0.95)),
+            served_ms: quantile(&served_ms, 0.5),
             worst: worst.transpose()?.unwrap_or_default(),
         })
+    }
+
+    fn time(
+        &self,
+        setting: &Setting,
+        scene: &Scene,
+        profile: &RenderProfile,
+        views: &[View],
+        place: &Place,
+    ) -> Result<Timed, ReportError> {
+        let backend = &*self.backends[setting.backend];
+        let own = Step { backend, scene, profile, views, sent: setting.sent };
+        let (usual, views) = (self.profile(), &place.views);
+        let scene = self.scene(views, &usual)?;
+        let backend = &*self.backends[0];
+        let served = Step { backend, scene: &scene, profile: &usual, views, sent: None };
+        own.time(&served, self.repeat)
     }
 
     fn profile(&self) -> RenderProfile {
@@ -172,66 +215,27 @@ impl Bench<'_> {
             }
         }
     }
+}
 
-    fn time(
-        &self,
-        setting: &Setting,
-        backend: &dyn Backend,
-        scene: &Scene,
-        profile: &RenderProfile,
-        views: &[View],
-    ) -> Result<Timed, ReportError> {
-        let empty = |view: &View| vec![0_u8; 3 * view.camera.pixels()];
-        let mut images: Vec<Vec<u8>> = views.iter().map(empty).collect();
-        let mut timed = Timed { steps_ms: Vec::new(), sent_bytes: 0 };
-        for repeat in 0..=self.repeat {
-            let targets = images.iter_mut();
-            let mut targets: Vec<Target<'_>> =
-                targets.map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
-            let sent = std::sync::Mutex::new(Ok(0));
-            let finished = |view: usize, target: &Target<'_>| {
-                let rgb8 = target.rgb8.as_deref().unwrap_or_default();
-                let bytes = file(setting, &views[view], rgb8).map(|file| match file {
-                    Some(file) => file.len() as u64,
-                    None => rgb8.len() as u64,
-                });
-                let mut sent = sent.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-                *sent = match (&*sent, bytes) {
-                    (Ok(sum), Ok(bytes)) => Ok(sum + bytes),
-                    (Ok(_), Err(error)) => Err(error),
-                    (Err(error), _) => Err(error.clone()),
-                };
-            };
-            let start = Instant::now();
-            backend.render(&Frame { scene, profile, views }, &mut targets, &finished)?;
-            // The first one makes room, and is not counted.
-            if repeat > 0 {
-                timed.steps_ms.push(start.elapsed().as_secs_f64() * 1e3);
-            }
-            let sent = sent.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-            timed.sent_bytes = sent.map_err(|reason| ReportError::Encode { reason })?;
-        }
-        Ok(timed)
+impl Measured {
+    /// Least PSNR of all places, in dB.
+    pub fn least_db(&self) -> f64 {
+        self.by_place.iter().map(|place| place.psnr_db).fold(f64::INFINITY, f64::min)
     }
 }
 
-struct Timed {
-    steps_ms: Vec<f64>,
-    sent_bytes: u64,
+/// Memory that the sky takes in the form in which a profile draws it, in bytes.
+fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, ReportError> {
+    let drawn = scene.sky.as_ref().map(|sky| sky.drawn(profile.sky_error)).transpose();
+    Ok(match drawn.map_err(RenderError::from)? {
+        Some(Drawn::Map(map)) => map.bytes() as u64,
+        Some(Drawn::Exact(_)) | None => 0,
+    })
 }
 
 impl Cost {
     const NOTHING: Self =
         Self { step_ms: 0.0, gaussians: 0, scene_bytes: 0, stored_bytes: 0.0, sent_bytes: 0 };
-}
-
-/// A JPEG of an image if the setting sends one.
-fn file(setting: &Setting, view: &View, rgb8: &[u8]) -> Result<Option<Vec<u8>>, String> {
-    let (width, height) = (view.camera.width_px, view.camera.height_px);
-    match setting.sent {
-        Some(Sent::Jpeg(quality)) => session::jpeg(rgb8, width, height, quality).map(Some),
-        Some(Sent::Raw) | None => Ok(None),
-    }
 }
 
 /// What arrives of a drawing, at the size of what it is compared with.
@@ -243,7 +247,7 @@ fn arrived(
 ) -> Result<Image, ReportError> {
     let mut image = shown(view, drawing);
     if setting.sent.is_some() {
-        let encoded = file(setting, view, &drawing.rgb8);
+        let encoded = file(setting.sent, view, &drawing.rgb8);
         let encoded = encoded.map_err(|reason| ReportError::Encode { reason })?;
         let bytes = match encoded {
             None => drawing.rgb8.clone(),

@@ -4,8 +4,10 @@
 //! ladder     the settings that are compared
 //! places     from where: along the recorded drive, beside it, or around a capture
 //! measure    every setting at every place, against the f64 reference
+//! timing     how long a step takes
 //! errors     PSNR, SSIM, percentiles, depth
 //! choose     the Pareto front, and the setting for a wanted error or time
+//! believed   trust over the distance from the recorded drive
 //! needed     what a scene with and without each feature holds and runs
 //! page       all of it as one HTML page, with plots and pictures
 //! stress     T1 to T28: extreme scenes, each with its bound, on any backend
@@ -13,6 +15,7 @@
 //! recorded   what a record makes of a scene
 //! ```
 
+pub mod believed;
 pub mod choose;
 pub mod drawing;
 pub mod errors;
@@ -25,6 +28,7 @@ pub mod places;
 mod plots;
 pub mod recorded;
 pub mod stress;
+pub mod timing;
 
 use serde::Serialize;
 
@@ -36,7 +40,9 @@ use crate::scene::profile::ProfileError;
 
 pub use pictures::Pictures;
 
+use believed::Believed;
 use choose::Recommendation;
+use ladder::LeftOut;
 use measure::Measured;
 use places::Sampling;
 use stress::table::{Column, Table};
@@ -56,6 +62,13 @@ pub struct Report {
     pub reference_ms: f64,
     /// Every setting, the twin as it is served first.
     pub settings: Vec<Measured>,
+    /// What is not among them.
+    pub left_out: Vec<LeftOut>,
+    /// What a step of the reference would take if every pixel's own ray were followed, in milliseconds;
+    /// none of pinholes at rest.
+    pub exact_rays_ms: Option<f64>,
+    /// How far images may be believed beside the recorded drive; empty without one.
+    pub believed: Vec<Believed>,
     /// What was asked for, if anything was.
     pub recommendations: Vec<Recommendation>,
     /// Extreme scenes on every backend.
@@ -158,7 +171,7 @@ impl Report {
                 m.setting.family.name(),
                 cost.step_ms,
                 e.psnr_db,
-                m.least_db[0].min(m.least_db[1]),
+                m.least_db(),
                 e.ssim,
                 e.max,
                 e.p99_9,

@@ -3,15 +3,21 @@
 //! Counts, not times: they are the same on every machine, and a base scene that pays for a feature of
 //! others is seen at once.
 
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
 use serde::Serialize;
 
 use super::ReportError;
 use super::drawing::look;
 use crate::generate;
+use crate::geometry::camera::{Fisheye, Lens, Rolls};
 use crate::render::cpu::Cpu;
 use crate::render::gpu::{Gpu, GpuUse};
-use crate::render::{Backend, Frame, Target, View};
-use crate::scene::{Gaussians, RenderProfile, Scene};
+use crate::render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
+use crate::scene::appearance::{Appearance, Exposure, Overlay};
+use crate::scene::sky::{CubeMap, Drawn, Layer, Model, Network};
+use crate::scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -22,11 +28,18 @@ pub struct Row {
     pub counts: Counts,
 }
 
-/// What one step takes. Those of a device are absent where there is none.
+/// What one step takes. Those of a device are absent where there is none, or where it does not draw such a
+/// frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Counts {
-    /// Bytes of a Gaussian in the host's memory.
+    /// Gaussians in the frame.
+    pub gaussians: u64,
+    /// Bytes of one in the host's memory.
     pub host_bytes: f64,
+    /// Bytes besides them there: maps of skies, images of hoods.
+    pub beside_bytes: u64,
+    /// Bytes of a pixel there.
+    pub host_pixel_bytes: u64,
     /// Evaluations of a Gaussian at a pixel by the cpu backend.
     pub evaluations: u64,
     /// What a device does.
@@ -51,10 +64,13 @@ pub struct DeviceCounts {
 }
 
 /// Names of the columns, in order of [`Counts::texts`].
-pub const COLUMNS: [&str; 8] = [
-    "B of a Gaussian, host",
+pub const COLUMNS: [&str; 11] = [
+    "Gaussians",
+    "B each, host",
+    "kB besides, host",
+    "B of a pixel, host",
     "evaluations, cpu",
-    "B of a Gaussian, device",
+    "B each, device",
     "pipelines",
     "buffers",
     "dispatches",
@@ -62,17 +78,48 @@ pub const COLUMNS: [&str; 8] = [
     "B of a pixel back",
 ];
 
-/// A feature: its name, the colour's degree, a change of the profile, and whether depth and opacity are
-/// wanted.
-type Feature = (&'static str, u8, Option<&'static str>, bool, bool);
+/// What this build has not, so that no twin can pay for it.
+pub const ABSENT: &str =
+    "Nothing repairs images: there is no code, library, buffer or pipeline of it.";
 
-const FEATURES: [Feature; 6] = [
-    ("nothing else", 0, None, false, false),
-    ("SH degree 1", 1, None, false, false),
-    ("SH degree 3", 3, None, false, false),
-    ("antialiasing", 0, Some("antialiased=true"), false, false),
-    ("depth", 0, None, true, false),
-    ("depth and opacity", 0, None, true, true),
+/// A feature, and what it changes.
+type Feature = (&'static str, fn(&mut Step));
+
+const FEATURES: [Feature; 16] = [
+    ("nothing else", |_| {}),
+    ("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
+    ("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
+    ("levels of detail, 1 m", |step| step.scene = coarser(&step.scene, 1.0)),
+    ("antialiasing", |step| step.profile.antialiased = true),
+    ("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
+    ("sky of images", |step| step.behind(Model::cube(CubeMap::plain(DVec3::splat(0.5))))),
+    ("sky, baked", |step| step.behind(network())),
+    ("sky, exact", |step| {
+        step.behind(network());
+        step.profile.sky_error = 0.0;
+    }),
+    ("fisheye", |step| {
+        step.view.camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
+    }),
+    ("rolling shutter", |step| {
+        let mut first = step.view.world_from_camera;
+        first.position_m.x -= 0.5;
+        let direction = Rolls::TopToBottom;
+        step.view.rolling = Some(Rolling { direction, world_from_camera_first: first });
+    }),
+    ("exposure", |step| {
+        let matrix = [[1.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]];
+        step.appearance.exposure = Some(Exposure { matrix, offset: [0.0; 3] });
+    }),
+    ("hood", |step| {
+        let rgba8 = [20, 20, 25, 255].repeat(step.view.camera.pixels());
+        // Whole rows: it is one.
+        step.appearance.overlay = Overlay::new(step.view.camera.width_px, rgba8).ok().map(Arc::new);
+    }),
+    ("depth", |step| step.depth = true),
+    ("depth and opacity", |step| (step.depth, step.opacity) = (true, true)),
+    // Trust is computed of the opacity, on the host.
+    ("trust", |step| step.opacity = true),
 ];
 
 /// Draws the street with each feature. `device` opens a device that drew nothing yet, or says that there
@@ -81,16 +128,12 @@ const FEATURES: [Feature; 6] = [
 /// # Errors
 /// A frame cannot be drawn.
 pub fn rows(cpu: &Cpu, device: &dyn Fn() -> Option<Gpu>) -> Result<Vec<Row>, ReportError> {
-    FEATURES
-        .into_iter()
-        .map(|(with, degree, change, depth, opacity)| {
-            let scene = Scene::from_gaussians(&street(degree));
-            let mut profile = RenderProfile::default();
-            change.map_or(Ok(()), |change| profile.set(change))?;
-            let step = Step { scene, profile, depth, opacity };
-            Ok(Row { with, counts: step.counts(cpu, device())? })
-        })
-        .collect()
+    let counted = |(with, change): Feature| {
+        let mut step = Step::base();
+        change(&mut step);
+        Ok(Row { with, counts: step.counts(cpu, device())? })
+    };
+    FEATURES.into_iter().map(counted).collect()
 }
 
 /// A street with colours of a degree, as flat where the base is.
@@ -102,70 +145,123 @@ fn street(degree: u8) -> Gaussians {
     street
 }
 
+/// The coarsest level of each chunk with at most this error, in metres.
+fn coarser(scene: &Scene, error_m: f32) -> Scene {
+    let level = |chunk: &Arc<Chunk>| {
+        let levels = lod::levels(chunk).into_iter();
+        let fine = levels.take_while(|level| level.error_m <= error_m);
+        fine.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))
+    };
+    Scene { chunks: scene.chunks.iter().map(level).collect(), ..scene.clone() }
+}
+
+/// A sky of three octaves and 16 neurons, gentle enough to be baked coarsely.
+fn network() -> Model {
+    let layer = |outputs: usize, inputs: usize| {
+        let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
+        Layer { outputs, inputs, weight: numbers(outputs * inputs), bias: numbers(outputs) }
+    };
+    let layers = [layer(16, 21), layer(16, 16), layer(3, 16)];
+    Model::network(Network::new(layers, Vec::new()).expect("layers that fit each other"))
+}
+
 struct Step {
     scene: Scene,
     profile: RenderProfile,
+    view: View,
+    appearance: Appearance,
     depth: bool,
     opacity: bool,
 }
 
 impl Step {
-    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<Counts, ReportError> {
-        let evaluations = self.draw(cpu)?;
-        let device = match device {
-            None => None,
-            Some(gpu) => {
-                // The first frame makes room, perhaps in several tries.
-                self.draw(&gpu)?;
-                let before = gpu.usage().map_or(0, |usage| usage.made.dispatches);
-                self.draw(&gpu)?;
-                gpu.usage().map(|usage| self.of_device(&usage, before))
-            }
-        };
-        let host_bytes = self.scene.bytes() as f64 / self.scene.gaussians() as f64;
-        Ok(Counts { host_bytes, evaluations, device })
-    }
-
-    fn of_device(&self, usage: &GpuUse, dispatches_before: u64) -> DeviceCounts {
-        DeviceCounts {
-            gaussian_bytes: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
-            pipelines: usage.made.pipelines,
-            buffers: usage.made.buffers,
-            dispatches: usage.made.dispatches - dispatches_before,
-            moved_bytes: usage.last.bytes().iter().map(|(_, bytes)| bytes).sum(),
-            pixel_bytes: 4 * usage.last.planes,
+    fn base() -> Self {
+        let eye_m = DVec3::new(-20.0, 0.3, 1.6);
+        Self {
+            scene: Scene::from_gaussians(&street(0)),
+            profile: RenderProfile::default(),
+            view: look([320, 180], 240.0, eye_m, DVec3::X, DVec3::NEG_Z),
+            appearance: Appearance::default(),
+            depth: false,
+            opacity: false,
         }
     }
 
-    fn draw(&self, backend: &dyn Backend) -> Result<u64, ReportError> {
-        let view = view();
-        let pixels = view.camera.pixels();
-        let (mut rgb8, mut depth_m, mut opacity) =
-            (vec![0; 3 * pixels], vec![0.0; pixels], vec![0.0; pixels]);
+    fn behind(&mut self, model: Model) {
+        self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
+    }
+
+    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<Counts, ReportError> {
+        let FrameStats { evaluations, .. } = self.draw(cpu)?;
+        let device = device.map(|gpu| self.of_device(&gpu)).transpose()?.flatten();
+        let gaussians = self.scene.gaussians() as u64;
+        let sky = self.scene.sky.as_ref();
+        let drawn = sky.map(|sky| sky.drawn(self.profile.sky_error)).transpose();
+        let sky_bytes = match drawn.map_err(RenderError::from)? {
+            Some(Drawn::Map(map)) => map.bytes(),
+            Some(Drawn::Exact(_)) | None => 0,
+        };
+        let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
+        Ok(Counts {
+            gaussians,
+            host_bytes: self.scene.bytes() as f64 / gaussians as f64,
+            beside_bytes: (sky_bytes + hood_bytes) as u64,
+            host_pixel_bytes: 3 + 4 * (u64::from(self.depth) + u64::from(self.opacity)),
+            evaluations,
+            device,
+        })
+    }
+
+    /// `None` if it does not draw such a frame.
+    fn of_device(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
+        // The first frame makes room, perhaps in several tries.
+        match self.draw(gpu) {
+            // A device that only looks skies up says so.
+            Err(_) if self.profile.sky_error == 0.0 => return Ok(None),
+            drawn => drawn?,
+        };
+        let dispatches = |usage: &GpuUse| usage.made.dispatches;
+        let before = gpu.usage().as_ref().map_or(0, dispatches);
+        self.draw(gpu)?;
+        Ok(gpu.usage().map(|usage| DeviceCounts {
+            gaussian_bytes: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
+            pipelines: usage.made.pipelines,
+            buffers: usage.made.buffers,
+            dispatches: dispatches(&usage) - before,
+            moved_bytes: usage.last.bytes().iter().map(|(_, bytes)| bytes).sum(),
+            pixel_bytes: 4 * usage.last.planes,
+        }))
+    }
+
+    fn draw(&self, backend: &dyn Backend) -> Result<FrameStats, RenderError> {
+        let pixels = self.view.camera.pixels();
+        let mut rgb8 = vec![0; 3 * pixels];
+        let plane = |wanted: bool| wanted.then(|| vec![0.0; pixels]);
+        let (mut depth_m, mut opacity) = (plane(self.depth), plane(self.opacity));
         let target = Target {
             rgb8: Some(&mut rgb8),
-            depth_m: self.depth.then_some(&mut depth_m),
-            opacity: self.opacity.then_some(&mut opacity),
+            depth_m: depth_m.as_deref_mut(),
+            opacity: opacity.as_deref_mut(),
+            appearance: (!self.appearance.is_plain()).then_some(&self.appearance),
             ..Target::default()
         };
-        let frame = Frame { scene: &self.scene, profile: &self.profile, views: &[view] };
-        Ok(backend.render(&frame, &mut [target], &|_, _| {})?.evaluations)
+        let views = &[self.view];
+        let frame = Frame { scene: &self.scene, profile: &self.profile, views };
+        backend.render(&frame, &mut [target], &|_, _| {})
     }
-}
-
-fn view() -> View {
-    use glam::DVec3;
-    look([320, 180], 240.0, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z)
 }
 
 impl Counts {
     /// In words, by [`COLUMNS`].
-    pub fn texts(&self) -> [String; 8] {
+    pub fn texts(&self) -> [String; 11] {
         let device = |text: &dyn Fn(&DeviceCounts) -> String| {
-            self.device.as_ref().map_or_else(|| "no device".to_owned(), text)
+            self.device.as_ref().map_or_else(|| "none".to_owned(), text)
         };
         [
+            self.gaussians.to_string(),
             format!("{:.1}", self.host_bytes),
+            format!("{:.1}", self.beside_bytes as f64 / 1e3),
+            self.host_pixel_bytes.to_string(),
             self.evaluations.to_string(),
             device(&|d| format!("{:.1}", d.gaussian_bytes)),
             device(&|d| d.pipelines.to_string()),

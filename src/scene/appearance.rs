@@ -4,7 +4,9 @@ use std::io::Cursor;
 use std::sync::Arc;
 
 use data_encoding::BASE64;
-use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
+use image::codecs::png::PngEncoder;
+use image::imageops::{FilterType, resize};
+use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Rgba, Rgba32FImage};
 use serde::{Deserialize, Serialize};
 
 /// How a camera's image differs from what is there.
@@ -32,11 +34,12 @@ pub struct Exposure {
 
 /// An image of the camera's own size that is laid over it. In JSON it is a PNG with opacity, as
 /// `"data:image/png;base64,.."`.
-#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Clone, PartialEq, Eq)]
 pub struct Overlay {
     width_px: u32,
     rgba8: Vec<u8>,
+    /// As it was read, so that it is written without another search for the shortest form.
+    png: Vec<u8>,
 }
 
 /// Why an appearance was refused.
@@ -50,6 +53,9 @@ pub enum AppearanceError {
         /// The number.
         value: f64,
     },
+    /// Two things that say the same, or nothing.
+    #[error("an exposure has either a matrix or a gain")]
+    Colours,
     /// The overlay is of another size than the image.
     #[error(
         "the overlay is {} x {} pixels, and the camera's image {} x {}",
@@ -67,6 +73,35 @@ pub enum AppearanceError {
         /// What is wrong with it.
         reason: String,
     },
+}
+
+impl Exposure {
+    /// Of a matrix, or of a gain per channel.
+    ///
+    /// # Errors
+    /// [`AppearanceError::Colours`] if both are given, or neither is.
+    pub fn new(
+        matrix: Option<[[f64; 3]; 3]>,
+        gain: Option<[f64; 3]>,
+        offset: [f64; 3],
+    ) -> Result<Self, AppearanceError> {
+        let matrix = match (matrix, gain) {
+            (Some(matrix), None) => matrix,
+            (None, Some([r, g, b])) => [[r, 0.0, 0.0], [0.0, g, 0.0], [0.0, 0.0, b]],
+            _ => return Err(AppearanceError::Colours),
+        };
+        Ok(Self { matrix, offset })
+    }
+}
+
+impl AppearanceError {
+    /// What of a camera it is about: `exposure` or `overlay`.
+    pub fn field(&self) -> &'static str {
+        match self {
+            Self::Exposure { .. } | Self::Colours => "exposure",
+            Self::Size { .. } | Self::Overlay { .. } => "overlay",
+        }
+    }
 }
 
 impl Appearance {
@@ -96,33 +131,95 @@ impl Appearance {
 }
 
 impl Overlay {
-    /// Most pixels: four times those of a 4K camera's image would be 33 million; a decoded overlay takes
-    /// 67 MB at most.
+    /// Most pixels of all overlays of a rig, 67 MB: two 4K images, or twice those of six surround
+    /// cameras of 1440 x 928 px.
     pub const MAX_PIXELS: u64 = 1 << 24;
 
-    /// From a PNG.
+    /// From a PNG for an image of a size, which is compared before anything is unpacked.
     ///
     /// # Errors
-    /// [`AppearanceError::Overlay`].
-    pub fn from_png(png: &[u8]) -> Result<Self, AppearanceError> {
-        let refused = |reason: String| AppearanceError::Overlay { reason };
-        let reader = || ImageReader::with_format(Cursor::new(png), ImageFormat::Png);
-        let size = reader().into_dimensions().map_err(|error| refused(error.to_string()))?;
-        let pixels = u64::from(size.0) * u64::from(size.1);
-        if pixels > Self::MAX_PIXELS {
-            let limit = Self::MAX_PIXELS;
-            return Err(refused(format!("it has {pixels} pixels; at most {limit} are read")));
+    /// [`AppearanceError::Size`], [`AppearanceError::Overlay`].
+    pub fn from_png(png: Vec<u8>, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
+        let unreadable = |error: image::ImageError| refused(&error.to_string());
+        let reader = || ImageReader::with_format(Cursor::new(&png[..]), ImageFormat::Png);
+        let (width_px, height_px) = reader().into_dimensions().map_err(unreadable)?;
+        let overlay_px = [width_px, height_px];
+        if overlay_px != camera_px {
+            return Err(AppearanceError::Size { overlay_px, camera_px });
         }
-        let image = reader().decode().map_err(|error| refused(error.to_string()))?.into_rgba8();
-        let width_px = image.width();
-        Self::new(width_px, image.into_raw()).ok_or_else(|| refused("it is empty".to_owned()))
+        check_pixels(u64::from(width_px) * u64::from(height_px))?;
+        let rgba8 = reader().decode().map_err(unreadable)?.into_rgba8().into_raw();
+        Ok(Self { width_px, rgba8, png })
     }
 
-    /// From `[height, width, 4]` of red, green, blue, not premultiplied, and opacity. `None` if that is
-    /// not a whole number of rows.
-    pub fn new(width_px: u32, rgba8: Vec<u8>) -> Option<Self> {
+    /// From `"data:image/png;base64,.."`, likewise.
+    ///
+    /// # Errors
+    /// As [`Overlay::from_png`].
+    pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
+        let bytes = text.strip_prefix(DATA_URI);
+        let bytes = bytes.ok_or_else(|| refused("it does not begin as data:image/png;base64,"))?;
+        let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
+        Self::from_png(png, camera_px)
+    }
+
+    /// From `[height, width, 4]` of red, green, blue, not premultiplied, and opacity.
+    ///
+    /// # Errors
+    /// [`AppearanceError::Overlay`]: that is not a whole number of rows, or more than is accepted.
+    pub fn new(width_px: u32, rgba8: Vec<u8>) -> Result<Self, AppearanceError> {
         let row = 4 * width_px as usize;
-        (row > 0 && rgba8.len().is_multiple_of(row)).then_some(Self { width_px, rgba8 })
+        if rgba8.is_empty() || row == 0 || !rgba8.len().is_multiple_of(row) {
+            return Err(refused("it is no whole number of rows"));
+        }
+        check_pixels(rgba8.len() as u64 / 4)?;
+        let mut png = Vec::new();
+        let height_px = (rgba8.len() / row) as u32;
+        PngEncoder::new(&mut png)
+            .write_image(&rgba8, width_px, height_px, ExtendedColorType::Rgba8)
+            .map_err(|error| refused(&error.to_string()))?;
+        Ok(Self { width_px, rgba8, png })
+    }
+
+    /// What lies over a part of the image, drawn at another size: a smaller one by a triangle that is two
+    /// of its pixels wide, weighted by opacity.
+    ///
+    /// # Errors
+    /// [`AppearanceError::Overlay`]: the part is not within it, or it becomes too large.
+    pub fn part(
+        &self,
+        [left, top]: [u32; 2],
+        part_px: [u32; 2],
+        size_px: [u32; 2],
+    ) -> Result<Self, AppearanceError> {
+        let [width, height] = self.size_px();
+        let [part_width, part_height] = part_px;
+        let within = |from: u32, part: u32, of: u32| part > 0 && from <= of && part <= of - from;
+        if !within(left, part_width, width) || !within(top, part_height, height) {
+            let of = "it is not within the overlay";
+            return Err(refused(&format!("{part_px:?} px at {left}, {top}: {of}")));
+        }
+        let [to_width, to_height] = size_px;
+        check_pixels(u64::from(to_width) * u64::from(to_height))?;
+        if size_px == part_px {
+            let row = |y: u32| {
+                let at = 4 * ((top + y) as usize * width as usize + left as usize);
+                &self.rgba8[at..at + 4 * part_width as usize]
+            };
+            return Self::new(to_width, (0..part_height).flat_map(row).copied().collect());
+        }
+        // Premultiplied, or colours of what is clear would leak into what is not.
+        let premultiplied = Rgba32FImage::from_fn(part_width, part_height, |x, y| {
+            let at = 4 * ((top + y) as usize * width as usize + (left + x) as usize);
+            let [r, g, b, a] = [0, 1, 2, 3].map(|c| f32::from(self.rgba8[at + c]) / 255.0);
+            Rgba([r * a, g * a, b * a, a])
+        });
+        let sized = resize(&premultiplied, to_width, to_height, FilterType::Triangle);
+        let straight = |&Rgba([r, g, b, a]): &Rgba<f32>| {
+            let over = if a > 0.0 { 1.0 / a } else { 0.0 };
+            [r * over, g * over, b * over, a].map(|v| (255.0 * v.clamp(0.0, 1.0)).round() as u8)
+        };
+        Self::new(to_width, sized.pixels().flat_map(straight).collect())
     }
 
     /// Width and height.
@@ -133,6 +230,23 @@ impl Overlay {
     /// `[height, width, 4]`.
     pub fn rgba8(&self) -> &[u8] {
         &self.rgba8
+    }
+
+    /// As JSON has it.
+    pub fn to_data_uri(&self) -> String {
+        format!("{DATA_URI}{}", BASE64.encode(&self.png))
+    }
+}
+
+fn refused(reason: &str) -> AppearanceError {
+    AppearanceError::Overlay { reason: reason.to_owned() }
+}
+
+fn check_pixels(pixels: u64) -> Result<(), AppearanceError> {
+    let limit = Overlay::MAX_PIXELS;
+    match pixels <= limit {
+        true => Ok(()),
+        false => Err(refused(&format!("it has {pixels} pixels; at most {limit} are accepted"))),
     }
 }
 
@@ -154,16 +268,11 @@ struct ExposureFields {
 }
 
 impl TryFrom<ExposureFields> for Exposure {
-    type Error = &'static str;
+    type Error = AppearanceError;
 
-    fn try_from(fields: ExposureFields) -> Result<Self, Self::Error> {
+    fn try_from(fields: ExposureFields) -> Result<Self, AppearanceError> {
         let ExposureFields { matrix, gain, offset } = fields;
-        let matrix = match (matrix, gain) {
-            (Some(matrix), None) => matrix,
-            (None, Some([r, g, b])) => [[r, 0.0, 0.0], [0.0, g, 0.0], [0.0, 0.0, b]],
-            _ => return Err("an exposure has either a matrix or a gain"),
-        };
-        Ok(Self { matrix, offset })
+        Self::new(matrix, gain, offset)
     }
 }
 
@@ -176,29 +285,6 @@ impl From<Exposure> for ExposureFields {
 /// What stands before an overlay's bytes in JSON.
 const DATA_URI: &str = "data:image/png;base64,";
 
-impl TryFrom<String> for Overlay {
-    type Error = AppearanceError;
-
-    fn try_from(text: String) -> Result<Self, AppearanceError> {
-        let refused = |reason: &str| AppearanceError::Overlay { reason: reason.to_owned() };
-        let bytes = text.strip_prefix(DATA_URI);
-        let bytes = bytes.ok_or_else(|| refused("it does not begin as data:image/png;base64,"))?;
-        let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
-        Self::from_png(&png)
-    }
-}
-
-impl From<Overlay> for String {
-    fn from(overlay: Overlay) -> Self {
-        let mut png = Vec::new();
-        let [width, height] = overlay.size_px();
-        let encoder = image::codecs::png::PngEncoder::new(&mut png);
-        // Into memory, of a size that was checked: it cannot fail.
-        let _ = encoder.write_image(&overlay.rgba8, width, height, ExtendedColorType::Rgba8);
-        format!("{DATA_URI}{}", BASE64.encode(&png))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -206,9 +292,9 @@ mod tests {
     #[test]
     fn json_and_back() {
         let overlay = Overlay::new(3, (0..24).collect()).unwrap();
-        let text = serde_json::to_string(&overlay).unwrap();
-        assert!(text.starts_with("\"data:image/png;base64,iVBOR"), "{text}");
-        assert_eq!(serde_json::from_str::<Overlay>(&text).unwrap(), overlay);
+        let text = overlay.to_data_uri();
+        assert!(text.starts_with("data:image/png;base64,iVBOR"), "{text}");
+        assert_eq!(Overlay::from_data_uri(&text, [3, 2]).unwrap(), overlay);
         let gain = r#"{"gain": [2, 3, 4]}"#;
         let exposure: Exposure = serde_json::from_str(gain).unwrap();
         assert_eq!(exposure.matrix, [[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0]]);
@@ -230,14 +316,35 @@ mod tests {
             ("data:image/png;base64,%%%", "it is not base64"),
             ("data:image/png;base64,aGVsbG8=", "the overlay cannot be read"),
         ] {
-            let error = Overlay::try_from(overlay.to_owned()).unwrap_err().to_string();
+            let error = Overlay::from_data_uri(overlay, [3, 2]).unwrap_err().to_string();
             assert!(error.contains(wanted), "{error}");
         }
+        let small = Overlay::new(3, vec![9; 24]).unwrap().to_data_uri();
+        let size = AppearanceError::Size { overlay_px: [3, 2], camera_px: [2, 3] };
+        assert_eq!(Overlay::from_data_uri(&small, [2, 3]), Err(size));
         // A PNG of 100,000 x 100,000 pixels that says so in its first bytes.
-        let mut png = Vec::new();
-        let encoder = image::codecs::png::PngEncoder::new(&mut png);
-        encoder.write_image(&[0; 4], 1, 1, ExtendedColorType::Rgba8).unwrap();
+        let mut png = Overlay::new(1, vec![0; 4]).unwrap().png;
         png[16..24].copy_from_slice(&[0, 1, 0x86, 0xA0, 0, 1, 0x86, 0xA0]);
-        assert!(Overlay::from_png(&png).is_err());
+        assert!(Overlay::from_png(png, [100_000; 2]).is_err());
+    }
+
+    #[test]
+    fn a_part_is_what_lies_there() {
+        // Four columns: clear, half clear, and two opaque ones; rows alike.
+        let row = [[200, 0, 0, 0], [0, 100, 0, 128], [10, 20, 30, 255], [50, 60, 70, 255]];
+        let overlay = Overlay::new(4, [row; 4].as_flattened().as_flattened().to_vec()).unwrap();
+        assert_eq!(overlay.part([0, 0], [4, 4], [4, 4]).unwrap(), overlay);
+        let right = overlay.part([2, 1], [2, 3], [2, 3]).unwrap();
+        assert_eq!(right.size_px(), [2, 3]);
+        assert_eq!(right.rgba8()[..8], [10, 20, 30, 255, 50, 60, 70, 255]);
+        // The colour of what is clear is nowhere to be seen.
+        let small = overlay.part([0, 0], [4, 4], [2, 2]).unwrap();
+        for pixel in small.rgba8().chunks(4).step_by(2) {
+            assert!(pixel[0] <= 5 && pixel[1] > 50 && (30..120).contains(&pixel[3]), "{pixel:?}");
+        }
+        for (at, part) in [([3, 0], [2, 1]), ([0, 0], [0, 1]), ([u32::MAX, 0], [1, 1])] {
+            assert!(overlay.part(at, part, [1, 1]).is_err(), "{at:?} {part:?}");
+        }
+        assert!(overlay.part([0, 0], [1, 1], [1 << 13, 1 << 12]).is_err(), "too large");
     }
 }

@@ -1,9 +1,11 @@
 //! Rigs: the cameras of a vehicle.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::appearance::{Appearance, AppearanceError, Exposure, Overlay};
 use crate::geometry::camera::Shutter;
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::{Camera, CameraError, Pose};
@@ -12,7 +14,8 @@ use crate::geometry::{Camera, CameraError, Pose};
 ///
 /// In rig files, manifests and episodes it looks as on the wire: `{"name", "width", "height", "fx",
 /// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels; what is no pinhole
-/// has `lens`, `windshield` and `shutter` besides ([`crate::geometry::camera::json`]).
+/// has `lens`, `windshield` and `shutter` besides ([`crate::geometry::camera::json`]), what is not
+/// recorded as it is `exposure`, and what has its own car before it `overlay` ([`Appearance`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
@@ -24,18 +27,59 @@ pub struct RigCamera {
     pub rig_from_camera: Pose,
     /// How its rows are exposed one after the other; all at once if absent.
     pub shutter: Option<Shutter>,
+    /// What it makes of colours, and what of its own car it sees.
+    pub appearance: Appearance,
 }
 
 impl RigCamera {
-    /// A camera whose rows are exposed all at once.
+    /// A camera whose rows are exposed all at once, and which shows what is there.
     pub fn new(name: impl Into<String>, camera: Camera, rig_from_camera: Pose) -> Self {
-        Self { name: name.into(), camera, rig_from_camera, shutter: None }
+        let appearance = Appearance::default();
+        Self { name: name.into(), camera, rig_from_camera, shutter: None, appearance }
+    }
+
+    /// The camera whose image is a part of this one's: first column and row, then width and height.
+    ///
+    /// # Errors
+    /// It is not within the image, or the lens does not see it.
+    pub fn cropped(&self, at_px: [u64; 2], size_px: [u64; 2]) -> Result<Self, RigError> {
+        let camera = self.camera.cropped(at_px, size_px).map_err(|cause| self.wrong(cause))?;
+        // Within the image: they are small.
+        self.part(camera, at_px.map(|at| at as u32), [camera.width_px, camera.height_px])
+    }
+
+    /// The camera with the same field of view and another number of pixels.
+    ///
+    /// # Errors
+    /// There is no such camera.
+    pub fn scaled(&self, width_px: u64, height_px: u64) -> Result<Self, RigError> {
+        let camera = self.camera.scaled(width_px, height_px).map_err(|cause| self.wrong(cause))?;
+        self.part(camera, [0, 0], [self.camera.width_px, self.camera.height_px])
+    }
+
+    /// With another camera, which sees a part of the image, and that part of what lies over it.
+    fn part(&self, camera: Camera, at_px: [u32; 2], part_px: [u32; 2]) -> Result<Self, RigError> {
+        let mut appearance = self.appearance.clone();
+        if let Some(overlay) = &mut appearance.overlay {
+            let size_px = [camera.width_px, camera.height_px];
+            let part = overlay.part(at_px, part_px, size_px);
+            *overlay = Arc::new(part.map_err(|cause| self.looks_wrong(cause))?);
+        }
+        Ok(Self { camera, appearance, ..self.clone() })
+    }
+
+    fn wrong(&self, cause: CameraError) -> RigError {
+        RigError::Camera { name: self.name.clone(), cause }
+    }
+
+    fn looks_wrong(&self, cause: AppearanceError) -> RigError {
+        RigError::Appearance { name: self.name.clone(), cause }
     }
 }
 
 /// The cameras of one vehicle, in the order in which images are answered.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "RigFields")]
 pub struct Rig {
     /// Name, `[a-z0-9._-]+`.
     pub name: String,
@@ -76,6 +120,22 @@ pub enum RigError {
         /// What is wrong with it.
         cause: CameraError,
     },
+    /// What it makes of an image cannot be used.
+    #[error("camera {name:?}: {cause}")]
+    Appearance {
+        /// The camera.
+        name: String,
+        /// What is wrong with it.
+        cause: AppearanceError,
+    },
+    /// Overlays that would take too much memory.
+    #[error("the overlays of a rig have {pixels} pixels in all; at most {limit} are accepted")]
+    Overlays {
+        /// Their pixels.
+        pixels: u64,
+        /// How many are accepted.
+        limit: u64,
+    },
 }
 
 /// Rigs that come with the program, by name: the JSON of `scenes/rigs`.
@@ -114,7 +174,8 @@ impl Rig {
             return Err(RigError::Name { name: self.name.clone() });
         }
         let mut names = BTreeSet::new();
-        for RigCamera { name, camera, shutter, .. } in &self.cameras {
+        for mounted in &self.cameras {
+            let RigCamera { name, camera, shutter, appearance, .. } = mounted;
             if !is_name(name) {
                 return Err(RigError::Name { name: name.clone() });
             }
@@ -122,13 +183,28 @@ impl Rig {
                 return Err(RigError::Duplicate { name: name.clone() });
             }
             let shutter = shutter.as_ref().map_or(Ok(()), Shutter::check);
-            camera
-                .check()
-                .and(shutter)
-                .map_err(|cause| RigError::Camera { name: name.clone(), cause })?;
+            camera.check().and(shutter).map_err(|cause| mounted.wrong(cause))?;
+            let looks = appearance.check([camera.width_px, camera.height_px]);
+            looks.map_err(|cause| mounted.looks_wrong(cause))?;
         }
-        Ok(())
+        check_overlays(&self.cameras)
     }
+}
+
+/// # Errors
+/// [`RigError::Overlays`].
+pub fn check_overlays(cameras: &[RigCamera]) -> Result<(), RigError> {
+    let (pixels, limit) = (overlay_pixels(cameras), Overlay::MAX_PIXELS);
+    match pixels <= limit {
+        true => Ok(()),
+        false => Err(RigError::Overlays { pixels, limit }),
+    }
+}
+
+/// Pixels of all overlays, 4 bytes each.
+pub fn overlay_pixels(cameras: &[RigCamera]) -> u64 {
+    let overlays = cameras.iter().filter_map(|camera| camera.appearance.overlay.as_ref());
+    overlays.map(|overlay| overlay.rgba8().len() as u64 / 4).sum()
 }
 
 /// Longest name, in bytes.
@@ -162,15 +238,56 @@ struct CameraFields {
     windshield: Option<WindshieldFields>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     shutter: Option<Shutter>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    exposure: Option<Exposure>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    overlay: Option<String>,
     camera_to_rig: Pose,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RigFields {
+    name: String,
+    cameras: Vec<CameraFields>,
+}
+
+/// Stops at the camera whose overlay is too much, so that no more is unpacked than a rig may have.
+impl TryFrom<RigFields> for Rig {
+    type Error = RigError;
+
+    fn try_from(RigFields { name, cameras: fields }: RigFields) -> Result<Self, RigError> {
+        let mut cameras = Vec::with_capacity(fields.len().min(Self::MAX_CAMERAS));
+        for camera in fields {
+            cameras.push(camera.try_into()?);
+            check_overlays(&cameras)?;
+        }
+        Ok(Self { name, cameras })
+    }
 }
 
 impl From<RigCamera> for CameraFields {
     fn from(from: RigCamera) -> Self {
-        let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter } = from;
+        let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter, appearance } = from;
         let Intrinsics { size_px, focal_px, center_px, lens, windshield } = Intrinsics::of(&camera);
         let ([width, height], [fx, fy], [cx, cy]) = (size_px, focal_px, center_px);
-        Self { name, width, height, fx, fy, cx, cy, lens, windshield, shutter, camera_to_rig }
+        let Appearance { exposure, overlay } = appearance;
+        let overlay = overlay.map(|overlay| overlay.to_data_uri());
+        Self {
+            name,
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            lens,
+            windshield,
+            shutter,
+            exposure,
+            overlay,
+            camera_to_rig,
+        }
     }
 }
 
@@ -183,13 +300,18 @@ impl TryFrom<CameraFields> for RigCamera {
         let CameraFields { name, width, height, fx, fy, cx, cy, lens, windshield, .. } = fields;
         let (size_px, focal_px, center_px) = ([width, height], [fx, fy], [cx, cy]);
         let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
-        match intrinsics.camera() {
-            Ok(camera) => {
-                let (rig_from_camera, shutter) = (fields.camera_to_rig, fields.shutter);
-                Ok(Self { name, camera, rig_from_camera, shutter })
-            }
-            Err(cause) => Err(RigError::Camera { name, cause }),
-        }
+        let camera = match intrinsics.camera() {
+            Ok(camera) => camera,
+            Err(cause) => return Err(RigError::Camera { name, cause }),
+        };
+        let overlay = fields.overlay.map(|text| Overlay::from_data_uri(&text, size_px));
+        let overlay = match overlay.transpose() {
+            Ok(overlay) => overlay.map(Arc::new),
+            Err(cause) => return Err(RigError::Appearance { name, cause }),
+        };
+        let appearance = Appearance { exposure: fields.exposure, overlay };
+        let (rig_from_camera, shutter) = (fields.camera_to_rig, fields.shutter);
+        Ok(Self { name, camera, rig_from_camera, shutter, appearance })
     }
 }
 
@@ -256,6 +378,18 @@ mod tests {
             let text = serde_json::to_string(&read).unwrap();
             assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), read, "{text}");
         }
+        let hood = Overlay::new(100, [[1, 2, 3, 4]; 8000].as_flattened().to_vec()).unwrap();
+        let looks = format!(
+            r#""fx":50,"fy":50,"exposure":{{"gain":[1,2,3]}},"overlay":"{}""#,
+            hood.to_data_uri()
+        );
+        let read = rig(&looks).unwrap();
+        assert_eq!(read.check(), Ok(()));
+        assert_eq!(read.cameras[0].appearance.overlay.as_deref(), Some(&hood));
+        let text = serde_json::to_string(&read).unwrap();
+        assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), read, "{text}");
+        let half = read.cameras[0].cropped([50, 0], [50, 80]).unwrap().scaled(25, 40).unwrap();
+        assert_eq!(half.appearance.overlay.map(|overlay| overlay.size_px()), Some([25, 40]));
         let zeros = r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[0,0,0,0,0,0]}"#;
         assert!(rig(zeros).unwrap().cameras[0].camera.is_ideal(), "a pinhole by another name");
         let refused = |more: &str| match rig(more) {
@@ -277,6 +411,8 @@ mod tests {
                 r#""fx":50,"fy":50,"windshield":{"reference":"forward","horizontal":[0,1],"vertical":[0]}"#,
                 "1, 3, 6",
             ),
+            (r#""fx":50,"fy":50,"exposure":{"gain":[1,1,1e9]}"#, "a number from -100 to 100"),
+            (r#""fx":50,"fy":50,"overlay":"hood.png""#, "camera \"front\": the overlay cannot be"),
         ] {
             assert!(refused(more).contains(reason), "{}", refused(more));
         }

@@ -4,6 +4,7 @@ use std::io;
 
 use crate::geometry::{CameraError, PoseError};
 use crate::ingest::IngestError;
+use crate::scene::appearance::AppearanceError;
 use crate::scene::rig::RigError;
 use crate::session::SessionError;
 use crate::store::StoreError;
@@ -99,6 +100,14 @@ pub(super) enum Fault {
         field: String,
         /// What is wrong with it.
         cause: CameraError,
+    },
+    /// Not what a camera makes of an image.
+    #[error("{field}: {cause}")]
+    Appearance {
+        /// The field, as `rig.cameras[2].overlay`.
+        field: String,
+        /// What is wrong with it.
+        cause: AppearanceError,
     },
     /// Not a rig.
     #[error("{cause}")]

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{HISTORY_POSES, HISTORY_STEP_US};
+use crate::config::{self, HISTORY_POSES, HISTORY_STEP_US};
 use crate::geometry::Pose;
 use crate::render::View;
 use crate::scene::rig::RigCamera;
@@ -29,6 +29,8 @@ pub struct Episode {
     track: VecDeque<(i64, Pose)>,
     /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
     begin_us: i64,
+    /// Of the observations that said how far they may be believed, the least mean of one's images.
+    least_trust: Option<f64>,
 }
 
 /// Why an episode ended.
@@ -37,6 +39,9 @@ pub struct Episode {
 pub enum Outcome {
     /// The agent closed it, or ended it.
     Completed,
+    /// The same, and on its way the images could not be believed: it left what was recorded
+    /// (`config::OFF_MODEL_TRUST`). Told only where observations say their trust.
+    OffModel,
     /// The agent broke the protocol beyond repair.
     AgentError,
     /// The agent was silent for too long.
@@ -59,6 +64,9 @@ pub struct Summary {
     pub time_us: i64,
     /// Distance driven, in metres: the sum of the straight lines between poses.
     pub distance_m: f64,
+    /// Trust of the observation that is believed least, the mean of its images; absent where none was said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least_trust: Option<f64>,
 }
 
 /// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last is the identity.
@@ -84,7 +92,17 @@ impl Episode {
         let now = (0, ego.world_from_rig());
         let track: VecDeque<_> = warm_up.iter().copied().chain([now]).collect();
         let begin_us = track[0].0;
-        Self { seed, dt_us, step: 0, distance_m: 0.0, ego, terminated: false, track, begin_us }
+        Self {
+            seed,
+            dt_us,
+            step: 0,
+            distance_m: 0.0,
+            ego,
+            terminated: false,
+            track,
+            begin_us,
+            least_trust: None,
+        }
     }
 
     /// The episode after one more step. `self` stays as it is, so that a step whose rendering fails has
@@ -177,9 +195,26 @@ impl Episode {
 
     /// How it went so far. An episode that the agent ended stays completed, whatever came after.
     pub fn summary(&self, outcome: Outcome) -> Summary {
-        let outcome = if self.terminated { Outcome::Completed } else { outcome };
+        let outcome = match (self.terminated, outcome) {
+            (true, _) | (_, Outcome::Completed) => match self.least_trust {
+                Some(trust) if trust < config::OFF_MODEL_TRUST => Outcome::OffModel,
+                _ => Outcome::Completed,
+            },
+            (false, outcome) => outcome,
+        };
         let (steps, time_us, distance_m) = (self.step, self.time_us(), self.distance_m);
-        Summary { outcome, steps, time_us, distance_m }
+        Summary { outcome, steps, time_us, distance_m, least_trust: self.least_trust }
+    }
+
+    /// Remembers how far the images of an observation may be believed, 0 to 1 each; nothing if there are
+    /// none.
+    pub(super) fn judged(&mut self, trusts: impl Iterator<Item = f64>) {
+        let (sum, count) =
+            trusts.fold((0.0, 0.0), |(sum, count), trust| (sum + trust, count + 1.0));
+        if count > 0.0 {
+            let mean = sum / count;
+            self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
+        }
     }
 
     /// What the ego remembers now.
@@ -324,8 +359,13 @@ mod tests {
         assert!((episode.ego().velocity_m_s() - DVec3::X * 10.0).length() < 1e-12);
         let over = moved(&episode, at(1.5, 0.0), true).unwrap();
         let summary = over.summary(Outcome::AgentLost);
-        let expected =
-            Summary { outcome: Outcome::Completed, steps: 4, time_us: 200_000, distance_m: 1.5 };
+        let expected = Summary {
+            outcome: Outcome::Completed,
+            steps: 4,
+            time_us: 200_000,
+            distance_m: 1.5,
+            least_trust: None,
+        };
         assert_eq!(summary, expected);
         let refused = moved(&over, at(2.0, 0.0), false);
         assert!(matches!(refused, Err(SessionError::EpisodeOver { steps: 4 })));

@@ -92,6 +92,8 @@ pub enum TensorKind {
     Depth(usize),
     /// Accumulated opacity: `[height, width]`.
     Opacity(usize),
+    /// Unit normals in the camera's axes: `[height, width, 3]`.
+    Normals(usize),
     /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
     Rgb(usize),
     /// Colour of an earlier frame, by its index in [`Frame::history`]: the same.

@@ -34,7 +34,7 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::render::View;
 use crate::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
-use crate::scene::rig::{Rig, RigCamera};
+use crate::scene::rig::{Rig, RigCamera, overlay_pixels};
 use crate::scene::{ProfileChanges, RenderProfile};
 use crate::sim::{Command, Dynamics, Ego, Ground};
 
@@ -48,7 +48,7 @@ pub use frame::{DType, Frame, Image, PastImage, Residency, Tensor, TensorKind, T
 pub use golden::{Changed, Golden};
 pub use listing::{TrajectorySummary, TwinSummary};
 pub use observation::HEADER_PREFIX_BYTES;
-pub use opening::{ImagePart, Opening, Outputs, RigChoice, Start};
+pub use opening::{ImagePart, Maps, Opening, Outputs, RigChoice, Start};
 pub use record::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedCommand, RecordedOutputs,
     RecordedVersion,
@@ -59,6 +59,7 @@ pub use trust::{Trained, Trust};
 
 use ahead::{Ahead, Route};
 use album::Album;
+use engine::Hold;
 use lookout::Lookout;
 pub(crate) use observation::eyes;
 use observation::{Assembly, Drawing, Layout, Shot};
@@ -79,6 +80,8 @@ pub struct Session {
     profile_hash: blake3::Hash,
     rig_name: String,
     layout: Arc<Layout>,
+    /// The part of what lies over its images in the budget for answers.
+    _overlays: Hold,
     dynamics: Dynamics,
     /// How episodes get to their start unless `reset` says otherwise.
     start: Track,
@@ -128,10 +131,11 @@ impl Session {
         let resident = engine.resident(opening.twin, opening.version).await?;
         let manifest = &resident.version.manifest;
         let (rig_name, cameras) = choose_cameras(&resident, opening.rig, &opening.outputs)?;
-        let Outputs { encoding, depth, opacity, frames, periods_us, trust, .. } = opening.outputs;
+        let Outputs { encoding, maps, frames, periods_us, trust, .. } = opening.outputs;
+        let overlays = engine.answers().hold(4 * overlay_pixels(&cameras))?;
         let lens = lens(&cameras);
         let schedule = Schedule::new(&cameras, dt_us, frames, &periods_us, opening.decision_us)?;
-        let layout = Layout::new(cameras, encoding, (depth, opacity), schedule)?;
+        let layout = Layout::new(cameras, encoding, maps, schedule)?;
         let (dynamics, warm_up_us) = (opening.dynamics, opening.warm_up_us);
         let start = settled(&resident, opening.start.as_ref(), warm_up_us, dynamics)?;
         let named = match &opening.start {
@@ -155,6 +159,7 @@ impl Session {
             profile,
             rig_name,
             layout: Arc::new(layout),
+            _overlays: overlays,
             episode: episode(opening.seed, &start, dynamics, dt_us),
             dynamics,
             start,
@@ -193,12 +198,13 @@ impl Session {
     ) -> Result<Frame, SessionError> {
         let command = command.into();
         let ground = Ground::of(&self.resident().version.manifest.trajectories);
-        let next = self.episode.stepped(&command, &ground, terminate)?;
+        let mut next = self.episode.stepped(&command, &ground, terminate)?;
         let shots = self.layout.shots(&next, &self.album);
         let drawing = self.draw(&next, shots, Some(self.album.clone())).await?;
         let mut line = self.frame_line(FrameRequest::Step, &next, &drawing);
         line.command = RecordedCommand::of(&command);
         self.record(line).await?;
+        next.judged(drawing.trusts());
         (self.episode, self.album) = (next, drawing.album);
         self.look_ahead();
         Ok(drawing.frame)
@@ -229,12 +235,13 @@ impl Session {
             Some(_) => settled(self.resident(), start.as_ref(), self.warm_up_us, self.dynamics)?,
             None => self.start.clone(),
         };
-        let next = episode(seed, &start, self.dynamics, self.dt_us);
+        let mut next = episode(seed, &start, self.dynamics, self.dt_us);
         let shots = self.layout.shots(&next, &Album::default());
         let drawing = self.draw(&next, shots, Some(Album::default())).await?;
         let line = self.frame_line(FrameRequest::Reset, &next, &drawing);
         let (recorder, number) = self.begin_recording(&next, Line::Frame(line)).await?;
         self.finish(Outcome::Completed).await;
+        next.judged(drawing.trusts());
         (self.recorder, self.episode_number, self.switched) = (Some(recorder), number, false);
         (self.episode, self.album) = (next, drawing.album);
         self.hint.clear();
@@ -343,9 +350,9 @@ impl Session {
         self.layout.encoding()
     }
 
-    /// Whether observations hold depth, and whether opacity.
-    pub fn depth_and_opacity(&self) -> (bool, bool) {
-        self.layout.depth_and_opacity()
+    /// What observations hold beside colours.
+    pub fn maps(&self) -> Maps {
+        self.layout.maps()
     }
 
     /// Whether observations say how far they may be believed.
@@ -550,7 +557,7 @@ impl Session {
         first_frame: Line,
     ) -> Result<(Recorder, u64), SessionError> {
         let version = &self.resident().version;
-        let (depth, opacity) = self.layout.depth_and_opacity();
+        let Maps { depth, opacity, normals } = self.layout.maps();
         let cameras = self.layout.cameras().to_vec();
         let header = EpisodeHeader {
             format: EpisodeHeader::FORMAT,
@@ -564,7 +571,7 @@ impl Session {
             backend: self.engine.backend().to_owned(),
             backend_detail: self.engine.backend_detail(),
             rig: Rig { name: self.rig_name.clone(), cameras },
-            outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity },
+            outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity, normals },
             seed: episode.seed(),
             dynamics: self.dynamics,
             start: episode.world_from_rig(),

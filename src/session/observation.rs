@@ -1,7 +1,7 @@
 //! An observation: one buffer that goes to the socket as it is.
 //!
 //! ```text
-//! | header | ego.history_xyz, ego.history_rot | depth, opacity per image | colour per image | colour
+//! | header | ego.history_xyz, ego.history_rot | depth, opacity, normals per image | colour per image | colour
 //! of earlier frames |
 //! ```
 //!
@@ -28,7 +28,7 @@ use super::encode::{Drawn, Encoding, encode};
 use super::engine::{Answers, Scratch};
 use super::frame::{DType, Frame, Image, PastImage, Residency, Tensor, TensorKind, Timings};
 use super::schedule::Schedule;
-use super::{Episode, History, SessionError, Trained, Trust};
+use super::{Episode, History, Maps, SessionError, Trained, Trust};
 
 /// The length of the header, little-endian, stands before it.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -37,10 +37,10 @@ pub const HEADER_PREFIX_BYTES: usize = 8;
 /// numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 
-/// Room for what the header says per image: three tensors of at most 190 bytes, and 16 numbers of
-/// at most 24 digits, two names and a hash with their escaped keys, below 1,700 bytes; a lens of 12
+/// Room for what the header says per image: four tensors of at most 190 bytes, and 16 numbers of
+/// at most 24 digits, two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12
 /// numbers and a windshield of 42, with their keys below 1,600.
-const HEADER_IMAGE_BYTES: usize = 3328;
+const HEADER_IMAGE_BYTES: usize = 3584;
 
 /// Images of one answer at most, of as many poses or frames.
 const IMAGES: usize = config::OBSERVE_POSES * Rig::MAX_CAMERAS;
@@ -59,8 +59,7 @@ pub(super) struct Layout {
     /// The share of each image that its lens sees, where that is not all.
     seen: Vec<Option<f64>>,
     encoding: Encoding,
-    depth: bool,
-    opacity: bool,
+    maps: Maps,
     schedule: Schedule,
 }
 
@@ -86,6 +85,13 @@ pub(super) struct Drawing {
     pub(super) hashes: Vec<blake3::Hash>,
 }
 
+impl Drawing {
+    /// How far each of its images may be believed, as far as that was asked for.
+    pub(super) fn trusts(&self) -> impl Iterator<Item = f64> {
+        self.frame.images.iter().filter_map(|image| image.trust).map(|trust| trust.value)
+    }
+}
+
 /// A frame in the making.
 pub(super) struct Assembly {
     layout: Arc<Layout>,
@@ -109,7 +115,7 @@ impl Layout {
     pub(super) fn new(
         cameras: Vec<RigCamera>,
         encoding: Encoding,
-        (depth, opacity): (bool, bool),
+        maps: Maps,
         schedule: Schedule,
     ) -> Result<Self, SessionError> {
         if let Encoding::Jpeg(quality) = encoding
@@ -122,7 +128,7 @@ impl Layout {
             Field::of(camera).map(|field| field.share(camera))
         };
         let seen = cameras.iter().map(seen).collect();
-        let layout = Self { cameras, seen, encoding, depth, opacity, schedule };
+        let layout = Self { cameras, seen, encoding, maps, schedule };
         layout.check_size(layout.schedule.frames())?;
         Ok(layout)
     }
@@ -140,8 +146,8 @@ impl Layout {
         self.encoding
     }
 
-    pub(super) fn depth_and_opacity(&self) -> (bool, bool) {
-        (self.depth, self.opacity)
+    pub(super) fn maps(&self) -> Maps {
+        self.maps
     }
 
     pub(super) fn schedule(&self) -> &Schedule {
@@ -189,7 +195,10 @@ impl Layout {
 
     fn check_size(&self, times: usize) -> Result<(), SessionError> {
         let pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
-        let (pixels, limit) = (pixels * times as u64, config::ANSWER_PIXELS);
+        let pixel_bytes = 3 + 4 * self.maps.values() as u64;
+        let room_bytes = config::OBSERVATION_BYTES as u64 - config::OBSERVATION_HEADER_BYTES;
+        let limit = config::ANSWER_PIXELS.min(room_bytes / pixel_bytes);
+        let pixels = pixels * times as u64;
         if pixels > limit {
             return Err(SessionError::AnswerTooLarge { pixels, limit });
         }
@@ -203,8 +212,10 @@ impl Layout {
         }
         let cameras = shot.cameras.iter().map(|&camera| self.cameras[camera].camera.pixels());
         let pixels: usize = cameras.sum();
-        let floats = usize::from(self.depth) + usize::from(self.opacity);
-        (4 * pixels * floats, if self.encoding == Encoding::Raw { 3 * pixels } else { 0 })
+        (
+            4 * pixels * self.maps.values(),
+            if self.encoding == Encoding::Raw { 3 * pixels } else { 0 },
+        )
     }
 }
 
@@ -257,14 +268,20 @@ impl Assembly {
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
         let trained = self.trained.clone().filter(|_| shot.shown);
-        // Seen by nobody else: coverage is a part of trust.
-        let mut coverage: Vec<Vec<f32>> = match trained.is_some() && !layout.opacity {
-            true => views.iter().map(|view| vec![0.0; view.camera.pixels()]).collect(),
-            false => Vec::new(),
+        // Seen by nobody else: coverage is a part of trust, and normals are computed of depth.
+        let unseen = |wanted: bool| -> Vec<Vec<f32>> {
+            let drawn = if wanted { views } else { &[] };
+            drawn.iter().map(|view| vec![0.0; view.camera.pixels()]).collect()
         };
+        let Maps { depth, opacity, normals } = layout.maps;
+        let mut coverage = unseen(trained.is_some() && !opacity);
+        let mut depths_m = unseen(normals && !depth && shot.shown);
         let mut targets = self.targets(shot, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut coverage) {
             target.opacity = Some(opacity);
+        }
+        for (target, depth_m) in targets.iter_mut().zip(&mut depths_m) {
+            target.depth_m = Some(depth_m);
         }
         let slots: Vec<OnceLock<Result<Drawn, String>>> =
             views.iter().map(|_| OnceLock::new()).collect();
@@ -320,10 +337,13 @@ impl Assembly {
         let mut targets = Vec::with_capacity(shot.cameras.len());
         for (&camera, scratch) in shot.cameras.iter().zip(scratch) {
             let pixels = layout.cameras[camera].camera.pixels();
-            let mut floats = |wanted: bool| {
-                (wanted && shot.shown).then(|| floats_of(take(&mut float_part, 4 * pixels)))
+            let mut floats = |wanted: bool, values: usize| {
+                let bytes = 4 * pixels * values;
+                (wanted && shot.shown).then(|| floats_of(take(&mut float_part, bytes)))
             };
-            let (depth_m, opacity) = (floats(layout.depth), floats(layout.opacity));
+            let Maps { depth, opacity, normals } = layout.maps;
+            let (depth_m, opacity) = (floats(depth, 1), floats(opacity, 1));
+            let normals = floats(normals, 3);
             let rgb8 = if layout.encoding == Encoding::Raw && shot.shown {
                 take(&mut raw_part, 3 * pixels)
             } else {
@@ -332,7 +352,10 @@ impl Assembly {
                 }
                 &mut scratch[..3 * pixels]
             };
-            targets.push(Target { rgb8: Some(rgb8), depth_m, opacity, ..Target::default() });
+            let appearance = Some(&layout.cameras[camera].appearance);
+            let rgb8 = Some(rgb8);
+            let rgba = None;
+            targets.push(Target { rgba, rgb8, depth_m, opacity, normals, appearance });
         }
         targets
     }
@@ -395,11 +418,14 @@ impl Assembly {
         tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
         for (index, image) in images.iter().enumerate() {
             let [height, width] = size(&layout.cameras[image.camera]);
-            if layout.depth {
+            if layout.maps.depth {
                 tensors.push(TensorKind::Depth(index), DType::F32, vec![height, width]);
             }
-            if layout.opacity {
+            if layout.maps.opacity {
                 tensors.push(TensorKind::Opacity(index), DType::F32, vec![height, width]);
+            }
+            if layout.maps.normals {
+                tensors.push(TensorKind::Normals(index), DType::F32, vec![height, width, 3]);
             }
         }
         for (index, (image, &file)) in images.iter().zip(&shown_files).enumerate() {

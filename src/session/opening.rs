@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+
 use crate::config;
 use crate::geometry::Pose;
 use crate::residency::Resident;
 use crate::scene::ProfileChanges;
 use crate::scene::Trajectory;
-use crate::scene::rig::{Rig, RigCamera};
+use crate::scene::rig::{Rig, RigCamera, check_overlays};
 use crate::scene::route::Route;
 use crate::sim::Dynamics;
 
@@ -96,10 +98,8 @@ pub struct Outputs {
     pub images: BTreeMap<String, ImagePart>,
     /// How colour images travel.
     pub encoding: Encoding,
-    /// Whether to add depth.
-    pub depth: bool,
-    /// Whether to add opacity.
-    pub opacity: bool,
+    /// What else of every image.
+    pub maps: Maps,
     /// How many last frames of each camera; 1 if absent.
     pub frames: Option<u64>,
     /// Whether to say how far each image may be believed.
@@ -115,12 +115,31 @@ impl Outputs {
             cameras: None,
             images: BTreeMap::new(),
             encoding,
-            depth: false,
-            opacity: false,
+            maps: Maps::default(),
             frames: None,
             trust: false,
             periods_us: BTreeMap::new(),
         }
+    }
+}
+
+/// What an observation holds of an image beside its colours, all f32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Maps {
+    /// Expected depth in metres, `[height, width]`.
+    pub depth: bool,
+    /// Accumulated opacity, `[height, width]`.
+    pub opacity: bool,
+    /// Unit normals in the camera's axes, `[height, width, 3]`.
+    #[serde(default)]
+    pub normals: bool,
+}
+
+impl Maps {
+    /// Values per pixel.
+    pub(super) fn values(self) -> usize {
+        usize::from(self.depth) + usize::from(self.opacity) + 3 * usize::from(self.normals)
     }
 }
 
@@ -140,13 +159,10 @@ pub(super) fn choose_cameras(
     outputs: &Outputs,
 ) -> Result<(String, Vec<RigCamera>), SessionError> {
     let (rig, mut cameras) = whole_cameras(resident, choice, outputs)?;
+    let refused = |must: String| SessionError::OutOfRange { field: "outputs.images", must };
     for (name, ImagePart { crop, size }) in &outputs.images {
-        let refused = |why: String| {
-            let must = format!("camera {name:?}: {why}");
-            SessionError::OutOfRange { field: "outputs.images", must }
-        };
         let drawn = cameras.iter_mut().find(|camera| camera.name == *name);
-        let camera = &mut drawn.ok_or_else(|| refused("it is not drawn".into()))?.camera;
+        let camera = drawn.ok_or_else(|| refused(format!("camera {name:?}: it is not drawn")))?;
         if let Some([left, top, width, height]) = *crop {
             let part = camera.cropped([left, top], [width, height]);
             *camera = part.map_err(|cause| refused(cause.to_string()))?;
@@ -156,6 +172,7 @@ pub(super) fn choose_cameras(
             *camera = scaled.map_err(|cause| refused(cause.to_string()))?;
         }
     }
+    check_overlays(&cameras).map_err(|cause| refused(cause.to_string()))?;
     Ok((rig, cameras))
 }
 

@@ -79,6 +79,9 @@ pub struct RecordedOutputs {
     pub depth: bool,
     /// Whether there was opacity.
     pub opacity: bool,
+    /// Whether there were normals.
+    #[serde(default)]
+    pub normals: bool,
 }
 
 /// One answer with images.
@@ -258,7 +261,8 @@ mod tests {
     use crate::session::Outcome;
 
     fn end(steps: u64) -> Line {
-        Line::End(Summary { outcome: Outcome::Completed, steps, time_us: 0, distance_m: 0.0 })
+        let (outcome, least_trust) = (Outcome::Completed, None);
+        Line::End(Summary { outcome, steps, time_us: 0, distance_m: 0.0, least_trust })
     }
 
     #[test]

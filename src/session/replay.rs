@@ -5,7 +5,7 @@ use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::config::EPISODE_LINE_BYTES;
+use crate::config::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::RenderProfile;
@@ -176,12 +176,12 @@ impl Recording {
         for line in 1.. {
             let wrong = |reason: String| ReplayError::Line { path: path.to_owned(), line, reason };
             let mut text = Vec::new();
-            let limit = EPISODE_LINE_BYTES as u64;
-            reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(failed)?;
+            let limit = if line == 1 { EPISODE_HEAD_BYTES } else { EPISODE_LINE_BYTES };
+            reader.by_ref().take(limit as u64).read_until(b'\n', &mut text).map_err(failed)?;
             match text.last() {
                 None => break,
                 Some(b'\n') => {}
-                Some(_) if text.len() == EPISODE_LINE_BYTES => {
+                Some(_) if text.len() == limit => {
                     return Err(wrong(format!("longer than {limit} bytes")));
                 }
                 Some(_) => return Err(wrong("cut off: it has no end".to_owned())),
@@ -269,7 +269,7 @@ impl Recording {
                 let scene = resident.scene(&observation::eyes(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
                 let to_draw = RenderFrame { scene: &scene, profile, views: &views };
-                redraw(backend, &to_draw, &cameras, &mut pixels)
+                redraw(backend, &to_draw, (all, &cameras), &mut pixels)
                     .map_err(|cause| ReplayError::Render { step, cause })?;
                 for (&camera, recorded) in cameras.iter().zip(&mut recorded) {
                     let (camera, rgb8) = (&all[camera], &*pixels[camera]);
@@ -357,12 +357,18 @@ impl std::fmt::Display for Difference {
 fn redraw(
     backend: &dyn Backend,
     frame: &RenderFrame<'_>,
-    cameras: &[usize],
+    (all, cameras): (&[RigCamera], &[usize]),
     pixels: &mut [Vec<u8>],
 ) -> Result<(), RenderError> {
-    let wanted = pixels.iter_mut().enumerate().filter(|(camera, _)| cameras.contains(camera));
-    let mut targets: Vec<Target<'_>> =
-        wanted.map(|(_, rgb8)| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
+    let wanted = pixels.iter_mut().zip(all).enumerate();
+    let wanted = wanted.filter(|(camera, _)| cameras.contains(camera));
+    let mut targets: Vec<Target<'_>> = wanted
+        .map(|(_, (rgb8, camera))| Target {
+            rgb8: Some(rgb8),
+            appearance: Some(&camera.appearance),
+            ..Target::default()
+        })
+        .collect();
     backend.render(frame, &mut targets, &|_, _| {})?;
     Ok(())
 }

@@ -27,11 +27,12 @@ const FADES_RAD: f64 = 12.0;
 /// is compared with.
 const METRES_PER_RAD: f64 = FADES_M / FADES_RAD;
 
-/// Every so many-th pixel is looked at, in rows and in columns: of 1440 x 928, 20,880 of 8 x 8.
-const PIXEL_STRIDE: usize = 8;
+/// Every so many-th pixel is looked at, in rows and in columns: of 1440 x 928, 5,220 of 16 x 16, so that a
+/// share is right within 0.7 %.
+const PIXEL_STRIDE: usize = 16;
 
 /// Every so many-th of those rays is followed through the map: of 1440 x 928, 345 of 64 x 64 px.
-const RAY_STRIDE: usize = 8;
+const RAY_STRIDE: usize = 4;
 
 /// How far rays are followed, in metres: through 13 blocks.
 const RAY_M: f64 = 200.0;

@@ -27,6 +27,7 @@ mod encoding;
 mod extremes;
 mod flat;
 mod mirror;
+mod needed;
 mod overlap;
 mod parity;
 mod parts;

@@ -1,7 +1,7 @@
 //! Golden text messages: one file per request and per answer.
 
 use serde_json::{Value, json};
-use wildcity::protocol::camera::{Lens, Rolls, Shutter};
+use wildcity::protocol::camera::{Exposure, Lens, Rolls, Shutter};
 use wildcity::protocol::error::Code;
 use wildcity::protocol::message::*;
 use wildcity::protocol::{PROTOCOL, unknown_field};
@@ -100,6 +100,8 @@ pub(crate) fn front() -> RigCamera {
         lens: None,
         windshield: None,
         shutter: None,
+        exposure: None,
+        overlay: None,
         camera_to_rig: pose([1.6, 0.0, 1.5], [0.5, -0.5, 0.5, -0.5]),
     }
 }
@@ -109,6 +111,11 @@ pub(crate) fn rear() -> RigCamera {
         name: "rear".into(),
         lens: Some(Lens::Fisheye { k: [-0.03, -0.005, -0.001, 0.001], max_angle: Some(1.2) }),
         shutter: Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 }),
+        exposure: Some(Exposure {
+            matrix: Some([[1.25, 0.0, 0.0], [0.0, 1.125, -0.0625], [0.0, 0.0, 1.5]]),
+            gain: None,
+            offset: [0.0, -0.03125, 0.0],
+        }),
         camera_to_rig: pose([-0.9, 0.0, 1.4], [0.5, -0.5, -0.5, 0.5]),
         ..front()
     }
@@ -116,7 +123,12 @@ pub(crate) fn rear() -> RigCamera {
 
 fn requests() -> Vec<(&'static str, Request)> {
     let station = Start::Station { trajectory: "log".into(), station_m: 12.5 };
-    let rig = Rig { name: "pair".into(), cameras: vec![front(), rear()] };
+    let seen = RigCamera {
+        exposure: Some(Exposure { matrix: None, gain: Some([1.5, 1.0, 0.75]), offset: [0.0; 3] }),
+        overlay: Some("data:image/png;base64,aG9vZA==".into()),
+        ..front()
+    };
+    let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()] };
     let open = Open {
         seq: 1,
         version: Some(3),
@@ -135,6 +147,7 @@ fn requests() -> Vec<(&'static str, Request)> {
             quality: Some(85),
             depth: true,
             opacity: true,
+            normals: Some(true),
             frames: Some(4),
             trust: Some(true),
             period_us: Some([("rear".to_owned(), 200_000)].into()),
@@ -260,8 +273,8 @@ fn answers() -> Vec<(&'static str, Answer)> {
         profile: opened.profile.clone(),
     };
     let session = "run-17".to_owned();
-    let summary =
-        Summary { outcome: Outcome::Completed, steps: 2, time_us: 200_000, distance_m: 1.75 };
+    let (outcome, least_trust) = (Outcome::OffModel, Some(0.0625));
+    let summary = Summary { outcome, steps: 2, time_us: 200_000, distance_m: 1.75, least_trust };
     let refused = Answer::Error {
         seq: Some(3),
         code: Code::PoseNotFinite,

@@ -44,7 +44,7 @@ async fn a_whole_conversation() {
     client.last_step(HERE).await.unwrap();
     client.observe(&[HERE, HERE]).await.unwrap();
     client.prefetch(&[HERE]).await.unwrap();
-    assert_eq!(client.close().await.unwrap().outcome, Outcome::Completed);
+    assert_eq!(client.close().await.unwrap().outcome, Outcome::OffModel);
     drop(client);
 
     let requests = server.requests().await.remove(0);

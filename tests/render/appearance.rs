@@ -73,8 +73,8 @@ fn a_plain_appearance_changes_no_bit() {
 fn what_cannot_be_is_refused() {
     let pixels = vec![9; 4 * 6 * 5];
     assert_eq!(Overlay::new(6, pixels.clone()).unwrap().size_px(), [6, 5]);
-    assert_eq!(Overlay::new(7, pixels.clone()), None);
-    assert_eq!(Overlay::new(0, Vec::new()), None);
+    assert!(Overlay::new(7, pixels.clone()).is_err());
+    assert!(Overlay::new(0, Vec::new()).is_err());
     let overlay = Some(Arc::new(Overlay::new(6, pixels).unwrap()));
     let seen = Appearance { exposure: None, overlay };
     assert_eq!(seen.check([6, 5]), Ok(()));

@@ -20,6 +20,7 @@ mod cameras;
 mod determinism;
 mod extremes;
 mod models;
+mod normals;
 mod others;
 mod parity;
 mod report;

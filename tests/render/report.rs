@@ -1,24 +1,30 @@
 //! `wildcity report`: what is measured is so, and what is recommended holds.
 
-use std::process::Command;
+use std::collections::BTreeSet;
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-use glam::{DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 use wildcity::generate;
 use wildcity::geometry::Pose;
+use wildcity::geometry::camera::{Fisheye, Lens};
 use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::report::believed::believed;
 use wildcity::report::choose::{Wanted, front, recommend};
-use wildcity::report::ladder::ladder;
-use wildcity::report::measure::{Bench, Measured};
+use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
+use wildcity::report::measure::{AtPlace, Bench, Measured};
 use wildcity::report::places::{OFFSETS_M, Sampling, places};
 use wildcity::report::{ReportError, needed};
 use wildcity::residency::{Cache, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::RigCamera;
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{Record, RenderProfile, Rig};
-use wildcity::store::{Catalog, NewVersion, Storage};
+use wildcity::scene::{Rays, Record, RenderProfile, Rig};
+use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
+
+use crate::skies::demo_sky;
 
 /// Two cameras of a twin whose levels are seen: a street of 40 m, 30,000 Gaussians.
 fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Arc<Resident> {
@@ -58,23 +64,38 @@ fn drive() -> Trajectory {
     Trajectory { name: "log".to_owned(), keyframes: (0..40).map(keyframe).collect() }
 }
 
-/// Every setting of the ladder on the cpu backend, at three stations.
-fn measured(resident: &Arc<Resident>) -> Vec<Measured> {
+/// Settings of the ladder on the cpu backend, at three stations, or at twelve places around; and what is
+/// left out.
+fn measured(
+    resident: &Arc<Resident>,
+    rig: &Rig,
+    keep: &dyn Fn(&Setting) -> bool,
+) -> (Vec<Measured>, Vec<LeftOut>) {
     let sampling = Sampling { stations: 3, window_px: [64, 48] };
     let manifest = &resident.version.manifest;
-    let places = places(manifest, &rig().cameras, sampling);
+    let places = places(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Bench { resident, backends: &backends, places: &places, repeat: 2 };
-    let truth = bench.truth(&mut |_| {}).unwrap();
-    assert!(truth.step_ms > 0.0);
-    let settings = ladder(&manifest.profile, manifest.record, &["cpu"]);
-    settings.iter().map(|setting| bench.measure(setting, &truth).unwrap()).collect()
+    let bench = Bench { resident, backends: &backends, places: &places, repeat: 1 };
+    let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let Ladder { settings, left_out } = ladder(&twin, &["cpu"]);
+    let truths = [Rays::Splats, Rays::Exact].map(|rays| {
+        let wanted = settings.iter().any(|s| keep(s) && s.against == rays);
+        wanted.then(|| bench.truth(rays, &mut |_| {}).unwrap())
+    });
+    let measure = |setting: &Setting| {
+        let truth = truths[usize::from(setting.against == Rays::Exact)].as_ref().unwrap();
+        assert!(truth.step_ms > 0.0);
+        bench.measure(setting, truth).unwrap()
+    };
+    (settings.iter().filter(|setting| keep(setting)).map(measure).collect(), left_out)
 }
 
 #[test]
 fn errors_and_costs_go_the_way_they_must() {
     let dir = tempfile::tempdir().unwrap();
-    let all = measured(&commit(dir.path(), vec![drive()]));
+    let (all, left_out) = measured(&commit(dir.path(), vec![drive()]), &rig(), &|_| true);
+    let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
+    assert_eq!(left_out, ["tile size", "sky_error", "rays"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     // Full detail on the cpu backend is what the reference draws.
@@ -104,8 +125,9 @@ fn errors_and_costs_go_the_way_they_must() {
         let errors = &m.errors;
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
         assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{errors:?}");
-        let least_db = m.least_db[0].min(m.least_db[1]);
-        assert!(least_db <= errors.psnr_db, "{}: {least_db} dB, {errors:?}", m.setting.name);
+        assert!(m.least_db() <= errors.psnr_db, "{}: {errors:?}", m.setting.name);
+        assert_eq!(m.by_place.len(), 12);
+        assert_eq!(m.by_place.iter().filter(|place| place.p95_ms.is_some()).count(), 3);
         let files = &m.worst.files;
         assert!(files.iter().all(|file| file.starts_with(b"\x89PNG")), "{}", m.setting.name);
         assert!(m.cost.step_ms > 0.0);
@@ -115,35 +137,157 @@ fn errors_and_costs_go_the_way_they_must() {
     let names = ["cpu".to_owned()];
     let best = recommend(Wanted::AtLeastDb(35.0), &all, &names).unwrap();
     let chosen = of(&best.setting);
-    assert!(best.verified >= 35.0 && chosen.least_db[1] >= 35.0, "{best:?}");
+    assert!(best.verified >= 35.0 && best.chosen_by >= 35.0 + best.margin, "{best:?}");
+    assert_eq!((least_db(chosen, true), least_db(chosen, false)), (best.chosen_by, best.verified));
     assert!(chosen.setting.can_be_served() && chosen.setting.scale == 1.0);
-    let is_worse = |m: &&Measured| m.setting.can_be_served() && m.least_db[0] >= 36.0;
-    assert!(all.iter().filter(is_worse).all(|m| m.cost.step_ms >= chosen.cost.step_ms));
     let too_much = recommend(Wanted::AtLeastDb(500.0), &all, &names).unwrap_err();
     assert!(matches!(too_much, ReportError::OutOfReach { .. }), "{too_much}");
     let too_fast = recommend(Wanted::AtMostMs(1e-6), &all, &names).unwrap_err();
     assert!(matches!(too_fast, ReportError::OutOfReach { .. }), "{too_fast}");
-    let slowest = all.iter().map(|m| m.p95_ms[0].max(m.p95_ms[1])).fold(0.0, f64::max);
+    let slowest = all.iter().flat_map(|m| &m.by_place).filter_map(|place| place.p95_ms);
+    let slowest = slowest.fold(0.0, f64::max);
     let exact = recommend(Wanted::AtMostMs(10.0 * slowest), &all, &names).unwrap();
-    assert_eq!(of(&exact.setting).least_db[0], best_db(&all), "{exact:?}");
-
-    // What fails elsewhere is not recommended.
-    let mut elsewhere = all.clone();
-    elsewhere.iter_mut().for_each(|m| m.least_db[1] = 12.0);
-    let refused = recommend(Wanted::AtLeastDb(35.0), &elsewhere, &names).unwrap_err();
-    assert!(matches!(refused, ReportError::NotVerified { verified: 12.0, .. }), "{refused}");
+    let servable = all.iter().filter(|m| m.setting.can_be_served());
+    let best_db = servable.map(|m| least_db(m, true)).fold(0.0, f64::max);
+    assert_eq!(least_db(of(&exact.setting), true), best_db, "{exact:?}");
 }
 
-fn best_db(all: &[Measured]) -> f64 {
-    let servable = all.iter().filter(|m| m.setting.can_be_served());
-    servable.map(|m| m.least_db[0]).fold(0.0, f64::max)
+/// Least PSNR of the places that choose, or of those that verify.
+fn least_db(m: &Measured, chooses: bool) -> f64 {
+    let places = m.by_place.iter().filter(|place| place.chooses == chooses);
+    places.map(|place| place.psnr_db).fold(f64::INFINITY, f64::min)
+}
+
+/// A slow and good setting and a fast one, at places that give so many dB: of each two the first chooses.
+fn two(like: &[Measured], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measured> {
+    let mut all = like.to_vec();
+    for (m, (db, ms)) in all.iter_mut().zip([(slow_db, 20.0), (fast_db, 10.0)]) {
+        m.cost.step_ms = ms;
+        let place = |(index, psnr_db): (usize, f64)| AtPlace {
+            chooses: index % 2 == 0,
+            psnr_db,
+            p95_ms: Some(ms),
+        };
+        m.by_place = db.into_iter().enumerate().map(place).collect();
+    }
+    all
+}
+
+#[test]
+fn the_margin_is_what_places_differ_by() {
+    let names = ["cpu".to_owned()];
+    let dir = tempfile::tempdir().unwrap();
+    let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
+    let (like, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
+    let chosen = |fast_db: [f64; 6]| {
+        let all = two(&like, [60.0, 59.0, 62.0, 60.0, f64::INFINITY, 61.0], fast_db);
+        recommend(Wanted::AtLeastDb(35.0), &all, &names).map(|best| (best.setting, best.margin))
+    };
+    // Alike everywhere: a decibel is enough.
+    assert_eq!(
+        chosen([36.2, 35.5, 36.4, 35.1, 36.3, 36.0]).unwrap(),
+        ("stop=0.016".to_owned(), 1.0)
+    );
+    // 36 is 2 dB below the median of 38: others will have less than 35, and the slow one is taken.
+    let (setting, margin) = chosen([36.0, 33.0, 38.0, 40.0, 44.0, 45.0]).unwrap();
+    assert_eq!(setting, "as served");
+    // Of 60, 62 and "exact", which is no reason to trust it less.
+    assert_eq!(margin, 2.0);
+    // What fails all the same is not recommended.
+    let refused = chosen([40.0, 41.0, 40.5, 34.9, 40.2, 40.0]).unwrap_err();
+    assert!(matches!(refused, ReportError::NotVerified { verified: 34.9, .. }), "{refused}");
+    // Times have a margin, too: 10 ms and a tenth.
+    let all = two(&like, [60.0; 6], [40.0; 6]);
+    let by_time = |ms: f64| recommend(Wanted::AtMostMs(ms), &all, &names).unwrap().setting;
+    assert_eq!(
+        [by_time(22.1), by_time(21.9), by_time(11.1)],
+        ["as served", "stop=0.016", "stop=0.016"]
+    );
+    assert!(recommend(Wanted::AtMostMs(10.9), &all, &names).is_err());
+}
+
+#[test]
+fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
+    let Some(path) = crate::data::real("scenes/skull/skull.ply") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let skull = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
+    let new = NewVersion {
+        storage: Storage { record: Record::F32, levels: false },
+        ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new, &mut |_, _| {}).unwrap();
+    let resident = Cache::new(catalog).open("skull", None).unwrap();
+    let tried = ["as served", "stop=0.004", "stop=0.016", "alpha_cut=0.008", "alpha_cut=0.032"];
+    let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
+    let (all, _) = measured(&resident, &rig(), &keep);
+    let names = ["cpu".to_owned()];
+    // One exact and slow, the others as fast as each other: whichever is taken must hold.
+    let mut met = Vec::new();
+    for fastest in tried {
+        let mut all = all.clone();
+        for m in &mut all {
+            m.cost.step_ms = if m.setting.name == fastest { 1.0 } else { 2.0 };
+        }
+        match recommend(Wanted::AtLeastDb(35.0), &all, &names) {
+            Ok(best) if best.setting == fastest => met.push(fastest),
+            Ok(best) => assert!(best.verified >= 35.0, "{best:?}"),
+            Err(refused) => panic!("{fastest}: {refused}"),
+        }
+    }
+    assert!(met.contains(&"as served") && met.contains(&"stop=0.004"), "{met:?}");
+    assert!(!met.contains(&"alpha_cut=0.032"), "{met:?}");
+    let refused = recommend(Wanted::AtLeastDb(150.0), &all, &names).unwrap_err();
+    assert!(matches!(refused, ReportError::OutOfReach { .. }), "{refused}");
+}
+
+#[test]
+fn a_sky_and_lenses_have_rungs_of_their_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let street = generate::canyon(3_000, &mut |_, _| {});
+    let bytes = std::fs::read(demo_sky()).unwrap();
+    let new = NewVersion {
+        profile: RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT },
+        trajectories: vec![drive()],
+        sky: Some(NewSky::Put(SkyBytes {
+            bytes: bytes.into(),
+            image: None,
+            sky_from_world: DMat3::IDENTITY,
+        })),
+        storage: Storage { record: Record::Q32, levels: false },
+        ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new, &mut |_, _| {}).unwrap();
+    let resident = Cache::new(catalog).open("street", None).unwrap();
+    let mut bent = rig();
+    bent.cameras.truncate(1);
+    bent.cameras[0].camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
+    let names = ["as served", "sky_error=0.1", "record q24", "against every pixel's own ray"];
+    let keep = |setting: &Setting| names.contains(&setting.name.as_str());
+    let (all, left_out) = measured(&resident, &bent, &keep);
+    let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
+    assert_eq!(left_out, ["tile size", "tau_px"]);
+    let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
+    let db = |name: &str| of(name).errors.psnr_db;
+    assert!(db("as served") > db("sky_error=0.1"), "{:?}", of("sky_error=0.1").errors);
+    assert!(of("as served").errors.max < 2.0 / 255.0, "{:?}", of("as served").errors);
+    assert!(of("as served").cost.scene_bytes < of("sky_error=0.1").cost.scene_bytes);
+    // Another record has the same sky.
+    assert!(db("record q24") > 48.0, "{:?}", of("record q24").errors);
+    let rays = of("against every pixel's own ray");
+    assert!((35.0..60.0).contains(&rays.errors.psnr_db), "{:?}", rays.errors);
+    assert!(!rays.setting.can_be_served());
+    assert!(rays.errors.psnr_db < db("as served"), "{:?}", rays.errors);
+    assert!(!front(std::slice::from_ref(rays))[0]);
 }
 
 #[test]
 fn a_setting_is_beaten_by_what_is_faster_and_closer() {
     let dir = tempfile::tempdir().unwrap();
-    let mut all = measured(&commit(dir.path(), vec![drive()]));
-    all.truncate(4);
+    let keep = |setting: &Setting| setting.family == Family::Detail;
+    let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
+    assert_eq!(all.len(), 4);
     for (m, (ms, db)) in all.iter_mut().zip([(1.0, 30.0), (2.0, 40.0), (2.5, 40.0), (3.0, 35.0)]) {
         (m.cost.step_ms, m.errors.psnr_db) = (ms, db);
     }
@@ -160,7 +304,7 @@ fn without_a_drive_a_twin_is_looked_at_from_around() {
     let sampling = Sampling { stations: 4, window_px: [64, 48] };
     let manifest = &resident.version.manifest;
     let places = places(manifest, &rig().cameras, sampling);
-    assert_eq!(places.len(), 4);
+    assert_eq!(places.len(), 16);
     let bounds = manifest.bounds();
     for place in &places {
         let [view] = place.views[..] else { panic!("one camera") };
@@ -169,7 +313,30 @@ fn without_a_drive_a_twin_is_looked_at_from_around() {
         let at = view.camera.pinhole.project(seen);
         assert!(seen.z > 0.0 && (at.x - 320.0).abs() < 1e-6 && (at.y - 240.0).abs() < 1e-6, "{at}");
     }
-    assert_eq!(places.iter().filter(|place| place.chooses).count(), 2);
+    assert_eq!(places.iter().filter(|place| place.chooses).count(), 8);
+}
+
+#[test]
+fn images_are_believed_less_beside_the_drive() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit(dir.path(), vec![drive()]);
+    let sampling = Sampling { stations: 2, window_px: [16, 16] };
+    let places = places(&resident.version.manifest, &rig().cameras, sampling);
+    let cpu = Cpu::new(2, Simd::Best).unwrap();
+    let all = believed(&resident, &cpu, &places).unwrap();
+    assert_eq!(all.iter().map(|b| b.offset_m).collect::<Vec<_>>(), OFFSETS_M);
+    assert!(all[0].mean > 0.9 && all[3].mean < 0.45, "{all:?}");
+    for (pair, [near_m, far_m]) in all.windows(2).zip([[0.0, 1.0], [1.0, 3.0], [3.0, 5.0]]) {
+        assert!(pair[1].mean < pair[0].mean && pair[1].most < pair[0].most);
+        assert!((pair[0].distance_m - near_m).abs() < 0.3, "{:?}", pair[0]);
+        assert!((pair[1].distance_m - far_m).abs() < 0.3, "{:?}", pair[1]);
+    }
+    for b in &all {
+        assert!(b.least <= b.mean && b.mean <= b.most && b.picture.file.starts_with(b"\xff\xd8"));
+        assert!(b.offset_m == 0.0 || b.picture.place.contains(&format!("{} m", b.offset_m)));
+    }
+    let nowhere = commit(tempfile::tempdir().unwrap().path(), Vec::new());
+    assert!(believed(&nowhere, &cpu, &places).unwrap().is_empty());
 }
 
 #[test]
@@ -180,12 +347,54 @@ fn the_base_pays_for_no_feature_of_others() {
     let base = of("nothing else");
     // 14 columns of 4 B, and no more than 1 % of ends of blocks and clusters.
     assert!((56.0..58.0).contains(&base.host_bytes), "{base:?}");
+    assert_eq!((base.beside_bytes, base.host_pixel_bytes), (0, 3));
+    for row in &rows {
+        let own = row.counts;
+        let more = |is_more: bool, features: &[&str], what: &str| {
+            assert_eq!(is_more, features.contains(&row.with), "{what} of {}: {own:?}", row.with);
+        };
+        let bytes = own.host_bytes;
+        more(bytes > base.host_bytes + 1.0, &["SH degree 1", "SH degree 3"], "bytes");
+        let beside = ["sky of images", "sky, baked", "hood"];
+        more(own.beside_bytes > 0, &beside, "bytes beside");
+        let planes = ["depth", "depth and opacity", "trust"];
+        more(own.host_pixel_bytes > 3, &planes, "bytes of a pixel");
+        // What a Gaussian is, or where it lands, is evaluated otherwise; all else is not.
+        let shapes = ["levels of detail, 1 m", "antialiasing", "fisheye", "rolling shutter"];
+        more(own.evaluations != base.evaluations, &shapes, "evaluations");
+        assert!(own.device.is_none());
+    }
     assert!((92.0..95.0).contains(&of("SH degree 1").host_bytes));
     assert!((236.0..242.0).contains(&of("SH degree 3").host_bytes));
-    for alike in ["SH degree 1", "SH degree 3", "depth", "depth and opacity"] {
-        assert_eq!(of(alike).evaluations, base.evaluations, "{alike}");
+    let coarse = of("levels of detail, 1 m");
+    assert!(coarse.gaussians < base.gaussians && coarse.evaluations < base.evaluations);
+}
+
+/// A library that only some machines need is opened by whoever needs it.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["serve", "--backend", "cpu", "--listen", "127.0.0.1:0"])
+        .args(["--twins", "twins", "--episodes", "episodes", "--uploads", "uploads"])
+        .current_dir(dir.path())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = String::new();
+    BufReader::new(server.stdout.take().unwrap()).read_line(&mut said).unwrap();
+    let maps = std::fs::read_to_string(format!("/proc/{}/maps", server.id()));
+    server.kill().unwrap();
+    server.wait().unwrap();
+    assert!(said.contains("listening"), "{said}");
+    let maps = maps.unwrap();
+    let paths = maps.lines().filter_map(|line| line.split_whitespace().nth(5));
+    let libraries: BTreeSet<&str> = paths.filter(|path| path.contains(".so")).collect();
+    assert!(libraries.iter().any(|path| path.contains("libc.so")), "{libraries:?}");
+    for needless in ["vulkan", "libdrm", "libGL", "libEGL", "LLVM", "onnx", "cuda"] {
+        assert!(!libraries.iter().any(|path| path.contains(needless)), "{libraries:?}");
     }
-    assert!(rows.iter().all(|row| row.counts.device.is_none()));
 }
 
 #[test]
@@ -219,6 +428,8 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
         families.collect::<Vec<_>>()
     );
     assert_eq!(report["recommendations"][0]["wanted"]["at_least_db"], 30.0);
+    assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
+    assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
     let profile: wildcity::scene::ProfileChanges =
         serde_json::from_str(&read("profile.json")).unwrap();

@@ -47,7 +47,7 @@ async fn nothing_of_what_was_opened_is_implicit() {
     assert_eq!((&cameras[0]["name"], &cameras[0]["width"]), (&json!("front"), &json!(8)));
     let outputs = json!({
         "cameras": ["front", "rear"], "encoding": "jpeg", "quality": 90,
-        "depth": false, "opacity": false,
+        "depth": false, "opacity": false, "normals": false,
         "frames": 1, "trust": false, "period_us": { "front": 100_000, "rear": 100_000 },
     });
     assert_eq!(opened["outputs"], outputs);
@@ -72,9 +72,9 @@ async fn observations_tell_what_they_waited_for_and_hints_are_taken() {
 }
 
 #[tokio::test]
-async fn raw_pixels_depth_and_opacity_are_the_renderers() {
+async fn raw_pixels_and_maps_are_the_renderers() {
     let server = TestServer::start().await;
-    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true });
+    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true, "normals": true });
     let mut agent = open(&server, outputs).await;
     let seen = agent.step(2.0).await;
     let tensors = seen.tensors();
@@ -90,6 +90,9 @@ async fn raw_pixels_depth_and_opacity_are_the_renderers() {
         assert_eq!(floats(depth.data()), vec![1.5 + k as f32; w * h]);
         let opacity = tensors.tensor(&format!("camera/{}/opacity", camera.name)).unwrap();
         assert_eq!(floats(opacity.data()), vec![0.25; w * h]);
+        let normals = tensors.tensor(&format!("camera/{}/normals", camera.name)).unwrap();
+        assert_eq!(normals.shape(), [h, w, 3]);
+        assert_eq!(floats(normals.data()), vec![-0.5; 3 * w * h]);
 
         let image = &seen.meta["images"][k];
         assert_eq!(image["hash"], blake3::hash(&expected).to_hex().as_str());
@@ -98,7 +101,7 @@ async fn raw_pixels_depth_and_opacity_are_the_renderers() {
         assert_eq!((&image["width"], &image["fx"]), (&json!(w), &json!(10.0)));
         assert_eq!(image["shutter_end_us"], 100_000);
     }
-    assert_eq!(tensors.len(), 8);
+    assert_eq!(tensors.len(), 10);
     assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
 }
 
@@ -159,10 +162,25 @@ async fn how_far_images_may_be_believed_is_said_if_asked_for() {
         assert!((trust["value"].as_f64().unwrap() - value).abs() < 1e-9, "{trust}");
     }
     assert!(!seen.tensors().names().iter().any(|name| name.ends_with("opacity")), "not asked for");
+    // Eleven metres off, and half of what is seen is a hole.
+    let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
+    assert_eq!(summary["outcome"], "off_model");
+    let least = summary["least_trust"].as_f64().unwrap();
+    assert!((least - 0.5 * (-11.0_f64 / 5.0).exp()).abs() < 1e-9, "{least}");
+    let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
+    agent.step(9.0).await;
     let looks = agent.look(json!({ "type": "observe", "poses": [pose(9.0), pose(12.0)] })).await;
     let images = looks.meta["images"].as_array().unwrap();
     let distances_m: Vec<_> = images.iter().map(|image| &image["trust"]["distance_m"]).collect();
     assert_eq!(distances_m, [0.0, 0.0, 3.0, 3.0].map(|m| json!(m)).iter().collect::<Vec<_>>());
+    // What is only looked at is no place where the ego was.
+    let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
+    assert_eq!(
+        *summary,
+        json!({
+            "outcome": "completed", "steps": 1, "time_us": 100_000, "distance_m": 9.0, "least_trust": 0.5,
+        })
+    );
     let seen = open(&server, json!({})).await.step(1.0).await;
     assert_eq!(seen.meta["images"][0].get("trust"), None);
 }
@@ -323,7 +341,7 @@ async fn the_longest_header_fits() {
         })
         .collect();
     let mut agent = server.agent().await;
-    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true });
+    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true, "normals": true });
     let rig = json!({ "name": "r", "cameras": cameras });
     agent
         .open(
@@ -335,7 +353,7 @@ async fn the_longest_header_fits() {
         .collect();
     let seen = agent.look(json!({ "type": "observe", "poses": poses })).await;
     assert_eq!(seen.meta["images"].as_array().unwrap().len(), 256);
-    assert_eq!(seen.tensors().len(), 2 + 3 * 256);
+    assert_eq!(seen.tensors().len(), 2 + 4 * 256);
 }
 
 #[tokio::test]

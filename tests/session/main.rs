@@ -3,6 +3,7 @@
 #[path = "../support/server.rs"]
 mod support;
 
+mod appearance;
 mod ego;
 mod integrators;
 mod long;

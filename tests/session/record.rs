@@ -37,7 +37,7 @@ async fn every_frame_is_on_record_before_it_is_answered() {
     assert_eq!(header["version_hash"], opened["version_hash"]);
     assert_eq!(header["profile_hash"], opened["profile_hash"]);
     assert_eq!(header["rig"]["cameras"][1]["name"], "rear");
-    let outputs = json!({ "encoding": "png", "depth": true, "opacity": false });
+    let outputs = json!({ "encoding": "png", "depth": true, "opacity": false, "normals": false });
     assert_eq!(header["outputs"], outputs);
     assert_eq!(header["dt_us"], 100_000);
     for (line, seen, request) in

@@ -89,6 +89,9 @@ impl Backend for Painter {
             if let Some(opacity) = target.opacity.as_deref_mut() {
                 opacity.fill(0.25);
             }
+            if let Some(normals) = target.normals.as_deref_mut() {
+                normals.fill(-0.5);
+            }
             finished(k, target);
         }
         Ok(FrameStats { stages_ms: vec![("paint", 0.5)], ..FrameStats::default() })

@@ -99,6 +99,7 @@ pub(crate) fn draw_seen(
         rgb8: Some(rgb8),
         depth_m: Some(depth_m),
         opacity: Some(opacity),
+        normals: None,
         appearance: Some(seen),
     };
     let frame = Frame { scene, profile: &RenderProfile::DEFAULT, views: &[view] };

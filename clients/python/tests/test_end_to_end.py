@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import os
 import queue
@@ -18,11 +20,13 @@ from typing import Any
 import numpy as np
 import pytest
 import wildcity
+from PIL import Image
 from wildcity import (
     Action,
     Camera,
     Disconnected,
     Dynamics,
+    Exposure,
     Observation,
     Outputs,
     Pose,
@@ -31,6 +35,7 @@ from wildcity import (
     Station,
     TimedPose,
     Trajectory,
+    png_data_uri,
 )
 
 Connect = Callable[..., Any]
@@ -45,7 +50,7 @@ PAIR = Rig(
         Camera("rear", 65, 43, 40.0, 40.0, 32.5, 21.5, BACK),
     ),
 )
-RAW = Outputs(encoding="raw", depth=True, opacity=True)
+RAW = Outputs(encoding="raw", depth=True, opacity=True, normals=True)
 
 
 @dataclass(frozen=True)
@@ -176,10 +181,40 @@ def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:
         columns = image.shape[1] // 4
         assert image[:, :columns, left].mean() > 3 * image[:, :columns, right].mean()
         assert image[:, -columns:, right].mean() > 3 * image[:, -columns:, left].mean()
+    # Walls are seen from between them: what is left faces right, in the camera's axes x.
+    normals = seen.normals["front"]
+    assert normals[20:44, 2:10, 0].mean() > 0.95 and normals[20:44, -10:-2, 0].mean() < -0.95
     # The wall is 2 m to the left: z = fx * 2 m / (cx - u) for the pixel centre of column 8.
     depth, opacity = seen.depth["front"][32, 8], seen.opacity["front"][32, 8]
     assert opacity > 0.9
     assert depth == pytest.approx(60.0 * 2.0 / (48.0 - 8.5), rel=0.1)
+
+
+def test_exposure_and_overlay_are_what_the_rig_says(connect: Connect, server: Server) -> None:
+    hood = np.zeros((64, 96, 4), np.uint8)
+    hood[48:] = (10, 20, 30, 255)
+    file = io.BytesIO()
+    Image.fromarray(hood).save(file, "png")
+    looks = dataclasses.replace(
+        PAIR.cameras[0],
+        exposure=Exposure(gain=(0.5, 1.0, 2.0), offset=(0.0, 0.1, 0.0)),
+        overlay=png_data_uri(file.getvalue()),
+    )
+    raw = Outputs(("front",), "raw", normals=True)
+    seen = {}
+    with connect(server.url) as client:
+        for name, camera in (("plain", PAIR.cameras[0]), ("looks", looks)):
+            with client.open("corridor", rig=Rig("one", (camera,)), outputs=raw) as session:
+                seen[name] = session.reset()
+    plain, image = (seen[name].images["front"].astype(float) for name in ("plain", "looks"))
+    wanted = np.clip(plain * (0.5, 1.0, 2.0) + (0.0, 25.5, 0.0), 0, 255)
+    # Each of the two is rounded once, and blue twice as much.
+    assert np.abs(image - wanted)[:48].max() <= 2.0
+    assert (image[48:] == (10, 20, 30)).all()
+    assert np.array_equal(seen["plain"].normals["front"], seen["looks"].normals["front"])
+    wrong = dataclasses.replace(looks, width=95)
+    with connect(server.url) as client, pytest.raises(Refused, match="overlay"):
+        client.open("corridor", rig=Rig("one", (wrong,)), outputs=raw)
 
 
 def test_encodings_agree(connect: Connect, server: Server) -> None:

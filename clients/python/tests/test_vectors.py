@@ -17,6 +17,7 @@ from wildcity import (
     Camera,
     Code,
     Dynamics,
+    Exposure,
     ImagePart,
     Lens,
     Observation,
@@ -28,6 +29,7 @@ from wildcity import (
     Station,
     TimedPose,
     Trajectory,
+    png_data_uri,
 )
 from wildcity.core import Conversation
 from wildcity.protocol import ANSWERS, decode_answer, encode
@@ -45,6 +47,12 @@ REAR = dataclasses.replace(
     camera_to_rig=Pose((-0.9, 0.0, 1.4), (0.5, -0.5, -0.5, 0.5)),
     lens=Lens("fisheye", k=(-0.03, -0.005, -0.001, 0.001), max_angle=1.2),
     shutter=Shutter("top_to_bottom", 30_000),
+    exposure=Exposure(
+        matrix=((1.25, 0.0, 0.0), (0.0, 1.125, -0.0625), (0.0, 0.0, 1.5)), offset=(0.0, -0.03125, 0.0)
+    ),
+)
+SEEN = dataclasses.replace(
+    FRONT, exposure=Exposure(gain=(1.5, 1.0, 0.75)), overlay=png_data_uri(b"hood")
 )
 
 REQUESTS: dict[str, Callable[[Conversation], Any]] = {
@@ -55,13 +63,14 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
         session="run-17",
         seed=42,
         start=LOG,
-        rig=Rig("pair", (FRONT, REAR)),
+        rig=Rig("pair", (SEEN, REAR)),
         outputs=Outputs(
             ("front", "rear"),
             "raw",
             85,
             depth=True,
             opacity=True,
+            normals=True,
             images={"front": ImagePart((1, 0, 3, 3), (6, 6))},
             frames=4,
             trust=True,

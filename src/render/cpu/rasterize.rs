@@ -53,7 +53,7 @@ pub(super) fn rasterize(
                 evaluations.fetch_add(count, Relaxed);
             });
             drop(bands);
-            target.mask(&view.camera);
+            target.finish(view);
             finished(index, target);
         },
     );

@@ -293,7 +293,7 @@ impl Gpu {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
                 pixels.deliver(view, target);
-                target.mask(&frame.views[index].camera);
+                target.finish(&frame.views[index]);
                 finished(index, target);
             });
         });

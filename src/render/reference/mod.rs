@@ -69,7 +69,7 @@ impl Backend for Reference {
             blend_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.evaluations += pixels.len() as u64 * splats.len() as u64;
             write(&pixels, target);
-            target.mask(&view.camera);
+            target.finish(view);
             finished(index, target);
         }
         stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];

@@ -17,14 +17,14 @@ use crate::scene::Rig;
 use crate::server::Limits as ServerLimits;
 use crate::server::fault::Fault;
 use crate::session::{
-    self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Outcome, PastImage, Session, Summary,
+    self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Maps, Outcome, PastImage, Session, Summary,
     TensorKind, TrajectorySummary, TwinSummary,
 };
 use crate::sim::{Dynamics, Model};
 use crate::store::Version;
 
 use super::SUBPROTOCOL;
-use super::camera::{beyond, shutter_to};
+use super::camera::{beyond, exposure_to, shutter_to};
 use super::fault::{cells, code_and_field};
 
 /// To `hello`.
@@ -62,7 +62,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
     let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let (depth, opacity) = session.depth_and_opacity();
+    let Maps { depth, opacity, normals } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     let outputs = message::Outputs {
@@ -70,6 +70,7 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
         quality,
         depth,
         opacity,
+        normals: Some(normals),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
@@ -134,15 +135,16 @@ pub(in crate::server) fn switched(seq: u64, session: &Session) -> Result<String,
 
 /// To `close`.
 pub(in crate::server) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
-    let Summary { outcome, steps, time_us, distance_m } = *summary;
+    let Summary { outcome, steps, time_us, distance_m, least_trust } = *summary;
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
+        Outcome::OffModel => message::Outcome::OffModel,
         Outcome::AgentError => message::Outcome::AgentError,
         Outcome::AgentTimeout => message::Outcome::AgentTimeout,
         Outcome::AgentLost => message::Outcome::AgentLost,
         Outcome::ServerError => message::Outcome::ServerError,
     };
-    let summary = message::Summary { outcome, steps, time_us, distance_m };
+    let summary = message::Summary { outcome, steps, time_us, distance_m, least_trust };
     text(&Answer::Closed { seq, summary })
 }
 
@@ -199,6 +201,7 @@ pub(in crate::server) fn observation(
             TensorKind::HistoryRotation => "ego.history_rot".to_owned(),
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
+            TensorKind::Normals(image) => format!("{}/normals", image_names[image]),
             TensorKind::Rgb(image) => format!("{}/rgb", image_names[image]),
             TensorKind::PastRgb(image) => past_tensor(session, &frame.history[image]),
         };
@@ -396,6 +399,8 @@ fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {
         lens,
         windshield,
         shutter: camera.shutter.map(shutter_to),
+        exposure: camera.appearance.exposure.map(exposure_to),
+        overlay: None,
         camera_to_rig: pose(&camera.rig_from_camera),
     }
 }

@@ -1,10 +1,13 @@
 //! Cameras, both ways.
 
+use std::sync::Arc;
+
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::camera::{
     Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
 };
 use crate::protocol::camera as wire;
+use crate::scene::appearance::{Appearance, AppearanceError, Exposure, Overlay};
 
 /// Wire to lens.
 pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
@@ -29,6 +32,24 @@ pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
         wire::WindshieldReference::Backward => WindshieldReference::Backward,
     };
     WindshieldFields { reference, horizontal, vertical }
+}
+
+/// Wire to what a camera makes of an image of a size.
+pub(super) fn appearance_of(
+    exposure: Option<wire::Exposure>,
+    overlay: Option<&str>,
+    size_px: [u32; 2],
+) -> Result<Appearance, AppearanceError> {
+    let exposure =
+        exposure.map(|wire::Exposure { matrix, gain, offset }| Exposure::new(matrix, gain, offset));
+    let exposure = exposure.transpose()?;
+    let overlay = overlay.map(|text| Overlay::from_data_uri(text, size_px)).transpose()?;
+    Ok(Appearance { exposure, overlay: overlay.map(Arc::new) })
+}
+
+/// Exposure to wire.
+pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposure {
+    wire::Exposure { matrix: Some(matrix), gain: None, offset }
 }
 
 /// Wire to shutter.

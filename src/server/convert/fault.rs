@@ -40,11 +40,12 @@ pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
         Fault::Camera { field, cause } => {
             (Code::CameraInvalid, Some(format!("{field}.{}", cause.field())))
         }
+        Fault::Appearance { field, .. } => (Code::CameraInvalid, Some(field.clone())),
         Fault::Rig { field, cause } => {
             let code = match cause {
-                RigError::Count { .. } => Code::OutOfRange,
+                RigError::Count { .. } | RigError::Overlays { .. } => Code::OutOfRange,
                 RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
-                RigError::Camera { .. } => Code::CameraInvalid,
+                RigError::Camera { .. } | RigError::Appearance { .. } => Code::CameraInvalid,
             };
             (code, Some(field.clone()))
         }

@@ -10,14 +10,14 @@ use crate::geometry::camera::json::Intrinsics;
 use crate::protocol::message::{self, Request};
 use crate::protocol::unknown_field;
 use crate::scene::ProfileChanges;
-use crate::scene::rig::{Rig, RigCamera, is_name};
+use crate::scene::rig::{Rig, RigCamera, check_overlays, is_name};
 use crate::server::fault::Fault;
-use crate::session::{Encoding, ImagePart, Opening, Outputs, RigChoice, SessionError, Start};
+use crate::session::{Encoding, ImagePart, Maps, Opening, Outputs, RigChoice, SessionError, Start};
 use crate::sim::ego::{Action, Path, TimedPose};
 use crate::sim::{self, Dynamics, Model};
 
 use super::SUBPROTOCOL;
-use super::camera::{lens_of, shutter_of, windshield_of};
+use super::camera::{appearance_of, lens_of, shutter_of, windshield_of};
 
 /// A text frame, checked as far as it can be on its own.
 #[derive(Debug)]
@@ -226,6 +226,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         quality,
         depth,
         opacity,
+        normals,
         frames,
         trust,
         period_us,
@@ -248,8 +249,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
             encoding,
-            depth,
-            opacity,
+            maps: Maps { depth, opacity, normals: normals.unwrap_or(false) },
             frames,
             trust,
             periods_us,
@@ -316,34 +316,45 @@ fn start_of(start: message::Start) -> Result<Start, Fault> {
 }
 
 fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
-    let cameras = rig
-        .cameras
-        .into_iter()
-        // One more than is accepted tells the check that there are too many.
-        .take(Rig::MAX_CAMERAS + 1)
-        .enumerate()
-        .map(|(index, camera)| {
-            let field = format!("rig.cameras[{index}]");
-            let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig, .. } =
-                camera;
-            let name = name_of(&format!("{field}.name"), name)?;
-            let rig_from_camera = pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?;
-            let intrinsics = Intrinsics {
-                size_px: [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX)),
-                focal_px: [fx, fy],
-                center_px: [cx, cy],
-                lens: camera.lens.map(lens_of),
-                windshield: camera.windshield.map(windshield_of),
-            };
-            let fault = |cause| Fault::Camera { field: field.clone(), cause };
-            let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
-            let shutter = camera.shutter.map(shutter_of).transpose().map_err(fault)?;
-            Ok(RigCamera { name, camera: checked.map_err(fault)?, rig_from_camera, shutter })
-        })
-        .collect::<Result<_, Fault>>()?;
+    let refused = |field: &str| {
+        let field = field.to_owned();
+        move |cause| Fault::Rig { field, cause }
+    };
+    let mut cameras = Vec::new();
+    // One more than is accepted tells the check that there are too many.
+    for (index, camera) in rig.cameras.into_iter().take(Rig::MAX_CAMERAS + 1).enumerate() {
+        cameras.push(camera_of(&format!("rig.cameras[{index}]"), camera)?);
+        // Before the next one is unpacked.
+        check_overlays(&cameras).map_err(refused("rig.cameras"))?;
+    }
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };
-    rig.check().map_err(|cause| Fault::Rig { field: "rig.cameras".to_owned(), cause })?;
+    rig.check().map_err(refused("rig.cameras"))?;
     Ok(rig)
+}
+
+fn camera_of(field: &str, camera: message::RigCamera) -> Result<RigCamera, Fault> {
+    let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig, .. } = camera;
+    let name = name_of(&format!("{field}.name"), name)?;
+    let rig_from_camera = pose_of(&format!("{field}.camera_to_rig"), &camera_to_rig)?;
+    let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
+    let intrinsics = Intrinsics {
+        size_px,
+        focal_px: [fx, fy],
+        center_px: [cx, cy],
+        lens: camera.lens.map(lens_of),
+        windshield: camera.windshield.map(windshield_of),
+    };
+    let fault = |cause| Fault::Camera { field: field.to_owned(), cause };
+    let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
+    let shutter = camera.shutter.map(shutter_of).transpose().map_err(fault)?;
+    let checked = checked.map_err(fault)?;
+    let looks = appearance_of(camera.exposure, camera.overlay.as_deref(), size_px);
+    let appearance = looks.and_then(|looks| looks.check(size_px).map(|()| looks));
+    let appearance = appearance.map_err(|cause| Fault::Appearance {
+        field: format!("{field}.{}", cause.field()),
+        cause,
+    })?;
+    Ok(RigCamera { name, camera: checked, rig_from_camera, shutter, appearance })
 }
 
 fn name_of(field: &str, name: String) -> Result<String, Fault> {

@@ -23,6 +23,7 @@ from .protocol import (
     Camera,
     Dynamics,
     Ego,
+    Exposure,
     ImageInfo,
     ImagePart,
     Lens,
@@ -43,6 +44,7 @@ from .protocol import (
     TwinInfo,
     Welcome,
     Windshield,
+    png_data_uri,
 )
 from .pushing import Push, PushProgress, push, rollback
 from .sync import Client, Session, connect
@@ -59,6 +61,7 @@ __all__ = [
     "Disconnected",
     "Dynamics",
     "Ego",
+    "Exposure",
     "ImageInfo",
     "ImagePart",
     "Lens",

@@ -75,6 +75,11 @@ class Observation:
         """Accumulated opacity by camera."""
         return self.views[0].opacity
 
+    @property
+    def normals(self) -> Mapping[str, NDArray[np.float32]]:
+        """Unit normals by camera, in its axes (x right, y down, z forward), 0 where there is no depth."""
+        return self.views[0].normals
+
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
@@ -118,9 +123,9 @@ class Observation:
                 self._expect(image.tensor, "U8", (*size, 3))
             else:
                 self._expect(image.tensor, "U8", None)
-            for output in ("depth", "opacity"):
+            for output, shape in (("depth", size), ("opacity", size), ("normals", (*size, 3))):
                 if _sibling(image, output) in self._tensors:
-                    self._expect(_sibling(image, output), "F32", size)
+                    self._expect(_sibling(image, output), "F32", shape)
 
     def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
         """`shape` None: any number of bytes."""
@@ -161,6 +166,11 @@ class View:
     def opacity(self) -> Mapping[str, NDArray[np.float32]]:
         """float32 [height, width] by camera: accumulated opacity, where asked for."""
         return self._floats("opacity")
+
+    @cached_property
+    def normals(self) -> Mapping[str, NDArray[np.float32]]:
+        """float32 [height, width, 3] by camera: unit normals of what is seen, where asked for."""
+        return self._floats("normals")
 
     def _floats(self, output: str) -> Mapping[str, NDArray[np.float32]]:
         tensors = self._observation._tensors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import math
@@ -123,11 +124,27 @@ class Shutter:
 
 
 @dataclass(frozen=True)
+class Exposure:
+    """What a camera makes of colours: matrix @ rgb + offset, or gain * rgb + offset."""
+
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    gain: tuple[float, float, float] | None = None
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def png_data_uri(png: bytes) -> str:
+    """A PNG file as `Camera.overlay` has it."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+@dataclass(frozen=True)
 class Camera:
     """A camera on the vehicle, a pinhole unless it has a lens; sizes and intrinsics in pixels.
 
     `camera_to_rig` takes camera coordinates (x right, y down, z forward) to the rig's. An f-theta lens
-    has its focal lengths from its polynomial: leave fx and fy None there.
+    has its focal lengths from its polynomial: leave fx and fy None there. `overlay` is what the camera
+    sees of its own car: `png_data_uri(bytes)` of a PNG with opacity, of the image's size; answers leave
+    it out.
     """
 
     name: str
@@ -141,6 +158,8 @@ class Camera:
     lens: Lens | None = None
     windshield: Windshield | None = None
     shutter: Shutter | None = None
+    exposure: Exposure | None = None
+    overlay: str | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +192,7 @@ class Outputs:
     quality: int | None = None
     depth: bool = False
     opacity: bool = False
+    normals: bool | None = None
     images: dict[str, ImagePart] | None = None
     frames: int | None = None
     trust: bool | None = None
@@ -284,10 +304,13 @@ class Switched:
 class Summary:
     """How an episode went."""
 
-    outcome: Literal["completed", "agent_error", "agent_timeout", "agent_lost", "server_error"]
+    outcome: Literal[
+        "completed", "off_model", "agent_error", "agent_timeout", "agent_lost", "server_error"
+    ]
     steps: int
     time_us: int
     distance_m: float
+    least_trust: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,123 @@
+//! Normals: of surfaces whose normal is known, through every lens, and where surfaces end.
+
+use glam::{DQuat, DVec3};
+use wildcity::geometry::Pose;
+use wildcity::geometry::camera::Rolls;
+use wildcity::render::reference::Reference;
+use wildcity::render::{Backend, Frame, RenderError, Rolling, Target, View};
+use wildcity::report::stress::blobs::{Blob, ahead, scene};
+use wildcity::scene::{RenderProfile, Scene};
+
+use crate::images::cpu;
+use crate::lenses::lenses;
+
+/// Depth, opacity and normals of a view.
+struct Drawn {
+    depth_m: Vec<f32>,
+    opacity: Vec<f32>,
+    normals: Vec<f32>,
+}
+
+fn draw(backend: &dyn Backend, scene: &Scene, view: View) -> Drawn {
+    let pixels = view.camera.pixels();
+    let of = |values: usize| vec![f32::NAN; values * pixels];
+    let mut drawn = Drawn { depth_m: of(1), opacity: of(1), normals: of(3) };
+    let target = Target {
+        depth_m: Some(&mut drawn.depth_m),
+        opacity: Some(&mut drawn.opacity),
+        normals: Some(&mut drawn.normals),
+        ..Target::default()
+    };
+    let frame = Frame { scene, profile: &RenderProfile::DEFAULT, views: &[view] };
+    backend.render(&frame, &mut [target], &|_, _| {}).unwrap();
+    drawn
+}
+
+/// A wall of small flat discs through a point, `facing` the camera.
+fn wall(through_m: DVec3, facing: DVec3, side_m: f64) -> Vec<Blob> {
+    let rotation = DQuat::from_rotation_arc(DVec3::Z, facing);
+    let count = (side_m / 0.05) as i32 / 2;
+    let places = (-count..=count).flat_map(|i| (-count..=count).map(move |k| (i, k)));
+    let disc = |(i, k): (i32, i32)| Blob {
+        mean_m: through_m + rotation * DVec3::new(0.05 * f64::from(i), 0.05 * f64::from(k), 0.0),
+        rotation,
+        sigma_m: DVec3::new(0.04, 0.04, 1e-4),
+        opacity: 0.9,
+        ..Blob::default()
+    };
+    places.map(disc).collect()
+}
+
+/// Angles between what was drawn and a direction, in degrees, of what is covered well; sorted.
+fn off_deg(drawn: &Drawn, facing: DVec3) -> Vec<f64> {
+    let covered = drawn.normals.chunks(3).zip(&drawn.opacity).filter(|(_, o)| **o > 0.98);
+    let angle = |(n, _): (&[f32], _)| {
+        let normal = DVec3::new(f64::from(n[0]), f64::from(n[1]), f64::from(n[2]));
+        assert!((normal.length() - 1.0).abs() < 1e-6, "{normal}");
+        normal.angle_between(facing).to_degrees()
+    };
+    let mut all: Vec<f64> = covered.map(angle).collect();
+    all.sort_by(f64::total_cmp);
+    all
+}
+
+#[test]
+fn a_wall_faces_where_it_does() {
+    let facing = DVec3::new(0.4, -0.3, -1.0).normalize();
+    let scene = scene(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
+    let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
+    let rolling = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: way };
+    let mut views: Vec<(&str, View)> = lenses()
+        .into_iter()
+        .map(|(name, camera)| (name, View::new(camera, Pose::IDENTITY)))
+        .collect();
+    views.push(("pinhole", ahead([160, 100], 90.0)));
+    views.push(("rolling", View { rolling: Some(rolling), ..ahead([160, 100], 90.0) }));
+    for (name, view) in views {
+        for backend in [&cpu() as &dyn Backend, &Reference] {
+            let off_deg = off_deg(&draw(backend, &scene, view), facing);
+            let [half, most] = [0.5, 0.99].map(|q| off_deg[(off_deg.len() as f64 * q) as usize]);
+            let count = off_deg.len();
+            assert!(half < 1.0, "{name}, {}: half within {half:.2}°", backend.name());
+            assert!(most < 5.0, "{name}, {}: 99 % within {most:.2}°", backend.name());
+            assert!(count > 5_000, "{name}: {count} px");
+        }
+    }
+}
+
+#[test]
+fn an_edge_belongs_to_neither_side() {
+    // A board 2 m away before a wall 4 m away: between them is one step, and no slope.
+    let board = wall(DVec3::new(-1.0, 0.0, 2.0), DVec3::NEG_Z, 2.0);
+    let behind = wall(DVec3::new(0.0, 0.0, 4.0), DVec3::NEG_Z, 12.0);
+    let scene = scene(&[board, behind].concat());
+    let drawn = draw(&cpu(), &scene, ahead([160, 100], 90.0));
+    // The board's last discs fade out over some pixels, whose depth is between the two and has a slope.
+    let (mut on_one, mut slopes) = (0, 0);
+    for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
+        if (depth_m - 2.0).abs() < 0.01 || (depth_m - 4.0).abs() < 0.02 {
+            on_one += 1;
+            slopes += usize::from(normal[2] > -0.9);
+        }
+    }
+    eprintln!("{slopes} of {on_one} px face elsewhere");
+    assert!(on_one > 14_000 && slopes < 70, "{slopes} of {on_one}");
+}
+
+#[test]
+fn where_nothing_is_nothing_faces() {
+    let ball = scene(&[Blob::default()]);
+    let drawn = draw(&cpu(), &ball, ahead([40, 30], 30.0));
+    let mut covered = 0;
+    for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
+        assert_eq!(normal == [0.0; 3], *depth_m == 0.0);
+        covered += usize::from(*depth_m > 0.0);
+    }
+    assert!((10..600).contains(&covered), "{covered}");
+    let views = [ahead([4, 3], 4.0)];
+    let mut normals = [0.0; 36];
+    let target = Target { normals: Some(&mut normals), ..Target::default() };
+    let frame = Frame { scene: &ball, profile: &RenderProfile::DEFAULT, views: &views };
+    let refused = cpu().render(&frame, &mut [target], &|_, _| {});
+    assert_eq!(refused, Err(RenderError::Normals { view: 0 }));
+}
