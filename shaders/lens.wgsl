@@ -23,7 +23,8 @@ const STRAIGHT_RAD: f32 = 1.446441332;
 fn land(of_view: u32, outside: vec3f) -> vec2f {
     let inside = turn(of_view, outside, INWARDS);
     let off_axis = length(inside.xy);
-    let azimuth = inside.xy / max(off_axis, 1e-30);
+    // Straight behind there is none.
+    let azimuth = inside.xy / max(off_axis, max(-1e-3 * inside.z, 1e-30));
     let end = lenses[of_view].end;
     var plane: vec2f;
     switch lenses[of_view].model {

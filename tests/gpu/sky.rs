@@ -208,14 +208,14 @@ fn slips_are_caught() {
         ("weight.w * values[place + 3u]", "weight.w * values[place + 2u]"),
         ("select(0u, encoded, behind.skip != 0u)", "0u"),
         ("select(0.0, 0.5, wave", "select(0.0, 0.0, wave"),
-        ("own += THREADS", "own += 2u * THREADS"),
+        ("wave % behind.octaves", "wave % 1u"),
     ];
     caught("rasterize_network", &EXACT, &all_around(), &network);
     let bent = [
         ("lenses[of_view].bent == 0u", "true"),
         ("vec2f(f32(k), 0.0)", "vec2f(0.0)"),
         ("-still_to_come(of_view, own_px)", "still_to_come(of_view, own_px)"),
-        ("slope - solve(", "slope - 0.5 * solve("),
+        ("distort(of_view, slope) - plane)", "distort(of_view, slope))"),
         ("2.0 * p * slope.yx + 6.0", "6.0"),
         ("off_axis_by(fall(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
         ("off_axis_by(rise(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
