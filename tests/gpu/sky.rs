@@ -216,7 +216,6 @@ fn slips_are_caught() {
         ("vec2f(f32(k), 0.0)", "vec2f(0.0)"),
         ("-still_to_come(of_view, own_px)", "still_to_come(of_view, own_px)"),
         ("distort(of_view, slope) - plane)", "distort(of_view, slope))"),
-        ("2.0 * p * slope.yx + 6.0", "6.0"),
         ("off_axis_by(fall(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
         ("off_axis_by(rise(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
         ("turn(of_view, inside, OUTWARDS)", "turn(of_view, inside, INWARDS)"),
