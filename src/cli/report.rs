@@ -7,11 +7,11 @@ use anyhow::{Context, ensure};
 use serde_json::{Map, Value};
 
 use crate::config;
+use crate::render::Backend;
 use crate::render::gpu::Gpu;
-use crate::render::{Backend, RenderError};
 use crate::report::believed::believed;
 use crate::report::choose::{Recommendation, Wanted, recommend};
-use crate::report::ladder::{Ladder, LeftOut, Traits, ladder};
+use crate::report::ladder::{Family, Ladder, LeftOut, Traits, ladder};
 use crate::report::measure::{Bench, Truth};
 use crate::report::places::{Sampling, places};
 use crate::report::stress::CASES;
@@ -187,10 +187,10 @@ impl Command {
             };
             match bench.measure(setting, truth) {
                 Ok(one) => measured.push(one),
-                // What a backend, or a sky, does not do.
-                Err(ReportError::Render(
-                    why @ (RenderError::ExactSky { .. } | RenderError::Sky(_)),
-                )) => left_out.push(LeftOut::new(setting.name.clone(), why.to_string())),
+                // A map that would be too large, or a backend that only looks skies up.
+                Err(ReportError::Render(why)) if setting.family == Family::Sky => {
+                    left_out.push(LeftOut::new(setting.name.clone(), why.to_string()));
+                }
                 Err(error) => return Err(error.into()),
             }
             bar.inc(1);

@@ -19,7 +19,7 @@ table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-botto
 td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases th{text-align:left}tr.beaten td{color:#999}
 tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#999}
 figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
-img{image-rendering:pixelated;margin-right:3px}img.smooth{image-rendering:auto;display:block}svg{max-width:100%;height:auto}.wide{overflow-x:auto}
+img{image-rendering:pixelated;margin-right:3px}.believed{width:272px}.believed img{image-rendering:auto;width:272px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}
 .key span{display:inline-block;padding:1px 8px;font-size:12px}";
 
 /// The whole page.
@@ -52,8 +52,8 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
     }
     let _ = write!(
         page,
-        "<p>A whole step of the reference would take {:.0} ms: of what was drawn, scaled to all pixels.</p>",
-        report.reference_ms
+        "<p>A whole step of the reference would take {:.0} s: of what was drawn, scaled to all pixels.</p>",
+        1e-3 * report.reference_ms
     );
     recommendations(&mut page, report);
     page.push_str("<h2>Error against time</h2><p>On the line is what nothing else beats in both; what is \
@@ -131,7 +131,8 @@ fn left_out(page: &mut String, report: &Report) {
         let _ = write!(
             page,
             "<p>Splats of bent cameras are compared with every pixel's own ray in a row of their own, and \
-             all else with splats. A whole step of such rays would take the reference {exact_ms:.0} ms.</p>"
+             all else with splats. A whole step of such rays would take the reference {:.0} s.</p>",
+            1e-3 * exact_ms
         );
     }
     page.push_str("<p>Not compared:</p><ul>");
@@ -169,7 +170,7 @@ fn believed(page: &mut String, report: &Report) -> Result<(), ReportError> {
     for b in &report.believed {
         let _ = write!(
             page,
-            "<figure><img class=\"smooth\" alt=\"\" src=\"data:image/jpeg;base64,{}\"><figcaption>{}: \
+            "<figure class=\"believed\"><img alt=\"\" src=\"data:image/jpeg;base64,{}\"><figcaption>{}: \
              trust {:.2} ({:.2} to {:.2}), {:.2} m and {:.3} rad from a keyframe, holes {:.3}, untrained \
              {:.3}</figcaption></figure>",
             BASE64.encode(&b.picture.file),

@@ -51,11 +51,19 @@ pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError
     let lowest = shown().map(|(m, _)| m.errors.psnr_db).fold(MOST_DB, f64::min);
     plot(all.len(), |root| {
         let mut chart = with_room_for_names(root).build_cartesian_2d(
-            (0.8 * least..1.2 * most).log_scale(),
+            least.log10() - 0.05..most.log10() + 0.05,
             (lowest - 4.0).floor()..MOST_DB + 4.0,
         )?;
-        axes(&mut chart, "milliseconds a step (log)", "PSNR against f64, dB")?;
-        let at = |m: &Measured| (m.cost.step_ms, shown_db(m.errors.psnr_db));
+        // Powers of 10 at tenths: 10, 13, 16, 20, 25, 32, 40, 50, 63, 79.
+        let time = |exponent: &f64| match 10.0_f64.powf(*exponent) {
+            ms if ms < 10.0 => format!("{ms:.1}"),
+            ms => format!("{ms:.0}"),
+        };
+        let y = "PSNR against f64, dB";
+        let mut mesh = chart.configure_mesh();
+        mesh.x_desc("milliseconds a step").y_desc(y).x_label_formatter(&time);
+        mesh.light_line_style(WHITE).draw()?;
+        let at = |m: &Measured| (m.cost.step_ms.log10(), shown_db(m.errors.psnr_db));
         let mut line: Vec<(f64, f64)> =
             shown().filter(|(_, is_on)| **is_on).map(|(m, _)| at(m)).collect();
         line.sort_by(|a, b| a.0.total_cmp(&b.0));

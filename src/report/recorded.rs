@@ -19,7 +19,8 @@ pub struct Recorded {
 
 /// Codes every chunk of a scene in parts, and decodes them again.
 pub fn recorded(scene: &Scene, record: Record) -> Recorded {
-    let mut all = Recorded { scene: Scene::default(), coded_bytes: 0, clamped: 0 };
+    let empty = Scene { chunks: Vec::new(), sky: scene.sky.clone() };
+    let mut all = Recorded { scene: empty, coded_bytes: 0, clamped: 0 };
     for chunk in &scene.chunks {
         let mut lanes = vec![Lanes([0.0; LANES]); chunk.len().div_ceil(LANES) * width(chunk)];
         let mut clamped = Clamped::default();

@@ -207,6 +207,41 @@ fn the_margin_is_what_places_differ_by() {
 }
 
 #[test]
+fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
+    let Some(path) = crate::data::real("scenes/skull/skull.ply") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let skull = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
+    let new = NewVersion {
+        storage: Storage { record: Record::F32, levels: false },
+        ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new, &mut |_, _| {}).unwrap();
+    let resident = Cache::new(catalog).open("skull", None).unwrap();
+    let tried = ["as served", "stop=0.004", "stop=0.016", "alpha_cut=0.008", "alpha_cut=0.032"];
+    let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
+    let (all, _) = measured(&resident, &rig(), &keep);
+    let names = ["cpu".to_owned()];
+    // One exact and slow, the others as fast as each other: whichever is taken must hold.
+    let mut met = Vec::new();
+    for fastest in tried {
+        let mut all = all.clone();
+        for m in &mut all {
+            m.cost.step_ms = if m.setting.name == fastest { 1.0 } else { 2.0 };
+        }
+        match recommend(Wanted::AtLeastDb(35.0), &all, &names) {
+            Ok(best) if best.setting == fastest => met.push(fastest),
+            Ok(best) => assert!(best.verified >= 35.0, "{best:?}"),
+            Err(refused) => panic!("{fastest}: {refused}"),
+        }
+    }
+    assert!(met.contains(&"as served") && met.contains(&"stop=0.004"), "{met:?}");
+    assert!(!met.contains(&"alpha_cut=0.032"), "{met:?}");
+    let refused = recommend(Wanted::AtLeastDb(150.0), &all, &names).unwrap_err();
+    assert!(matches!(refused, ReportError::OutOfReach { .. }), "{refused}");
+}
+
+#[test]
 fn a_sky_and_lenses_have_rungs_of_their_own() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
@@ -220,7 +255,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q24, levels: false },
+        storage: Storage { record: Record::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -228,16 +263,18 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     let mut bent = rig();
     bent.cameras.truncate(1);
     bent.cameras[0].camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
-    let keep =
-        |setting: &Setting| matches!(setting.family, Family::AsServed | Family::Sky | Family::Rays);
+    let names = ["as served", "sky_error=0.1", "record q24", "against every pixel's own ray"];
+    let keep = |setting: &Setting| names.contains(&setting.name.as_str());
     let (all, left_out) = measured(&resident, &bent, &keep);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "tau_px", "record"]);
+    assert_eq!(left_out, ["tile size", "tau_px"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     assert!(db("as served") > db("sky_error=0.1"), "{:?}", of("sky_error=0.1").errors);
     assert!(of("as served").errors.max < 2.0 / 255.0, "{:?}", of("as served").errors);
     assert!(of("as served").cost.scene_bytes < of("sky_error=0.1").cost.scene_bytes);
+    // Another record has the same sky.
+    assert!(db("record q24") > 48.0, "{:?}", of("record q24").errors);
     let rays = of("against every pixel's own ray");
     assert!((35.0..60.0).contains(&rays.errors.psnr_db), "{:?}", rays.errors);
     assert!(!rays.setting.can_be_served());

@@ -191,8 +191,13 @@ fn by_speed(samples: &[Sample], panel: &Panel<'_>) {
     // |1 + z + z²/2| <= 1 ends at z = -2, with the next two terms at -2.785; z = -438 / v 0.01 s.
     for (limit, way) in [(437.9 * 0.01 / 2.785, Way::Rk4), (437.9 * 0.01 / 2.0, Way::Rk2)] {
         let line = [(limit, LEAST), (limit, 3.0 * LOST)];
-        let style = label(way).1.mix(0.4).stroke_width(1);
-        chart.draw_series(LineSeries::new(line, style)).unwrap();
+        let (name, colour) = label(way);
+        chart.draw_series(LineSeries::new(line, colour.mix(0.6).stroke_width(2))).unwrap();
+        let text = format!("{name} is stable from {limit:.1} m/s on");
+        // Below the errors, right of both lines.
+        let height = if way == Way::Rk4 { 2e-15 } else { 1e-16 };
+        let style = ("sans-serif", 12).into_font().color(&colour);
+        chart.draw_series([Text::new(text, (2.5, height), style)]).unwrap();
     }
     for way in WAYS {
         let (name, colour) = label(way);

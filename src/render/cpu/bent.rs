@@ -8,7 +8,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use super::lanes::Vec3x16;
 use super::optics::{Landed, Optics};
 use super::project::{Ellipse, LOG2_UNIT, SplatLanes, color, rotation_columns, shown};
-use crate::geometry::camera::{Lens, WIDEST_RAD};
+use crate::geometry::camera::WIDEST_RAD;
 use crate::render::View;
 use crate::render::constants::EXTENT_SLACK_PX;
 use crate::render::layout::Cutoffs;
@@ -54,7 +54,7 @@ impl<'a> BentView<'a> {
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
             beside: bent.beside(),
-            by_distance: matches!(view.camera.lens, Lens::Fisheye(_) | Lens::FTheta(_)),
+            by_distance: view.camera.depth_is_distance(),
         }
     }
 }

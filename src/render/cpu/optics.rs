@@ -94,7 +94,9 @@ impl Optics {
             Lens::Fisheye(lens) => {
                 let px_from_round = [[pinhole.fx as f32, 0.0], [0.0, pinhole.fy as f32]];
                 let largest_px = pinhole.fx.max(pinhole.fy);
-                round(lens.limit_rad(), px_from_round, largest_px, &|angle| lens.radius_at(angle))?
+                round(lens.limit_rad(), px_from_round, largest_px, &|angle| {
+                    lens.radius().at(angle)
+                })?
             }
             Lens::FTheta(lens) => {
                 let [c, d, e] = lens.linear_cde().map(|value| value as f32);

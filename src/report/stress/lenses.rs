@@ -14,12 +14,64 @@ use crate::scene::{Rays, RenderProfile, Scene};
 
 pub(super) const T22: Case = Case {
     number: "T22",
-    what: "weights of the unscented transform",
-    bound: "compared with Monte Carlo",
-    run: Run::Limit(
-        "no setting: six points weigh a sixth each; tests/render/cameras.rs compares them with 200,000",
-    ),
+    what: "a Gaussian an eighth as deep as it is far, through a fisheye: six points for all of it",
+    bound: "agrees with f64; centre within 0.2 px and spread within 3 % of 20,000 points of it",
+    run: Run::Light(t22),
 };
+
+fn t22(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+    const POINTS: usize = 20_000;
+    let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 80.0, cy: 60.0 };
+    let lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
+    let camera = Camera { lens, ..Camera::ideal(160, 120, pinhole) };
+    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
+    let blob = Blob {
+        mean_m: DVec3::new(0.8, 0.3, 2.0),
+        rotation: DQuat::from_rotation_y(0.5),
+        sigma_m: DVec3::new(0.2, 0.12, 0.25),
+        ..Blob::default()
+    };
+    let drawing = trial.agreed("six points", &scene(&[blob]), &profile, view)?;
+    let pixels = drawing.opacity.iter().enumerate().map(|(pixel, &opacity)| {
+        let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
+        (f64::from(opacity), at_px)
+    });
+    let (drawn_px, drawn_px2) = moments(pixels);
+
+    // Box and Muller's normal numbers, of fractions that fill the cube evenly.
+    let normal = |u: f64, v: f64| (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos();
+    let point = |i: usize| {
+        let [a, b, c, d, e, f] = evenly(i);
+        let unit = DVec3::new(normal(a, b), normal(c, d), normal(e, f));
+        (1.0, camera.project_beyond(blob.mean_m + blob.rotation * (blob.sigma_m * unit)))
+    };
+    let (point_px, point_px2) = moments((0..POINTS).map(point));
+
+    trial.at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
+    // What is drawn ends where alpha is below the cut, at r² = 2 ln(opacity / cut): a Gaussian up to r has
+    // 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. And the renderer blurs.
+    let left = profile.alpha_cut / blob.opacity;
+    let share = 1.0 + left.ln() * left / (1.0 - left);
+    let size_px2 = point_px2[0] + point_px2[1];
+    for (axis, (drawn, point)) in
+        ["x", "y", "xy"].into_iter().zip(drawn_px2.into_iter().zip(point_px2))
+    {
+        let blur = if axis == "xy" { 0.0 } else { profile.blur };
+        let off = (drawn / share - blur - point).abs() / size_px2;
+        trial.at_most(format!("spread along {axis} off by"), off, 0.03);
+    }
+    Ok(())
+}
+
+/// Mean of weighted places, and their variances along x, along y, and mixed.
+fn moments(places: impl Iterator<Item = (f64, DVec2)> + Clone) -> (DVec2, [f64; 3]) {
+    let sum: f64 = places.clone().map(|(weight, _)| weight).sum();
+    let mean = places.clone().map(|(weight, at)| weight * at).sum::<DVec2>() / sum;
+    let variance = |of: fn(DVec2) -> f64| {
+        places.clone().map(|(weight, at)| weight * of(at - mean)).sum::<f64>() / sum
+    };
+    (mean, [variance(|d| d.x * d.x), variance(|d| d.y * d.y), variance(|d| d.x * d.y)])
+}
 
 pub(super) const T23: Case = Case {
     number: "T23",

@@ -7,7 +7,8 @@
 //! order      equal depths, duplicates, popping, millions of keys    T6 T8 T20 T21 T27
 //! opacities  every opacity, poison, the stop rule                   T11 T12 T19 T28
 //! sizes      nothing, one pixel, 8K, growing buffers, crops         T14 to T18
-//! limits     what is not run here, and why                          T22 to T25
+//! lenses     a wide splat, beyond a half circle, rolling shutters   T22 T23 T24
+//! actors     what turns with its colours                            T25
 //! ```
 
 mod actors;
@@ -49,8 +50,6 @@ enum Run {
     Light(Body),
     /// Gigabytes and minutes: only if asked for.
     Heavy(Body),
-    /// Not here: why.
-    Limit(&'static str),
 }
 
 type Body = fn(&mut Trial<'_>) -> Result<(), RenderError>;
@@ -122,7 +121,6 @@ impl Case {
     /// Runs the case on a backend; a heavy one only if `heavy`.
     pub fn run(&self, backend: &dyn Backend, heavy: bool) -> Outcome {
         let body = match self.run {
-            Run::Limit(why) => return self.not_run(backend.name(), why),
             Run::Heavy(_) if !heavy => {
                 return self.not_run(backend.name(), "takes gigabytes and minutes: add --heavy");
             }
