@@ -184,9 +184,9 @@ fn beside<S: Simd>(
     let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
     let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
     let (least_rad, most_rad) = (half + half - splat(0.01), half + half + splat(0.01));
-    // asin s is at most 1.0472 s up to a half.
+    // asin s is at most s π/3 up to a half.
     let share = splat(3.0_f64.sqrt()) * sigma_m / distance_m;
-    let spread_rad = share.mul_add(splat(1.0472), splat(bound.turned_rad));
+    let spread_rad = share.mul_add(splat(std::f64::consts::FRAC_PI_3), splat(bound.turned_rad));
     let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
     let out_px =
         (least_rad - splat(bound.turned_rad + bound.image_rad)) * splat(bound.least_px_per_rad);

@@ -229,7 +229,7 @@ fn asin<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let z = steep.select(splat(0.5) * (splat(1.0) - size).max(splat(0.0)), size * size);
     let root = steep.select(z.sqrt(), size);
     let series = splat(4.216_32e-2)
-        .mul_add(z, splat(2.418_131_1e-2))
+        .mul_add(z, splat(2.418_131e-2))
         .mul_add(z, splat(4.547_002_6e-2))
         .mul_add(z, splat(7.495_300_3e-2))
         .mul_add(z, splat(1.666_675_2e-1));
