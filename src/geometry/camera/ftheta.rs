@@ -98,6 +98,14 @@ impl FTheta {
         }
     }
 
+    /// The angle off the axis that lands so far from the principal point, the other way.
+    pub fn angle_rad(&self, radius_px: f64) -> f64 {
+        match self.reference {
+            Reference::AngleToPixel => self.rising.invert(radius_px),
+            Reference::PixelToAngle => self.rising.at(radius_px),
+        }
+    }
+
     /// The reference polynomial, as far as it is used: radians to pixels, or the other way.
     pub fn rising(&self) -> &Rising {
         &self.rising
@@ -150,11 +158,7 @@ impl FTheta {
     /// The unit direction that lands there, if it is within the limit.
     pub(super) fn direction(&self, offset_px: DVec2) -> Option<DVec3> {
         let round = self.linear().inverse() * offset_px;
-        let angle_rad = match self.reference {
-            Reference::AngleToPixel => self.rising.invert(round.length()),
-            Reference::PixelToAngle => self.rising.at(round.length()),
-        };
-        at_angle(round, angle_rad, self.limit_rad())
+        at_angle(round, self.angle_rad(round.length()), self.limit_rad())
     }
 
     /// Pixels per radian at the axis.

@@ -50,7 +50,7 @@ impl Rising {
     }
 
     /// Where it reaches a value of at least 0; beyond the end, where its straight continuation does.
-    pub(super) fn invert(&self, y: f64) -> f64 {
+    pub fn invert(&self, y: f64) -> f64 {
         let top = self.at(self.end);
         let beyond = y >= top;
         if beyond {

@@ -6,6 +6,7 @@ use fearless_simd::{f32x16, i32x16, prelude::*, u32x16};
 use glam::{DMat3, DVec2};
 
 use super::lanes::Vec3x16;
+use super::optics;
 use super::resolve::TileSums;
 use crate::render::constants::BLOCK_PX;
 use crate::render::{Frame, RenderError, View};
@@ -27,6 +28,8 @@ pub(super) struct Behind {
 enum Looks {
     /// Rows that take `(x, y, 1)` in pixels to a direction of any length.
     Ideal([[f32; 3]; 3]),
+    /// Of a round lens.
+    Round(optics::Looks),
     /// Pixel by pixel, as the lens and the shutter have it; the matrix is `sky_from_world`.
     Bent(Box<(View, DMat3)>),
 }
@@ -39,9 +42,12 @@ impl Behind {
     pub(super) fn of(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
         let Some((drawn, axes)) = frame.behind()? else { return Ok(Vec::new()) };
         let of_view = |view: &View| {
-            let looks = match view.is_ideal() {
-                true => Looks::Ideal(view.sky_from_pixel(axes)),
-                false => Looks::Bent(Box::new((*view, axes))),
+            let looks = if view.is_ideal() {
+                Looks::Ideal(view.sky_from_pixel(axes))
+            } else if let Some(looks) = optics::Looks::of(view, axes) {
+                Looks::Round(looks)
+            } else {
+                Looks::Bent(Box::new((*view, axes)))
             };
             Self { drawn: drawn.clone(), looks }
         };
@@ -95,6 +101,7 @@ fn add_sky<S: Simd>(
             let row = |[a, b, c]: [f32; 3]| x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
             Vec3x16 { x: row(*first), y: row(*second), z: row(*third) }
         }
+        Looks::Round(looks) => looks.toward(simd, x, y),
         Looks::Bent(bent) => {
             let (view, sky_from_world) = &**bent;
             let [x, y, z] = directions(view, *sky_from_world, &x.to_array(), &y.to_array());

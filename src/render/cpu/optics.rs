@@ -7,6 +7,7 @@
 //! one in f64 ([`super::bent`]).
 
 use fearless_simd::{f32x16, prelude::*};
+use glam::{DMat2, DMat3, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
 use crate::geometry::Camera;
@@ -16,9 +17,12 @@ use crate::render::View;
 /// What is left out of a series, in pixels: a tenth of what f32 tells apart beside the middle of an image.
 const LEFT_PX: f64 = 1e-5;
 
-/// Nodes at which a radius is sampled, and most terms of its series: at 2.2 rad off the axis 17 are enough.
-const NODES: usize = 64;
-const TERMS: usize = 32;
+/// The same of the tangent of half an angle: f32 tells no more apart.
+const LEFT: f64 = 5e-8;
+
+/// Nodes at which a function is sampled, and most terms of its series: real lenses need 8 to 14.
+const NODES: usize = 32;
+const TERMS: usize = 24;
 
 /// A lens, ready for many points.
 #[derive(Clone, Debug)]
@@ -41,14 +45,8 @@ struct Sheet(Vec<Vec<f32>>);
 
 #[derive(Clone, Debug)]
 enum Kind {
-    /// `center + px_from_round (x, y)/(|p| + z) Σ terms`, up to a t.
-    Round {
-        px_from_round: [[f32; 2]; 2],
-        /// Of Chebyshev polynomials of `t per_limit - 1`, which runs from -1 to 1.
-        terms: Vec<f32>,
-        per_limit: f32,
-        limit: f32,
-    },
+    /// `center + px_from_round (x, y)/(|p| + z) r(t)/t`, up to a t.
+    Round { px_from_round: [[f32; 2]; 2], series: Series, limit: f32 },
     /// OpenCV's polynomials of the slopes, up to a square of their length.
     Slopes { focal_px: [f32; 2], k: [f32; 6], p: [f32; 2], s: [f32; 4], limit: f32 },
 }
@@ -93,15 +91,13 @@ impl Optics {
             }
             Lens::Fisheye(lens) => {
                 let px_from_round = [[pinhole.fx as f32, 0.0], [0.0, pinhole.fy as f32]];
-                let largest_px = pinhole.fx.max(pinhole.fy);
-                round(lens.limit_rad(), px_from_round, largest_px, &|angle| {
-                    lens.radius().at(angle)
-                })?
+                let left = LEFT_PX / pinhole.fx.max(pinhole.fy);
+                round(lens.limit_rad(), px_from_round, left, &|angle| lens.radius().at(angle))?
             }
             Lens::FTheta(lens) => {
                 let [c, d, e] = lens.linear_cde().map(|value| value as f32);
                 let px_from_round = [[c, d], [e, 1.0]];
-                round(lens.limit_rad(), px_from_round, 1.0, &|angle| lens.radius_px(angle))?
+                round(lens.limit_rad(), px_from_round, LEFT_PX, &|angle| lens.radius_px(angle))?
             }
         };
         Some(Self { glass, center_px: [pinhole.cx as f32, pinhole.cy as f32], kind })
@@ -123,19 +119,11 @@ impl Optics {
         let Vec3x16 { x, y, z } = point_m;
         let [cx, cy] = self.center_px.map(splat);
         match &self.kind {
-            Kind::Round { px_from_round, terms, per_limit, limit } => {
+            Kind::Round { px_from_round, series, limit } => {
                 let off_axis2 = x.mul_add(x, y * y);
                 let inverse = splat(1.0) / (z.mul_add(z, off_axis2).sqrt() + z);
                 let t = off_axis2.sqrt() * inverse;
-                // Clenshaw's recurrence.
-                let v = t.mul_add(splat(*per_limit), splat(-1.0));
-                let twice = v + v;
-                let (mut last, mut before) = (splat(0.0), splat(0.0));
-                for term in terms[1..].iter().rev() {
-                    let next = twice.mul_add(last, splat(*term)) - before;
-                    (before, last) = (last, next);
-                }
-                let radius = (v.mul_add(last, splat(terms[0])) - before) * inverse;
+                let radius = series.at(simd, t) * inverse;
                 let [[c, d], [e, f]] = px_from_round.map(|row| row.map(splat));
                 Landed {
                     x_px: c.mul_add(x, d * y).mul_add(radius, cx),
@@ -190,6 +178,24 @@ impl Glass {
         let z = (splat(1.0) - x * x - y * y).max(splat(0.0)).sqrt();
         let [_, in_full] = Windshield::FADES_Z;
         (Vec3x16 { x, y, z }, unit.z - splat(in_full as f32))
+    }
+}
+
+impl Glass {
+    /// Unit directions outside, of directions of any length inside.
+    #[inline(always)]
+    fn outside<S: Simd>(&self, simd: S, inside: Vec3x16<S>) -> Vec3x16<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let unit = inside.scale(splat(1.0) / inside.dot(inside).sqrt());
+        let (from_phi, from_theta) = (asin(simd, unit.x), asin(simd, unit.y));
+        let (mut phi, mut theta) = (from_phi, from_theta);
+        for _ in 0..Looks::ROUNDS {
+            let off_phi = self.horizontal.at(simd, phi, theta) - from_phi;
+            let off_theta = self.vertical.at(simd, phi, theta) - from_theta;
+            (phi, theta) = (phi - off_phi, theta - off_theta);
+        }
+        let (x, y) = (sin(simd, phi), sin(simd, theta));
+        Vec3x16 { x, y, z: (splat(1.0) - x * x - y * y).max(splat(0.0)).sqrt() }
     }
 }
 
@@ -255,42 +261,169 @@ fn sin<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
 /// The share of a field, in the measure of its limit, that surely is within it.
 const INSIDE: f32 = 1.0 - 1e-5;
 
-/// The series of `r(2 atan t)/t`, of which `radius` gives r in units of `unit_px`.
+/// Whether a windshield turns less than in full what a lens sees at the end of its field.
+fn fades(camera: &Camera) -> bool {
+    let bare = Camera { windshield: None, ..*camera };
+    let (sin, cos) = (camera.limit_rad() * (1.0 - 1e-9)).sin_cos();
+    let [_, in_full] = Windshield::FADES_Z;
+    (0..32).any(|k| {
+        let (y, x) = (f64::from(k) * std::f64::consts::TAU / 32.0).sin_cos();
+        let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
+        let outside = at_px.and_then(|at_px| camera.unproject(at_px));
+        // Between two of the 32 it is nearly the same.
+        outside.is_none_or(|outside| outside.z < in_full + 0.02)
+    })
+}
+
+/// The series of `r(2 atan t)/t`, which leaves less than `left`.
 fn round(
     limit_rad: f64,
     px_from_round: [[f32; 2]; 2],
-    unit_px: f64,
+    left: f64,
     radius: &dyn Fn(f64) -> f64,
 ) -> Option<Kind> {
     let limit = (0.5 * limit_rad).tan();
-    let node = |j: usize| std::f64::consts::PI * (j as f64 + 0.5) / NODES as f64;
-    let samples: Vec<f64> = (0..NODES)
-        .map(|j| {
-            let t = 0.5 * (node(j).cos() + 1.0) * limit;
-            radius(2.0 * t.atan()) / t
-        })
-        .collect();
-    let term = |k: usize| {
-        let sum: f64 =
-            samples.iter().enumerate().map(|(j, g)| g * (k as f64 * node(j)).cos()).sum();
-        sum * if k == 0 { 1.0 } else { 2.0 } / NODES as f64
-    };
-    let mut terms: Vec<f64> = (0..NODES).map(term).collect();
-    let mut left_px = 0.0;
-    while let Some(last) = terms.last() {
-        left_px += last.abs() * limit * unit_px;
-        if left_px > LEFT_PX {
-            break;
+    let series = Series::fit(limit, left, &|t| radius(2.0 * t.atan()))?;
+    Some(Kind::Round { px_from_round, series, limit: limit as f32 * INSIDE })
+}
+
+/// `f(x)/x` from 0 to a limit.
+#[derive(Clone, Debug)]
+struct Series {
+    /// Of Chebyshev polynomials of `x per_limit - 1`, which runs from -1 to 1.
+    terms: Vec<f32>,
+    per_limit: f32,
+}
+
+impl Series {
+    /// As many terms as leave less than `left` of f; `None` if those are too many.
+    fn fit(limit: f64, left: f64, f: &dyn Fn(f64) -> f64) -> Option<Self> {
+        let node = |j: usize| std::f64::consts::PI * (j as f64 + 0.5) / NODES as f64;
+        let sample = |j: usize| {
+            let x = 0.5 * (node(j).cos() + 1.0) * limit;
+            f(x) / x
+        };
+        let samples: Vec<f64> = (0..NODES).map(sample).collect();
+        let term = |k: usize| {
+            let term = |(j, g): (usize, &f64)| g * (k as f64 * node(j)).cos();
+            let sum: f64 = samples.iter().enumerate().map(term).sum();
+            sum * if k == 0 { 1.0 } else { 2.0 } / NODES as f64
+        };
+        let mut terms: Vec<f64> = (0..NODES).map(term).collect();
+        let mut cut = 0.0;
+        while let Some(last) = terms.last() {
+            cut += last.abs() * limit;
+            let needed = cut > left || cut.is_nan();
+            if needed {
+                break;
+            }
+            terms.pop();
         }
-        terms.pop();
+        let usable = (1..=TERMS).contains(&terms.len()) && cut.is_finite();
+        let terms = terms.iter().map(|&term| term as f32).collect();
+        usable.then_some(Self { terms, per_limit: (2.0 / limit) as f32 })
     }
-    let usable = (1..=TERMS).contains(&terms.len()) && left_px.is_finite();
-    usable.then(|| Kind::Round {
-        px_from_round,
-        terms: terms.iter().map(|&term| term as f32).collect(),
-        per_limit: (2.0 / limit) as f32,
-        limit: limit as f32 * INSIDE,
-    })
+
+    /// By Clenshaw's recurrence.
+    #[inline(always)]
+    fn at<S: Simd>(&self, simd: S, x: f32x16<S>) -> f32x16<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let v = x.mul_add(splat(self.per_limit), splat(-1.0));
+        let twice = v + v;
+        let (mut last, mut before) = (splat(0.0), splat(0.0));
+        for term in self.terms[1..].iter().rev() {
+            let next = twice.mul_add(last, splat(*term)) - before;
+            (before, last) = (last, next);
+        }
+        v.mul_add(last, splat(self.terms[0])) - before
+    }
+}
+
+/// Where the pixels of a round lens look, 16 at a time: what [`Optics`] does, the other way.
+#[derive(Clone, Debug)]
+pub(super) struct Looks {
+    glass: Option<Glass>,
+    /// Rows that take (x, y, 1) in pixels to what is round, in pixels or focal lengths.
+    round_from_px: [[f32; 3]; 2],
+    /// `tan(θ/2)/ρ` by the distance ρ from the axis, up to a limit.
+    series: Series,
+    limit: f32,
+    /// Rows that take directions in the camera's frame to other axes.
+    axes_from_camera: [[f32; 3]; 3],
+}
+
+impl Looks {
+    /// Rounds of the search behind a windshield: each halves its error at worst, and real ones leave a
+    /// fiftieth.
+    const ROUNDS: u32 = 24;
+
+    /// `None` for what is not round, rolls, or is turned by a windshield as far as that fades.
+    pub(super) fn of(view: &View, axes_from_world: DMat3) -> Option<Self> {
+        let Camera { pinhole, lens, windshield, .. } = &view.camera;
+        if view.rolling.is_some() {
+            return None;
+        }
+        let glass = match windshield {
+            None => None,
+            Some(windshield) => Some(Glass::of(windshield).filter(|_| !fades(&view.camera))?),
+        };
+        let limit_rad = view.camera.limit_rad();
+        let (px_from_round, limit, series) = match lens {
+            Lens::Pinhole | Lens::OpenCv(_) => return None,
+            Lens::Fisheye(lens) => {
+                let limit = lens.radius().at(limit_rad);
+                let half = |radius: f64| (0.5 * lens.radius().invert(radius)).tan();
+                let px_from_round = DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy));
+                (px_from_round, limit, Series::fit(limit, LEFT, &half)?)
+            }
+            Lens::FTheta(lens) => {
+                let limit = lens.radius_px(limit_rad);
+                let half = |radius_px: f64| (0.5 * lens.angle_rad(radius_px)).tan();
+                (lens.linear(), limit, Series::fit(limit, LEFT, &half)?)
+            }
+        };
+        let inverse = px_from_round.inverse();
+        let center = inverse * DVec2::new(pinhole.cx, pinhole.cy);
+        let row = |axis: usize| {
+            let row = inverse.row(axis);
+            [row.x, row.y, -center[axis]].map(|value| value as f32)
+        };
+        let rows = (axes_from_world * view.world_from_camera.rotation_matrix()).transpose();
+        Some(Self {
+            glass,
+            round_from_px: [row(0), row(1)],
+            series,
+            limit: limit as f32,
+            axes_from_camera: rows.to_cols_array_2d().map(|row| row.map(|value| value as f32)),
+        })
+    }
+
+    /// Directions, of any length, of places of the image in pixels. Beyond the field they are some direction.
+    #[inline(always)]
+    pub(super) fn toward<S: Simd>(&self, simd: S, x: f32x16<S>, y: f32x16<S>) -> Vec3x16<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let [[a, b, c], [d, e, f]] = self.round_from_px;
+        let x_round = x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
+        let y_round = x.mul_add(splat(d), y.mul_add(splat(e), splat(f)));
+        let square = x_round.mul_add(x_round, y_round * y_round);
+        let radius = square.sqrt().min(splat(self.limit));
+        // (sin θ, cos θ) is as (2 t, 1 - t²).
+        let per_radius = self.series.at(simd, radius);
+        let t = per_radius * radius;
+        let twice = per_radius + per_radius;
+        let z = splat(1.0) - t * t;
+        let inside = Vec3x16 { x: twice * x_round, y: twice * y_round, z };
+        let away = match &self.glass {
+            None => inside,
+            Some(glass) => glass.outside(simd, inside),
+        };
+        let [first, second, third] = self.axes_from_camera;
+        Vec3x16 {
+            x: Vec3x16::splat(simd, first).dot(away),
+            y: Vec3x16::splat(simd, second).dot(away),
+            z: Vec3x16::splat(simd, third).dot(away),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -299,7 +432,39 @@ mod tests {
     use crate::geometry::Pose;
     use crate::scene::Rig;
     use fearless_simd::{Level, dispatch};
-    use glam::DVec3;
+    use glam::DQuat;
+
+    #[test]
+    fn pixels_look_where_the_lens_says() {
+        let mut most_rad: f64 = 0.0;
+        for rig in ["alpamayo1", "alpamayo2"] {
+            for mounted in Rig::preset(rig).unwrap().cameras {
+                let camera = mounted.camera;
+                let turned = Pose { rotation: DQuat::from_rotation_x(0.7), ..Pose::IDENTITY };
+                let view = View::new(camera, turned);
+                let axes = DMat3::from_rotation_z(1.1);
+                let looks = Looks::of(&view, axes).expect(&mounted.name);
+                let mut seen = 0;
+                for step in 0..2_000 {
+                    let (column, row) = (step * 37 % camera.width_px, step * 11 % camera.height_px);
+                    let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
+                    let Some(ray) = view.ray_world(at_px) else { continue };
+                    let away = dispatch!(Level::new(), simd => {
+                        let x = f32x16::splat(simd, at_px.x as f32);
+                        let y = f32x16::splat(simd, at_px.y as f32);
+                        let Vec3x16 { x, y, z } = looks.toward(simd, x, y);
+                        [x.to_array()[0], y.to_array()[0], z.to_array()[0]].map(f64::from)
+                    });
+                    let away = DVec3::from_array(away).normalize();
+                    most_rad = most_rad.max((axes * ray).distance(away));
+                    seen += 1;
+                }
+                assert!(seen > 1_500, "{}: {seen}", mounted.name);
+            }
+        }
+        eprintln!("off by {most_rad:.1e} rad at most");
+        assert!(most_rad < 2e-6, "{most_rad:e} rad");
+    }
 
     /// Points on spirals from the axis to where a camera of a rig ends, and a little beyond.
     #[test]
