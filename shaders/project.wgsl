@@ -3,11 +3,13 @@
 //
 // `cull` decides which are visible and counts them; a prefix sum over the items gives each its place;
 // `project` writes the visible ones there, so that splats keep the order of their items. Twin of
-// `src/render/cpu/project.rs`, where the equations are documented.
+// `src/render/cpu/project.rs`, where the equations are documented. `SIGHT` is `straight` for pinholes at
+// rest, and `bent` for all else.
 
 #import constants
 #import layout
 #import math
+#import SIGHT
 
 override SH_DEGREE: u32;
 
@@ -91,7 +93,7 @@ fn project(
     let own = geometry(item.line, thread);
     let projected = project_shape(own, chunk_view, true);
     shapes[place] = projected.shape;
-    let rgb = color(item.line, thread, own.mean_m - chunk_view.camera_m);
+    let rgb = color(item.line, thread, projected.toward_m);
     colors[place] = SplatColor(rgb, projected.depth_m);
     let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
     keys[place] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
@@ -102,26 +104,81 @@ struct Projected {
     visible: bool,
     shape: SplatShape,
     depth_m: f32,
+    // The way from the camera to the centre, in world axes.
+    toward_m: vec3f,
 }
 
-// Camera-space z, as if computed exactly and rounded once: splats are blended in order of it, and
-// surfels of one facade must not be ordered by rounding errors. Products and sums carry what their
-// rounding loses (Dekker 1971; two-sum by Knuth). Not by `fma`, which may round twice: lavapipe's does.
-fn depth(mean: vec3f, view: ChunkView) -> f32 {
-    var sum = view.forward_high.w;
-    var lost = view.forward_low.w;
-    for (var axis = 0; axis < 3; axis++) {
-        let product = mean[axis] * view.forward_high[axis];
-        let a = halves(mean[axis]);
-        let b = halves(view.forward_high[axis]);
-        lost += ((a.x * b.x - product) + a.x * b.y + a.y * b.x) + a.y * b.y;
-        lost += mean[axis] * view.forward_low[axis];
-        let next = rounded(sum + product);
-        let part = rounded(next - sum);
-        lost += (sum - (next - part)) + (product - part);
-        sum = next;
+// A Gaussian on the screen, before the blur.
+struct Footprint {
+    mean_px: vec2f,
+    // xx, xy, yy and their determinant, a sum of positives. `per_px` of its units are a pixel.
+    covariance: vec3f,
+    det_before: f32,
+    per_px: f32,
+}
+
+// The shape of a footprint, and whether any of it is on what is drawn of the image.
+fn shape_of(foot: Footprint, of_log2_opacity: f32, view: u32) -> Projected {
+    let blur = frame.blur_px2 * foot.per_px * foot.per_px;
+    let xx = foot.covariance.x;
+    let yy = foot.covariance.z;
+    let det = blur * (xx + yy + blur) + foot.det_before;
+    let a = xx + blur;
+    let c = yy + blur;
+    var log2_opacity = of_log2_opacity;
+    if frame.antialiased != 0u {
+        log2_opacity += 0.5 * log2(max(foot.det_before / det, 0.005 * 0.005));
     }
-    return sum + lost;
+    let unit = 0.8493218 * foot.per_px; // sqrt(log2(e) / 2)
+    let root_c = sqrt(c);
+    let root_det = sqrt(det);
+    let l2 = unit / root_c;
+    let l0 = unit * root_c / root_det;
+    let l1 = -(foot.covariance.y * l2) / root_det;
+
+    // The box where alpha reaches the cut, against the pixel centres of what is drawn of the image.
+    let power = log2_opacity - frame.log2_alpha_cut;
+    let reach = sqrt(max(power, 0.0)) / unit;
+    let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
+    let image = frame.view[view];
+    let first_px = vec2u(0u, image.rows.x * TILE_PX);
+    let end_px = vec2u(image.size_px.x, min(image.rows.y * TILE_PX, image.size_px.y));
+    let on_image = all(foot.mean_px + extent_px >= vec2f(first_px) + 0.5)
+        && all(foot.mean_px - extent_px <= vec2f(end_px) - 0.5);
+    let shape = SplatShape(foot.mean_px, extent_px, vec3f(l0, l1, l2), log2_opacity);
+    return Projected(power >= 0.0 && on_image, shape, 0.0, vec3f(0.0));
+}
+
+// A product and what its rounding loses (Dekker 1971). Not by `fma`, which may round twice: lavapipe's
+// does.
+fn product(a: f32, b: f32) -> vec2f {
+    let rounds_to = a * b;
+    let p = halves(a);
+    let q = halves(b);
+    return vec2f(rounds_to, ((p.x * q.x - rounds_to) + p.x * q.y + p.y * q.x) + p.y * q.y);
+}
+
+// A sum and what its rounding loses (two-sum by Knuth).
+fn sum_of(a: f32, b: f32) -> vec2f {
+    let next = rounded(a + b);
+    let part = rounded(next - a);
+    return vec2f(next, (a - (next - part)) + (b - part));
+}
+
+// Camera-space z at the exposure's end and what its rounding lost: their sum is rounded once. Splats are
+// blended in order of depth, and surfels of one facade must not be ordered by rounding errors.
+fn exact_z(mean: vec3f, view: ChunkView) -> vec2f {
+    var sum = view.depth_high.w;
+    var lost = view.depth_low.w;
+    for (var axis = 0; axis < 3; axis++) {
+        let term = product(mean[axis], view.depth_high[axis]);
+        lost += term.y;
+        lost += mean[axis] * view.depth_low[axis];
+        let next = sum_of(sum, term.x);
+        lost += next.y;
+        sum = next.x;
+    }
+    return vec2f(sum, lost);
 }
 
 // Keeps a compiler from calculating with what was to be rounded: WGSL has no `precise`, and Mesa takes
@@ -134,70 +191,6 @@ fn rounded(x: f32) -> f32 {
 fn halves(x: f32) -> vec2f {
     let high = bitcast<f32>(bitcast<u32>(x) & 0xFFFFF000u);
     return vec2f(high, x - high);
-}
-
-// What is not in range has no shape, unless it was `decided` that it is.
-fn project_shape(own: Geometry, view: ChunkView, decided: bool) -> Projected {
-    // Camera space: in range?
-    let mean = vec4f(own.mean_m, 1.0);
-    let x = dot(view.camera_from_chunk[0], mean);
-    let y = dot(view.camera_from_chunk[1], mean);
-    let z = depth(own.mean_m, view);
-    let in_range = z >= frame.near_m && z <= frame.far_m
-        && own.log2_opacity >= frame.log2_alpha_cut;
-    if !in_range && !decided {
-        return Projected();
-    }
-
-    // V = J W R S, with J at the clamped slope. What is wider than f32 can square twice is computed in a
-    // larger unit than the pixel, blur and all.
-    let slope = vec2f(x, y) / z;
-    let mean_px = view.focal_px * slope + view.center_px;
-    let clamped = clamp(slope, view.slope_min, view.slope_max);
-    let px_per_m = view.focal_px / z;
-    let right = view.camera_from_chunk[0].xyz;
-    let down = view.camera_from_chunk[1].xyz;
-    let forward = view.camera_from_chunk[2].xyz;
-    let rotation = rotation_from_quat(own.quat_wxyz);
-    var v0 = ((right - clamped.x * forward) * px_per_m.x) * rotation * own.scale_m;
-    var v1 = ((down - clamped.y * forward) * px_per_m.y) * rotation * own.scale_m;
-    let widest = max(max_component(abs(v0)), max_component(abs(v1)));
-    let per_px = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
-    v0 *= per_px;
-    v1 *= per_px;
-    let blur = frame.blur_px2 * per_px * per_px;
-
-    // The covariance, its determinant (a sum of positives), and the factor of its inverse.
-    let xx = dot(v0, v0);
-    let yy = dot(v1, v1);
-    let b = dot(v0, v1);
-    let minors = cross(v0, v1);
-    let det_before = dot(minors, minors);
-    let det = blur * (xx + yy + blur) + det_before;
-    let a = xx + blur;
-    let c = yy + blur;
-    var log2_opacity = own.log2_opacity;
-    if frame.antialiased != 0u {
-        log2_opacity += 0.5 * log2(max(det_before / det, 0.005 * 0.005));
-    }
-    let unit = 0.8493218 * per_px; // sqrt(log2(e) / 2)
-    let root_c = sqrt(c);
-    let root_det = sqrt(det);
-    let l2 = unit / root_c;
-    let l0 = unit * root_c / root_det;
-    let l1 = -(b * l2) / root_det;
-
-    // The box where alpha reaches the cut, against the pixel centres of what is drawn of the image.
-    let power = log2_opacity - frame.log2_alpha_cut;
-    let reach = sqrt(max(power, 0.0)) / unit;
-    let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
-    let image = frame.view[view.view];
-    let first_px = vec2u(0u, image.rows.x * TILE_PX);
-    let end_px = vec2u(image.size_px.x, min(image.rows.y * TILE_PX, image.size_px.y));
-    let on_image = all(mean_px + extent_px >= vec2f(first_px) + 0.5)
-        && all(mean_px - extent_px <= vec2f(end_px) - 0.5);
-    let shape = SplatShape(mean_px, extent_px, vec3f(l0, l1, l2), log2_opacity);
-    return Projected(power >= 0.0 && on_image, shape, z);
 }
 
 fn max_component(v: vec3f) -> f32 {

@@ -8,7 +8,7 @@
 #import layout
 #import math
 #import resolve
-#import SKY
+#import BEHIND
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;
@@ -116,7 +116,7 @@ fn main(
         atomicAdd(&counters.batches, batches);
         atomicMax(&counters.most_batches, batches);
     }
-    sums = complete(sums, view_index, at_px);
+    sums = complete(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 

@@ -1,11 +1,14 @@
 // A sky that was baked: `CubeMap` in `src/scene/sky/cube.rs`.
 
-#import behind
-
 // Red in the lower and green in the upper 16 bits, and blue.
 @group(0) @binding(9) var<storage, read> texels: array<vec2u>;
 
-fn sky(away: Away) -> array<vec4f, 3> {
+// The colours behind four pixels, if they are wanted.
+fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
+    if !wanted {
+        return array<vec4f, 3>();
+    }
+    let away = look(view, at_px);
     let ax = abs(away.x);
     let ay = abs(away.y);
     let az = abs(away.z);

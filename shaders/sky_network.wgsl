@@ -1,93 +1,90 @@
-// A sky that is evaluated: `Folded` in `src/scene/sky/folded.rs`, four directions at once. Up to 575
-// vectors lie in private memory, which is slow, and exact.
+// A sky that is evaluated: `Folded` in `src/scene/sky/folded.rs`. The threads of a tile evaluate it together,
+// four pixels after four, an output of a layer each: what one thread alone would need, 9 KiB for every
+// four pixels, is in no register.
 
-#import behind
+#import angle
 
-// Layer by layer: for each group of eight outputs their biases, and then eight weights per input.
+// Layer by layer, output by output: the bias, and then its weights, four a vector.
 @group(0) @binding(9) var<storage, read> weights: array<vec4f>;
 
+// Four directions whose colours are asked for, if they are.
+var<workgroup> asked: array<vec4f, 3>;
+var<workgroup> is_asked: u32;
 // The second layer's outputs, the first one's, and behind them the encoded directions.
-var<private> values: array<vec4f, 575>;
+var<workgroup> values: array<vec4f, 576>;
 
-fn sky(away: Away) -> array<vec4f, 3> {
-    let scale = inverseSqrt(away.x * away.x + away.y * away.y + away.z * away.z);
-    let directions = array<vec4f, 3>(away.x * scale, away.y * scale, away.z * scale);
+// The colours behind four pixels, if they are wanted. All threads of a tile call it.
+fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     let width = behind.width;
-    var next = 2u * width;
-    if behind.identity != 0u {
-        for (var axis = 0u; axis < 3u; axis++) {
-            values[next] = directions[axis];
-            next++;
+    let encoded = (behind.encoded + 3u) / 4u * 4u;
+    let joined = width + select(0u, encoded, behind.skip != 0u);
+    let second = width * (1u + encoded / 4u);
+    let third = second + width * (1u + joined / 4u);
+    var rgb: array<vec4f, 3>;
+    for (var turn = 0u; turn < THREADS; turn++) {
+        if thread == turn {
+            is_asked = u32(wanted);
+            if wanted {
+                let away = look(view, at_px);
+                let scale = inverseSqrt(away.x * away.x + away.y * away.y + away.z * away.z);
+                asked = array<vec4f, 3>(away.x * scale, away.y * scale, away.z * scale);
+            }
         }
-    }
-    for (var cosine = 0u; cosine < 2u; cosine++) {
-        for (var octave = 0u; octave < behind.octaves; octave++) {
-            for (var axis = 0u; axis < 3u; axis++) {
-                values[next] = sine(directions[axis] * f32(1u << octave), cosine);
-                next++;
+        if workgroupUniformLoad(&is_asked) == 0u {
+            continue;
+        }
+        if thread < encoded {
+            values[2u * width + thread] = encode(thread);
+        }
+        workgroupBarrier();
+        dense(0u, 2u * width, encoded, thread, width, width);
+        workgroupBarrier();
+        dense(second, width, joined, thread, width, 0u);
+        workgroupBarrier();
+        if thread < 3u {
+            values[width + thread] = output(third, 0u, width, thread);
+        }
+        workgroupBarrier();
+        if thread == turn {
+            for (var c = 0u; c < 3u; c++) {
+                rgb[c] = 1.0 / (1.0 + exp(-values[width + c]));
             }
         }
     }
-    let joined = width + select(0u, behind.encoded, behind.skip != 0u);
-    let second = dense(0u, 2u * width, behind.encoded, width);
-    let third = dense(second, width, joined, 0u);
-    let logits = group(third, 0u, width);
-    var rgb: array<vec4f, 3>;
-    rgb[0] = 1.0 / (1.0 + exp(-logits.low[0]));
-    rgb[1] = 1.0 / (1.0 + exp(-logits.low[1]));
-    rgb[2] = 1.0 / (1.0 + exp(-logits.low[2]));
     return rgb;
 }
 
+// One value of the encoded directions; 0 behind the last.
+fn encode(place: u32) -> vec4f {
+    let first = select(0u, 3u, behind.identity != 0u);
+    if place < first {
+        return asked[place];
+    }
+    if place >= behind.encoded {
+        return vec4f(0.0);
+    }
+    let wave = (place - first) / 3u;
+    let scale = f32(1u << (wave % behind.octaves));
+    return sine(asked[(place - first) % 3u] * scale, select(0.0, 0.5, wave >= behind.octaves));
+}
+
 // One hidden layer, whose weights begin `at`: reads `inputs` values after `source`, writes as many as
-// it is wide after `dest`. Returns where the next layer's weights begin.
-fn dense(at: u32, source: u32, inputs: u32, dest: u32) -> u32 {
-    var first = at;
-    for (var output = 0u; output < behind.width; output += 8u) {
-        var sums = group(first, source, inputs);
-        for (var k = 0u; k < 4u; k++) {
-            values[dest + output + k] = max(sums.low[k], vec4f(0.0));
-            values[dest + output + 4u + k] = max(sums.high[k], vec4f(0.0));
-        }
-        first += 2u * (inputs + 1u);
+// there are `outputs` after `dest`.
+fn dense(at: u32, source: u32, inputs: u32, thread: u32, outputs: u32, dest: u32) {
+    for (var own = thread; own < outputs; own += THREADS) {
+        values[dest + own] = max(output(at, source, inputs, own), vec4f(0.0));
     }
-    return first;
 }
 
-// Eight outputs of a layer: four directions each.
-struct Outputs {
-    low: mat4x4f,
-    high: mat4x4f,
-}
-
-// One group of outputs, whose biases and weights begin `at`: two vectors for the biases, two per input.
-fn group(at: u32, source: u32, inputs: u32) -> Outputs {
-    let one = vec4f(1.0);
-    var low = outer(weights[at], one);
-    var high = outer(weights[at + 1u], one);
-    for (var input = 0u; input < inputs; input++) {
-        let value = values[source + input];
-        low += outer(weights[at + 2u * input + 2u], value);
-        high += outer(weights[at + 2u * input + 3u], value);
+// One output of a layer, before anything cuts it off.
+fn output(at: u32, source: u32, inputs: u32, own: u32) -> vec4f {
+    let row = at + own * (1u + inputs / 4u);
+    var sum = vec4f(weights[row].x);
+    for (var input = 0u; input < inputs; input += 4u) {
+        let weight = weights[row + 1u + input / 4u];
+        let place = source + input;
+        sum += weight.x * values[place] + weight.y * values[place + 1u];
+        sum += weight.z * values[place + 2u] + weight.w * values[place + 3u];
     }
-    return Outputs(low, high);
-}
-
-fn outer(weight: vec4f, value: vec4f) -> mat4x4f {
-    return mat4x4f(weight.x * value, weight.y * value, weight.z * value, weight.w * value);
-}
-
-// As in `src/scene/sky/folded.rs`: WGSL's own sine may be 2^-11 off. Products with the first two parts
-// of pi are exact, so that it does not matter whether sums are fused with them.
-fn sine(x: vec4f, cosine: u32) -> vec4f {
-    let quarter = 0.5 * f32(cosine);
-    let whole = floor(x * 0.31830988618 + (0.5 - quarter));
-    let turns = whole + quarter;
-    let r = ((x - turns * 3.140625) - turns * 9.6774101257e-4) + turns * 8.742278e-8;
-    let square = r * r;
-    let fit = ((2.6000546e-6 * square - 1.9806615e-4) * square + 8.333017e-3) * square
-        - 1.6666657e-1;
-    let value = r + fit * square * r;
-    let odd = (vec4i(whole) + i32(cosine)) & vec4i(1);
-    return select(value, -value, odd != vec4i(0));
+    return sum;
 }

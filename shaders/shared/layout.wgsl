@@ -33,7 +33,11 @@ struct Behind {
     scale: f32,
     offset: f32,
     edge: u32,
-    pad0: u32,
+    width: u32,
+    octaves: u32,
+    encoded: u32,
+    identity: u32,
+    skip: u32,
     sky_from_pixel: array<array<vec4f, 3>, MAX_VIEWS>,
 }
 
@@ -46,14 +50,37 @@ struct Seen {
 
 struct ChunkView {
     camera_from_chunk: array<vec4f, 3>,
-    forward_high: vec4f,
-    forward_low: vec4f,
+    depth_high: vec4f,
+    depth_low: vec4f,
     camera_m: vec3f,
     view: u32,
     focal_px: vec2f,
     center_px: vec2f,
     slope_min: vec2f,
     slope_max: vec2f,
+}
+
+struct Lens {
+    center_px: vec2f,
+    model: u32,
+    windshield: u32,
+    linear: vec4f,
+    end: f32,
+    end_value: f32,
+    end_slope: f32,
+    limit_rad: f32,
+    widest_rad: f32,
+    by_distance: u32,
+    bent: u32,
+    pad0: u32,
+    c: array<vec4f, 3>,
+    bend: array<vec2f, 22>,
+    rolls: vec4f,
+    moved_m: vec3f,
+    pad1: u32,
+    moved_world_m: vec3f,
+    pad2: u32,
+    turned: vec4f,
 }
 
 struct Item {

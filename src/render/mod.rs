@@ -178,15 +178,6 @@ pub enum RenderError {
         /// What they may take.
         limit_bytes: u64,
     },
-    /// The backend looks skies up in baked maps alone.
-    #[error(
-        "the {backend} backend looks skies up in baked maps, and the profile asks for sky_error=0: use \
-         the cpu or the reference backend, or another sky_error"
-    )]
-    ExactSky {
-        /// Its name.
-        backend: &'static str,
-    },
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),

@@ -9,8 +9,8 @@
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{Rolling, View};
-use crate::geometry::Pose;
 use crate::geometry::camera::{Cone, WIDEST_RAD};
+use crate::geometry::{Camera, Pose};
 use crate::scene::RenderProfile;
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole
@@ -68,7 +68,7 @@ impl<'a> Bent<'a> {
             camera_from_world: view.world_from_camera.inverse(),
             cone: Cone::of(&view.camera),
             range_m: [profile.near, profile.far],
-            widest_rad: (view.camera.limit_rad() + BESIDE_RAD).min(WIDEST_RAD),
+            widest_rad: widest_rad(&view.camera),
             moves,
             reach: [sigmas, sigmas * profile.blur.sqrt() + 2.0],
             turned_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
@@ -155,6 +155,11 @@ impl<'a> Bent<'a> {
         let out = beyond_px > reach_px;
         !out
     }
+}
+
+/// How far off the axis a centre may lie and still be drawn, in radians.
+pub fn widest_rad(camera: &Camera) -> f64 {
+    (camera.limit_rad() + BESIDE_RAD).min(WIDEST_RAD)
 }
 
 /// The angle of a point off the axis, in radians.

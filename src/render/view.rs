@@ -111,6 +111,12 @@ impl View {
         rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
     }
 
+    /// Rows that take directions in the camera's frame at the exposure's end to a sky's axes.
+    pub(super) fn sky_from_camera(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
+        let rows = (sky_from_world * self.world_from_camera.rotation_matrix()).transpose();
+        rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
+    }
+
     /// Where a point of the world lands, in pixels; `None` outside of the lens' field.
     pub fn project_world(&self, point_m: DVec3) -> Option<DVec2> {
         self.camera.project(self.land(point_m, 1.0).point_m)

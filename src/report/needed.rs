@@ -212,14 +212,10 @@ impl Step {
         })
     }
 
-    /// `None` if it does not draw such a frame.
+    /// `None` if it was lost meanwhile.
     fn of_device(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
         // The first frame makes room, perhaps in several tries.
-        match self.draw(gpu) {
-            // A device that only looks skies up says so.
-            Err(_) if self.profile.sky_error == 0.0 => return Ok(None),
-            drawn => drawn?,
-        };
+        self.draw(gpu)?;
         let dispatches = |usage: &GpuUse| usage.made.dispatches;
         let before = gpu.usage().as_ref().map_or(0, dispatches);
         self.draw(gpu)?;

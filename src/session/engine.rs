@@ -226,6 +226,17 @@ impl Engine {
         Ok(opened.await.map_err(|_| SessionError::Crashed)??)
     }
 
+    /// Makes the map of the twin's sky that a profile's frames look up, so that none of them waits for it.
+    pub(super) async fn bake(
+        resident: Arc<Resident>,
+        profile: RenderProfile,
+    ) -> Result<(), SessionError> {
+        let Some(sky) = resident.sky().cloned() else { return Ok(()) };
+        let baked = tokio::task::spawn_blocking(move || sky.drawn(profile.sky_error));
+        let drawn = baked.await.map_err(|_| SessionError::Crashed)?;
+        drawn.map(|_| ()).map_err(SessionError::Sky)
+    }
+
     /// Sets aside the memory for the frames of a rig, if there is enough.
     pub(super) async fn reserve(
         resident: Arc<Resident>,

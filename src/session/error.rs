@@ -4,6 +4,7 @@ use crate::render::RenderError;
 use crate::residency::ResidencyError;
 use crate::scene::profile::ProfileError;
 use crate::scene::route::RouteError;
+use crate::scene::sky::SkyError;
 use crate::sim::EgoError;
 use crate::store::StoreError;
 
@@ -66,6 +67,9 @@ pub enum SessionError {
     /// The profile that is asked for cannot be had.
     #[error(transparent)]
     Profile(#[from] ProfileError),
+    /// The twin's sky is too sharp for the profile's `sky_error`.
+    #[error("profile: {0}")]
+    Sky(SkyError),
     /// The images of one answer have too many pixels.
     #[error("the answer has {pixels} pixels; at most {limit} fit: ask for fewer or smaller images")]
     AnswerTooLarge {

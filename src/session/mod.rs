@@ -147,6 +147,7 @@ impl Session {
         let route = route.map(|log| Arc::new(Route::new(log)));
         let changes = opening.profile;
         let profile = changes.apply(manifest.profile)?;
+        Engine::bake(resident.clone(), profile).await?;
         let trained = match trust {
             true => Some(trained(&resident).await?),
             false => None,
@@ -276,6 +277,7 @@ impl Session {
         }
         let lens = lens(self.layout.cameras());
         let profile = self.changes.apply(resident.version.manifest.profile)?;
+        Engine::bake(resident.clone(), profile).await?;
         let bytes = Engine::worst_bytes(resident.clone(), lens, profile).await?;
         let trained = match &self.trained {
             Some(_) => Some(trained(&resident).await?),

@@ -1,6 +1,7 @@
 //! What each stage must do, in f64, one thing after the other: every tile and every pixel is asked
 //! about every splat.
 
+use glam::DVec2;
 use wildcity::geometry::Camera;
 use wildcity::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
 use wildcity::render::reference;
@@ -130,7 +131,7 @@ pub(crate) fn rasterize(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> V
             Image { rgba: Vec::new(), rgb8: Vec::new(), depth_m: Vec::new(), opacity: Vec::new() };
         for row in 0..view.camera.height_px {
             for column in 0..view.camera.width_px {
-                pixel(&here, [column, row], frame, &mut image);
+                pixel(&here, &view.camera, [column, row], frame, &mut image);
             }
         }
         image
@@ -138,8 +139,17 @@ pub(crate) fn rasterize(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> V
     images.collect()
 }
 
-fn pixel(splats: &[Splat], [column, row]: [u32; 2], frame: &Frame<'_>, image: &mut Image) {
+fn pixel(
+    splats: &[Splat],
+    camera: &Camera,
+    [column, row]: [u32; 2],
+    frame: &Frame<'_>,
+    image: &mut Image,
+) {
     let log2_cut = frame.profile.alpha_cut.log2();
+    let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
+    // What a lens does not see is nothing.
+    let splats = camera.unproject(at_px).map_or(&[][..], |_| splats);
     let (mut rgb, mut depth_m, mut transmittance) = ([0.0; 3], 0.0, 1.0);
     for splat in splats {
         let log2_alpha = splat.log2_alpha(column, row);

@@ -48,7 +48,12 @@ fn features_pay_for_themselves_and_the_base_for_none() {
     let [pipelines, buffers, dispatches, planes] = beyond("levels of detail, 1 m");
     assert!(buffers <= 0 && [pipelines, dispatches, planes] == [0; 3]);
     // What is behind or before the Gaussians is done in the last kernel, of more buffers.
-    for with in ["background", "sky of images", "sky, baked", "exposure", "hood"] {
+    for with in ["background", "sky of images", "sky, baked", "sky, exact", "exposure", "hood"] {
+        let [pipelines, buffers, dispatches, planes] = beyond(with);
+        assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
+    }
+    // Another projection takes the place of the pinhole's, and is told of its lens.
+    for with in ["fisheye", "rolling shutter"] {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }

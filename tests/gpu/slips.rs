@@ -44,7 +44,7 @@ pub(crate) const SLIPS: &[Slip] = &[
         "let clamped = slope * 0.9;",
         PROJECT,
     ),
-    slip("project", "let l1 = -(b * l2)", "let l1 = (b * l2)", PROJECT),
+    slip("project", "-(foot.covariance.y * l2)", "(foot.covariance.y * l2)", PROJECT),
     slip("project", "x.y + turn.z", "x.y - turn.z", PROJECT),
     slip("project", "(high & 0xFFu) << 12u", "(high & 0xFFu) << 11u", PROJECT),
     slip("project", "2.890611442640554", "2.0", PROJECT),
@@ -101,6 +101,41 @@ pub(crate) const SLIPS: &[Slip] = &[
     slip("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)", RASTERIZE),
     slip("rasterize", "sums.depth / select", "sums.depth * select", RASTERIZE),
     slip("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0", RASTERIZE),
+];
+
+/// Faults of lenses and shutters: what of `project_bent` is replaced, by what.
+pub(crate) const LENS_SLIPS: &[(&str, &str)] = &[
+    ("0.07902598 * square", "0.0 * square"),
+    ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),
+    ("off_axis < end * inside.z", "off_axis < 0.5 * end * inside.z"),
+    (
+        "let across = 2.0 * slope.x * slope.y * factor.y",
+        "let across = slope.x * slope.y * factor.y",
+    ),
+    ("p.yx * (r2 + 2.0 * slope * slope)", "p * (r2 + 2.0 * slope * slope)"),
+    ("(s.xz + s.yw * r2) * r2", "(s.xy + s.zw * r2) * r2"),
+    ("(STRAIGHT + (1.0 + STRAIGHT * STRAIGHT) * beyond_rad)", "(STRAIGHT + STRAIGHT * beyond_rad)"),
+    (
+        "lenses[of_view].center_px + linear(of_view) * plane",
+        "lenses[of_view].center_px + plane * linear(of_view)",
+    ),
+    ("max(x - end, 0.0)", "0.0"),
+    ("if at.x > y {", "if at.x < y {"),
+    ("end + (y - top)", "end - (y - top)"),
+    ("if way != has {", "if way == has {"),
+    ("saturate((z - 0.05) / 0.1) * sum", "sum"),
+    ("sines * sine(by, 0.5).xy", "sines"),
+    ("along.x * at_px.x + along.y * at_px.y", "along.x * at_px.y + along.y * at_px.x"),
+    ("2.0 * sines.y * sines.y", "sines.y * sines.y"),
+    ("let share = still_to_come(of_view, seen.at_px);", "let share = guess;"),
+    ("middle = (1.0 / ROOT_3)", "middle = 0.0"),
+    ("+ center.share * lenses[of_view].moved_world_m", ""),
+    ("<= lenses[of_view].widest_rad", "<= 0.5 * lenses[of_view].widest_rad"),
+    ("moved_m.z + turning(view.view, at_end_m + moved_m, share).z", "moved_m.z"),
+    ("sum.x + (sum.y + exact_m.y)", "sum.x"),
+    ("2.0 * then.x * (away.y + then.y - view.depth_low[axis])", "0.0"),
+    ("/ max(2.0 * root, 1e-30)", "* 0.0"),
+    ("for (var k = 0u; k < i; k++)", "for (var k = 0u; k < 1u; k++)"),
 ];
 
 /// A street of SH degree 3 with mist in it, over more macro tiles than one thread emits.

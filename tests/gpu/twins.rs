@@ -80,11 +80,15 @@ fn layouts_are_the_same() {
             blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
         }
         Behind {
-            scale, offset, edge, pad0, sky_from_pixel,
+            scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,
         }
         Seen { exposure, overlay_px, first_overlay, exposed }
         ChunkView {
-            camera_from_chunk, forward_high, forward_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
+            camera_from_chunk, depth_high, depth_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
+        }
+        Lens {
+            center_px, model, windshield, linear, end, end_value, end_slope, limit_rad, widest_rad, by_distance,
+            bent, pad0, c, bend, rolls, moved_m, pad1, moved_world_m, pad2, turned,
         }
         Item { line, chunk_view }
         Span { first, count }

@@ -123,6 +123,26 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
     assert!(edges.is_sorted() && edges[0] < edges[2], "{edges:?}");
 }
 
+/// Sessions that ask for different errors have maps side by side, and no frame of one bakes anew because
+/// of the other.
+#[test]
+fn every_error_keeps_its_map() {
+    let sky = sky();
+    let wanted = [0.05, 0.0005, 0.005];
+    let maps = wanted.map(|wanted| map_of(sky.drawn(wanted).unwrap()));
+    let bytes = sky.bytes();
+    for (wanted, map) in wanted.into_iter().zip(&maps) {
+        assert!(Arc::ptr_eq(&map_of(sky.drawn(wanted).unwrap()), map), "{wanted}");
+    }
+    // What a coarser map is good enough for is it, whoever asked first.
+    let coarsest = map_of(sky.drawn(1.0).unwrap());
+    assert_eq!(coarsest.edge(), 129);
+    assert!(coarsest.error() <= 0.05 && Arc::ptr_eq(&coarsest, &maps[0]));
+    assert_eq!(sky.bytes(), bytes);
+    let fresh = Sky::new(sky.model().clone(), sky.sky_from_world());
+    assert!(*map_of(fresh.drawn(0.005).unwrap()) == *maps[2], "whatever was asked for before");
+}
+
 #[test]
 fn the_demo_sky_is_within_the_default_bound() {
     let sky = Sky::new(demo_model(None), DMat3::IDENTITY);

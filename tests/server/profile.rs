@@ -1,8 +1,17 @@
 //! Profiles that a server or a session wants otherwise.
 
-use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::Path;
 
-use crate::support::{TestServer, refused};
+use glam::DMat3;
+use safetensors::tensor::{Dtype, TensorView};
+use serde_json::{Value, json};
+use wildcity::ingest;
+use wildcity::scene::Gaussians;
+use wildcity::scene::manifest::Provenance;
+use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes};
+
+use crate::support::{TestServer, refused, rig};
 
 fn changes(json: Value) -> wildcity::scene::ProfileChanges {
     serde_json::from_value(json).unwrap()
@@ -52,4 +61,59 @@ async fn a_profile_that_cannot_be_had_is_refused_by_its_field() {
     }
     refused(&agent.try_open(json!({ "profile": 7 })).await, "invalid_request");
     agent.open(json!({})).await;
+}
+
+/// Commits a twin `creased`, whose sky has one kink: half of 8 bits at most where it is baked at the
+/// default, and too much for any map at 1e-4.
+fn commit_creased(dir: &Path) {
+    let floats = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let layers: [(usize, usize, Vec<u8>, Vec<u8>); 3] = [
+        (1, 3, floats(&[2.0, 0.0, 0.0]), floats(&[0.2])),
+        (1, 1, floats(&[1.0]), floats(&[0.0])),
+        (3, 1, floats(&[1.0; 3]), floats(&[0.0; 3])),
+    ];
+    let mut tensors = BTreeMap::new();
+    for (k, (outputs, inputs, weight, bias)) in layers.iter().enumerate() {
+        let view = |shape, data| TensorView::new(Dtype::F32, shape, data).unwrap();
+        tensors.insert(
+            format!("sky_head.layers.{k}.weight"),
+            view(vec![*outputs, *inputs], &weight[..]),
+        );
+        tensors.insert(format!("sky_head.layers.{k}.bias"), view(vec![*outputs], &bias[..]));
+    }
+    let file = safetensors::serialize(tensors, None).unwrap();
+    let bytes = ingest::sky::read_bytes(&file, None).unwrap().bytes.into();
+    let sky = SkyBytes { bytes, image: None, sky_from_world: DMat3::IDENTITY };
+    let gaussians = Gaussians {
+        sh_degree: 0,
+        means_m: vec![[5.0, 0.0, 1.0]],
+        quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+        ln_scales: vec![[-1.0; 3]],
+        logit_opacities: vec![2.0],
+        sh: vec![0.5; 3],
+    };
+    let new = NewVersion {
+        rig: Some(rig()),
+        sky: Some(NewSky::Put(sky)),
+        ..NewVersion::of("creased", &gaussians, Provenance::of("test".to_owned()))
+    };
+    Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
+}
+
+#[tokio::test]
+async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
+    let server = TestServer::configured(|config| commit_creased(&config.twins)).await;
+    let mut agent = server.agent().await;
+    let asked =
+        |sky_error: f64| json!({ "twin": "creased", "profile": { "sky_error": sky_error } });
+    let answer = agent.try_open(asked(1e-4)).await;
+    refused(&answer, "out_of_range");
+    assert_eq!(answer["field"], "profile", "{answer}");
+    let message = answer["message"].as_str().unwrap();
+    assert!(message.contains("sky_error is 0.0001: set sky_error to 0.000"), "{message}");
+    // What it says is the way out: another error, or none.
+    for sky_error in [0.001, 0.0] {
+        let opened = server.agent().await.try_open(asked(sky_error)).await;
+        assert_eq!(opened["profile"]["sky_error"], sky_error, "{opened}");
+    }
 }

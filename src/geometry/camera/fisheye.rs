@@ -38,6 +38,11 @@ impl Fisheye {
         self.max_angle_rad
     }
 
+    /// The distance from the axis in focal lengths, by the angle off it in radians.
+    pub fn radius(&self) -> &Rising {
+        &self.radius
+    }
+
     /// How far off the axis it sees.
     pub fn limit_rad(&self) -> f64 {
         self.radius.end()
@@ -68,8 +73,15 @@ pub(super) fn radial(direction: DVec3, r: impl Fn(f64) -> f64, central: f64) -> 
     if off_axis < 1e-12 * direction.z {
         return direction.truncate() * (central / direction.z);
     }
-    // Straight behind there is no azimuth: any finite answer will do.
-    direction.truncate() * (r(off_axis.atan2(direction.z)) / off_axis.max(1e-300))
+    azimuth(direction) * r(off_axis.atan2(direction.z))
+}
+
+/// The unit vector across the axis towards which a direction lies. Straight behind there is none: within a
+/// thousandth of that it goes to 0, so that what reaches there on either side is no tear.
+#[inline(always)]
+pub(super) fn azimuth(direction: DVec3) -> DVec2 {
+    let least = (-1e-3 * direction.z).max(1e-300);
+    direction.truncate() / direction.truncate().length().max(least)
 }
 
 /// The unit direction at an angle off the axis along an azimuth, if that is within a limit.

@@ -89,8 +89,13 @@ impl FTheta {
         DVec2::new(self.linear_cde[0], 1.0) * self.central_px()
     }
 
+    /// The reference polynomial, as far as it is used: radians to pixels, or the other way.
+    pub fn rising(&self) -> &Rising {
+        &self.rising
+    }
+
     /// `[[c, d], [e, 1]]`.
-    fn linear(&self) -> DMat2 {
+    pub fn linear(&self) -> DMat2 {
         let [c, d, e] = self.linear_cde;
         DMat2::from_cols(DVec2::new(c, e), DVec2::new(d, 1.0))
     }

@@ -10,7 +10,7 @@ pub mod ftheta;
 pub mod json;
 pub mod opencv;
 pub mod pinhole;
-mod rising;
+pub mod rising;
 pub mod shutter;
 pub mod windshield;
 
@@ -21,6 +21,7 @@ pub use fisheye::Fisheye;
 pub use ftheta::{FTheta, Reference};
 pub use opencv::OpenCv;
 pub use pinhole::Pinhole;
+pub use rising::Rising;
 pub use shutter::{Rolls, Shutter};
 pub use windshield::{Bivariate, Windshield, WindshieldReference};
 
@@ -229,10 +230,13 @@ impl Camera {
     /// pinhole, its distance where there may be something at 90° and beyond.
     #[inline(always)]
     pub fn depth_m(&self, point_m: DVec3) -> f64 {
-        match self.lens {
-            Lens::Pinhole | Lens::OpenCv(_) => point_m.z,
-            Lens::Fisheye(_) | Lens::FTheta(_) => point_m.length(),
-        }
+        if self.depth_is_distance() { point_m.length() } else { point_m.z }
+    }
+
+    /// Whether depth is distance.
+    #[inline(always)]
+    pub fn depth_is_distance(&self) -> bool {
+        matches!(self.lens, Lens::Fisheye(_) | Lens::FTheta(_))
     }
 
     /// How far off the axis the lens sees, in radians.

@@ -3,6 +3,7 @@
 use glam::{DMat2, DVec2, DVec3};
 
 use super::CameraError;
+use super::fisheye::azimuth;
 use super::rising::last;
 
 /// `(x, y) -> (x, y) icD + tangential + prism` of the slopes `x/z, y/z`, with
@@ -82,7 +83,7 @@ impl OpenCv {
         if within {
             return self.distort(direction.truncate() / direction.z);
         }
-        let azimuth = direction.truncate() / off_axis.max(1e-300);
+        let azimuth = azimuth(direction);
         let edge = azimuth * self.limit_slope;
         let beyond_rad = off_axis.atan2(direction.z) - self.limit_slope.atan();
         let slope_per_rad = 1.0 + self.limit_slope * self.limit_slope;

@@ -3,6 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::CameraError;
+use super::fisheye::azimuth;
 
 /// Pinhole intrinsics, in pixels from the image's top-left corner.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -55,7 +56,7 @@ impl Pinhole {
         }
         let beyond_rad = off_axis.atan2(direction.z) - Self::STRAIGHT.atan();
         let per_rad = 1.0 + Self::STRAIGHT * Self::STRAIGHT;
-        direction.truncate() / off_axis.max(1e-300) * (Self::STRAIGHT + per_rad * beyond_rad)
+        azimuth(direction) * (Self::STRAIGHT + per_rad * beyond_rad)
     }
 
     /// Where a camera-space point lands, in pixels; meaningless unless `z > 0`.

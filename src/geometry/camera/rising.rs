@@ -1,11 +1,11 @@
 //! Polynomials that rise: from the angle off the axis to a distance on the image, or the other way.
 
 /// Coefficients of a polynomial, the constant first.
-pub(super) const TERMS: usize = 10;
+pub const TERMS: usize = 10;
 
 /// A polynomial that is 0 at 0, on the range from 0 on over which it rises.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Rising {
+pub struct Rising {
     coefficients: [f64; TERMS],
     /// Where the range ends; 0 if it does not even begin.
     end: f64,
@@ -37,7 +37,7 @@ impl Rising {
 
     /// Its value; beyond the end it goes on straight.
     #[inline(always)]
-    pub(super) fn at(&self, x: f64) -> f64 {
+    pub fn at(&self, x: f64) -> f64 {
         let within = x.min(self.end);
         let value = self.coefficients.iter().rev().fold(0.0, |sum, c| sum * within + c);
         if x > self.end { value + self.slope(self.end) * (x - self.end) } else { value }
@@ -45,7 +45,7 @@ impl Rising {
 
     /// Its slope within the range.
     #[inline(always)]
-    pub(super) fn slope(&self, x: f64) -> f64 {
+    pub fn slope(&self, x: f64) -> f64 {
         (1..TERMS).rev().fold(0.0, |sum, k| sum * x + k as f64 * self.coefficients[k])
     }
 
@@ -77,8 +77,13 @@ impl Rising {
         x
     }
 
+    /// Of powers 0 to 9.
+    pub fn coefficients(&self) -> &[f64; TERMS] {
+        &self.coefficients
+    }
+
     /// Where the range ends.
-    pub(super) fn end(&self) -> f64 {
+    pub fn end(&self) -> f64 {
         self.end
     }
 }

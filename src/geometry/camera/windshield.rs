@@ -178,6 +178,14 @@ impl Bivariate {
         &self.coefficients[..self.count]
     }
 
+    /// That of φ^i θ^j; 0 where there is none.
+    pub fn coefficient(&self, i: usize, j: usize) -> f64 {
+        let order = self.order();
+        // Behind those of smaller j: order + 1, order, ... of them.
+        let first = j * (order + 1) - j * j.saturating_sub(1) / 2;
+        if i + j <= order { self.coefficients[first + i] } else { 0.0 }
+    }
+
     fn order(&self) -> usize {
         (0..=5).find(|order| (order + 1) * (order + 2) / 2 == self.count).unwrap_or(0)
     }

@@ -1,10 +1,8 @@
 //! What is behind the Gaussians and what cameras make of it, on the device: made with the first frame
 //! that has either.
 //!
-//! Twin of `render/cpu/{behind,appearance}.rs`; WGSL: `shaders/{behind,sky_map,appearance}.wgsl`,
-//! linked into `rasterize`.
-
-use std::sync::Arc;
+//! Twin of `render/cpu/{behind,appearance}.rs`; WGSL: `shaders/behind.wgsl` and what it imports, linked into
+//! `rasterize`.
 
 use bytemuck::Zeroable;
 use glam::DMat3;
@@ -16,9 +14,9 @@ use super::kernel::{Kernel, module};
 use super::layout;
 use super::resolve::Planes;
 use super::shaders::Shaders;
-use crate::render::{Frame, MAX_VIEWS, RenderError};
+use crate::render::{Frame, MAX_VIEWS, RenderError, View};
 use crate::scene::appearance::{Appearance, Exposure};
-use crate::scene::sky::{CubeMap, Drawn};
+use crate::scene::sky::{Drawn, Folded};
 
 /// What is behind the Gaussians of the frame at hand.
 #[derive(Debug)]
@@ -27,11 +25,24 @@ pub(super) struct Behind {
     values: Growing,
     seen: Growing,
     overlays: Growing,
-    /// Whose values the device holds.
-    held: Option<Arc<CubeMap>>,
+    /// What the device holds.
+    held: Option<Drawn>,
+    /// Which of the variants the frame takes.
+    variant: usize,
+    variants: [Variant; VARIANTS.len()],
+}
+
+/// The stage with one kind of sky and of views, compiled when first asked for.
+#[derive(Debug, Default)]
+struct Variant {
     module: Option<ShaderModule>,
+    /// By the planes that are wanted.
     kernels: [Option<Kernel>; Planes::VARIANTS],
 }
+
+/// A map or a network; and each with lenses or rolling shutters.
+const VARIANTS: [&str; 4] =
+    ["rasterize_map", "rasterize_network", "rasterize_map_bent", "rasterize_network_bent"];
 
 impl Behind {
     pub(super) fn new(device: &Device) -> Self {
@@ -43,8 +54,8 @@ impl Behind {
             seen: Growing::new(device, "appearances", uniform),
             overlays: Growing::new(device, "overlays", storage),
             held: None,
-            module: None,
-            kernels: [const { None }; Planes::VARIANTS],
+            variant: 0,
+            variants: Default::default(),
         }
     }
 
@@ -61,20 +72,36 @@ impl Behind {
     ) -> Result<(), RenderError> {
         let mut behind = layout::Behind::zeroed();
         for (slot, view) in behind.sky_from_pixel.iter_mut().zip(frame.views) {
-            *slot = view.sky_from_pixel(axes).map(|[a, b, c]| [a, b, c, 0.0]);
+            let rows = match view.is_ideal() {
+                true => view.sky_from_pixel(axes),
+                false => view.sky_from_camera(axes),
+            };
+            *slot = rows.map(|[a, b, c]| [a, b, c, 0.0]);
         }
-        let Drawn::Map(map) = drawn else { return Err(RenderError::ExactSky { backend: "gpu" }) };
-        let [scale, offset] = map.look_up();
-        (behind.scale, behind.offset) = (scale as f32, offset as f32);
-        behind.edge = map.edge() as u32;
+        match &drawn {
+            Drawn::Map(map) => {
+                let [scale, offset] = map.look_up();
+                (behind.scale, behind.offset) = (scale as f32, offset as f32);
+                behind.edge = map.edge() as u32;
+            }
+            Drawn::Exact(network) => set_network(&mut behind, network),
+        }
         let limit = device.binding_bytes();
-        if map.bytes() as u64 > limit {
+        if drawn.bytes() as u64 > limit {
             let what = "bytes of a sky in one binding of the GPU";
             return Err(RenderError::TooMany { what, limit });
         }
-        if !self.held.as_ref().is_some_and(|held| Arc::ptr_eq(held, &map)) {
-            self.values.fill(device, bytemuck::cast_slice(map.texels()));
-            self.held = Some(map);
+        let has_bent = !frame.views.iter().all(View::is_ideal);
+        let has_network = matches!(drawn, Drawn::Exact(_));
+        self.variant = usize::from(has_network) + 2 * usize::from(has_bent);
+        if !self.held.as_ref().is_some_and(|held| held.is(&drawn)) {
+            match &drawn {
+                Drawn::Map(map) => self.values.fill(device, bytemuck::cast_slice(map.texels())),
+                Drawn::Exact(network) => {
+                    self.values.fill(device, bytemuck::cast_slice(&network.weights()));
+                }
+            }
+            self.held = Some(drawn);
         }
         self.views.fill(device, bytemuck::bytes_of(&behind));
         self.see(device, appearances)
@@ -114,8 +141,10 @@ impl Behind {
         shaders: &Shaders,
         planes: Planes,
     ) -> (&Kernel, [(u32, BindingResource<'_>); 4]) {
-        let module = self.module.get_or_insert_with(|| module(device, shaders, "rasterize_sky"));
-        let kernel = self.kernels[planes.variant()]
+        let Variant { module: compiled, kernels } = &mut self.variants[self.variant];
+        let name = VARIANTS[self.variant];
+        let module = compiled.get_or_insert_with(|| module(device, shaders, name));
+        let kernel = kernels[planes.variant()]
             .get_or_insert_with(|| Kernel::new(device, module, "main", &planes.constants()));
         let resources = [
             (8, self.views.bind()),
@@ -125,4 +154,31 @@ impl Behind {
         ];
         (kernel, resources)
     }
+
+    /// Iterations of loops that it takes of a thread, at most: four pixels' way back through a lens, 40 and
+    /// 26 each, and of a network all of a tile's 64 times four, four inputs each.
+    pub(super) fn iterations(&self) -> u64 {
+        let look = if self.is_bent() { 4 * (1 + 40 + 26) } else { 0 };
+        let sky = match &self.held {
+            Some(Drawn::Exact(network)) => {
+                let (width, encoded) = (network.width() as u64, network.encoded() as u64);
+                let rows = width.div_ceil(64);
+                let hidden = rows * (2 + encoded.div_ceil(4) + (width + encoded).div_ceil(4));
+                64 * (1 + hidden + width / 4 + 3)
+            }
+            _ => 4,
+        };
+        look + sky
+    }
+
+    /// Whether the frame has views of lenses or rolling shutters.
+    pub(super) fn is_bent(&self) -> bool {
+        self.variant >= 2
+    }
+}
+
+fn set_network(behind: &mut layout::Behind, network: &Folded) {
+    let sizes = [network.width(), network.octaves(), network.encoded()];
+    [behind.width, behind.octaves, behind.encoded] = sizes.map(|size| size as u32);
+    (behind.identity, behind.skip) = (network.identity().into(), network.skip().into());
 }

@@ -13,6 +13,7 @@ use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Recorder, TICKS_BYTES, clock};
 use super::layout::{Counters, Frame as GpuFrame, RASTER_BATCH};
+use super::lens::Lenses;
 use super::mirror::Mirror;
 use super::parts::{Cuts, Needs, Rows, Subject};
 use super::plan::{Counts, Plan, job};
@@ -46,6 +47,7 @@ pub(super) struct Chain {
     bin: Bin,
     rasterize: Rasterize,
     splats: Splats,
+    lenses: Lenses,
     clock: Option<QuerySet>,
     /// Resolved ticks, on their way to the host.
     ticks: Growing,
@@ -108,6 +110,7 @@ impl Chain {
             bin: Bin::new(&device, shaders),
             rasterize: Rasterize::new(&device, shaders),
             splats: Splats::new(&device),
+            lenses: Lenses::default(),
             clock: clock(&device),
             ticks: Growing::new(
                 &device,
@@ -206,6 +209,7 @@ impl Chain {
         wanted: &Wanted,
     ) -> Result<(GpuFrame, ReadBack), RenderError> {
         let planes = wanted.planes;
+        self.lenses.hold(&self.device, frame);
         self.rasterize.hold_behind(&self.device, frame, &wanted.appearances)?;
         let gpu_frame = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
@@ -250,7 +254,7 @@ impl Chain {
             self.time(stats, &stages, &ticks, submitted.elapsed());
             let (needs, fits) = self.learn(&counters, frame);
             if fits {
-                let limit = self.device.tile_splats();
+                let limit = self.device.tile_splats(self.rasterize.iterations_behind());
                 if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
                     let what = "visible splats in one tile (of a device in software)";
                     return Err(RenderError::TooMany { what, limit });
@@ -333,10 +337,10 @@ impl Chain {
     ) -> (Vec<&'static str>, SubmissionIndex) {
         let mut recorder = Recorder::new(&self.device, self.clock.clone());
         self.record(&mut recorder, source, frame, Stage::Bin);
-        let Self { device, plan, splats, bin, .. } = self;
+        let Self { device, plan, splats, bin, lenses, .. } = self;
 
         let mut pass = recorder.stage("rasterize");
-        self.rasterize.run(device, &mut pass, plan, (splats, bin), output);
+        self.rasterize.run(device, &mut pass, plan, (splats, bin, lenses), output);
         drop(pass);
 
         let stages = recorder.finish_stages(self.ticks.buffer());
@@ -363,13 +367,19 @@ impl Chain {
             Source::Gaussians(work) => Counts { items: work.items(), ..Counts::default() },
             Source::Between(between) => self.fill(between),
         };
-        let Self { device, plan, scan, splats, .. } = self;
+        let Self { device, plan, scan, splats, lenses, .. } = self;
         let (device, plan, scan) = (&*device, &*plan, &*scan);
         plan.start(device, frame, &counts);
 
         if let Source::Gaussians(work) = source {
             let mut pass = recorder.stage("project");
-            self.project.run(device, &mut pass, (work, &self.mirror), (plan, scan), splats);
+            self.project.run(
+                device,
+                &mut pass,
+                (work, &self.mirror),
+                (plan, scan),
+                (splats, lenses),
+            );
         }
 
         let mut sorted = 0;

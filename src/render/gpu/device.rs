@@ -273,11 +273,12 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most splats of a tile that are blended. A batch of `rasterize` takes one iteration, one for
-    /// each of its splats, and two that load them.
-    pub(super) fn tile_splats(&self) -> u64 {
+    /// Most splats of a tile that are blended, where what is behind them takes so many iterations. A batch
+    /// of `rasterize` takes one iteration, one for each of its splats, and two that load them.
+    pub(super) fn tile_splats(&self, behind: u64) -> u64 {
         let batch = u64::from(RASTER_BATCH);
-        self.loop_iterations().map_or(u64::MAX, |most| most / (batch + 3) * batch)
+        let blended = |most: u64| most.saturating_sub(behind) / (batch + 3) * batch;
+        self.loop_iterations().map_or(u64::MAX, blended)
     }
 
     /// Most touches of a macro tile that `expand` hands on. Half of the iterations are for batches of

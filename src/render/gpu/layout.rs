@@ -4,6 +4,7 @@
 use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
 
 use super::parts::{Part, Rows};
 use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
@@ -141,7 +142,7 @@ impl Frame {
     }
 }
 
-/// What is behind the Gaussians of all views (784 bytes).
+/// What is behind the Gaussians of all views (800 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Behind {
@@ -149,11 +150,20 @@ pub struct Behind {
     pub scale: f32,
     /// ... where its first one lies, ...
     pub offset: f32,
-    /// ... and values along an edge.
+    /// ... and values along an edge; of a map.
     pub edge: u32,
-    /// Zero.
-    pub pad0: u32,
-    /// By view, rows that take `(x, y, 1)` in pixels to a direction of any length.
+    /// Outputs of a hidden layer, ...
+    pub width: u32,
+    /// ... octaves of sines and cosines, ...
+    pub octaves: u32,
+    /// ... values of a direction and its octaves, ...
+    pub encoded: u32,
+    /// ... and whether the direction itself is one, 1 or 0, ...
+    pub identity: u32,
+    /// ... and the second layer reads them again; of a network.
+    pub skip: u32,
+    /// By view, rows that take `(x, y, 1)` in pixels to a direction of any length; of a lens or a rolling
+    /// shutter, directions in the camera's frame at the exposure's end.
     pub sky_from_pixel: [[[f32; 4]; 3]; MAX_VIEWS],
 }
 
@@ -171,16 +181,17 @@ pub struct Seen {
     pub exposed: u32,
 }
 
-/// A pinhole view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
+/// A view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct ChunkView {
     /// Rows of the rigid transform, translation last, in metres.
     pub camera_from_chunk: [[f32; 4]; 3],
-    /// The camera's forward axis in the chunk and the chunk's origin along it, rounded to f32, ...
-    pub forward_high: [f32; 4],
-    /// ... and what the rounding left over: depth is computed from both.
-    pub forward_low: [f32; 4],
+    /// What depth is computed from, rounded to f32: the camera's forward axis in the chunk and the chunk's
+    /// origin along it, or, where depth is distance, the camera's centre in the chunk, ...
+    pub depth_high: [f32; 4],
+    /// ... and what the rounding left over.
+    pub depth_low: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
     /// Index of the view.
@@ -204,8 +215,8 @@ impl ChunkView {
         };
         Self {
             camera_from_chunk: [row(0), row(1), row(2)],
-            forward_high: from.forward.map(|high| high as f32),
-            forward_low: from.forward.map(|exact| (exact - f64::from(exact as f32)) as f32),
+            depth_high: from.forward.map(|high| high as f32),
+            depth_low: from.forward.map(low),
             camera_m: from.camera_m,
             view,
             focal_px: from.focal_px,
@@ -214,6 +225,63 @@ impl ChunkView {
             slope_max: from.slope_max,
         }
     }
+
+    /// The same, with depth as the distance from a centre in the chunk, in metres.
+    pub(super) fn by_distance(self, center_m: DVec3) -> Self {
+        let exact = center_m.extend(0.0).to_array();
+        Self { depth_high: exact.map(|high| high as f32), depth_low: exact.map(low), ..self }
+    }
+}
+
+/// What is left of a number that is rounded to f32.
+fn low(exact: f64) -> f32 {
+    (exact - f64::from(exact as f32)) as f32
+}
+
+/// What a view has that a pinhole at rest has not (352 bytes). WGSL: `shaders/lens.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Lens {
+    /// Where the axis lands, in pixels.
+    pub center_px: [f32; 2],
+    /// 0 a pinhole, 1 OpenCV's model, 2 a distance from the axis by the angle off it, 3 the other way.
+    pub model: u32,
+    /// Which way the windshield's polynomials go: 0 none, 1 inwards, 2 outwards.
+    pub windshield: u32,
+    /// Columns that take the lens' plane to pixels.
+    pub linear: [f32; 4],
+    /// Where the model begins to go on straight: a slope, an angle or a distance, ...
+    pub end: f32,
+    /// ... what its polynomial is there, ...
+    pub end_value: f32,
+    /// ... and its slope; and ...
+    pub end_slope: f32,
+    /// ... the angle off the axis there, in radians.
+    pub limit_rad: f32,
+    /// How far off the axis a centre may be, in radians.
+    pub widest_rad: f32,
+    /// 1 if depth is distance, 0 if it is z.
+    pub by_distance: u32,
+    /// 0 for a pinhole at rest, 1 for all else.
+    pub bent: u32,
+    /// Zero.
+    pub pad0: u32,
+    /// k1 to k6, p1 and p2, s1 to s4; or a polynomial from its first power on, in shares of the end.
+    pub c: [[f32; 4]; 3],
+    /// By how much the windshield changes the angles: 21 coefficients, horizontal and vertical.
+    pub bend: [[f32; 2]; 22],
+    /// The share of the exposure that is still to come, as a sum of this times x, y and 1.
+    pub rolls: [f32; 4],
+    /// From the camera's first centre to its last, in the frame of the last, in metres.
+    pub moved_m: [f32; 3],
+    /// Zero.
+    pub pad1: u32,
+    /// The same along the world's axes.
+    pub moved_world_m: [f32; 3],
+    /// Zero.
+    pub pad2: u32,
+    /// The axis about which the camera turns meanwhile, and the angle in radians.
+    pub turned: [f32; 4],
 }
 
 /// One cluster in one view (8 bytes): the unit of projection.

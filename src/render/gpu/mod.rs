@@ -11,6 +11,7 @@ mod device;
 mod growing;
 mod kernel;
 pub mod layout;
+mod lens;
 mod mirror;
 mod parts;
 mod plan;
@@ -25,7 +26,7 @@ mod sort;
 mod traffic;
 mod turns;
 
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use rayon::ThreadPool;
@@ -42,9 +43,8 @@ use self::read_back::Drawn;
 use self::resolve::{Pixels, Wanted};
 use self::shaders::Shaders;
 use self::turns::Turns;
-use super::cpu::{Cpu, Simd};
 use super::stage::{Between, Stage};
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
+use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 use crate::config;
 
 /// The wgpu backend.
@@ -61,8 +61,6 @@ pub struct Gpu {
     /// is encoded.
     cull: ThreadPool,
     turns: Turns,
-    /// Projects what no matrix does: the views of lenses and rolling shutters. Made for the first one.
-    host: OnceLock<Cpu>,
     /// Gone after the device failed, and made again by the next frame.
     chain: Mutex<Option<Chain>>,
 }
@@ -163,7 +161,6 @@ impl Gpu {
             deliver,
             cull,
             turns: Turns::default(),
-            host: OnceLock::new(),
             chain: Mutex::new(Some(Chain::new(device, &shaders, limits.mirror_bytes)?)),
             shaders,
         })
@@ -265,36 +262,6 @@ impl Gpu {
         done
     }
 
-    /// Renders a frame in which there is a lens or a rolling shutter: the host projects, and the device
-    /// does the rest.
-    fn render_bent(
-        &self,
-        frame: &Frame<'_>,
-        targets: &mut [Target<'_>],
-        finished: Finished<'_>,
-    ) -> Result<FrameStats, RenderError> {
-        frame.check(targets)?;
-        let host = match self.host.get() {
-            Some(host) => host,
-            None => {
-                let host = Cpu::new(self.threads(), Simd::Best);
-                let failed =
-                    |reason: String| RenderError::Device { device: "the host".into(), reason };
-                let host = host.map_err(|error| failed(error.to_string()))?;
-                self.host.get_or_init(|| host)
-            }
-        };
-        // The device looks at a sky through a matrix, which no lens is.
-        if frame.behind()?.is_some() {
-            return host.render(frame, targets, finished);
-        }
-        let (between, before) = host.through(frame, Stage::Project)?;
-        let mut stats = self.go_on(&between, frame, targets, finished)?;
-        stats.stages_ms.splice(0..0, before.stages_ms);
-        stats.visible_pairs = before.visible_pairs;
-        Ok(stats)
-    }
-
     /// Draws a frame, and delivers its pixels.
     fn render_with(
         &self,
@@ -369,9 +336,6 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: Finished<'_>,
     ) -> Result<FrameStats, RenderError> {
-        if !frame.views.iter().all(View::is_ideal) {
-            return self.render_bent(frame, targets, finished);
-        }
         self.render_with(frame, targets, finished, |chain, wanted| {
             chain.draw(frame, wanted, &self.cull)
         })
@@ -383,6 +347,7 @@ mod tests {
     use super::*;
     use crate::geometry::camera::Pinhole;
     use crate::geometry::{Camera, Pose};
+    use crate::render::View;
     use crate::scene::{RenderProfile, Scene};
 
     #[test]

@@ -11,13 +11,16 @@ use super::device::Device;
 use super::growing::{Growing, HANDED_OVER};
 use super::kernel::{Groups, Kernel, SLOT_BYTES, module, slot};
 use super::layout::{ChunkView, Item, Span, SplatColor, SplatShape};
+use super::lens::Lenses;
 use super::mirror::Mirror;
 use super::plan::{Plan, job};
 use super::scan::Scan;
 use super::shaders::Shaders;
-use crate::render::Frame;
 use crate::render::layout::{ChunkView as CpuChunkView, Frustum};
+use crate::render::unscented::Bent;
+use crate::render::{Frame, View};
 use crate::scene::Chunk;
+use crate::scene::chunk::Cluster;
 
 /// What a frame projects.
 #[derive(Debug, Default)]
@@ -26,8 +29,9 @@ pub(super) struct Work {
     items: Vec<Item>,
     /// Indices of items, page after page of the mirror, since one page is bound at a time.
     page_items: Vec<u32>,
-    /// Each page that is needed, and its part of `page_items`.
-    spans: Vec<(usize, Span)>,
+    /// Each page that is needed, whether what follows is for lenses and rolling shutters, and its part of
+    /// `page_items`.
+    spans: Vec<(usize, bool, Span)>,
     chunk_views: Vec<ChunkView>,
 }
 
@@ -37,26 +41,41 @@ impl Work {
         let pairs: Vec<(usize, &Arc<Chunk>)> = views
             .flat_map(|view| frame.scene.chunks.iter().map(move |chunk| (view, chunk)))
             .collect();
-        let visible: Vec<Vec<(usize, u32)>> =
-            pairs.par_iter().map(|(view, chunk)| visible(frame, *view, chunk, mirror)).collect();
+        let bent: Vec<Option<Bent<'_>>> =
+            frame.views.iter().map(|view| Bent::of(view, frame.profile)).collect();
+        let visible: Vec<Vec<(usize, u32)>> = pairs
+            .par_iter()
+            .map(|(view, chunk)| visible(frame, (*view, bent[*view].as_ref()), chunk, mirror))
+            .collect();
         let mut work = Self { sh_degree: frame.scene.sh_degree(), ..Self::default() };
-        let mut pages = vec![Vec::new(); mirror.pages()];
+        // Of each page, those of pinholes at rest and the others: each has a kernel of its own.
+        let mut pages = vec![[Vec::new(), Vec::new()]; mirror.pages()];
         for ((view, chunk), clusters) in pairs.into_iter().zip(visible) {
             if clusters.is_empty() {
                 continue;
             }
             let chunk_view = work.chunk_views.len() as u32;
-            let from = CpuChunkView::new(&frame.views[view], chunk);
-            work.chunk_views.push(ChunkView::new(view as u32, &from));
+            let View { camera, world_from_camera, .. } = &frame.views[view];
+            let from = ChunkView::new(view as u32, &CpuChunkView::new(&frame.views[view], chunk));
+            work.chunk_views.push(match camera.depth_is_distance() {
+                false => from,
+                true => from.by_distance(world_from_camera.position_m - chunk.origin_m()),
+            });
+            let bent = usize::from(!frame.views[view].is_ideal());
             for (page, line) in clusters {
-                pages[page].push(work.items.len() as u32);
+                pages[page][bent].push(work.items.len() as u32);
                 work.items.push(Item { line, chunk_view });
             }
         }
-        for (page, items) in pages.into_iter().enumerate().filter(|(_, items)| !items.is_empty()) {
-            let first = work.page_items.len() as u32;
-            work.spans.push((page, Span { first, count: items.len() as u32 }));
-            work.page_items.extend(items);
+        for (page, kinds) in pages.into_iter().enumerate() {
+            for (items, bent) in kinds.into_iter().zip([false, true]) {
+                if !items.is_empty() {
+                    let first = work.page_items.len() as u32;
+                    let span = Span { first, count: items.len() as u32 };
+                    work.spans.push((page, bent, span));
+                    work.page_items.extend(items);
+                }
+            }
         }
         work
     }
@@ -70,14 +89,21 @@ impl Work {
 /// Page and first line of the clusters that one view may see of a chunk, in order.
 fn visible(
     frame: &Frame<'_>,
-    view: usize,
+    (view, bent): (usize, Option<&Bent<'_>>),
     chunk: &Arc<Chunk>,
     mirror: &Mirror,
 ) -> Vec<(usize, u32)> {
     let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
+    let may_see = |cluster: &Cluster| {
+        let Cluster { min_m, max_m, sigma_m, .. } = *cluster;
+        match bent {
+            Some(bent) => bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
+            None => frustum.may_see(min_m, max_m, sigma_m),
+        }
+    };
     let places = mirror.places(chunk).iter().zip(chunk.clusters());
     places
-        .filter(|(_, cluster)| frustum.may_see(cluster.min_m, cluster.max_m, cluster.sigma_m))
+        .filter(|(_, cluster)| may_see(cluster))
         .map(|(place, _)| (place.page, place.lines.start))
         .collect()
 }
@@ -125,9 +151,10 @@ impl Splats {
 /// The stage on the device.
 #[derive(Debug)]
 pub(super) struct Project {
-    module: ShaderModule,
-    /// By SH degree, compiled when the first scene needs it: cull, project.
-    kernels: [Option<[Kernel; 2]>; 4],
+    shaders: Shaders,
+    straight: Kernels,
+    /// For lenses and rolling shutters.
+    bent: Kernels,
     items: Growing,
     page_items: Growing,
     chunk_views: Growing,
@@ -136,13 +163,42 @@ pub(super) struct Project {
     offsets: Growing,
 }
 
+/// One variant of the stage.
+#[derive(Debug)]
+struct Kernels {
+    variant: &'static str,
+    module: Option<ShaderModule>,
+    /// By SH degree, compiled when the first scene needs it: cull, project.
+    by_degree: [Option<[Kernel; 2]>; 4],
+}
+
+impl Kernels {
+    /// Compiled when first needed.
+    fn new(variant: &'static str) -> Self {
+        Self { variant, module: None, by_degree: [const { None }; 4] }
+    }
+
+    fn of_degree(&mut self, device: &Device, shaders: &Shaders, degree: u8) -> &[Kernel; 2] {
+        let degree = usize::from(degree.min(3));
+        let module = self.module.get_or_insert_with(|| module(device, shaders, self.variant));
+        self.by_degree[degree].get_or_insert_with(|| {
+            let constants = [("SH_DEGREE", degree as f64)];
+            ["cull", "project"].map(|entry| Kernel::new(device, module, entry, &constants))
+        })
+    }
+}
+
 impl Project {
     pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let uniform = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
         Self {
-            module: module(device, shaders, "project"),
-            kernels: [const { None }; 4],
+            shaders: shaders.clone(),
+            straight: Kernels {
+                module: Some(module(device, shaders, "project")),
+                ..Kernels::new("project")
+            },
+            bent: Kernels::new("project_bent"),
             items: Growing::new(device, "items", storage),
             page_items: Growing::new(device, "page items", storage),
             chunk_views: Growing::new(device, "chunk views", storage),
@@ -161,7 +217,7 @@ impl Project {
     /// Sends a frame's work to the device.
     pub(super) fn upload(&mut self, device: &Device, work: &Work) {
         let spans: Vec<[u32; SLOT_BYTES as usize / 4]> = (work.spans.iter())
-            .map(|(_, span)| {
+            .map(|(_, _, span)| {
                 let mut slot = [0; SLOT_BYTES as usize / 4];
                 slot[..2].copy_from_slice(&[span.first, span.count]);
                 slot
@@ -182,18 +238,18 @@ impl Project {
         pass: &mut ComputePass<'_>,
         (work, mirror): (&Work, &Mirror),
         (plan, scan): (&Plan, &Scan),
-        splats: &Splats,
+        (splats, lenses): (&Splats, &Lenses),
     ) {
-        let degree = usize::from(work.sh_degree.min(3));
-        let module = &self.module;
-        let [cull, project] = self.kernels[degree].get_or_insert_with(|| {
-            let constants = [("SH_DEGREE", degree as f64)];
-            ["cull", "project"].map(|entry| Kernel::new(device, module, entry, &constants))
-        });
+        let Self { shaders, straight, bent, .. } = self;
+        let degree = work.sh_degree;
+        let any = |is_bent| work.spans.iter().any(|(_, bent, _)| *bent == is_bent);
+        let straight = any(false).then(|| straight.of_degree(device, shaders, degree));
+        let bent = any(true).then(|| bent.of_degree(device, shaders, degree));
         let mut pages = Vec::with_capacity(work.spans.len());
-        for (index, (page, span)) in work.spans.iter().enumerate() {
+        for (index, (page, is_bent, span)) in work.spans.iter().enumerate() {
             let Some(page) = mirror.page(*page) else { continue };
-            let resources = vec![
+            let Some(kernels) = (if *is_bent { bent } else { straight }) else { continue };
+            let mut resources = vec![
                 (0, plan.frame().as_entire_binding()),
                 (1, slot(self.spans.buffer(), index as u64, size_of::<Span>())),
                 (2, self.page_items.bind()),
@@ -203,14 +259,17 @@ impl Project {
                 (6, self.visible.bind()),
                 (7, self.offsets.bind()),
             ];
-            pages.push((Groups::Count(span.count), resources));
+            if *is_bent {
+                resources.extend(lenses.bind());
+            }
+            pages.push((kernels, Groups::Count(span.count), resources));
         }
-        for (groups, resources) in &pages {
+        for ([cull, _], groups, resources) in &pages {
             cull.run(device, pass, *groups, resources);
         }
         scan.run(device, pass, (plan.jobs(), job::ITEMS), self.offsets.buffer());
         plan.splats(device, pass, scan.block_sums());
-        for (groups, mut resources) in pages {
+        for ([_, project], groups, mut resources) in pages {
             resources.extend([
                 (8, splats.shapes.bind()),
                 (9, splats.colors.bind()),

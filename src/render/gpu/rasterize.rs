@@ -17,6 +17,7 @@ use super::device::Device;
 use super::growing::Growing;
 use super::kernel::{Groups, Kernel, SLOT_BYTES, module, slot};
 use super::layout::Span;
+use super::lens::Lenses;
 use super::plan::Plan;
 use super::project::Splats;
 use super::resolve::Planes;
@@ -83,6 +84,12 @@ impl Rasterize {
         held.hold(device, frame, drawn, appearances)
     }
 
+    /// Iterations of loops that what is behind the Gaussians takes of a thread, at most.
+    pub(super) fn iterations_behind(&self) -> u64 {
+        let behind = self.behind.as_ref().filter(|_| self.has_behind);
+        behind.map_or(0, Behind::iterations)
+    }
+
     /// Makes room for the pixels of all tiles. Returns how many tiles a page holds.
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32) -> u32 {
         let tile_bytes = planes.tile_bytes();
@@ -103,20 +110,21 @@ impl Rasterize {
         device: &Device,
         pass: &mut ComputePass<'_>,
         plan: &Plan,
-        (splats, bin): (&Splats, &Bin),
+        (splats, bin, lenses): (&Splats, &Bin, &Lenses),
         (planes, tiles, per_page): (Planes, &Range<u32>, u32),
     ) {
         let (kernel, of_behind) = match self.behind.as_mut().filter(|_| self.has_behind) {
             Some(behind) => {
+                let lenses = if behind.is_bent() { lenses.bind() } else { None };
                 let (kernel, resources) = behind.kernel(device, &self.shaders, planes);
-                (kernel, Some(resources))
+                (kernel, resources.into_iter().chain(lenses).collect())
             }
             None => {
                 let module = &self.module;
                 let kernel = self.kernels[planes.variant()].get_or_insert_with(|| {
                     Kernel::new(device, module, "main", &planes.constants())
                 });
-                (&*kernel, None)
+                (&*kernel, Vec::new())
             }
         };
         let spans = pages(tiles, per_page).map(|(_, tiles)| {
@@ -143,7 +151,7 @@ impl Rasterize {
                 (6, plan.counters().as_entire_binding()),
                 (7, BindingResource::Buffer(pixels)),
             ];
-            all.extend(of_behind.iter().flatten().cloned());
+            all.extend(of_behind.iter().cloned());
             kernel.run(device, pass, Groups::Count(tiles.len() as u32), &all);
         }
     }

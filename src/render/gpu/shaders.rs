@@ -1,44 +1,93 @@
-//! The WGSL of each stage, with its `#import NAME` lines replaced by `shaders/shared/NAME.wgsl`
-//! (`shaders/resolve.wgsl` for `resolve`, and likewise the skies). That one directive is the whole
-//! preprocessor; `#import SKY` in `rasterize` stands for one of two, each a variant of the stage.
+//! The WGSL of each stage, with its `#import NAME` lines replaced by the file of that name. That one
+//! directive is the whole preprocessor; a NAME in capitals stands for one of several files, and each choice
+//! is a variant of the stage.
 
-/// The linked sources of all stages.
+use std::sync::Arc;
+
+/// The linked sources of all stages. A copy shares them.
 #[derive(Clone, Debug)]
 pub struct Shaders {
-    stages: Vec<(&'static str, String)>,
+    stages: Arc<Vec<(&'static str, String)>>,
 }
+
+/// Name of a variant, its stage, and what its capitals stand for.
+type Variant = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+
+/// A stage without a choice is its own variant.
+const VARIANTS: &[Variant] = &[
+    ("project", "project", &[("SIGHT", "straight")]),
+    ("project_bent", "project", &[("SIGHT", "bent")]),
+    ("scan", "scan", &[]),
+    ("plan", "plan", &[]),
+    ("sort", "sort", &[]),
+    ("bin", "bin", &[]),
+    ("ranges", "ranges", &[]),
+    ("expand", "expand", &[]),
+    ("rasterize", "rasterize", &[("BEHIND", "plain")]),
+    ("rasterize_map", "rasterize", &[BEHIND, MAP, STRAIGHT]),
+    ("rasterize_map_bent", "rasterize", &[BEHIND, MAP, BENT]),
+    ("rasterize_network", "rasterize", &[BEHIND, NETWORK, STRAIGHT]),
+    ("rasterize_network_bent", "rasterize", &[BEHIND, NETWORK, BENT]),
+    ("roofline", "roofline", &[]),
+];
+
+const BEHIND: (&str, &str) = ("BEHIND", "behind");
+const MAP: (&str, &str) = ("SKY", "sky_map");
+const NETWORK: (&str, &str) = ("SKY", "sky_network");
+const STRAIGHT: (&str, &str) = ("LOOK", "look_straight");
+const BENT: (&str, &str) = ("LOOK", "look_bent");
+
+/// The files in `shaders` and `shaders/shared`.
+const FILES: &[(&str, &str)] = &[
+    ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
+    ("appearance", include_str!("../../../shaders/appearance.wgsl")),
+    ("behind", include_str!("../../../shaders/behind.wgsl")),
+    ("bent", include_str!("../../../shaders/bent.wgsl")),
+    ("bin", include_str!("../../../shaders/bin.wgsl")),
+    ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
+    ("expand", include_str!("../../../shaders/expand.wgsl")),
+    ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
+    ("lens", include_str!("../../../shaders/lens.wgsl")),
+    ("look_bent", include_str!("../../../shaders/look_bent.wgsl")),
+    ("look_straight", include_str!("../../../shaders/look_straight.wgsl")),
+    ("math", include_str!("../../../shaders/shared/math.wgsl")),
+    ("plain", include_str!("../../../shaders/shared/plain.wgsl")),
+    ("plan", include_str!("../../../shaders/plan.wgsl")),
+    ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
+    ("project", include_str!("../../../shaders/project.wgsl")),
+    ("ranges", include_str!("../../../shaders/ranges.wgsl")),
+    ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+    ("resolve", include_str!("../../../shaders/resolve.wgsl")),
+    ("roofline", include_str!("../../../shaders/roofline.wgsl")),
+    ("scan", include_str!("../../../shaders/scan.wgsl")),
+    ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
+    ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
+    ("sort", include_str!("../../../shaders/sort.wgsl")),
+    ("straight", include_str!("../../../shaders/straight.wgsl")),
+];
 
 impl Default for Shaders {
     fn default() -> Self {
-        let stages = [
-            ("project", include_str!("../../../shaders/project.wgsl")),
-            ("scan", include_str!("../../../shaders/scan.wgsl")),
-            ("plan", include_str!("../../../shaders/plan.wgsl")),
-            ("sort", include_str!("../../../shaders/sort.wgsl")),
-            ("bin", include_str!("../../../shaders/bin.wgsl")),
-            ("ranges", include_str!("../../../shaders/ranges.wgsl")),
-            ("expand", include_str!("../../../shaders/expand.wgsl")),
-            ("roofline", include_str!("../../../shaders/roofline.wgsl")),
-        ];
-        let mut stages = stages.map(|(name, source)| (name, link(source))).to_vec();
-        let rasterize = include_str!("../../../shaders/rasterize.wgsl");
-        for (name, sky) in [("rasterize", "plain"), ("rasterize_sky", "sky_map")] {
-            stages.push((name, link(&rasterize.replace("#import SKY", &format!("#import {sky}")))));
-        }
-        Self { stages }
+        let linked = VARIANTS.iter().map(|(name, stage, choices)| {
+            let mut source = String::new();
+            import(stage, choices, &mut Vec::new(), &mut source);
+            (*name, source)
+        });
+        Self { stages: Arc::new(linked.collect()) }
     }
 }
 
 impl Shaders {
-    /// Name and linked source of every stage.
+    /// Name and linked source of every variant of a stage.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, &str)> {
         self.stages.iter().map(|(name, source)| (*name, source.as_str()))
     }
 
-    /// The same with the first `part` of a stage replaced, or `None` if the stage does not have it:
-    /// how tests break a shader to see that it is noticed.
+    /// The same with the first `part` of a variant replaced, or `None` if it does not have it: how tests
+    /// break a shader to see that it is noticed.
     pub fn with_slip(mut self, stage: &str, part: &str, slip: &str) -> Option<Self> {
-        let (_, source) = self.stages.iter_mut().find(|(name, _)| *name == stage)?;
+        let stages = Arc::make_mut(&mut self.stages);
+        let (_, source) = stages.iter_mut().find(|(name, _)| *name == stage)?;
         if !source.contains(part) {
             return None;
         }
@@ -51,25 +100,32 @@ impl Shaders {
     }
 }
 
-/// What `#import` can name.
-const SHARED: &[(&str, &str)] = &[
-    ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
-    ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
-    ("math", include_str!("../../../shaders/shared/math.wgsl")),
-    ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
-    ("plain", include_str!("../../../shaders/shared/plain.wgsl")),
-    ("appearance", include_str!("../../../shaders/appearance.wgsl")),
-    ("behind", include_str!("../../../shaders/behind.wgsl")),
-    ("resolve", include_str!("../../../shaders/resolve.wgsl")),
-    ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
-];
-
-fn link(stage: &str) -> String {
-    let source = |line| {
-        let name = str::strip_prefix(line, "#import ");
-        let shared = name.and_then(|name| SHARED.iter().find(|(shared, _)| *shared == name));
-        // An unknown name stays, and the shader's compiler says where.
-        shared.map_or_else(|| format!("{line}\n"), |(_, source)| link(source))
+/// Appends a file and, where it asks for them, those that are not there yet. What no file is called
+/// stays, and the shader's compiler says where.
+fn import(
+    name: &str,
+    choices: &[(&'static str, &'static str)],
+    there: &mut Vec<&'static str>,
+    source: &mut String,
+) {
+    let Some((name, text)) = FILES.iter().find(|(file, _)| *file == name) else {
+        source.push_str(&format!("#import {name}\n"));
+        return;
     };
-    stage.lines().map(source).collect()
+    if there.contains(name) {
+        return;
+    }
+    there.push(name);
+    for line in text.lines() {
+        match line.strip_prefix("#import ") {
+            Some(asked) => {
+                let chosen = choices.iter().find(|(capitals, _)| *capitals == asked);
+                import(chosen.map_or(asked, |(_, file)| file), choices, there, source);
+            }
+            None => {
+                source.push_str(line);
+                source.push('\n');
+            }
+        }
+    }
 }

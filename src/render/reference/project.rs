@@ -7,9 +7,8 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::geometry::Camera;
-use crate::geometry::camera::WIDEST_RAD;
 use crate::render::View;
-use crate::render::unscented::BESIDE_RAD;
+use crate::render::unscented::widest_rad;
 use crate::scene::chunk::column;
 use crate::scene::{Chunk, RenderProfile, Scene, sh};
 
@@ -134,8 +133,9 @@ fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) 
     let center = view.land(mean_world, 1.0);
     let depth_m = view.camera.depth_m(center.point_m);
     let off_axis_rad = center.point_m.angle_between(DVec3::Z);
-    let widest_rad = (view.camera.limit_rad() + BESIDE_RAD).min(WIDEST_RAD);
-    let in_range = depth_m >= profile.near && depth_m <= profile.far && off_axis_rad <= widest_rad;
+    let in_range = depth_m >= profile.near
+        && depth_m <= profile.far
+        && off_axis_rad <= widest_rad(&view.camera);
     if !in_range {
         return None;
     }

@@ -1,4 +1,8 @@
-//! A network as a cube map whose error is known.
+//! A network as cube maps whose error is known.
+//!
+//! There are four, each of twice the resolution of the one before, and what is asked for gets the coarsest that
+//! is close enough. So whoever asks for what, a sky has at most four maps, of 0.8, 3, 13 and 50 MB, and none is
+//! baked twice.
 //!
 //! A grid is compared with one of twice its resolution: at the middle of every edge of a cell and at
 //! its centre. Where a function bends smoothly, that is where a bilinear patch is farthest off. Where it
@@ -9,7 +13,9 @@
 //! The first grid has 129 values along an edge, 0.9° or less apart, and is compared with one of 0.45°: the
 //! finest sine of seven octaves has a period of 5.6°, so that nothing that it draws lies unseen between.
 
-use fearless_simd::{Level, dispatch, f32x16, prelude::*};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use fearless_simd::{Level as Simd, dispatch, f32x16, prelude::*};
 use rayon::prelude::*;
 
 use super::{CubeMap, FACES, Folded, SkyError};
@@ -18,24 +24,86 @@ use crate::scene::chunk::LANES;
 /// Values along an edge of the first grid.
 const FIRST_EDGE: usize = 129;
 
-/// The coarsest map whose error is at most `wanted`.
-///
-/// # Errors
-/// [`SkyError::Coarse`] if the finest one is worse.
-pub(super) fn bake(network: &Folded, wanted: f64) -> Result<CubeMap, SkyError> {
-    let level = Level::new();
-    let mut grid = Grid::new(level, network, FIRST_EDGE);
-    loop {
-        let finer = Grid::new(level, network, 2 * grid.edge - 1);
-        let error = 2.0 * grid.difference(&finer) + CubeMap::STEP;
-        if error <= wanted {
-            return Ok(CubeMap::from_nodes(grid.edge, &grid.rgb, error));
+/// What is known of the maps of a network.
+#[derive(Debug, Default)]
+pub(super) struct Maps {
+    /// The coarsest first. Held for moments alone: frames that have their map never wait for one that is
+    /// baked for somebody else.
+    levels: Mutex<Vec<Level>>,
+    /// Whoever bakes; who comes meanwhile waits for the map rather than bakes another.
+    baking: Mutex<()>,
+}
+
+#[derive(Debug)]
+struct Level {
+    /// How far a map of this resolution is off, at most.
+    error: f64,
+    /// It, if anybody asked for it.
+    map: Option<Arc<CubeMap>>,
+}
+
+impl Maps {
+    /// The coarsest map whose error is at most `wanted`.
+    ///
+    /// # Errors
+    /// [`SkyError::Coarse`] if the finest one is worse.
+    pub(super) fn get(&self, network: &Folded, wanted: f64) -> Result<Arc<CubeMap>, SkyError> {
+        if let Ok(answer) = self.known(wanted) {
+            return answer;
         }
-        if finer.edge > CubeMap::MAX_EDGE {
-            return Err(SkyError::Coarse { edge: grid.edge, reached: error, wanted });
+        let _turn = self.baking.lock().unwrap_or_else(PoisonError::into_inner);
+        let simd = Simd::new();
+        let mut next: Option<Grid> = None;
+        loop {
+            let level = match self.known(wanted) {
+                Ok(answer) => return answer,
+                Err(level) => level,
+            };
+            let fits = |grid: &Grid| grid.edge == edge(level);
+            let grid = next.take().filter(fits);
+            let grid = grid.unwrap_or_else(|| Grid::new(simd, network, edge(level)));
+            let known = self.levels().get(level).map(|level| level.error);
+            let error = known.unwrap_or_else(|| {
+                let finer = next.insert(Grid::new(simd, network, edge(level + 1)));
+                2.0 * grid.difference(finer) + CubeMap::STEP
+            });
+            let map = (error <= wanted).then(|| Arc::new(grid.map(error)));
+            let mut levels = self.levels();
+            match levels.get_mut(level) {
+                Some(known) => known.map = map,
+                None => levels.push(Level { error, map }),
+            }
         }
-        grid = finer;
     }
+
+    /// What is known to be the answer, or else the level that is to be baked.
+    fn known(&self, wanted: f64) -> Result<Result<Arc<CubeMap>, SkyError>, usize> {
+        let levels = self.levels();
+        let found = levels.iter().position(|level| level.error <= wanted);
+        let level = found.unwrap_or(levels.len());
+        match levels.get(level) {
+            Some(Level { map: Some(map), .. }) => Ok(Ok(map.clone())),
+            None if edge(level) > CubeMap::MAX_EDGE => {
+                let reached = levels.last().map_or(f64::INFINITY, |level| level.error);
+                Ok(Err(SkyError::Coarse { edge: CubeMap::MAX_EDGE, reached, wanted }))
+            }
+            _ => Err(level),
+        }
+    }
+
+    /// Memory of the maps, in bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.levels().iter().filter_map(|level| level.map.as_ref()).map(|map| map.bytes()).sum()
+    }
+
+    fn levels(&self) -> MutexGuard<'_, Vec<Level>> {
+        self.levels.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Values along an edge of the grids of a level.
+fn edge(level: usize) -> usize {
+    ((FIRST_EDGE - 1) << level) + 1
 }
 
 /// The network at `i / (edge - 1)` along both sides of six faces.
@@ -45,7 +113,7 @@ struct Grid {
 }
 
 impl Grid {
-    fn new(level: Level, network: &Folded, edge: usize) -> Self {
+    fn new(level: Simd, network: &Folded, edge: usize) -> Self {
         let mut rgb = vec![[0.0; 3]; FACES * edge * edge];
         rgb.par_chunks_mut(edge).enumerate().for_each_init(
             || network.scratch(),
@@ -73,6 +141,10 @@ impl Grid {
             },
         );
         Self { edge, rgb }
+    }
+
+    fn map(&self, error: f64) -> CubeMap {
+        CubeMap::from_nodes(self.edge, &self.rgb, error)
     }
 
     /// How far its patches are from the values of a grid of twice the resolution, at most.

@@ -84,6 +84,54 @@ impl Folded {
         }
     }
 
+    /// Outputs of a hidden layer, a multiple of 8.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Octaves of sines and cosines.
+    pub fn octaves(&self) -> usize {
+        self.octaves
+    }
+
+    /// Values of a direction and its octaves.
+    pub fn encoded(&self) -> usize {
+        self.encoded
+    }
+
+    /// Whether the direction itself is one of them.
+    pub fn identity(&self) -> bool {
+        self.identity
+    }
+
+    /// Whether the second layer reads them again, behind the first one's outputs.
+    pub fn skip(&self) -> bool {
+        self.skip
+    }
+
+    /// All numbers, layer by layer and output by output: the bias, and then the weights of inputs, four by
+    /// four, those of the encoded direction filled up with zeros.
+    pub fn weights(&self) -> Vec<[f32; 4]> {
+        let mut rows = Vec::new();
+        for (layer, outputs) in self.layers.iter().zip([self.width, self.width, 3]) {
+            for output in 0..outputs {
+                let (group, k) = (output / GROUP, output % GROUP);
+                rows.push([layer.bias[group][k], 0.0, 0.0, 0.0]);
+                let weights = &layer.weight[group * layer.inputs..][..layer.inputs];
+                rows.extend(weights.chunks(4).map(|four| {
+                    std::array::from_fn(|i| four.get(i).map_or(0.0, |weight| weight[k]))
+                }));
+            }
+        }
+        rows
+    }
+
+    /// Memory of its numbers, in bytes.
+    pub fn bytes(&self) -> usize {
+        let of_layer = |layer: &Dense| (layer.weight.len() + layer.bias.len()) * 4 * GROUP;
+        self.layers.iter().map(of_layer).sum()
+    }
+
     /// Room for evaluations.
     pub fn scratch(&self) -> Scratch {
         let zero = |len| vec![Lanes([0.0; LANES]); len];

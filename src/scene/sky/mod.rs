@@ -10,9 +10,11 @@ mod cube;
 mod folded;
 mod network;
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
+
+use self::bake::Maps;
 
 pub use cube::{CubeMap, FACES};
 pub use folded::{Folded, Scratch};
@@ -28,12 +30,9 @@ pub struct Sky {
     model: Model,
     /// Takes world axes to the model's: a rotation, perhaps with a mirror.
     sky_from_world: DMat3,
-    /// For which error it was baked last, and what came of it.
-    baked: Mutex<Option<Baked>>,
+    /// What was baked so far.
+    baked: Maps,
 }
-
-/// An error that was asked for, and the map that has it or why there is none.
-type Baked = (f64, Result<Arc<CubeMap>, SkyError>);
 
 /// What a sky is made of.
 #[derive(Clone, Debug)]
@@ -51,6 +50,25 @@ pub enum Drawn {
     Exact(Arc<Folded>),
     /// A cube map.
     Map(Arc<CubeMap>),
+}
+
+impl Drawn {
+    /// Whether it is the very same.
+    pub fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Exact(own), Self::Exact(other)) => Arc::ptr_eq(own, other),
+            (Self::Map(own), Self::Map(other)) => Arc::ptr_eq(own, other),
+            _ => false,
+        }
+    }
+
+    /// Memory of what is looked up or multiplied, in bytes.
+    pub fn bytes(&self) -> usize {
+        match self {
+            Self::Exact(network) => network.bytes(),
+            Self::Map(map) => map.bytes(),
+        }
+    }
 }
 
 /// Why a sky was refused.
@@ -121,7 +139,7 @@ pub enum SkyError {
 impl Sky {
     /// A sky whose model has axes of its own: `sky_from_world` is orthonormal.
     pub fn new(model: Model, sky_from_world: DMat3) -> Self {
-        Self { model, sky_from_world, baked: Mutex::default() }
+        Self { model, sky_from_world, baked: Maps::default() }
     }
 
     /// The colour towards a unit direction in world axes, in [0, 1]: by definition, in f64.
@@ -144,7 +162,7 @@ impl Sky {
     }
 
     /// The form in which it is drawn with a profile's `sky_error`. Bakes a network the first time, which
-    /// takes about a second. Images are their own cube map, whatever the error.
+    /// takes about a second, and ten for the finest of its four maps; they stay. Images are their own cube map, whatever the error.
     ///
     /// # Errors
     /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] is close enough.
@@ -152,28 +170,13 @@ impl Sky {
         match &self.model {
             Model::Cube(map) => Ok(Drawn::Map(map.clone())),
             Model::Network(_, folded) if sky_error == 0.0 => Ok(Drawn::Exact(folded.clone())),
-            Model::Network(_, folded) => {
-                // Held while baking: whoever comes meanwhile waits for the map rather than bakes another.
-                let mut baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-                let known = baked.as_ref().filter(|(error, _)| *error == sky_error);
-                let map = match known {
-                    Some((_, map)) => map.clone(),
-                    None => {
-                        let map = bake::bake(folded, sky_error).map(Arc::new);
-                        *baked = Some((sky_error, map.clone()));
-                        map
-                    }
-                };
-                map.map(Drawn::Map)
-            }
+            Model::Network(_, folded) => self.baked.get(folded, sky_error).map(Drawn::Map),
         }
     }
 
     /// Memory that it takes, in bytes.
     pub fn bytes(&self) -> usize {
-        let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-        let baked = baked.iter().flat_map(|(_, map)| map).map(|map| map.bytes()).sum::<usize>();
-        baked
+        self.baked.bytes()
             + match &self.model {
                 Model::Network(network, _) => 2 * network.bytes(),
                 Model::Cube(map) => map.bytes(),

@@ -114,7 +114,7 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
         SessionError::UnknownTrajectory { .. } => {
             (Code::UnknownTrajectory, field("start.trajectory"))
         }
-        SessionError::Profile(_) => (Code::OutOfRange, field("profile")),
+        SessionError::Profile(_) | SessionError::Sky(_) => (Code::OutOfRange, field("profile")),
         SessionError::OutOfRange { field, .. } => (Code::OutOfRange, Some((*field).to_owned())),
         SessionError::AnswerTooLarge { .. } | SessionError::Render(RenderError::TooMany { .. }) => {
             (Code::AnswerTooLarge, None)

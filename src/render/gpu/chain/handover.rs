@@ -59,6 +59,7 @@ impl Chain {
             None => {
                 cull.install(|| self.mirror.hold(&self.device, frame.scene))?;
                 work = cull.install(|| Work::new(frame, 0..frame.views.len(), &self.mirror));
+                self.lenses.hold(&self.device, frame);
                 self.project.upload(&self.device, &work);
                 Source::Gaussians(&work)
             }

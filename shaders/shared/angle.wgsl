@@ -1,0 +1,36 @@
+// Angles, as exact as f32 has them: WGSL's own functions may be 2^-11 off.
+
+const HALF_TURN: f32 = 3.14159265359;
+
+// The angle of (x, y) from the x axis in radians, for y of at least 0; 0 at the origin. A fit of degree
+// 9, 5e-9 off up to 22.5 degrees, where the rest is folded to.
+fn angle(y: f32, x: f32) -> f32 {
+    let along = abs(x);
+    let small = min(y, along);
+    let large = max(max(y, along), 1e-30);
+    let steep = small > 0.41421356 * large;
+    let t = select(small, small - large, steep) / select(large, small + large, steep);
+    let square = t * t;
+    let fit = ((0.07902598 * square - 0.13824454) * square + 0.19971879) * square - 0.33332756;
+    let within = t + fit * square * t + select(0.0, 0.25 * HALF_TURN, steep);
+    let folded = select(within, 0.5 * HALF_TURN - within, y > along);
+    return select(folded, HALF_TURN - folded, x < 0.0);
+}
+
+fn arc_sine(x: f32) -> f32 {
+    return sign(x) * angle(abs(x), sqrt(max((1.0 - x) * (1.0 + x), 0.0)));
+}
+
+// Sines (`quarter` 0) or cosines (0.5), as in `src/scene/sky/folded.rs`. Products with the first two
+// parts of pi are exact, so that it does not matter whether sums are fused with them.
+fn sine(x: vec4f, quarter: f32) -> vec4f {
+    let whole = floor(x * 0.31830988618 + (0.5 - quarter));
+    let turns = whole + quarter;
+    let r = ((x - turns * 3.140625) - turns * 9.6774101257e-4) + turns * 8.742278e-8;
+    let square = r * r;
+    let fit = ((2.6000546e-6 * square - 1.9806615e-4) * square + 8.333017e-3) * square
+        - 1.6666657e-1;
+    let value = r + fit * square * r;
+    let odd = (vec4i(whole) + i32(2.0 * quarter)) & vec4i(1);
+    return select(value, -value, odd != vec4i(0));
+}

@@ -1,0 +1,161 @@
+//! What a device is told of lenses and rolling shutters: with the first frame that has either.
+//!
+//! WGSL: `shaders/lens.wgsl`. The models are in `geometry/camera`, the search for rows in `render/view.rs`.
+
+use bytemuck::Zeroable;
+use glam::{DMat2, DVec2, DVec3};
+use wgpu::{BindingResource, BufferUsages};
+
+use super::device::Device;
+use super::growing::Growing;
+use super::layout::Lens;
+use crate::geometry::camera::{
+    self, Camera, FTheta, Fisheye, OpenCv, Reference, Rising, Rolls, Windshield,
+    WindshieldReference,
+};
+use crate::render::unscented::widest_rad;
+use crate::render::{Frame, MAX_VIEWS, Rolling, View};
+
+/// The views' lenses on the device.
+#[derive(Debug, Default)]
+pub(super) struct Lenses {
+    buffer: Option<Growing>,
+}
+
+impl Lenses {
+    /// Sends what a frame's views have; nothing, where all are pinholes at rest.
+    pub(super) fn hold(&mut self, device: &Device, frame: &Frame<'_>) {
+        if frame.views.iter().all(View::is_ideal) {
+            return;
+        }
+        let mut lenses = [Lens::zeroed(); MAX_VIEWS];
+        for (lens, view) in lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_ideal()) {
+            *lens = Lens::of(view);
+        }
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let buffer = self.buffer.get_or_insert_with(|| Growing::new(device, "lenses", usage));
+        buffer.fill(device, bytemuck::cast_slice(&lenses));
+    }
+
+    /// Where shaders find them; `None` until there were any.
+    pub(super) fn bind(&self) -> Option<(u32, BindingResource<'_>)> {
+        self.buffer.as_ref().map(|buffer| (12, buffer.bind()))
+    }
+}
+
+impl Lens {
+    fn of(view: &View) -> Self {
+        let camera = &view.camera;
+        let pinhole = &camera.pinhole;
+        let mut lens = Self {
+            center_px: [pinhole.cx as f32, pinhole.cy as f32],
+            linear: columns(DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy))),
+            limit_rad: camera.limit_rad() as f32,
+            widest_rad: widest_rad(camera) as f32,
+            by_distance: camera.depth_is_distance().into(),
+            bent: 1,
+            ..Self::zeroed()
+        };
+        match &camera.lens {
+            camera::Lens::Pinhole => {}
+            camera::Lens::OpenCv(of) => lens.set_opencv(of),
+            camera::Lens::Fisheye(of) => lens.set_fisheye(of),
+            camera::Lens::FTheta(of) => lens.set_ftheta(of),
+        }
+        if let Some(windshield) = &camera.windshield {
+            lens.set_windshield(windshield);
+        }
+        if let Some(rolling) = &view.rolling {
+            lens.set_rolling(rolling, view);
+        }
+        lens
+    }
+
+    fn set_opencv(&mut self, lens: &OpenCv) {
+        let ([k1, k2, k3, k4, k5, k6], [p1, p2], s) = (lens.k(), lens.p(), lens.s());
+        self.model = 1;
+        self.end = lens.limit_slope() as f32;
+        self.c = [[k1, k2, k3, k4], [k5, k6, p1, p2], s].map(|row| row.map(|value| value as f32));
+    }
+
+    fn set_fisheye(&mut self, lens: &Fisheye) {
+        self.model = 2;
+        self.set_rising(lens.radius());
+    }
+
+    fn set_ftheta(&mut self, lens: &FTheta) {
+        self.model = match lens.reference() {
+            Reference::AngleToPixel => 2,
+            Reference::PixelToAngle => 3,
+        };
+        self.linear = columns(lens.linear());
+        self.set_rising(lens.rising());
+    }
+
+    /// In shares of the end no power of a distance in pixels leaves f32.
+    fn set_rising(&mut self, rising: &Rising) {
+        let end = rising.end();
+        self.end = end as f32;
+        self.end_value = rising.at(end) as f32;
+        self.end_slope = rising.slope(end) as f32;
+        let scaled = rising.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
+        for (to, c) in self.c.as_flattened_mut().iter_mut().zip(scaled.skip(1)) {
+            *to = c as f32;
+        }
+    }
+
+    /// Its polynomials less the angles themselves, padded to order 5.
+    fn set_windshield(&mut self, windshield: &Windshield) {
+        self.windshield = match windshield.reference() {
+            WindshieldReference::Forward => 1,
+            WindshieldReference::Backward => 2,
+        };
+        for (axis, polynomial) in
+            [windshield.horizontal(), windshield.vertical()].iter().enumerate()
+        {
+            let mut place = 0;
+            for j in 0..=5 {
+                for i in 0..=5 - j {
+                    let own = if [i, j] == [1 - axis, axis] { 1.0 } else { 0.0 };
+                    self.bend[place][axis] = (polynomial.coefficient(i, j) - own) as f32;
+                    place += 1;
+                }
+            }
+        }
+    }
+
+    /// `Pose::interpolate` seen from the exposure's end: what is still to come of the way and of the turn.
+    fn set_rolling(&mut self, rolling: &Rolling, view: &View) {
+        let Rolling { direction, world_from_camera_first: first } = rolling;
+        let last = &view.world_from_camera;
+        let Camera { width_px, height_px, .. } = view.camera;
+        // 0 for the last row's middle, 1 for the first's; a single row is the last one.
+        let along = |size_px: u32| {
+            let last_px = f64::from(size_px) - 1.0;
+            if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
+        };
+        let (columns, rows) = (along(width_px), along(height_px));
+        let from_end =
+            |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
+        let (x, y) = match direction {
+            Rolls::TopToBottom => ([0.0; 2], rows),
+            Rolls::BottomToTop => ([0.0; 2], from_end(rows, height_px)),
+            Rolls::LeftToRight => (columns, [0.0; 2]),
+            Rolls::RightToLeft => (from_end(columns, width_px), [0.0; 2]),
+        };
+        self.rolls = [x[0], y[0], x[1] + y[1], 0.0].map(|value| value as f32);
+        let moved_m = last.position_m - first.position_m;
+        self.moved_world_m = moved_m.as_vec3().to_array();
+        self.moved_m = (last.rotation.inverse() * moved_m).as_vec3().to_array();
+        let turn = first.rotation.inverse() * last.rotation;
+        // The short way round.
+        let turn = if turn.w < 0.0 { -turn } else { turn };
+        let sine = turn.xyz().length();
+        let axis = if sine > 0.0 { turn.xyz() / sine } else { DVec3::Z };
+        self.turned = axis.extend(2.0 * sine.atan2(turn.w)).as_vec4().to_array();
+    }
+}
+
+fn columns(m: DMat2) -> [f32; 4] {
+    m.to_cols_array().map(|value| value as f32)
+}
