@@ -43,7 +43,7 @@ impl Pinhole {
     }
 
     /// Slope of a ray beyond which [`Pinhole::slope_beyond`] goes on straight: 82.9° off the axis.
-    const STRAIGHT: f64 = 8.0;
+    pub const STRAIGHT: f64 = 8.0;
 
     /// The slopes x/z and y/z of a direction; from 8 on, they rise with the angle as they do at 8, and
     /// on behind the camera, so that the shape of what reaches there is finite.
