@@ -48,6 +48,26 @@ pub struct Footprint {
     pub camera_m: DVec3,
 }
 
+/// The numbers of the bound that [`Bent::may_see`] explains. At rest a Gaussian whose centre is at an angle a
+/// off the axis, and whose points are within s of it, is not seen if `a > widest`, or if
+/// `least (a - turned - image) > reach (s + turned) + blur` and `a + s + turned` is below
+/// [`WIDEST_RAD`].
+#[derive(Clone, Copy, Debug)]
+pub struct Beside {
+    /// How far a centre may be off the axis, in radians.
+    pub widest_rad: f64,
+    /// How far off the axis the image's corner is, in radians.
+    pub image_rad: f64,
+    /// Fewest pixels that an angle beyond the image makes, per radian.
+    pub least_px_per_rad: f64,
+    /// How far a splat reaches at most, in pixels per radian of its points' spread.
+    pub reach_px_per_rad: f64,
+    /// What the blur adds to it, in pixels.
+    pub blur_px: f64,
+    /// What a windshield may add to angles, in radians.
+    pub turned_rad: f64,
+}
+
 impl<'a> Bent<'a> {
     /// `None` for a pinhole at rest.
     pub fn of(view: &'a View, profile: &RenderProfile) -> Option<Self> {
@@ -118,6 +138,20 @@ impl<'a> Bent<'a> {
         let [e0, e1, e2] = pairs.map(|[a, b]| (0.5 * (a + b) - mean_px) * third);
         let camera_m = center.world_from_camera.position_m;
         Some(Footprint { mean_px, root_px: [d0, d1, d2, e0, e1, e2], depth_m, camera_m })
+    }
+
+    /// What decides beside the field of a camera at rest, for tests of many Gaussians at once.
+    pub fn beside(&self) -> Beside {
+        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = self.cone;
+        let [sigmas, blur_px] = self.reach;
+        Beside {
+            widest_rad: self.widest_rad,
+            image_rad,
+            least_px_per_rad,
+            reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
+            blur_px,
+            turned_rad: self.turned_rad,
+        }
     }
 
     /// Size of the image, in pixels.

@@ -89,6 +89,15 @@ impl FTheta {
         DVec2::new(self.linear_cde[0], 1.0) * self.central_px()
     }
 
+    /// How far from the principal point an angle off the axis lands before `[[c, d], [e, 1]]`, in pixels.
+    #[inline(always)]
+    pub fn radius_px(&self, angle_rad: f64) -> f64 {
+        match self.reference {
+            Reference::AngleToPixel => self.rising.at(angle_rad),
+            Reference::PixelToAngle => self.rising.invert(angle_rad),
+        }
+    }
+
     /// The reference polynomial, as far as it is used: radians to pixels, or the other way.
     pub fn rising(&self) -> &Rising {
         &self.rising
@@ -135,12 +144,7 @@ impl FTheta {
     /// Where a direction lands, in pixels from the principal point; beyond the limit it goes on straight.
     #[inline(always)]
     pub(super) fn offset_px(&self, direction: DVec3) -> DVec2 {
-        let central_px = self.central_px();
-        self.linear()
-            * match self.reference {
-                Reference::AngleToPixel => radial(direction, |a| self.rising.at(a), central_px),
-                Reference::PixelToAngle => radial(direction, |a| self.rising.invert(a), central_px),
-            }
+        self.linear() * radial(direction, |angle| self.radius_px(angle), self.central_px())
     }
 
     /// The unit direction that lands there, if it is within the limit.

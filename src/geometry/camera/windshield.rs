@@ -40,7 +40,7 @@ impl Windshield {
     /// It turns rays in full up to 81° off the axis, and not at all from 87° on: z as a share of their
     /// length. Without an end, polynomials would turn what is beside the camera anywhere; with a sudden one,
     /// a Gaussian across it would be torn.
-    const FADES_Z: [f64; 2] = [0.05, 0.15];
+    pub const FADES_Z: [f64; 2] = [0.05, 0.15];
 
     /// How far it may turn a ray, in radians. Real ones turn by 0.01.
     const MOST_RAD: f64 = 0.2;
@@ -186,7 +186,8 @@ impl Bivariate {
         if i + j <= order { self.coefficients[first + i] } else { 0.0 }
     }
 
-    fn order(&self) -> usize {
+    /// The highest sum of powers.
+    pub fn order(&self) -> usize {
         (0..=5).find(|order| (order + 1) * (order + 2) / 2 == self.count).unwrap_or(0)
     }
 

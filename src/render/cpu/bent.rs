@@ -1,30 +1,87 @@
-//! Stage project for lenses and rolling shutters: Gaussian by Gaussian in f64, and their colours 16 at a
-//! time. `Bent` says where one lands.
+//! Stage project for lenses and rolling shutters: six points of each Gaussian, where [`Optics`] describes
+//! the lens and all of them are within its field 16 Gaussians at a time in f32, else one by one in f64, where
+//! [`Bent`] says where each lands.
 
-use fearless_simd::{f32x16, prelude::*};
+use fearless_simd::{f32x16, f64x8, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
-use super::project::{LOG2_UNIT, SplatLanes, color};
+use super::optics::{Landed, Optics};
+use super::project::{Ellipse, LOG2_UNIT, SplatLanes, color, rotation_columns, shown};
+use crate::geometry::camera::WIDEST_RAD;
+use crate::render::View;
 use crate::render::constants::EXTENT_SLACK_PX;
 use crate::render::layout::Cutoffs;
-use crate::render::unscented::{Bent, Footprint};
+use crate::render::unscented::{Bent, Beside, Footprint};
+use crate::scene::Chunk;
 use crate::scene::chunk::{LANES, Lanes, column};
 
-/// Projects one block of a chunk with this origin, or returns `None` if nothing of it can be seen.
+/// A chunk as a lens sees it.
+#[derive(Clone, Copy)]
+pub(super) struct BentView<'a> {
+    pub(super) bent: &'a Bent<'a>,
+    optics: Option<&'a Optics>,
+    origin_m: DVec3,
+    /// Rows that take a place in the chunk to the camera's frame, in metres.
+    camera_from_chunk: [[f64; 4]; 3],
+    /// The camera's centre relative to the chunk's origin, in world axes, in metres.
+    camera_m: [f32; 3],
+    size_px: [f32; 2],
+    beside: Beside,
+    /// Whether depth is distance, and not z.
+    by_distance: bool,
+}
+
+impl<'a> BentView<'a> {
+    /// Subtracts in f64, so that a twin far from its origin loses nothing.
+    pub(super) fn new(
+        view: &View,
+        chunk: &Chunk,
+        bent: &'a Bent<'a>,
+        optics: Option<&'a Optics>,
+    ) -> Self {
+        let origin_m = chunk.origin_m();
+        let camera_from_world = view.world_from_camera.inverse();
+        let camera_m = view.world_from_camera.position_m - origin_m;
+        let rows = camera_from_world.rotation_matrix().transpose();
+        let moved_m = camera_from_world.rotation * -camera_m;
+        let row = |axis: usize| rows.col(axis).extend(moved_m[axis]).to_array();
+        Self {
+            bent,
+            optics,
+            origin_m,
+            camera_from_chunk: [0, 1, 2].map(row),
+            camera_m: camera_m.as_vec3().to_array(),
+            size_px: view.camera.size_px().as_vec2().to_array(),
+            beside: bent.beside(),
+            by_distance: view.camera.depth_is_distance(),
+        }
+    }
+}
+
+/// Projects one block of a chunk, or returns `None` if nothing of it can be seen.
 #[inline(always)]
 pub(super) fn project_block<S: Simd>(
     simd: S,
     columns: &[Lanes],
     sh_degree: u8,
-    (view, origin_m): (&Bent<'_>, DVec3),
+    view: &BentView<'_>,
     cutoffs: &Cutoffs,
 ) -> Option<SplatLanes> {
-    let mut lanes = SplatLanes::default();
+    let (mut lanes, left) = match view.optics {
+        Some(optics) => project_lanes(simd, columns, (view, optics), cutoffs),
+        None => (SplatLanes::default(), (1 << LANES) - 1),
+    };
+    // From a camera that stands still all are seen from one place.
     let mut toward_m = [[0.0_f32; LANES]; 3];
-    for lane in 0..LANES {
+    if view.optics.is_some() {
+        let mean = Vec3x16::load(simd, columns, column::MEAN);
+        let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
+        toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
+    }
+    for lane in (0..LANES).filter(|lane| left >> lane & 1 == 1) {
         if let Some(from_camera_m) =
-            project_one(columns, lane, (view, origin_m), cutoffs, &mut lanes)
+            project_one(columns, lane, (view.bent, view.origin_m), cutoffs, &mut lanes)
         {
             lanes.visible |= 1 << lane;
             for (to, from) in toward_m.iter_mut().zip(from_camera_m.to_array()) {
@@ -36,11 +93,138 @@ pub(super) fn project_block<S: Simd>(
         return None;
     }
     let [x, y, z] = toward_m.each_ref().map(|axis| f32x16::load_array_ref(simd, axis));
-    let rgb = color(simd, columns, sh_degree, Vec3x16 { x, y, z });
-    rgb.x.store_array(&mut lanes.red);
-    rgb.y.store_array(&mut lanes.green);
-    rgb.z.store_array(&mut lanes.blue);
+    lanes.paint(color(simd, columns, sh_degree, Vec3x16 { x, y, z }));
     Some(lanes)
+}
+
+/// Projects those of a block whose points are within the lens' field, and tells which others may be
+/// seen.
+#[inline(always)]
+fn project_lanes<S: Simd>(
+    simd: S,
+    columns: &[Lanes],
+    (view, optics): (&BentView<'_>, &Optics),
+    cutoffs: &Cutoffs,
+) -> (SplatLanes, u64) {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let (center, depth_m) = to_camera(simd, columns, view);
+    let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+    let in_range = depth_m.simd_ge(splat(cutoffs.near_m))
+        & depth_m.simd_le(splat(cutoffs.far_m))
+        & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
+    let in_range = in_range & !beside(simd, center, x.max(y).max(z), &view.beside);
+    if in_range.all_false() {
+        return (SplatLanes::default(), 0);
+    }
+    let own = rotation_columns(simd, columns);
+    let [right, down, forward] =
+        view.camera_from_chunk.map(|[x, y, z, _]| [x as f32, y as f32, z as f32]);
+    let right = Vec3x16::splat(simd, right);
+    let down = Vec3x16::splat(simd, down);
+    let forward = Vec3x16::splat(simd, forward);
+    let third = splat(1.0 / 3.0_f32.sqrt());
+    let mut within = optics.land(simd, center).within;
+    let mut pairs = [[splat(0.0); 4]; 3];
+    let [mut mean_x, mut mean_y] = [splat(0.0); 2];
+    for axis in 0..3 {
+        let sigma = [x, y, z][axis] * splat(3.0_f32.sqrt());
+        let own = own[axis].scale(sigma);
+        let offset = Vec3x16 { x: right.dot(own), y: down.dot(own), z: forward.dot(own) };
+        let there = center.plus(offset);
+        let Landed { x_px: ax, y_px: ay, within: a } = optics.land(simd, there);
+        let Landed { x_px: bx, y_px: by, within: b } = optics.land(simd, center.minus(offset));
+        within = within.min(a).min(b);
+        pairs[axis] = [ax, ay, bx, by];
+        (mean_x, mean_y) = (mean_x + (ax + bx), mean_y + (ay + by));
+    }
+    let sixth = splat(1.0 / 6.0);
+    (mean_x, mean_y) = (mean_x * sixth, mean_y * sixth);
+
+    // As in `Bent::project`: half differences, and middles from the mean.
+    let half = splat(0.5) * third;
+    let mut root = [[splat(0.0); 2]; 6];
+    for (axis, [ax, ay, bx, by]) in pairs.into_iter().enumerate() {
+        root[axis] = [(ax - bx) * half, (ay - by) * half];
+        root[3 + axis] =
+            [(ax - mean_x + (bx - mean_x)) * half, (ay - mean_y + (by - mean_y)) * half];
+    }
+    let [mut xx, mut yy, mut b, mut det_before] = [splat(0.0); 4];
+    for (i, [x, y]) in root.into_iter().enumerate() {
+        (xx, yy, b) = (x.mul_add(x, xx), y.mul_add(y, yy), x.mul_add(y, b));
+        for [other_x, other_y] in &root[..i] {
+            let minor = x * *other_y - y * *other_x;
+            det_before = minor.mul_add(minor, det_before);
+        }
+    }
+    let ellipse =
+        Ellipse::of_moments([xx, yy, b], det_before, splat(cutoffs.blur_px2), splat(LOG2_UNIT));
+    let inside = in_range & within.simd_ge(splat(0.0));
+    let drawn = (mean_x, mean_y, depth_m);
+    let lanes = shown(simd, drawn, log2_opacity, &ellipse, inside, view.size_px, cutoffs);
+    (lanes, in_range.to_bitmask() & !inside.to_bitmask())
+}
+
+/// Which Gaussians surely are not seen from a camera at rest: see [`Beside`].
+#[inline(always)]
+fn beside<S: Simd>(
+    simd: S,
+    center_m: Vec3x16<S>,
+    sigma_m: f32x16<S>,
+    bound: &Beside,
+) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
+    let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
+    // Half the angle: atan t for t up to 1 is t (π/4 + 0.273 (1 - t)) within 0.004, and π/2 less that of
+    // 1/t beyond.
+    let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
+    let steep = t.simd_gt(splat(1.0));
+    let low = steep.select(splat(1.0) / t, t);
+    let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+    let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+    let (least_rad, most_rad) = (half + half - splat(0.01), half + half + splat(0.01));
+    // asin s is at most s π/3 up to a half.
+    let share = splat(3.0_f64.sqrt()) * sigma_m / distance_m;
+    let spread_rad = share.mul_add(splat(std::f64::consts::FRAC_PI_3), splat(bound.turned_rad));
+    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
+    let out_px =
+        (least_rad - splat(bound.turned_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
+    let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
+    share.simd_lt(splat(0.5)) & (out | least_rad.simd_gt(splat(bound.widest_rad)))
+}
+
+/// Centres in the camera's frame, and their depth, in metres: computed in f64 and rounded once, since
+/// splats are blended in order of it.
+#[inline(always)]
+fn to_camera<S: Simd>(simd: S, columns: &[Lanes], view: &BentView<'_>) -> (Vec3x16<S>, f32x16<S>) {
+    let mean = Vec3x16::load(simd, columns, column::MEAN);
+    let (x, y, z) = (mean.x.widen(), mean.y.widen(), mean.z.widen());
+    let [right, down, forward] = view.camera_from_chunk;
+    let (x, y, z) = (
+        along(simd, (x, y, z), right),
+        along(simd, (x, y, z), down),
+        along(simd, (x, y, z), forward),
+    );
+    let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
+    if !view.by_distance {
+        return (center, center.z);
+    }
+    let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
+    let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
+    (center, low.narrow(high))
+}
+
+/// Sixteen numbers of f64.
+type Wide<S> = (f64x8<S>, f64x8<S>);
+
+/// One coordinate in the camera's frame.
+#[inline(always)]
+fn along<S: Simd>(simd: S, (x, y, z): (Wide<S>, Wide<S>, Wide<S>), row: [f64; 4]) -> Wide<S> {
+    let [rx, ry, rz, moved_m] = row.map(|value| f64x8::splat(simd, value));
+    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, moved_m)));
+    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, moved_m)));
+    (low, high)
 }
 
 /// Fills one lane, and returns the way from the camera to the centre, in metres; `None` if the

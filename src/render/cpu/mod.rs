@@ -9,6 +9,7 @@ mod bent;
 mod bin;
 mod handover;
 mod lanes;
+mod optics;
 mod project;
 mod rasterize;
 mod resolve;

@@ -5,11 +5,12 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use fearless_simd::{Level, dispatch, f32x16, f64x8, i32x16, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, f64x8, i32x16, mask32x16, prelude::*};
 use rayon::prelude::*;
 
-use super::bent;
+use super::bent::{self, BentView};
 use super::lanes::Vec3x16;
+use super::optics::Optics;
 use crate::render::Frame;
 use crate::render::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
@@ -62,7 +63,7 @@ enum Sight<'a> {
     /// A pinhole at rest.
     Straight { chunk_view: ChunkView, frustum: Frustum },
     /// A lens, or a rolling shutter.
-    Bent(&'a Bent<'a>),
+    Bent(BentView<'a>),
 }
 
 impl Projected {
@@ -71,8 +72,11 @@ impl Projected {
         let Self { pages, units, free } = self;
         let all_free = free.get_mut().unwrap_or_else(PoisonError::into_inner);
         all_free.append(pages);
-        let bent: Vec<Option<Bent<'_>>> =
-            frame.views.iter().map(|view| Bent::of(view, frame.profile)).collect();
+        let bent: Vec<Option<(Bent<'_>, Option<Optics>)>> = frame
+            .views
+            .iter()
+            .map(|view| Some((Bent::of(view, frame.profile)?, Optics::of(view))))
+            .collect();
         let jobs: Vec<Job<'_>> = jobs(frame, &bent);
         let filled: Vec<(usize, Vec<Page>)> = jobs
             .par_iter()
@@ -134,12 +138,14 @@ fn into_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
 }
 
 /// The units of a frame: chunks that a view cannot see cost one test.
-fn jobs<'a>(frame: &Frame<'a>, bent: &'a [Option<Bent<'a>>]) -> Vec<Job<'a>> {
+fn jobs<'a>(frame: &Frame<'a>, bent: &'a [Option<(Bent<'a>, Option<Optics>)>]) -> Vec<Job<'a>> {
     let mut jobs = Vec::new();
     for (index, (view, bent)) in frame.views.iter().zip(bent).enumerate() {
         for chunk in &frame.scene.chunks {
             let sight = match bent {
-                Some(bent) => Sight::Bent(bent),
+                Some((bent, optics)) => {
+                    Sight::Bent(BentView::new(view, chunk, bent, optics.as_ref()))
+                }
                 None => Sight::Straight {
                     chunk_view: ChunkView::new(view, chunk),
                     frustum: Frustum::new(view, chunk, frame.profile),
@@ -157,7 +163,7 @@ impl Sight<'_> {
         let Cluster { min_m, max_m, sigma_m, .. } = *cluster;
         match self {
             Self::Straight { frustum, .. } => frustum.may_see(min_m, max_m, sigma_m),
-            Self::Bent(bent) => bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
+            Self::Bent(view) => view.bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
         }
     }
 }
@@ -187,10 +193,7 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
                 Sight::Straight { chunk_view, .. } => {
                     project_block(simd, columns, degree, chunk_view, cutoffs)
                 }
-                Sight::Bent(view) => {
-                    let origin_m = job.chunk.origin_m();
-                    bent::project_block(simd, columns, degree, (view, origin_m), cutoffs)
-                }
+                Sight::Bent(view) => bent::project_block(simd, columns, degree, view, cutoffs),
             };
             if let Some(lanes) = lanes {
                 lanes.append(splats);
@@ -218,6 +221,14 @@ pub(super) struct SplatLanes {
 }
 
 impl SplatLanes {
+    /// Gives them their colours.
+    #[inline(always)]
+    pub(super) fn paint<S: Simd>(&mut self, rgb: Vec3x16<S>) {
+        rgb.x.store_array(&mut self.red);
+        rgb.y.store_array(&mut self.green);
+        rgb.z.store_array(&mut self.blue);
+    }
+
     #[inline(always)]
     fn append(&self, splats: &mut Vec<Splat>) {
         let mut visible = self.visible;
@@ -248,7 +259,7 @@ fn project_block<S: Simd>(
     let splat = |value: f32| f32x16::splat(simd, value);
     let mean = Vec3x16::load(simd, columns, column::MEAN);
     let z = depth(simd, view, mean);
-    let mut log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+    let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let in_range = z.simd_ge(splat(cutoffs.near_m))
         & z.simd_le(splat(cutoffs.far_m))
         & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
@@ -267,12 +278,33 @@ fn project_block<S: Simd>(
     let v0 = root_row(simd, view, 0, slope_x, inverse_z, own).times(scale);
     let v1 = root_row(simd, view, 1, slope_y, inverse_z, own).times(scale);
     let ellipse = Ellipse::new(simd, v0, v1, cutoffs.blur_px2);
+    let mut lanes =
+        shown(simd, (mean_x, mean_y, z), log2_opacity, &ellipse, in_range, view.size_px, cutoffs);
+    if lanes.visible == 0 {
+        return None;
+    }
+    let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
+    lanes.paint(color(simd, columns, sh_degree, toward));
+    Some(lanes)
+}
+
+/// What an image shows of 16 splats, but for their colours.
+#[inline(always)]
+pub(super) fn shown<S: Simd>(
+    simd: S,
+    (mean_x, mean_y, depth_m): (f32x16<S>, f32x16<S>, f32x16<S>),
+    mut log2_opacity: f32x16<S>,
+    ellipse: &Ellipse<S>,
+    in_range: mask32x16<S>,
+    size_px: [f32; 2],
+    cutoffs: &Cutoffs,
+) -> SplatLanes {
+    let splat = |value: f32| f32x16::splat(simd, value);
     if cutoffs.antialiased {
         // Yu et al. 2024 (Mip-Splatting): sqrt(det before / det), with gsplat's floor 0.005.
         let ratio = ellipse.det_share.max(splat(0.005 * 0.005));
         log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
     }
-
     // The box where alpha reaches the cut, against the image's pixel centres.
     let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
     let reach = power.max(splat(0.0)).sqrt() / splat(LOG2_UNIT);
@@ -283,15 +315,12 @@ fn project_block<S: Simd>(
     };
     let visible = in_range
         & power.simd_ge(splat(0.0))
-        & on_image(mean_x, extent_x, view.size_px[0])
-        & on_image(mean_y, extent_y, view.size_px[1]);
+        & on_image(mean_x, extent_x, size_px[0])
+        & on_image(mean_y, extent_y, size_px[1]);
     if visible.all_false() {
-        return None;
+        return SplatLanes::default();
     }
-
-    let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
-    let rgb = color(simd, columns, sh_degree, toward);
-    Some(SplatLanes {
+    SplatLanes {
         visible: visible.to_bitmask(),
         mean_x: mean_x.to_array(),
         mean_y: mean_y.to_array(),
@@ -299,13 +328,11 @@ fn project_block<S: Simd>(
         l1: ellipse.l1.to_array(),
         l2: ellipse.l2.to_array(),
         log2_opacity: log2_opacity.to_array(),
-        red: rgb.x.to_array(),
-        green: rgb.y.to_array(),
-        blue: rgb.z.to_array(),
-        depth_m: z.to_array(),
+        depth_m: depth_m.to_array(),
         extent_x: extent_x.to_array(),
         extent_y: extent_y.to_array(),
-    })
+        ..SplatLanes::default()
+    }
 }
 
 /// Camera-space z of centres, in metres: computed in f64 and rounded to f32 once.
@@ -355,7 +382,7 @@ fn root_row<S: Simd>(
 pub(super) const LOG2_UNIT: f32 = 0.849_321_8;
 
 /// Screen ellipses, by their factor.
-struct Ellipse<S: Simd> {
+pub(super) struct Ellipse<S: Simd> {
     l0: f32x16<S>,
     l1: f32x16<S>,
     l2: f32x16<S>,
@@ -383,21 +410,32 @@ impl<S: Simd> Ellipse<S> {
         let (v0, v1) = (v0.scale(per_px), v1.scale(per_px));
         let blur = splat(blur_px2) * per_px * per_px;
 
-        let (xx, yy, b) = (v0.dot(v0), v1.dot(v1), v0.dot(v1));
         let minors = v0.cross(v1);
-        let det_before = minors.dot(minors);
+        let moments = [v0.dot(v0), v1.dot(v1), v0.dot(v1)];
+        let unit = splat(LOG2_UNIT) * per_px;
+        let ellipse = Self::of_moments(moments, minors.dot(minors), blur, unit);
+        Self { sigma_x: ellipse.sigma_x * px, sigma_y: ellipse.sigma_y * px, ..ellipse }
+    }
+
+    /// From the covariance before the blur, `[xx, yy, xy]`, and its determinant.
+    #[inline(always)]
+    pub(super) fn of_moments(
+        [xx, yy, b]: [f32x16<S>; 3],
+        det_before: f32x16<S>,
+        blur: f32x16<S>,
+        unit: f32x16<S>,
+    ) -> Self {
         let det = blur.mul_add(xx + yy + blur, det_before);
         // q(dx, dy) = (c dx - b dy)²/(c det) + dy²/c; times log2(e)/2 it is a power of two.
         let (sigma_x, sigma_y) = ((xx + blur).sqrt(), (yy + blur).sqrt());
-        let unit = splat(LOG2_UNIT) * per_px;
         let l2 = unit / sigma_y;
         let root_det = det.sqrt();
         Self {
             l0: unit * sigma_y / root_det,
             l1: -(b * l2) / root_det,
             l2,
-            sigma_x: sigma_x * px,
-            sigma_y: sigma_y * px,
+            sigma_x,
+            sigma_y,
             det_share: det_before / det,
         }
     }
@@ -405,7 +443,7 @@ impl<S: Simd> Ellipse<S> {
 
 /// Columns of the rotation matrices of a block's unit quaternions: the own axes in the world.
 #[inline(always)]
-fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+pub(super) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
     let one = f32x16::splat(simd, 1.0);
     let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
     let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
