@@ -17,7 +17,7 @@ use super::{Pictures, ReportError, pictures};
 use crate::render::reference::Reference;
 use crate::render::{Backend, RenderError, View};
 use crate::residency::{Pinned, Resident};
-use crate::scene::sky::{Drawn, Sky};
+use crate::scene::sky::Drawn;
 use crate::scene::{Rays, RenderProfile, Scene};
 use crate::session;
 
@@ -116,11 +116,6 @@ impl Bench<'_> {
     pub fn measure(&self, setting: &Setting, truth: &Truth) -> Result<Measured, ReportError> {
         let profile = setting.apply(self.profile())?;
         let backend = &*self.backends[setting.backend];
-        // A sky keeps the map that was looked at last, and the twin as served is timed in turn.
-        let own_sky = (profile.sky_error != self.profile().sky_error)
-            .then(|| self.resident.sky())
-            .flatten()
-            .map(|sky| Arc::new(Sky::new(sky.model().clone(), sky.sky_from_world())));
         let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
         let mut by_place = Vec::new();
         let (mut steps_ms, mut served_ms, mut cost) = (Vec::new(), Vec::new(), Cost::NOTHING);
@@ -129,11 +124,7 @@ impl Bench<'_> {
             let own = place.scaled(setting.scale)?;
             let needed = self.scene(&own.views, &profile)?;
             let (stored, stored_bytes) = self.stored(setting, &needed);
-            let mut scene = stored.unwrap_or_else(|| (*needed).clone());
-            if let Some(sky) = &own_sky {
-                scene.sky = Some(sky.clone());
-            }
-            let scene = &scene;
+            let scene: &Scene = stored.as_ref().unwrap_or(&needed);
             let offset = OFFSETS_M.iter().position(|o| *o == place.offset_m).unwrap_or(0);
 
             let drawings = draw(backend, scene, &profile, &own.windows)?;

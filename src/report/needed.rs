@@ -28,8 +28,7 @@ pub struct Row {
     pub counts: Counts,
 }
 
-/// What one step takes. Those of a device are absent where there is none, or where it does not draw such a
-/// frame.
+/// What one step takes. Those of a device are absent where there is none.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Counts {
     /// Gaussians in the frame.

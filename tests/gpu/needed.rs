@@ -47,8 +47,17 @@ fn features_pay_for_themselves_and_the_base_for_none() {
     // Fewer Gaussians, and perhaps a buffer that need not grow.
     let [pipelines, buffers, dispatches, planes] = beyond("levels of detail, 1 m");
     assert!(buffers <= 0 && [pipelines, dispatches, planes] == [0; 3]);
-    // What is behind or before the Gaussians is done in the last kernel, of more buffers.
-    for with in ["background", "sky of images", "sky, baked", "sky, exact", "exposure", "hood"] {
+    // Other kernels in the places of the last and of the first one, with more buffers.
+    for with in [
+        "background",
+        "sky of images",
+        "sky, baked",
+        "sky, exact",
+        "exposure",
+        "hood",
+        "fisheye",
+        "rolling shutter",
+    ] {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }

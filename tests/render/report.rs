@@ -16,6 +16,7 @@ use wildcity::report::choose::{Wanted, front, recommend};
 use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
 use wildcity::report::measure::{AtPlace, Bench, Measured};
 use wildcity::report::places::{OFFSETS_M, Sampling, places};
+use wildcity::report::timing::at_one_speed;
 use wildcity::report::{ReportError, needed};
 use wildcity::residency::{Cache, Resident};
 use wildcity::scene::manifest::Provenance;
@@ -196,6 +197,12 @@ fn the_margin_is_what_places_differ_by() {
     // What fails all the same is not recommended.
     let refused = chosen([40.0, 41.0, 40.5, 34.9, 40.2, 40.0]).unwrap_err();
     assert!(matches!(refused, ReportError::NotVerified { verified: 34.9, .. }), "{refused}");
+    // The first was measured while the machine was twice as fast as with the second.
+    let mut uneven = two(&like, [60.0; 6], [40.0; 6]);
+    (uneven[0].served_ms, uneven[1].served_ms) = (15.0, 30.0);
+    at_one_speed(&mut uneven);
+    let times = [0, 1].map(|i| (uneven[i].cost.step_ms, uneven[i].by_place[0].p95_ms));
+    assert_eq!(times, [(40.0, Some(40.0)), (10.0, Some(10.0))]);
     // Times have a margin, too: 10 ms and a tenth.
     let all = two(&like, [60.0; 6], [40.0; 6]);
     let by_time = |ms: f64| recommend(Wanted::AtMostMs(ms), &all, &names).unwrap().setting;
