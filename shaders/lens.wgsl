@@ -15,10 +15,6 @@ const FROM_DISTANCE: u32 = 3;
 const INWARDS: u32 = 1;
 const OUTWARDS: u32 = 2;
 
-// Slope from which a pinhole goes on straight in the angle.
-const STRAIGHT: f32 = 8.0;
-const STRAIGHT_RAD: f32 = 1.446441332;
-
 // Where a direction of any length lands, in pixels; beyond the field the model goes on straight.
 fn land(of_view: u32, outside: vec3f) -> vec2f {
     let inside = turn(of_view, outside, INWARDS);
@@ -33,18 +29,19 @@ fn land(of_view: u32, outside: vec3f) -> vec2f {
                 plane = distort(of_view, inside.xy / inside.z);
             } else {
                 let edge = azimuth * end;
-                let beyond = (1.0 + end * end) * (angle(off_axis, inside.z) - lenses[of_view].limit_rad);
+                let beyond_rad = angle(off_axis, inside.z) - lenses[of_view].end_rad;
+                let beyond = (1.0 + end * end) * beyond_rad;
                 plane = distort(of_view, edge) + jacobian(of_view, edge) * azimuth * beyond;
             }
         }
         case FROM_ANGLE: { plane = azimuth * rise(of_view, angle(off_axis, inside.z)); }
         case FROM_DISTANCE: { plane = azimuth * fall(of_view, angle(off_axis, inside.z)); }
         default: {
-            if off_axis < STRAIGHT * inside.z {
+            if off_axis < end * inside.z {
                 plane = inside.xy / inside.z;
             } else {
-                let beyond_rad = angle(off_axis, inside.z) - STRAIGHT_RAD;
-                plane = azimuth * (STRAIGHT + (1.0 + STRAIGHT * STRAIGHT) * beyond_rad);
+                let beyond_rad = angle(off_axis, inside.z) - lenses[of_view].end_rad;
+                plane = azimuth * (end + (1.0 + end * end) * beyond_rad);
             }
         }
     }

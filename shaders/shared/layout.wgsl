@@ -68,7 +68,7 @@ struct Lens {
     end: f32,
     end_value: f32,
     end_slope: f32,
-    limit_rad: f32,
+    end_rad: f32,
     widest_rad: f32,
     by_distance: u32,
     bent: u32,

@@ -61,11 +61,6 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }
-    // Another projection takes the place of the pinhole's, and is told of its lens.
-    for with in ["fisheye", "rolling shutter"] {
-        let [pipelines, buffers, dispatches, planes] = beyond(with);
-        assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
-    }
     let bytes = |with: &str| of(with).unwrap().gaussian_bytes;
     // Colours of SH are halves: 9 values, and 45.
     let colours = ["SH degree 1", "SH degree 3"].map(|with| bytes(with) - bytes("nothing else"));

@@ -114,7 +114,6 @@ pub(crate) const LENS_SLIPS: &[(&str, &str)] = &[
     ),
     ("p.yx * (r2 + 2.0 * slope * slope)", "p * (r2 + 2.0 * slope * slope)"),
     ("(s.xz + s.yw * r2) * r2", "(s.xy + s.zw * r2) * r2"),
-    ("(STRAIGHT + (1.0 + STRAIGHT * STRAIGHT) * beyond_rad)", "(STRAIGHT + STRAIGHT * beyond_rad)"),
     (
         "lenses[of_view].center_px + linear(of_view) * plane",
         "lenses[of_view].center_px + plane * linear(of_view)",

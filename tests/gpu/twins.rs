@@ -87,7 +87,7 @@ fn layouts_are_the_same() {
             camera_from_chunk, depth_high, depth_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
         }
         Lens {
-            center_px, model, windshield, linear, end, end_value, end_slope, limit_rad, widest_rad, by_distance,
+            center_px, model, windshield, linear, end, end_value, end_slope, end_rad, widest_rad, by_distance,
             bent, pad0, c, bend, rolls, moved_m, pad1, moved_world_m, pad2, turned,
         }
         Item { line, chunk_view }

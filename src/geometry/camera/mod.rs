@@ -198,14 +198,28 @@ impl Camera {
             Lens::Fisheye(lens) => off_axis.atan2(inside.z) <= lens.limit_rad(),
             Lens::FTheta(lens) => off_axis.atan2(inside.z) <= lens.limit_rad(),
         };
-        seen.then(|| self.land(inside))
+        seen.then(|| self.land(inside, OpenCv::MOST_SLOPE))
     }
 
     /// Where a camera-space point lands if the model is continued beyond its field: at the same rate
     /// in the angle as at its end. For the shape of what reaches into the field from beyond.
     #[inline(always)]
     pub fn project_beyond(&self, point_m: DVec3) -> DVec2 {
-        self.land(self.inside(point_m))
+        self.land(self.inside(point_m), self.straight_slope())
+    }
+
+    /// The slope from which pinholes and OpenCV's lenses are continued straight in the angle: 4, 76° off the
+    /// axis, or where the farthest corner of the image is, but never beyond 8.
+    ///
+    /// A slope grows with the square of its own per radian: at 8, what lies beside the camera, a road below
+    /// it, is torn into splats of some hundred pixels that reach into the image. At 4 none did.
+    #[inline(always)]
+    pub fn straight_slope(&self) -> f64 {
+        let Pinhole { fx, fy, cx, cy } = self.pinhole;
+        let center_px = DVec2::new(cx, cy);
+        let most_px = center_px.abs().max((self.size_px() - center_px).abs());
+        let corner = (most_px / DVec2::new(fx, fy)).length();
+        (corner / OpenCv::LEAST_FACTOR).clamp(4.0, OpenCv::MOST_SLOPE)
     }
 
     /// The unit direction in the camera's frame that lands on a place of the image, in pixels; `None`
@@ -308,14 +322,14 @@ impl Camera {
         }
     }
 
-    /// Where a direction behind the windshield lands.
+    /// Where a direction behind the windshield lands; what has slopes goes on straight from one on.
     #[inline(always)]
-    fn land(&self, inside: DVec3) -> DVec2 {
+    fn land(&self, inside: DVec3, straight: f64) -> DVec2 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let (focal_px, center_px) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
         match &self.lens {
-            Lens::Pinhole => center_px + focal_px * Pinhole::slope_beyond(inside),
-            Lens::OpenCv(lens) => center_px + focal_px * lens.plane(inside),
+            Lens::Pinhole => center_px + focal_px * Pinhole::slope_beyond(inside, straight),
+            Lens::OpenCv(lens) => center_px + focal_px * lens.plane(inside, straight),
             Lens::Fisheye(lens) => center_px + focal_px * lens.plane(inside),
             Lens::FTheta(lens) => center_px + lens.offset_px(inside),
         }

@@ -19,11 +19,11 @@ pub struct OpenCv {
 
 impl OpenCv {
     /// Largest slope of a ray: 82.9° off the axis, where a pixel in the middle is 65 wide.
-    const MOST_SLOPE: f64 = 8.0;
+    pub(super) const MOST_SLOPE: f64 = 8.0;
 
     /// Least radial factor: below, calibrations have left the range that they were made in (gsplat's
     /// bound).
-    const LEAST_FACTOR: f64 = 0.8;
+    pub(super) const LEAST_FACTOR: f64 = 0.8;
 
     /// How much of its slope at the axis `r icD(r)` must keep, as of every lens.
     const LEAST_RISE: f64 = 0.02;
@@ -75,18 +75,20 @@ impl OpenCv {
         super::check_field(self.limit_slope.atan())
     }
 
-    /// Where a direction lands, in focal lengths; beyond the limit it goes on straight in the angle.
+    /// Where a direction lands, in focal lengths; beyond the limit, or this slope if that is sooner, it goes
+    /// on straight in the angle.
     #[inline(always)]
-    pub(super) fn plane(&self, direction: DVec3) -> DVec2 {
+    pub(super) fn plane(&self, direction: DVec3, straight: f64) -> DVec2 {
+        let end = straight.min(self.limit_slope);
         let off_axis = direction.truncate().length();
-        let within = off_axis < self.limit_slope * direction.z;
+        let within = off_axis < end * direction.z;
         if within {
             return self.distort(direction.truncate() / direction.z);
         }
         let azimuth = azimuth(direction);
-        let edge = azimuth * self.limit_slope;
-        let beyond_rad = off_axis.atan2(direction.z) - self.limit_slope.atan();
-        let slope_per_rad = 1.0 + self.limit_slope * self.limit_slope;
+        let edge = azimuth * end;
+        let beyond_rad = off_axis.atan2(direction.z) - end.atan();
+        let slope_per_rad = 1.0 + end * end;
         self.distort(edge) + self.jacobian(edge) * azimuth * (slope_per_rad * beyond_rad)
     }
 

@@ -42,21 +42,18 @@ impl Pinhole {
         Ok(())
     }
 
-    /// Slope of a ray beyond which [`Pinhole::slope_beyond`] goes on straight: 82.9° off the axis.
-    pub const STRAIGHT: f64 = 8.0;
-
-    /// The slopes x/z and y/z of a direction; from 8 on, they rise with the angle as they do at 8, and
-    /// on behind the camera, so that the shape of what reaches there is finite.
+    /// The slopes x/z and y/z of a direction; from `straight` on, they rise with the angle as they do there,
+    /// and on behind the camera, so that the shape of what reaches there is finite.
     #[inline(always)]
-    pub(super) fn slope_beyond(direction: DVec3) -> DVec2 {
+    pub(super) fn slope_beyond(direction: DVec3, straight: f64) -> DVec2 {
         let off_axis = direction.truncate().length();
-        let within = off_axis < Self::STRAIGHT * direction.z;
+        let within = off_axis < straight * direction.z;
         if within {
             return direction.truncate() / direction.z;
         }
-        let beyond_rad = off_axis.atan2(direction.z) - Self::STRAIGHT.atan();
-        let per_rad = 1.0 + Self::STRAIGHT * Self::STRAIGHT;
-        azimuth(direction) * (Self::STRAIGHT + per_rad * beyond_rad)
+        let beyond_rad = off_axis.atan2(direction.z) - straight.atan();
+        let per_rad = 1.0 + straight * straight;
+        azimuth(direction) * (straight + per_rad * beyond_rad)
     }
 
     /// Where a camera-space point lands, in pixels; meaningless unless `z > 0`.

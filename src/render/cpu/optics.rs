@@ -11,7 +11,7 @@ use glam::{DMat2, DMat3, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
 use crate::geometry::Camera;
-use crate::geometry::camera::{Bivariate, Lens, Pinhole, Windshield, WindshieldReference};
+use crate::geometry::camera::{Bivariate, Lens, Windshield, WindshieldReference};
 use crate::render::View;
 
 /// What is left out of a series, in pixels: a tenth of what f32 tells apart beside the middle of an image.
@@ -76,11 +76,12 @@ impl Optics {
         let kind = match lens {
             // As it is behind a windshield: slopes without a distortion.
             Lens::Pinhole => {
-                let limit = (Pinhole::STRAIGHT * Pinhole::STRAIGHT) as f32 * INSIDE;
+                let limit = view.camera.straight_slope().powi(2) as f32 * INSIDE;
                 Kind::Slopes { focal_px, k: [0.0; 6], p: [0.0; 2], s: [0.0; 4], limit }
             }
             Lens::OpenCv(lens) => {
-                let limit = (lens.limit_slope() * lens.limit_slope()) as f32;
+                let end = view.camera.straight_slope().min(lens.limit_slope());
+                let limit = (end * end) as f32;
                 Kind::Slopes {
                     focal_px,
                     k: lens.k().map(|k| k as f32),

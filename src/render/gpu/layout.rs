@@ -256,8 +256,8 @@ pub struct Lens {
     pub end_value: f32,
     /// ... and its slope; and ...
     pub end_slope: f32,
-    /// ... the angle off the axis there, in radians.
-    pub limit_rad: f32,
+    /// ... of a slope, its angle off the axis, in radians.
+    pub end_rad: f32,
     /// How far off the axis a centre may be, in radians.
     pub widest_rad: f32,
     /// 1 if depth is distance, 0 if it is z.

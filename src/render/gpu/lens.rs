@@ -50,15 +50,17 @@ impl Lens {
         let mut lens = Self {
             center_px: [pinhole.cx as f32, pinhole.cy as f32],
             linear: columns(DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy))),
-            limit_rad: camera.limit_rad() as f32,
             widest_rad: widest_rad(camera) as f32,
             by_distance: camera.depth_is_distance().into(),
             bent: 1,
             ..Self::zeroed()
         };
         match &camera.lens {
-            camera::Lens::Pinhole => {}
-            camera::Lens::OpenCv(of) => lens.set_opencv(of),
+            camera::Lens::Pinhole => lens.set_end(camera.straight_slope()),
+            camera::Lens::OpenCv(of) => {
+                lens.set_opencv(of);
+                lens.set_end(camera.straight_slope().min(of.limit_slope()));
+            }
             camera::Lens::Fisheye(of) => lens.set_fisheye(of),
             camera::Lens::FTheta(of) => lens.set_ftheta(of),
         }
@@ -71,10 +73,13 @@ impl Lens {
         lens
     }
 
+    fn set_end(&mut self, slope: f64) {
+        (self.end, self.end_rad) = (slope as f32, slope.atan() as f32);
+    }
+
     fn set_opencv(&mut self, lens: &OpenCv) {
         let ([k1, k2, k3, k4, k5, k6], [p1, p2], s) = (lens.k(), lens.p(), lens.s());
         self.model = 1;
-        self.end = lens.limit_slope() as f32;
         self.c = [[k1, k2, k3, k4], [k5, k6, p1, p2], s].map(|row| row.map(|value| value as f32));
     }
 
