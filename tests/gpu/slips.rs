@@ -108,6 +108,7 @@ pub(crate) const LENS_SLIPS: &[(&str, &str)] = &[
     ("0.07902598 * square", "0.0 * square"),
     ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),
     ("off_axis < end * inside.z", "off_axis < 0.5 * end * inside.z"),
+    ("azimuth * (end + (1.0 + end * end) * beyond_rad)", "azimuth * (end + end * beyond_rad)"),
     (
         "let across = 2.0 * slope.x * slope.y * factor.y",
         "let across = slope.x * slope.y * factor.y",
