@@ -100,7 +100,8 @@ pub const SPARE_CONNECTIONS: usize = 64;
 /// passed can leave a dead one behind, hence twice.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
-/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`: 100 sessions with
+/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of what lies over
+/// the images of sessions, 134 MB each at worst: 100 sessions with
 /// six raw 1440x928 images, depth and opacity (88 MB each), or every session with JPEGs.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
@@ -129,6 +130,10 @@ pub const EPISODE_LINE_BYTES: usize = 1 << 20;
 /// Longest first line, which has the rig: its overlays, 2^24 pixels of 4 bytes which no PNG makes smaller,
 /// are 90 MB in base64.
 pub const EPISODE_HEAD_BYTES: usize = 96 << 20;
+
+/// Longer requests are read on a thread that may take its time: what is 16 KiB unpacks to 17 MB of an
+/// overlay at most, in some 20 ms.
+pub const INLINE_REQUEST_BYTES: usize = 16 << 10;
 
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;

@@ -8,10 +8,11 @@ use serde_json::{Map, Value};
 
 use crate::config;
 use crate::render::Backend;
+use crate::render::RenderError;
 use crate::render::gpu::Gpu;
 use crate::report::believed::believed;
 use crate::report::choose::{Recommendation, Wanted, recommend};
-use crate::report::ladder::{Family, Ladder, LeftOut, Traits, ladder};
+use crate::report::ladder::{Ladder, LeftOut, Traits, ladder};
 use crate::report::measure::{Bench, Truth};
 use crate::report::places::{Sampling, places};
 use crate::report::stress::CASES;
@@ -187,8 +188,8 @@ impl Command {
             };
             match bench.measure(setting, truth) {
                 Ok(one) => measured.push(one),
-                // A map that would be too large, or a backend that only looks skies up.
-                Err(ReportError::Render(why)) if setting.family == Family::Sky => {
+                // A map that would be too large.
+                Err(ReportError::Render(why @ RenderError::Sky(_))) => {
                     left_out.push(LeftOut::new(setting.name.clone(), why.to_string()));
                 }
                 Err(error) => return Err(error.into()),

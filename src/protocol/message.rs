@@ -597,7 +597,7 @@ pub struct Summary {
 pub enum Outcome {
     /// The agent closed it, or ended it with `terminate`.
     Completed,
-    /// The same, and an observation's images had a trust below 0.1 on average: the agent left what was
+    /// The same, and images of a reset or a step had a trust below 0.1 on average: the agent left what was
     /// recorded. Told only with `outputs.trust`.
     OffModel,
     /// The agent broke the protocol beyond repair.

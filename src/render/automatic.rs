@@ -167,7 +167,7 @@ mod tests {
     fn a_wrong_device_is_not() {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
         for (stage, part, slip) in [
-            ("project", "let l1 = -(b * l2)", "let l1 = (b * l2)"),
+            ("project", "let l1 = -(foot.covariance.y * l2)", "let l1 = (foot.covariance.y * l2)"),
             ("scan", "sum = saturating_add(sum, before);", "sum = max(sum, before);"),
             ("sort", "is_last = after == 0u", "is_last = beside == own_bit"),
             (

@@ -65,7 +65,8 @@ fn points(view: &View, depth_m: &[f32], row: usize) -> Vec<Option<Point>> {
     let width = view.camera.width_px as usize;
     let camera_from_world = view.world_from_camera.inverse();
     let point = |(x, &depth_m): (usize, &f32)| {
-        if depth_m <= 0.0 {
+        let seen = depth_m > 0.0;
+        if !seen {
             return None;
         }
         let depth_m = f64::from(depth_m);

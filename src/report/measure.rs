@@ -61,8 +61,8 @@ pub struct AtPlace {
     pub chooses: bool,
     /// PSNR in dB.
     pub psnr_db: f64,
-    /// The longest of a hundred steps but five, in milliseconds; none beside the drive, where no step is
-    /// timed.
+    /// The 95th percentile of its steps, in milliseconds, which is the longest of fewer than twenty; none
+    /// beside the drive, where no step is timed.
     pub p95_ms: Option<f64>,
 }
 

@@ -209,7 +209,7 @@ mod tests {
         let heights = [10, 11, 11, 12, 200, 201, 390, 395, 399];
         let spread = spread(&heights, 400);
         assert!(spread.windows(2).all(|pair| pair[1] - pair[0] >= LINE_PX), "{spread:?}");
-        assert_eq!((spread[0], spread[4], spread[8]), (10, 200, 399));
+        assert_eq!((spread[0], spread[4], spread[8]), (10, 200, 400));
         assert_eq!(super::spread(&[5, 300], 400), [5, 300]);
     }
 }

@@ -232,6 +232,11 @@ impl Overlay {
         &self.rgba8
     }
 
+    /// Memory that it takes, in bytes.
+    pub fn bytes(&self) -> u64 {
+        (self.rgba8.len() + self.png.len()) as u64
+    }
+
     /// As JSON has it.
     pub fn to_data_uri(&self) -> String {
         format!("{DATA_URI}{}", BASE64.encode(&self.png))

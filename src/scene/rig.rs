@@ -194,17 +194,24 @@ impl Rig {
 /// # Errors
 /// [`RigError::Overlays`].
 pub fn check_overlays(cameras: &[RigCamera]) -> Result<(), RigError> {
-    let (pixels, limit) = (overlay_pixels(cameras), Overlay::MAX_PIXELS);
+    let overlays = cameras.iter().filter_map(|camera| camera.appearance.overlay.as_ref());
+    check_overlay_pixels(overlays.map(|overlay| overlay.rgba8().len() as u64 / 4).sum())
+}
+
+/// # Errors
+/// [`RigError::Overlays`].
+pub fn check_overlay_pixels(pixels: u64) -> Result<(), RigError> {
+    let limit = Overlay::MAX_PIXELS;
     match pixels <= limit {
         true => Ok(()),
         false => Err(RigError::Overlays { pixels, limit }),
     }
 }
 
-/// Pixels of all overlays, 4 bytes each.
-pub fn overlay_pixels(cameras: &[RigCamera]) -> u64 {
+/// Memory of all overlays, in bytes: their pixels, and the files that they are written as.
+pub fn overlay_bytes(cameras: &[RigCamera]) -> u64 {
     let overlays = cameras.iter().filter_map(|camera| camera.appearance.overlay.as_ref());
-    overlays.map(|overlay| overlay.rgba8().len() as u64 / 4).sum()
+    overlays.map(|overlay| overlay.bytes()).sum()
 }
 
 /// Longest name, in bytes.

@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use tokio::time::{Instant, sleep_until, timeout};
 
+use crate::config;
 use crate::session::{Frame, Outcome, Session, SessionError};
 
 use super::Server;
@@ -98,7 +99,14 @@ impl Connection {
     }
 
     async fn handle(&mut self, text: &str) -> Result<(), Lost> {
-        let (seq, command) = match convert::parse(text) {
+        let parsed = if text.len() <= config::INLINE_REQUEST_BYTES {
+            convert::parse(text)
+        } else {
+            let text = text.to_owned();
+            let parsed = tokio::task::spawn_blocking(move || convert::parse(&text)).await;
+            parsed.unwrap_or_else(|error| Parsed::Unnumbered(Fault::Internal(error.to_string())))
+        };
+        let (seq, command) = match parsed {
             Parsed::Numbered { seq, command } => (seq, command),
             Parsed::Unnumbered(fault) => return self.refuse(None, &fault).await,
         };

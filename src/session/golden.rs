@@ -63,6 +63,9 @@ impl Engine {
         let mut new = new.map_err(|_| SessionError::Crashed)?;
         let twin = manifest.twin.clone();
         let resident = self.resident(twin, Some(changed.before.number)).await?;
+        for profile in [manifest.profile, changed.profile] {
+            Self::bake(resident.clone(), profile).await?;
+        }
         let (mut loaded, mut golden) = (BTreeMap::new(), Vec::new());
         let total = poses.len() as u64;
         for (done, world_from_rig) in (0..).zip(poses) {

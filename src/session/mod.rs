@@ -34,7 +34,7 @@ use crate::config;
 use crate::geometry::Pose;
 use crate::render::View;
 use crate::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
-use crate::scene::rig::{Rig, RigCamera, overlay_pixels};
+use crate::scene::rig::{Rig, RigCamera, overlay_bytes};
 use crate::scene::{ProfileChanges, RenderProfile};
 use crate::sim::{Command, Dynamics, Ego, Ground};
 
@@ -130,9 +130,13 @@ impl Session {
         }
         let resident = engine.resident(opening.twin, opening.version).await?;
         let manifest = &resident.version.manifest;
-        let (rig_name, cameras) = choose_cameras(&resident, opening.rig, &opening.outputs)?;
+        let (chosen_of, rig, outputs) = (resident.clone(), opening.rig, opening.outputs.clone());
+        // Overlays that are made smaller or larger take a second at worst.
+        let chosen =
+            tokio::task::spawn_blocking(move || choose_cameras(&chosen_of, rig, &outputs)).await;
+        let (rig_name, cameras) = chosen.map_err(|_| SessionError::Crashed)??;
         let Outputs { encoding, maps, frames, periods_us, trust, .. } = opening.outputs;
-        let overlays = engine.answers().hold(4 * overlay_pixels(&cameras))?;
+        let overlays = engine.answers().hold(overlay_bytes(&cameras))?;
         let lens = lens(&cameras);
         let schedule = Schedule::new(&cameras, dt_us, frames, &periods_us, opening.decision_us)?;
         let layout = Layout::new(cameras, encoding, maps, schedule)?;

@@ -276,6 +276,8 @@ impl Assembly {
         let Maps { depth, opacity, normals } = layout.maps;
         let mut coverage = unseen(trained.is_some() && !opacity);
         let mut depths_m = unseen(normals && !depth && shot.shown);
+        let unseen_bytes = coverage.iter().chain(&depths_m).map(|image| 4 * image.len() as u64);
+        let _hold = self.answers.hold(unseen_bytes.sum())?;
         let mut targets = self.targets(shot, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut coverage) {
             target.opacity = Some(opacity);

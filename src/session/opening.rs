@@ -3,14 +3,12 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use crate::config;
 use crate::geometry::Pose;
 use crate::residency::Resident;
 use crate::scene::ProfileChanges;
 use crate::scene::Trajectory;
-use crate::scene::rig::{Rig, RigCamera, check_overlays};
+use crate::scene::rig::{Rig, RigCamera, check_overlay_pixels};
 use crate::scene::route::Route;
 use crate::sim::Dynamics;
 
@@ -124,15 +122,13 @@ impl Outputs {
 }
 
 /// What an observation holds of an image beside its colours, all f32.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Maps {
     /// Expected depth in metres, `[height, width]`.
     pub depth: bool,
     /// Accumulated opacity, `[height, width]`.
     pub opacity: bool,
     /// Unit normals in the camera's axes, `[height, width, 3]`.
-    #[serde(default)]
     pub normals: bool,
 }
 
@@ -160,6 +156,17 @@ pub(super) fn choose_cameras(
 ) -> Result<(String, Vec<RigCamera>), SessionError> {
     let (rig, mut cameras) = whole_cameras(resident, choice, outputs)?;
     let refused = |must: String| SessionError::OutOfRange { field: "outputs.images", must };
+    // Before any overlay is made larger.
+    let drawn_pixels = |camera: &RigCamera| {
+        let whole = [camera.camera.width_px, camera.camera.height_px].map(u64::from);
+        let part = outputs.images.get(&camera.name).copied().unwrap_or_default();
+        let cropped = part.crop.map_or(whole, |[_, _, width, height]| [width, height]);
+        let [width, height] = part.size.unwrap_or(cropped);
+        width.saturating_mul(height)
+    };
+    let overlaid = cameras.iter().filter(|camera| camera.appearance.overlay.is_some());
+    let pixels = overlaid.map(drawn_pixels).fold(0, u64::saturating_add);
+    check_overlay_pixels(pixels).map_err(|cause| refused(cause.to_string()))?;
     for (name, ImagePart { crop, size }) in &outputs.images {
         let drawn = cameras.iter_mut().find(|camera| camera.name == *name);
         let camera = drawn.ok_or_else(|| refused(format!("camera {name:?}: it is not drawn")))?;
@@ -172,7 +179,6 @@ pub(super) fn choose_cameras(
             *camera = scaled.map_err(|cause| refused(cause.to_string()))?;
         }
     }
-    check_overlays(&cameras).map_err(|cause| refused(cause.to_string()))?;
     Ok((rig, cameras))
 }
 

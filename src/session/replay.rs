@@ -9,6 +9,7 @@ use crate::config::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
 use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
 use crate::residency::{ResidencyError, Resident};
 use crate::scene::RenderProfile;
+use crate::scene::appearance::Overlay;
 use crate::scene::rig::{RigCamera, RigError};
 use crate::sim::Ground;
 
@@ -17,6 +18,10 @@ use super::record::{
 };
 use super::retrace::{Retrace, StrayedStep};
 use super::{SessionError, Summary, observation};
+
+// In base64 and with a thousandth for what PNG adds; a rig and a profile are below 1 MiB.
+const _: () =
+    assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= EPISODE_HEAD_BYTES as u64);
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]

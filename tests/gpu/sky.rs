@@ -64,7 +64,7 @@ fn an_evaluated_sky_is_that_of_the_definition() {
         let off = off_truth(&scene, &EXACT, &all_around());
         eprintln!("{octaves} octaves: off by {off:e}");
         // 512 times a direction of f32 is off by 3e-5 rad.
-        let most = if octaves == 10 { 3e-4 } else { 1e-5 };
+        let most = if octaves == 10 { 3e-5 } else { 1e-5 };
         assert!(off < most, "{identity} {octaves} {appearance} {skip}: off by {off}");
     }
     let scene = empty(Arc::new(Sky::new(demo_model(None), DMat3::IDENTITY)));
