@@ -99,6 +99,10 @@ fn draw_within(gpu: &Gpu, scene: &Scene, frames: usize) {
     }
 }
 
+/// After so many steps everything repeats: scenes (2), sizes (3) and places. Buffers grow with what a frame
+/// needs and by how much depends on the order, so that only frames that were there before leave them alone.
+const ROUND: u32 = 198;
+
 /// Two small views of changing size from a place that changes.
 fn draw(gpu: &Gpu, scene: &Scene, step: u32) -> Result<(), RenderError> {
     draw_and(gpu, scene, step, &|_, _| {})
@@ -111,7 +115,7 @@ fn draw_and(
     finished: Finished<'_>,
 ) -> Result<(), RenderError> {
     let view = |yaw: f64| -> View {
-        let at = DVec3::new(0.0, 0.0, 20.0 + 0.01 * f64::from(step % 1_000));
+        let at = DVec3::new(0.0, 0.0, 20.0 + 0.05 * f64::from(step % ROUND));
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
         look([24 + 8 * (step % 3), 16], 20.0, at, forward, DVec3::Y)
     };
