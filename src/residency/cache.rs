@@ -10,7 +10,8 @@ use crate::scene::{Chunk, Manifest, RenderProfile, Sky};
 use crate::store::{Catalog, Listing, StoreError, Version};
 
 use super::budget::{Budget, default_bytes};
-use super::pager::{Done, Pager, Waiting, Wanted};
+use super::pager::{Pager, Waiting};
+use super::requests::{Done, Wanted};
 use super::reservation::Reservation;
 use super::table::{Id, Key};
 use super::worst::{Lens, worst_bytes};
@@ -264,15 +265,17 @@ impl Resident {
     pub fn worst_bytes_with(&self, lens: Lens, profile: &RenderProfile) -> u64 {
         // What of a profile decides how much is drawn.
         let looks = (lens, profile.tau_px, profile.reach_m);
-        if let Some((_, bytes)) = lock(&self.worst).iter().find(|(known, _)| *known == looks) {
-            return *bytes;
-        }
-        let sky_bytes = self.sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
-        let bytes = sky_bytes + worst_bytes(&self.index, &self.version.manifest, lens, profile);
-        let mut worst = lock(&self.worst);
-        worst.truncate(crate::config::REMEMBERED_LENSES - 1);
-        worst.insert(0, (looks, bytes));
-        bytes
+        let known =
+            lock(&self.worst).iter().find(|(known, _)| *known == looks).map(|known| known.1);
+        let bytes = known.unwrap_or_else(|| {
+            let bytes = worst_bytes(&self.index, &self.version.manifest, lens, profile);
+            let mut worst = lock(&self.worst);
+            worst.truncate(crate::config::REMEMBERED_LENSES - 1);
+            worst.insert(0, (looks, bytes));
+            bytes
+        });
+        // Every other `sky_error` that somebody asks for may add a map.
+        bytes + self.sky.as_ref().map_or(0, |sky| sky.bytes() as u64)
     }
 
     /// What is behind its Gaussians.

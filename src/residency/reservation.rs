@@ -6,7 +6,7 @@ use crate::scene::RenderProfile;
 
 use super::budget::Claim;
 use super::cache::lock;
-use super::pager::Urgency;
+use super::requests::Urgency;
 use super::{Eye, Needed, ResidencyError, Resident};
 
 /// Memory that is set aside for the frames of one session, and what it expects to need next. Given

@@ -117,3 +117,17 @@ async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
         assert_eq!(opened["profile"]["sky_error"], sky_error, "{opened}");
     }
 }
+
+#[tokio::test]
+async fn every_map_that_was_baked_of_a_sky_is_set_aside() {
+    let server = TestServer::configured(|config| commit_creased(&config.twins)).await;
+    let mut agents = [server.agent().await, server.agent().await];
+    let mut reserved_bytes = Vec::new();
+    for (agent, sky_error) in agents.iter_mut().zip([0.1, 0.001]) {
+        let asked = json!({ "twin": "creased", "profile": { "sky_error": sky_error } });
+        reserved_bytes.push(agent.try_open(asked).await["reserved_bytes"].as_u64().unwrap());
+    }
+    // Six faces of 257 x 257 values and more, of 8 B.
+    let [coarse, fine] = reserved_bytes[..] else { panic!("{reserved_bytes:?}") };
+    assert!(fine >= coarse + 6 * 257 * 257 * 8, "{reserved_bytes:?}");
+}
