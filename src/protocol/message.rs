@@ -3,6 +3,9 @@
 //! Answers may gain fields, so the types in them let unknown ones pass. In requests unknown fields
 //! are mistakes: types of requests refuse them, and [`super::unknown_field`] finds them within the
 //! types that both ways share.
+//!
+//! One file, since whoever speaks the protocol reads it from top to bottom: requests, what they hold,
+//! answers.
 
 use std::collections::BTreeMap;
 
