@@ -269,15 +269,15 @@ impl Assembly {
 
         let trained = self.trained.clone().filter(|_| shot.shown);
         // Seen by nobody else: coverage is a part of trust, and normals are computed of depth.
-        let unseen = |wanted: bool| -> Vec<Vec<f32>> {
+        let Maps { depth, opacity, normals } = layout.maps;
+        let wanted = [trained.is_some() && !opacity, normals && !depth && shot.shown];
+        let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        let images = wanted.iter().filter(|wanted| **wanted).count() as u64;
+        let _hold = self.answers.hold(4 * pixels * images)?;
+        let [mut coverage, mut depths_m] = wanted.map(|wanted| -> Vec<Vec<f32>> {
             let drawn = if wanted { views } else { &[] };
             drawn.iter().map(|view| vec![0.0; view.camera.pixels()]).collect()
-        };
-        let Maps { depth, opacity, normals } = layout.maps;
-        let mut coverage = unseen(trained.is_some() && !opacity);
-        let mut depths_m = unseen(normals && !depth && shot.shown);
-        let unseen_bytes = coverage.iter().chain(&depths_m).map(|image| 4 * image.len() as u64);
-        let _hold = self.answers.hold(unseen_bytes.sum())?;
+        });
         let mut targets = self.targets(shot, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut coverage) {
             target.opacity = Some(opacity);
