@@ -7,6 +7,7 @@ use wildcity::render::gpu::shaders::Shaders;
 use wildcity::render::gpu::{AdapterChoice, Gpu};
 use wildcity::render::reference::Reference;
 use wildcity::render::{Backend, RenderError, View};
+use wildcity::scene::appearance::{Appearance, Overlay};
 use wildcity::scene::sky::{CubeMap, Model};
 use wildcity::scene::{RenderProfile, Scene, Sky};
 
@@ -161,6 +162,14 @@ fn what_cameras_make_of_colours() {
             let seen = appearance(view);
             let [image, truth] =
                 [&*gpu as &dyn Backend, &cpu()].map(|b| draw_seen(b, &scene, view, &seen));
+            agree(&image, &truth).unwrap();
+            // Another hood of its size takes its place.
+            let hood = seen.overlay.as_ref().unwrap();
+            let rgba8 = hood.rgba8().iter().map(|value| 255 - value).collect();
+            let other = Arc::new(Overlay::new(hood.size_px()[0], rgba8).unwrap());
+            let other = Appearance { overlay: Some(other), ..seen };
+            let [image, truth] =
+                [&*gpu as &dyn Backend, &cpu()].map(|b| draw_seen(b, &scene, view, &other));
             agree(&image, &truth).unwrap();
             // Without one, none is left over.
             let plain = render_one(&*gpu, &scene, &RenderProfile::DEFAULT, view);

@@ -4,6 +4,8 @@
 //! Twin of `render/cpu/{behind,appearance}.rs`; WGSL: `shaders/behind.wgsl` and what it imports, linked into
 //! `rasterize`.
 
+use std::sync::Arc;
+
 use bytemuck::Zeroable;
 use glam::DMat3;
 use wgpu::{BindingResource, BufferUsages, ShaderModule};
@@ -15,7 +17,7 @@ use super::layout;
 use super::resolve::Planes;
 use super::shaders::Shaders;
 use crate::render::{Frame, MAX_VIEWS, RenderError, View};
-use crate::scene::appearance::{Appearance, Exposure};
+use crate::scene::appearance::{Appearance, Exposure, Overlay};
 use crate::scene::sky::{Drawn, Folded};
 
 /// What is behind the Gaussians of the frame at hand.
@@ -25,8 +27,9 @@ pub(super) struct Behind {
     values: Growing,
     seen: Growing,
     overlays: Growing,
-    /// What the device holds.
+    /// What the device holds of skies, and of overlays, one behind the other.
     held: Option<Drawn>,
+    held_overlays: Vec<Arc<Overlay>>,
     /// Which of the variants the frame takes.
     variant: usize,
     variants: [Variant; VARIANTS.len()],
@@ -54,12 +57,14 @@ impl Behind {
             seen: Growing::new(device, "appearances", uniform),
             overlays: Growing::new(device, "overlays", storage),
             held: None,
+            held_overlays: Vec::new(),
             variant: 0,
             variants: Default::default(),
         }
     }
 
-    /// Sends what is behind a frame to the device; a sky that is there already is not sent again.
+    /// Sends what is behind a frame to the device; a sky or overlays that are there already are not sent
+    /// again.
     ///
     /// # Errors
     /// It is larger than a binding of the device.
@@ -109,7 +114,9 @@ impl Behind {
 
     /// Sends what cameras make of colours.
     fn see(&mut self, device: &Device, appearances: &[Appearance]) -> Result<(), RenderError> {
-        let (mut seen, mut pixels) = ([layout::Seen::zeroed(); MAX_VIEWS], Vec::new());
+        let mut seen = [layout::Seen::zeroed(); MAX_VIEWS];
+        let mut overlays: Vec<Arc<Overlay>> = Vec::new();
+        let mut bytes = 0;
         for (seen, Appearance { exposure, overlay }) in seen.iter_mut().zip(appearances) {
             if let Some(Exposure { matrix, offset }) = exposure {
                 let row = |c: usize| {
@@ -120,17 +127,24 @@ impl Behind {
             }
             if let Some(overlay) = overlay {
                 seen.overlay_px = overlay.size_px();
-                seen.first_overlay = (pixels.len() / 4) as u32;
-                pixels.extend_from_slice(overlay.rgba8());
+                seen.first_overlay = (bytes / 4) as u32;
+                bytes += overlay.rgba8().len();
+                overlays.push(overlay.clone());
             }
         }
         let limit = device.binding_bytes();
-        if pixels.len() as u64 > limit {
+        if bytes as u64 > limit {
             let what = "bytes of overlays in one binding of the GPU";
             return Err(RenderError::TooMany { what, limit });
         }
         self.seen.fill(device, bytemuck::cast_slice(&seen));
-        self.overlays.fill(device, &pixels);
+        let same = |(one, other): (&Arc<Overlay>, &Arc<Overlay>)| Arc::ptr_eq(one, other);
+        let held = &self.held_overlays;
+        if overlays.len() != held.len() || !overlays.iter().zip(held).all(same) {
+            let pixels: Vec<u8> = overlays.iter().flat_map(|o| o.rgba8()).copied().collect();
+            self.overlays.fill(device, &pixels);
+            self.held_overlays = overlays;
+        }
         Ok(())
     }
 
