@@ -216,9 +216,9 @@ impl Measured {
 }
 
 /// Memory that the sky takes in the form in which a profile draws it, in bytes.
-fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, ReportError> {
-    let drawn = scene.sky.as_ref().map(|sky| sky.drawn(profile.sky_error)).transpose();
-    Ok(match drawn.map_err(RenderError::from)? {
+pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, RenderError> {
+    let drawn = scene.sky.as_ref().map(|sky| sky.drawn(profile.sky_error));
+    Ok(match drawn.transpose()? {
         Some(Drawn::Map(map)) => map.bytes() as u64,
         Some(Drawn::Exact(_)) | None => 0,
     })

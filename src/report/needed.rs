@@ -10,13 +10,14 @@ use serde::Serialize;
 
 use super::ReportError;
 use super::drawing::look;
+use super::measure::sky_bytes;
 use crate::generate;
-use crate::geometry::camera::{Fisheye, Lens, Rolls};
+use crate::geometry::camera::{Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference};
 use crate::render::cpu::Cpu;
 use crate::render::gpu::{Gpu, GpuUse};
 use crate::render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
 use crate::scene::appearance::{Appearance, Exposure, Overlay};
-use crate::scene::sky::{CubeMap, Drawn, Layer, Model, Network};
+use crate::scene::sky::{CubeMap, Layer, Model, Network};
 use crate::scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
@@ -84,7 +85,7 @@ pub const ABSENT: &str =
 /// A feature, and what it changes.
 type Feature = (&'static str, fn(&mut Step));
 
-const FEATURES: [Feature; 16] = [
+const FEATURES: [Feature; 18] = [
     ("nothing else", |_| {}),
     ("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
     ("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
@@ -100,6 +101,7 @@ const FEATURES: [Feature; 16] = [
     ("fisheye", |step| {
         step.view.camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
     }),
+    ("windshield", |step| step.view.camera.windshield = Some(windshield())),
     ("rolling shutter", |step| {
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
@@ -117,6 +119,8 @@ const FEATURES: [Feature; 16] = [
     }),
     ("depth", |step| step.depth = true),
     ("depth and opacity", |step| (step.depth, step.opacity) = (true, true)),
+    // Normals are computed of the depth, on the host.
+    ("normals", |step| (step.depth, step.normals) = (true, true)),
     // Trust is computed of the opacity, on the host.
     ("trust", |step| step.opacity = true),
 ];
@@ -164,6 +168,14 @@ fn network() -> Model {
     Model::network(Network::new(layers, Vec::new()).expect("layers that fit each other"))
 }
 
+/// One that turns rays by some milliradians.
+fn windshield() -> Windshield {
+    let plane = |field, plane: [f64; 3]| Bivariate::new(field, &plane).expect("three are order 1");
+    let horizontal = plane("horizontal", [-0.004, 1.002, 0.0]);
+    let vertical = plane("vertical", [0.005, 0.0, 1.01]);
+    Windshield::new(WindshieldReference::Forward, horizontal, vertical)
+}
+
 struct Step {
     scene: Scene,
     profile: RenderProfile,
@@ -171,6 +183,7 @@ struct Step {
     appearance: Appearance,
     depth: bool,
     opacity: bool,
+    normals: bool,
 }
 
 impl Step {
@@ -183,6 +196,7 @@ impl Step {
             appearance: Appearance::default(),
             depth: false,
             opacity: false,
+            normals: false,
         }
     }
 
@@ -194,18 +208,14 @@ impl Step {
         let FrameStats { evaluations, .. } = self.draw(cpu)?;
         let device = device.map(|gpu| self.of_device(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
-        let sky = self.scene.sky.as_ref();
-        let drawn = sky.map(|sky| sky.drawn(self.profile.sky_error)).transpose();
-        let sky_bytes = match drawn.map_err(RenderError::from)? {
-            Some(Drawn::Map(map)) => map.bytes(),
-            Some(Drawn::Exact(_)) | None => 0,
-        };
+        let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
+        let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
         Ok(Counts {
             gaussians,
             host_bytes: self.scene.bytes() as f64 / gaussians as f64,
-            beside_bytes: (sky_bytes + hood_bytes) as u64,
-            host_pixel_bytes: 3 + 4 * (u64::from(self.depth) + u64::from(self.opacity)),
+            beside_bytes: sky_bytes + hood_bytes as u64,
+            host_pixel_bytes: 3 + 4 * floats,
             evaluations,
             device,
         })
@@ -231,12 +241,14 @@ impl Step {
     fn draw(&self, backend: &dyn Backend) -> Result<FrameStats, RenderError> {
         let pixels = self.view.camera.pixels();
         let mut rgb8 = vec![0; 3 * pixels];
-        let plane = |wanted: bool| wanted.then(|| vec![0.0; pixels]);
-        let (mut depth_m, mut opacity) = (plane(self.depth), plane(self.opacity));
+        let plane = |wanted: bool, values: usize| wanted.then(|| vec![0.0; values * pixels]);
+        let (mut depth_m, mut opacity) = (plane(self.depth, 1), plane(self.opacity, 1));
+        let mut normals = plane(self.normals, 3);
         let target = Target {
             rgb8: Some(&mut rgb8),
             depth_m: depth_m.as_deref_mut(),
             opacity: opacity.as_deref_mut(),
+            normals: normals.as_deref_mut(),
             appearance: (!self.appearance.is_plain()).then_some(&self.appearance),
             ..Target::default()
         };

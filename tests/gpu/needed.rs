@@ -25,6 +25,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         Gpu::new(&AdapterChoice::Best, 0).ok()
     };
     let rows = needed::rows(&cpu(), &open).unwrap();
+    rows.iter().for_each(|row| eprintln!("| {} | {} |", row.with, row.counts.texts().join(" | ")));
     // Each on a device that drew nothing else.
     assert_eq!(opened.get(), rows.len());
     let of = |with: &str| rows.iter().find(|row| row.with == with).unwrap().counts.device;
@@ -39,6 +40,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         ("SH degree 3", 0),
         ("antialiasing", 0),
         ("depth", 1),
+        ("normals", 1),
         ("trust", 1),
         ("depth and opacity", 2),
     ] {
@@ -56,6 +58,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         "exposure",
         "hood",
         "fisheye",
+        "windshield",
         "rolling shutter",
     ] {
         let [pipelines, buffers, dispatches, planes] = beyond(with);

@@ -364,10 +364,11 @@ fn the_base_pays_for_no_feature_of_others() {
         more(bytes > base.host_bytes + 1.0, &["SH degree 1", "SH degree 3"], "bytes");
         let beside = ["sky of images", "sky, baked", "hood"];
         more(own.beside_bytes > 0, &beside, "bytes beside");
-        let planes = ["depth", "depth and opacity", "trust"];
+        let planes = ["depth", "depth and opacity", "normals", "trust"];
         more(own.host_pixel_bytes > 3, &planes, "bytes of a pixel");
         // What a Gaussian is, or where it lands, is evaluated otherwise; all else is not.
-        let shapes = ["levels of detail, 1 m", "antialiasing", "fisheye", "rolling shutter"];
+        let shapes =
+            ["levels of detail, 1 m", "antialiasing", "fisheye", "windshield", "rolling shutter"];
         more(own.evaluations != base.evaluations, &shapes, "evaluations");
         assert!(own.device.is_none());
     }
