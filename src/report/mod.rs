@@ -11,6 +11,7 @@
 //! needed     what a scene with and without each feature holds and runs
 //! page       all of it as one HTML page, with plots and pictures
 //! stress     T1 to T28: extreme scenes, each with its bound, on any backend
+//! points     whether a camera shows points where its lens says
 //! drawing    what a backend draws of a view, and whether two drawings agree
 //! recorded   what a record makes of a scene
 //! ```
@@ -26,6 +27,7 @@ pub mod page;
 mod pictures;
 pub mod places;
 mod plots;
+pub mod points;
 pub mod recorded;
 pub mod stress;
 pub mod timing;

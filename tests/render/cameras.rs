@@ -7,90 +7,39 @@ use wildcity::geometry::{Camera, Pose};
 use wildcity::render::reference::Reference;
 use wildcity::render::unscented::Bent;
 use wildcity::render::{Backend, RenderError, Rolling, Target, View};
+use wildcity::report::points::centroid;
+use wildcity::report::stress::blobs::{Blob, scene};
 use wildcity::scene::{Rays, RenderProfile, Scene};
 
-use crate::images::{
-    Image, agree, cpu, look, max_difference, psnr, render, render_one, try_render,
+use crate::images::{agree, cpu, max_difference, psnr, render, render_one, try_render};
+use crate::lenses::{
+    driven, lands, lenses, meets_what_each_pixels_ray_meets, sizes_of, street_scene,
 };
-use crate::lenses::lenses;
-use crate::streets::street;
-use wildcity::report::stress::blobs::{Blob, scene};
-
-/// A target of small opaque balls, 0.3 m apart on a wall 2 m ahead, one at a time.
-fn target(camera: &Camera) -> Vec<(DVec3, DVec2)> {
-    let points = (-4..=4).flat_map(|i| (-2..=2).map(move |k| (f64::from(i), f64::from(k))));
-    let points = points.map(|(x, y)| DVec3::new(0.3 * x, 0.3 * y, 2.0));
-    let seen = points.filter_map(|point_m| Some((point_m, camera.project(point_m)?)));
-    let within = |at_px: DVec2| {
-        at_px.cmpgt(DVec2::splat(5.0)).all() && at_px.cmplt(camera.size_px() - 5.0).all()
-    };
-    seen.filter(|(_, at_px)| within(*at_px)).collect()
-}
-
-/// Where the image of a single ball is, weighted by opacity.
-fn centroid(image: &Image, camera: &Camera) -> DVec2 {
-    let (mut sum, mut weight) = (DVec2::ZERO, 0.0);
-    for (pixel, &opacity) in image.opacity.iter().enumerate() {
-        let (row, column) = (pixel as u32 / camera.width_px, pixel as u32 % camera.width_px);
-        let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
-        sum += f64::from(opacity) * at_px;
-        weight += f64::from(opacity);
-    }
-    sum / weight
-}
-
-/// Draws each ball alone and compares; returns how many there were.
-fn lands(backend: &dyn Backend, name: &str, camera: Camera) -> usize {
-    let target = target(&camera);
-    // Its own image is as wide as the blur, so that the centroid is not that of a bent disc.
-    let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
-    for (point_m, at_px) in &target {
-        let ball = Blob { mean_m: *point_m, sigma_m: DVec3::splat(0.003), ..Blob::default() };
-        let view = View::new(camera, Pose::IDENTITY);
-        let image = render_one(backend, &scene(&[ball]), &fine, view);
-        let off_px = centroid(&image, &camera).distance(*at_px);
-        assert!(off_px < 0.1, "{name}, {} : {off_px:.3} px from {at_px}", backend.name());
-    }
-    target.len()
-}
 
 #[test]
 fn known_points_land_where_the_model_says() {
     for (name, camera) in lenses() {
-        let half = camera.scaled(96, 50).unwrap();
-        let part = camera.cropped([30, 20], [90, 70]).unwrap();
-        for (camera, least) in [(camera, 20), (half, 20), (part, 5)] {
-            let points = lands(&cpu(), name, camera);
+        for (camera, least) in sizes_of(&camera).into_iter().zip([20, 20, 5]) {
+            let points = lands(&cpu(), name, camera, 0.3);
             assert!(points >= least, "{name}: {points} points");
         }
-        lands(&Reference, name, camera.scaled(64, 40).unwrap());
+        lands(&Reference, name, camera.scaled(64, 40).unwrap(), 0.3);
     }
 }
 
-/// Views along a street through each lens, and the profile of every pixel's own ray.
-fn street_scene() -> (Scene, Pose, RenderProfile) {
-    let at = DVec3::new(0.4, 0.0, 20.0);
-    let pose = look([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
-    let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
-    (Scene::from_gaussians(&street(20_000, 1, 31)), pose, exact)
+/// The profile of every pixel's own ray.
+fn exact() -> RenderProfile {
+    RenderProfile { rays: Rays::Exact, ..RenderProfile::default() }
 }
 
 #[test]
 fn every_lens_draws_what_each_pixels_ray_meets() {
-    let (street, pose, exact) = street_scene();
-    for (name, camera) in lenses() {
-        let view = View::new(camera, pose);
-        let truth = render_one(&Reference, &street, &exact, view);
-        let drawn = render_one(&Reference, &street, &RenderProfile::default(), view);
-        let db = psnr(&drawn.rgba, &truth.rgba);
-        eprintln!("{name}: {db:.1} dB against every pixel's ray");
-        assert!(db >= 45.0, "{name}: {db:.1} dB");
-    }
+    meets_what_each_pixels_ray_meets(&Reference);
 }
 
 #[test]
 fn the_cpu_backend_draws_lenses_as_they_are_defined() {
-    let (street, pose, _) = street_scene();
+    let (street, pose) = street_scene();
     for (name, camera) in lenses() {
         let view = View::new(camera, pose);
         let profile = RenderProfile::default();
@@ -111,7 +60,7 @@ fn the_cpu_backend_draws_lenses_as_they_are_defined() {
 
 #[test]
 fn zero_distortion_draws_the_bytes_of_a_pinhole() {
-    let (street, pose, _) = street_scene();
+    let (street, pose) = street_scene();
     let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let none = Lens::opencv(OpenCv::new([0.0; 6], [0.0; 2], [0.0; 4]));
     let still = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: pose };
@@ -156,7 +105,8 @@ fn t23_beyond_180_degrees_and_never_around() {
         assert!(image.opacity.iter().all(|&o| o == 0.0), "{}: from behind", backend.name());
         let image = render_one(backend, &scene(&[behind_of(&right)]), &profile, view);
         let at_px = camera.project(right.mean_m).unwrap();
-        assert!(centroid(&image, &camera).distance(at_px) < 0.3);
+        let found_px = centroid(&image.opacity, [120, 100], at_px, f64::INFINITY).unwrap();
+        assert!(found_px.distance(at_px) < 0.3);
         // A wall all around: what the lens does not see stays empty, to the pixel.
         let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
         let image = render_one(backend, &scene(&[wall]), &profile, view);
@@ -171,9 +121,9 @@ fn t23_beyond_180_degrees_and_never_around() {
         }
     }
     // All around, against every pixel's ray.
-    let (street, pose, exact) = street_scene();
+    let (street, pose) = street_scene();
     let view = View { world_from_camera: pose, ..view };
-    let truth = render_one(&Reference, &street, &exact, view);
+    let truth = render_one(&Reference, &street, &exact(), view);
     let drawn = render_one(&cpu(), &street, &RenderProfile::default(), view);
     let db = psnr(&drawn.rgba, &truth.rgba);
     eprintln!("a fisheye of 220°: {db:.1} dB against every pixel's ray");
@@ -229,7 +179,7 @@ fn t2_long_things_on_the_ground_beside_the_view() {
 
 #[test]
 fn t18_a_part_of_a_lens_image_is_the_image_of_the_part() {
-    let (street, pose, _) = street_scene();
+    let (street, pose) = street_scene();
     for (name, camera) in lenses() {
         let whole = render_one(&cpu(), &street, &RenderProfile::default(), View::new(camera, pose));
         for [left, top] in [[0, 0], [90, 48], [61, 17]] {
@@ -248,19 +198,9 @@ fn t18_a_part_of_a_lens_image_is_the_image_of_the_part() {
     }
 }
 
-/// 0.9 m and 0.01 rad during the exposure: 30 m/s for 30 ms, in a curve.
-fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
-    let before = Pose {
-        position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
-        rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
-    };
-    let rolling = Some(Rolling { direction, world_from_camera_first: before });
-    View { camera, world_from_camera: pose, rolling }
-}
-
 #[test]
 fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
-    let (street, pose, exact) = street_scene();
+    let (street, pose) = street_scene();
     let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let profile = RenderProfile::default();
     let fisheye = lenses()[1].1;
@@ -283,7 +223,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
                     ([0, u64::from(row)], [160, 1])
                 };
                 let strip = View::new(camera.cropped(corner, size).unwrap(), world_from_camera);
-                let strip = render_one(&Reference, &street, &exact, strip).rgba;
+                let strip = render_one(&Reference, &street, &exact(), strip).rgba;
                 for (k, value) in strip.chunks_exact(4).enumerate() {
                     let pixel =
                         if across { k * 160 + row as usize } else { row as usize * 160 + k };
@@ -313,7 +253,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
 
 #[test]
 fn the_cpu_backend_rolls_as_it_is_defined() {
-    let (street, pose, _) = street_scene();
+    let (street, pose) = street_scene();
     for camera in [lenses()[0].1, lenses()[2].1] {
         let view = driven(camera, pose, Rolls::TopToBottom);
         let truth = render_one(&Reference, &street, &RenderProfile::default(), view);
@@ -372,25 +312,25 @@ fn t22_six_points_scatter_as_a_million() {
 
 #[test]
 fn exact_rays_are_for_the_reference_alone() {
-    let (_, pose, exact) = street_scene();
+    let (_, pose) = street_scene();
     let view = View::new(lenses()[0].1, pose);
-    let refused = try_render(&cpu(), &Scene::default(), &exact, &[view]).unwrap_err();
+    let refused = try_render(&cpu(), &Scene::default(), &exact(), &[view]).unwrap_err();
     assert_eq!(refused, RenderError::ExactRays { backend: "cpu" });
     assert!(refused.to_string().contains("rays=splats"), "{refused}");
     let mut rgb8 = vec![7; 3 * view.camera.pixels()];
     let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
     let frame =
-        wildcity::render::Frame { scene: &Scene::default(), profile: &exact, views: &[view] };
+        wildcity::render::Frame { scene: &Scene::default(), profile: &exact(), views: &[view] };
     assert!(cpu().render(&frame, &mut [target], &|_, _| {}).is_err());
     assert!(rgb8.iter().all(|&b| b == 7), "nothing was written");
 }
 
 #[test]
 fn exact_rays_of_a_pinhole_are_its_splats_but_for_the_linearisation() {
-    let (street, pose, exact) = street_scene();
+    let (street, pose) = street_scene();
     let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let view = View::new(ideal, pose);
-    let truth = render_one(&Reference, &street, &exact, view);
+    let truth = render_one(&Reference, &street, &exact(), view);
     let drawn = render_one(&Reference, &street, &RenderProfile::default(), view);
     let db = psnr(&drawn.rgba, &truth.rgba);
     eprintln!("pinhole: {db:.1} dB against every pixel's ray");
@@ -399,7 +339,7 @@ fn exact_rays_of_a_pinhole_are_its_splats_but_for_the_linearisation() {
 
 #[test]
 fn lenses_and_pinholes_share_a_frame() {
-    let (street, pose, _) = street_scene();
+    let (street, pose) = street_scene();
     let ideal = Camera::ideal(90, 70, Pinhole { fx: 60.0, fy: 60.0, cx: 45.0, cy: 35.0 });
     let views: Vec<View> =
         [lenses()[2].1, ideal, beyond_half()].map(|c| View::new(c, pose)).to_vec();

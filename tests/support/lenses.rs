@@ -1,10 +1,19 @@
-//! A camera of every model.
+//! A camera of every model, and what each must show.
 
-use glam::DVec2;
-use wildcity::geometry::Camera;
+use glam::{DQuat, DVec2, DVec3};
 use wildcity::geometry::camera::{
-    Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield, WindshieldReference,
+    Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Rolls, Windshield,
+    WindshieldReference,
 };
+use wildcity::geometry::{Camera, Pose};
+use wildcity::render::reference;
+use wildcity::render::{Backend, Rolling, View};
+use wildcity::report::points::centroid;
+use wildcity::report::stress::blobs::{Blob, scene};
+use wildcity::scene::{Rays, RenderProfile, Scene};
+
+use crate::images::{look, psnr, render_one};
+use crate::streets::street;
 
 /// A camera of each model at moderate distortion, 160 x 100 px, and one bent windshield.
 pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
@@ -42,4 +51,65 @@ pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
             },
         ),
     ]
+}
+
+/// A street, and where a camera stands in it.
+pub(crate) fn street_scene() -> (Scene, Pose) {
+    let at = DVec3::new(0.4, 0.0, 20.0);
+    let pose = look([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
+    (Scene::from_gaussians(&street(20_000, 1, 31)), pose)
+}
+
+/// A camera that came 0.9 m and 0.01 rad during the exposure: 30 m/s for 30 ms, in a curve.
+pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
+    let world_from_camera_first = Pose {
+        position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
+        rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
+    };
+    let rolling = Some(Rolling { direction, world_from_camera_first });
+    View { camera, world_from_camera: pose, rolling }
+}
+
+/// Of small opaque balls on a wall 2 m ahead, so far apart, each is drawn alone and compared; returns how
+/// many the camera sees.
+pub(crate) fn lands(backend: &dyn Backend, name: &str, camera: Camera, apart_m: f64) -> usize {
+    // Its own image is as wide as the blur, so that the centroid is not that of a bent disc.
+    let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
+    let size_px = [camera.width_px, camera.height_px];
+    let steps = |most_m: f64| (-(most_m / apart_m) as i32)..=(most_m / apart_m) as i32;
+    let points = steps(1.2).flat_map(|i| steps(0.6).map(move |k| (f64::from(i), f64::from(k))));
+    let mut seen = 0;
+    for mean_m in points.map(|(x, y)| DVec3::new(apart_m * x, apart_m * y, 2.0)) {
+        let Some(at_px) = camera.project(mean_m) else { continue };
+        if at_px.min(camera.size_px() - at_px).min_element() <= 5.0 {
+            continue;
+        }
+        let ball = Blob { mean_m, sigma_m: DVec3::splat(0.003), ..Blob::default() };
+        let view = View::new(camera, Pose::IDENTITY);
+        let image = render_one(backend, &scene(&[ball]), &fine, view);
+        let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
+        let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
+        assert!(off_px < 0.1, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());
+        seen += 1;
+    }
+    seen
+}
+
+/// Every camera at half its size, and a part of its image.
+pub(crate) fn sizes_of(camera: &Camera) -> [Camera; 3] {
+    [*camera, camera.scaled(96, 50).unwrap(), camera.cropped([30, 20], [90, 70]).unwrap()]
+}
+
+/// A backend's images through every lens, against every pixel's own ray.
+pub(crate) fn meets_what_each_pixels_ray_meets(backend: &dyn Backend) {
+    let (street, pose) = street_scene();
+    let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
+    for (name, camera) in lenses() {
+        let view = View::new(camera, pose);
+        let truth = render_one(&reference::Reference, &street, &exact, view);
+        let drawn = render_one(backend, &street, &RenderProfile::default(), view);
+        let db = psnr(&drawn.rgba, &truth.rgba);
+        eprintln!("{name}, {}: {db:.1} dB against every pixel's ray", backend.name());
+        assert!(db >= 45.0, "{name}, {}: {db:.1} dB", backend.name());
+    }
 }
