@@ -7,9 +7,8 @@ use anyhow::{Context, ensure};
 use serde_json::{Map, Value};
 
 use crate::config;
-use crate::render::Backend;
-use crate::render::RenderError;
 use crate::render::gpu::Gpu;
+use crate::render::{Backend, RenderError};
 use crate::report::believed::believed;
 use crate::report::choose::{Recommendation, Wanted, recommend};
 use crate::report::ladder::{Ladder, LeftOut, Traits, ladder};

@@ -22,17 +22,11 @@ pub const BESIDE_RAD: f64 = 0.5;
 pub struct Bent<'a> {
     view: &'a View,
     camera_from_world: Pose,
-    cone: Cone,
     /// Nearest and farthest depth of a centre, in metres.
     range_m: [f64; 2],
-    /// How far a centre may be off the axis, in radians.
-    widest_rad: f64,
     /// How far the camera moves and turns during the exposure, in metres and radians.
     moves: [f64; 2],
-    /// Largest extent of any splat, in standard deviations, and what the blur adds to it, in pixels.
-    reach: [f64; 2],
-    /// How much farther apart than its points a windshield may take a Gaussian, in radians.
-    turned_rad: f64,
+    beside: Beside,
 }
 
 /// Where a Gaussian lands.
@@ -82,16 +76,23 @@ impl<'a> Bent<'a> {
                     first.rotation.angle_between(last.rotation),
                 ]
             });
+        // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
+        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = Cone::of(&view.camera);
+        let beside = Beside {
+            widest_rad: widest_rad(&view.camera),
+            image_rad,
+            least_px_per_rad,
+            reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
+            blur_px: sigmas * profile.blur.sqrt() + 2.0,
+            turned_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
+        };
         Some(Self {
             view,
             camera_from_world: view.world_from_camera.inverse(),
-            cone: Cone::of(&view.camera),
             range_m: [profile.near, profile.far],
-            widest_rad: widest_rad(&view.camera),
             moves,
-            reach: [sigmas, sigmas * profile.blur.sqrt() + 2.0],
-            turned_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
+            beside,
         })
     }
 
@@ -120,8 +121,9 @@ impl<'a> Bent<'a> {
         }
         let center = self.view.land(mean_m, 1.0);
         let depth_m = self.view.camera.depth_m(center.point_m);
-        let in_range =
-            depth_m >= near_m && depth_m <= far_m && angle_rad(center.point_m) <= self.widest_rad;
+        let in_range = depth_m >= near_m
+            && depth_m <= far_m
+            && angle_rad(center.point_m) <= self.beside.widest_rad;
         if !in_range {
             return None;
         }
@@ -141,17 +143,8 @@ impl<'a> Bent<'a> {
     }
 
     /// What decides beside the field of a camera at rest, for tests of many Gaussians at once.
-    pub fn beside(&self) -> Beside {
-        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = self.cone;
-        let [sigmas, blur_px] = self.reach;
-        Beside {
-            widest_rad: self.widest_rad,
-            image_rad,
-            least_px_per_rad,
-            reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
-            blur_px,
-            turned_rad: self.turned_rad,
-        }
+    pub fn beside(&self) -> &Beside {
+        &self.beside
     }
 
     /// Size of the image, in pixels.
@@ -163,7 +156,8 @@ impl<'a> Bent<'a> {
     /// the image.
     #[inline(always)]
     fn may_touch(&self, center_m: DVec3, radius_m: f64, sigma_m: f64) -> bool {
-        let [moved_m, turned_rad] = self.moves;
+        let [moved_m, rolled_rad] = self.moves;
+        let Beside { widest_rad, image_rad, turned_rad, .. } = self.beside;
         let radius_m = radius_m + moved_m;
         let distance_m = center_m.length();
         if distance_m + radius_m < self.range_m[0] {
@@ -173,19 +167,18 @@ impl<'a> Bent<'a> {
         if distance_m - radius_m <= points_m {
             return true;
         }
-        let nearest_rad = angle_rad(center_m) - (radius_m / distance_m).asin() - turned_rad;
-        if nearest_rad > self.widest_rad {
+        let nearest_rad = angle_rad(center_m) - (radius_m / distance_m).asin() - rolled_rad;
+        if nearest_rad > widest_rad {
             return false;
         }
-        let spread_rad = (points_m / (distance_m - radius_m)).asin() + self.turned_rad;
-        let farthest_rad = nearest_rad + 2.0 * (radius_m / distance_m).asin() + 2.0 * turned_rad;
+        let spread_rad = (points_m / (distance_m - radius_m)).asin() + turned_rad;
+        let farthest_rad = nearest_rad + 2.0 * (radius_m / distance_m).asin() + 2.0 * rolled_rad;
         if farthest_rad + spread_rad >= WIDEST_RAD {
             return true;
         }
-        let [sigmas, blur_px] = self.reach;
-        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = self.cone;
-        let reach_px = (1.0 + sigmas) * most_px_per_rad * spread_rad + blur_px;
-        let beyond_px = least_px_per_rad * (nearest_rad - self.turned_rad - image_rad);
+        let Beside { least_px_per_rad, reach_px_per_rad, blur_px, .. } = self.beside;
+        let reach_px = reach_px_per_rad * spread_rad + blur_px;
+        let beyond_px = least_px_per_rad * (nearest_rad - turned_rad - image_rad);
         let out = beyond_px > reach_px;
         !out
     }

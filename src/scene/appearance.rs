@@ -105,6 +105,19 @@ impl AppearanceError {
 }
 
 impl Appearance {
+    /// Of an exposure, and of an overlay as [`Overlay::from_data_uri`] reads it.
+    ///
+    /// # Errors
+    /// As that.
+    pub fn new(
+        exposure: Option<Exposure>,
+        overlay: Option<&str>,
+        camera_px: [u32; 2],
+    ) -> Result<Self, AppearanceError> {
+        let overlay = overlay.map(|text| Overlay::from_data_uri(text, camera_px)).transpose()?;
+        Ok(Self { exposure, overlay: overlay.map(Arc::new) })
+    }
+
     /// Whether it changes nothing.
     pub fn is_plain(&self) -> bool {
         self.exposure.is_none() && self.overlay.is_none()

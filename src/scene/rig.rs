@@ -311,12 +311,11 @@ impl TryFrom<CameraFields> for RigCamera {
             Ok(camera) => camera,
             Err(cause) => return Err(RigError::Camera { name, cause }),
         };
-        let overlay = fields.overlay.map(|text| Overlay::from_data_uri(&text, size_px));
-        let overlay = match overlay.transpose() {
-            Ok(overlay) => overlay.map(Arc::new),
+        let appearance = match Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
+        {
+            Ok(appearance) => appearance,
             Err(cause) => return Err(RigError::Appearance { name, cause }),
         };
-        let appearance = Appearance { exposure: fields.exposure, overlay };
         let (rig_from_camera, shutter) = (fields.camera_to_rig, fields.shutter);
         Ok(Self { name, camera, rig_from_camera, shutter, appearance })
     }

@@ -2,12 +2,12 @@
 //! the lens and all of them are within its field 16 Gaussians at a time in f32, else one by one in f64, where
 //! [`Bent`] says where each lands.
 
-use fearless_simd::{f32x16, f64x8, mask32x16, prelude::*};
+use fearless_simd::{f32x16, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
 use super::optics::{Landed, Optics};
-use super::project::{Ellipse, LOG2_UNIT, SplatLanes, color, rotation_columns, shown};
+use super::project::{Ellipse, LOG2_UNIT, SplatLanes, along, color, rotation_columns, shown};
 use crate::geometry::camera::WIDEST_RAD;
 use crate::render::View;
 use crate::render::constants::EXTENT_SLACK_PX;
@@ -27,7 +27,6 @@ pub(super) struct BentView<'a> {
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
-    beside: Beside,
     /// Whether depth is distance, and not z.
     by_distance: bool,
 }
@@ -53,7 +52,6 @@ impl<'a> BentView<'a> {
             camera_from_chunk: [0, 1, 2].map(row),
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
-            beside: bent.beside(),
             by_distance: view.camera.depth_is_distance(),
         }
     }
@@ -113,7 +111,7 @@ fn project_lanes<S: Simd>(
         & depth_m.simd_le(splat(cutoffs.far_m))
         & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
     let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
-    let in_range = in_range & !beside(simd, center, x.max(y).max(z), &view.beside);
+    let in_range = in_range & !beside(simd, center, x.max(y).max(z), view.bent.beside());
     if in_range.all_false() {
         return (SplatLanes::default(), 0);
     }
@@ -123,7 +121,6 @@ fn project_lanes<S: Simd>(
     let right = Vec3x16::splat(simd, right);
     let down = Vec3x16::splat(simd, down);
     let forward = Vec3x16::splat(simd, forward);
-    let third = splat(1.0 / 3.0_f32.sqrt());
     let mut within = optics.land(simd, center).within;
     let mut pairs = [[splat(0.0); 4]; 3];
     let [mut mean_x, mut mean_y] = [splat(0.0); 2];
@@ -142,7 +139,7 @@ fn project_lanes<S: Simd>(
     (mean_x, mean_y) = (mean_x * sixth, mean_y * sixth);
 
     // As in `Bent::project`: half differences, and middles from the mean.
-    let half = splat(0.5) * third;
+    let half = splat(0.5 / 3.0_f32.sqrt());
     let mut root = [[splat(0.0); 2]; 6];
     for (axis, [ax, ay, bx, by]) in pairs.into_iter().enumerate() {
         root[axis] = [(ax - bx) * half, (ay - by) * half];
@@ -199,13 +196,9 @@ fn beside<S: Simd>(
 #[inline(always)]
 fn to_camera<S: Simd>(simd: S, columns: &[Lanes], view: &BentView<'_>) -> (Vec3x16<S>, f32x16<S>) {
     let mean = Vec3x16::load(simd, columns, column::MEAN);
-    let (x, y, z) = (mean.x.widen(), mean.y.widen(), mean.z.widen());
     let [right, down, forward] = view.camera_from_chunk;
-    let (x, y, z) = (
-        along(simd, (x, y, z), right),
-        along(simd, (x, y, z), down),
-        along(simd, (x, y, z), forward),
-    );
+    let (x, y) = (along(simd, mean, right), along(simd, mean, down));
+    let z = along(simd, mean, forward);
     let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
     if !view.by_distance {
         return (center, center.z);
@@ -213,18 +206,6 @@ fn to_camera<S: Simd>(simd: S, columns: &[Lanes], view: &BentView<'_>) -> (Vec3x
     let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
     let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
     (center, low.narrow(high))
-}
-
-/// Sixteen numbers of f64.
-type Wide<S> = (f64x8<S>, f64x8<S>);
-
-/// One coordinate in the camera's frame.
-#[inline(always)]
-fn along<S: Simd>(simd: S, (x, y, z): (Wide<S>, Wide<S>, Wide<S>), row: [f64; 4]) -> Wide<S> {
-    let [rx, ry, rz, moved_m] = row.map(|value| f64x8::splat(simd, value));
-    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, moved_m)));
-    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, moved_m)));
-    (low, high)
 }
 
 /// Fills one lane, and returns the way from the camera to the centre, in metres; `None` if the

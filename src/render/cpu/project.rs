@@ -341,12 +341,19 @@ pub(super) fn shown<S: Simd>(
 /// facade would be blended in the order of their rounding errors.
 #[inline(always)]
 fn depth<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>) -> f32x16<S> {
-    let splat = |value: f64| f64x8::splat(simd, value);
-    let [rx, ry, rz, origin_m] = view.forward.map(splat);
-    let (x, y, z) = (mean.x.widen(), mean.y.widen(), mean.z.widen());
-    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, origin_m)));
-    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, origin_m)));
+    let (low, high) = along(simd, mean, view.forward);
     low.narrow(high)
+}
+
+/// A row's product with (x, y, z, 1) in f64: one coordinate of centres in another frame, in metres, of the
+/// first eight and of the others.
+#[inline(always)]
+pub(super) fn along<S: Simd>(simd: S, mean: Vec3x16<S>, row: [f64; 4]) -> (f64x8<S>, f64x8<S>) {
+    let [rx, ry, rz, moved_m] = row.map(|value| f64x8::splat(simd, value));
+    let (x, y, z) = (mean.x.widen(), mean.y.widen(), mean.z.widen());
+    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, moved_m)));
+    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, moved_m)));
+    (low, high)
 }
 
 /// The camera-space x or y of centres, in metres.

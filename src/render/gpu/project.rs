@@ -4,6 +4,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use glam::Vec3;
 use rayon::prelude::*;
 use wgpu::{BufferUsages, ComputePass, ShaderModule};
 
@@ -93,19 +94,23 @@ fn visible(
     chunk: &Arc<Chunk>,
     mirror: &Mirror,
 ) -> Vec<(usize, u32)> {
-    let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
-    let may_see = |cluster: &Cluster| {
-        let Cluster { min_m, max_m, sigma_m, .. } = *cluster;
-        match bent {
-            Some(bent) => bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
-            None => frustum.may_see(min_m, max_m, sigma_m),
-        }
+    let of = |may_see: &dyn Fn(Vec3, Vec3, f32) -> bool| {
+        let places = mirror.places(chunk).iter().zip(chunk.clusters());
+        let seen = places.filter(|(_, cluster)| {
+            let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
+            may_see(min_m, max_m, sigma_m)
+        });
+        seen.map(|(place, _)| (place.page, place.lines.start)).collect()
     };
-    let places = mirror.places(chunk).iter().zip(chunk.clusters());
-    places
-        .filter(|(_, cluster)| may_see(cluster))
-        .map(|(place, _)| (place.page, place.lines.start))
-        .collect()
+    match bent {
+        Some(bent) => {
+            of(&|min_m, max_m, sigma_m| bent.may_see(chunk.origin_m(), min_m, max_m, sigma_m))
+        }
+        None => {
+            let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
+            of(&|min_m, max_m, sigma_m| frustum.may_see(min_m, max_m, sigma_m))
+        }
+    }
 }
 
 /// The splats of a frame, and the keys that they are sorted by.

@@ -162,7 +162,8 @@ impl Sky {
     }
 
     /// The form in which it is drawn with a profile's `sky_error`. Bakes a network the first time, which
-    /// takes about a second, and ten for the finest of its four maps; they stay. Images are their own cube map, whatever the error.
+    /// takes about a second, and ten for the finest of its four maps; they stay. Images are their own cube
+    /// map, whatever the error.
     ///
     /// # Errors
     /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] is close enough.

@@ -1,13 +1,11 @@
 //! Cameras, both ways.
 
-use std::sync::Arc;
-
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::camera::{
     Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
 };
 use crate::protocol::camera as wire;
-use crate::scene::appearance::{Appearance, AppearanceError, Exposure, Overlay};
+use crate::scene::appearance::{Appearance, AppearanceError, Exposure};
 
 /// Wire to lens.
 pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
@@ -42,9 +40,7 @@ pub(super) fn appearance_of(
 ) -> Result<Appearance, AppearanceError> {
     let exposure =
         exposure.map(|wire::Exposure { matrix, gain, offset }| Exposure::new(matrix, gain, offset));
-    let exposure = exposure.transpose()?;
-    let overlay = overlay.map(|text| Overlay::from_data_uri(text, size_px)).transpose()?;
-    Ok(Appearance { exposure, overlay: overlay.map(Arc::new) })
+    Appearance::new(exposure.transpose()?, overlay, size_px)
 }
 
 /// Exposure to wire.

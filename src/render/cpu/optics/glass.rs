@@ -19,25 +19,6 @@ pub(super) struct Glass {
 #[derive(Clone, Debug)]
 struct Sheet(Vec<Vec<f32>>);
 
-/// Whether a windshield turns less than in full what a lens sees at the end of its field.
-pub(super) fn fades(camera: &Camera) -> bool {
-    let bare = Camera { windshield: None, ..*camera };
-    let (sin, cos) = (seen_rad(camera) * (1.0 - 1e-9)).sin_cos();
-    let [_, in_full] = Windshield::FADES_Z;
-    (0..32).any(|k| {
-        let (y, x) = (f64::from(k) * std::f64::consts::TAU / 32.0).sin_cos();
-        let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
-        let in_full = at_px.is_some_and(|at_px| {
-            camera.unproject(at_px).is_some_and(|outside| {
-                let found = camera.project_beyond(outside).distance(at_px) < 1e-6;
-                // Between two of the 32 it is nearly the same.
-                found && outside.z >= in_full + 0.02
-            })
-        });
-        !in_full
-    })
-}
-
 impl Glass {
     /// Rounds of the search behind a windshield: each halves its error at worst, and real ones leave a
     /// fiftieth.
@@ -64,9 +45,7 @@ impl Glass {
         let in_full = splat(in_full as f32);
         (Vec3x16 { x, y, z }, unit.z.simd_ge(in_full).select(unit.z - in_full, splat(-1.0)))
     }
-}
 
-impl Glass {
     /// Unit directions outside, of directions of any length inside.
     #[inline(always)]
     pub(super) fn outside<S: Simd>(&self, simd: S, inside: Vec3x16<S>) -> Vec3x16<S> {
@@ -82,6 +61,25 @@ impl Glass {
         let (x, y) = (sin(simd, phi), sin(simd, theta));
         Vec3x16 { x, y, z: (splat(1.0) - x * x - y * y).max(splat(0.0)).sqrt() }
     }
+}
+
+/// Whether a windshield turns less than in full what a lens sees at the end of its field.
+pub(super) fn fades(camera: &Camera) -> bool {
+    let bare = Camera { windshield: None, ..*camera };
+    let (sin, cos) = (seen_rad(camera) * (1.0 - 1e-9)).sin_cos();
+    let [_, in_full] = Windshield::FADES_Z;
+    (0..32).any(|k| {
+        let (y, x) = (f64::from(k) * std::f64::consts::TAU / 32.0).sin_cos();
+        let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
+        let in_full = at_px.is_some_and(|at_px| {
+            camera.unproject(at_px).is_some_and(|outside| {
+                let found = camera.project_beyond(outside).distance(at_px) < 1e-6;
+                // Between two of the 32 it is nearly the same.
+                found && outside.z >= in_full + 0.02
+            })
+        });
+        !in_full
+    })
 }
 
 impl Sheet {

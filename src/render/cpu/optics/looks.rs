@@ -59,13 +59,12 @@ impl Looks {
             let row = inverse.row(axis);
             [row.x, row.y, -center[axis]].map(|value| value as f32)
         };
-        let rows = (axes_from_world * view.world_from_camera.rotation_matrix()).transpose();
         Some(Self {
             glass,
             round_from_px: [row(0), row(1)],
             series,
             limit: limit as f32,
-            axes_from_camera: rows.to_cols_array_2d().map(|row| row.map(|value| value as f32)),
+            axes_from_camera: view.sky_from_camera(axes_from_world),
         })
     }
 

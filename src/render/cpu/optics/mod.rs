@@ -64,7 +64,7 @@ impl Optics {
         };
         let focal_px = [pinhole.fx as f32, pinhole.fy as f32];
         // Most of what reaches into an image has all its points around it.
-        let about_rad = view.camera.limit_rad().min(1.25 * seen_rad(&view.camera) + 0.1);
+        let about_rad = || view.camera.limit_rad().min(1.25 * seen_rad(&view.camera) + 0.1);
         let kind = match lens {
             // As it is behind a windshield: slopes without a distortion.
             Lens::Pinhole => {
@@ -85,12 +85,12 @@ impl Optics {
             Lens::Fisheye(lens) => {
                 let px_from_round = [[pinhole.fx as f32, 0.0], [0.0, pinhole.fy as f32]];
                 let left = LEFT_PX / pinhole.fx.max(pinhole.fy);
-                round(about_rad, px_from_round, left, &|angle| lens.radius().at(angle))?
+                round(about_rad(), px_from_round, left, &|angle| lens.radius().at(angle))?
             }
             Lens::FTheta(lens) => {
                 let [c, d, e] = lens.linear_cde().map(|value| value as f32);
                 let px_from_round = [[c, d], [e, 1.0]];
-                round(about_rad, px_from_round, LEFT_PX, &|angle| lens.radius_px(angle))?
+                round(about_rad(), px_from_round, LEFT_PX, &|angle| lens.radius_px(angle))?
             }
         };
         Some(Self { glass, center_px: [pinhole.cx as f32, pinhole.cy as f32], kind })
