@@ -4,8 +4,8 @@
 #import lens
 
 // Rounds of the search for the row that sees a point, and the share of the exposure at which it ends.
-const ROUNDS: u32 = 16;
-const STILL: f32 = 1e-7;
+const ROUNDS: u32 = 32;
+const STILL: f32 = 1e-6;
 
 const ROOT_3: f32 = 1.7320508;
 
@@ -78,15 +78,26 @@ struct Exposed {
 }
 
 // Of a point in the camera's frame at the exposure's end. The row decides where the camera stands, and
-// that decides the row: found by going back and forth, from a first guess.
+// that decides the row: found by going back and forth, from a first guess, or by halves where that leads astray.
 fn expose(of_view: u32, at_end_m: vec3f, guess: f32) -> Exposed {
     var seen = exposed(of_view, at_end_m, guess);
+    var least = 0.0;
+    var most = 1.0;
+    var off_before = 2.0;
     for (var round = 0u; round < ROUNDS; round++) {
         let share = still_to_come(of_view, seen.at_px);
-        if abs(share - seen.share) <= STILL {
+        let off = share - seen.share;
+        if abs(off) <= STILL {
             break;
         }
-        seen = exposed(of_view, at_end_m, share);
+        if off > 0.0 {
+            least = seen.share;
+        } else {
+            most = seen.share;
+        }
+        let closes = abs(off) <= 0.5 * off_before && share >= least && share <= most;
+        off_before = abs(off);
+        seen = exposed(of_view, at_end_m, select(0.5 * (least + most), share, closes));
     }
     return seen;
 }

@@ -24,8 +24,6 @@ pub struct Bent<'a> {
     camera_from_world: Pose,
     /// Nearest and farthest depth of a centre, in metres.
     range_m: [f64; 2],
-    /// How far the camera moves and turns during the exposure, in metres and radians.
-    moves: [f64; 2],
     beside: Beside,
 }
 
@@ -42,10 +40,10 @@ pub struct Footprint {
     pub camera_m: DVec3,
 }
 
-/// The numbers of the bound that [`Bent::may_see`] explains. At rest a Gaussian whose centre is at an angle a
-/// off the axis, and whose points are within s of it, is not seen if `a > widest`, or if
-/// `least (a - turned - image) > reach (s + turned) + blur` and `a + s + turned` is below
-/// [`WIDEST_RAD`].
+/// The numbers of the bound that [`Bent::may_see`] explains. A Gaussian whose centre is never less than an angle
+/// a off the axis, and whose points are within s of it, is not seen if `a > widest`, or if
+/// `least (a - turned - image) > reach (s + turned) + blur` and its centre's largest angle and `s + turned`
+/// are below [`WIDEST_RAD`] together.
 #[derive(Clone, Copy, Debug)]
 pub struct Beside {
     /// How far a centre may be off the axis, in radians.
@@ -60,6 +58,10 @@ pub struct Beside {
     pub blur_px: f64,
     /// What a windshield may add to angles, in radians.
     pub turned_rad: f64,
+    /// How far the camera moves and turns during the exposure, in metres and radians.
+    pub moved_m: f64,
+    /// See there.
+    pub rolled_rad: f64,
 }
 
 impl<'a> Bent<'a> {
@@ -68,7 +70,7 @@ impl<'a> Bent<'a> {
         if view.is_ideal() {
             return None;
         }
-        let moves =
+        let [moved_m, rolled_rad] =
             view.rolling.map_or([0.0; 2], |Rolling { world_from_camera_first: first, .. }| {
                 let last = &view.world_from_camera;
                 [
@@ -86,12 +88,13 @@ impl<'a> Bent<'a> {
             reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
             blur_px: sigmas * profile.blur.sqrt() + 2.0,
             turned_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
+            moved_m,
+            rolled_rad,
         };
         Some(Self {
             view,
             camera_from_world: view.world_from_camera.inverse(),
             range_m: [profile.near, profile.far],
-            moves,
             beside,
         })
     }
@@ -142,7 +145,7 @@ impl<'a> Bent<'a> {
         Some(Footprint { mean_px, root_px: [d0, d1, d2, e0, e1, e2], depth_m, camera_m })
     }
 
-    /// What decides beside the field of a camera at rest, for tests of many Gaussians at once.
+    /// What decides beside the field, for tests of many Gaussians at once.
     pub fn beside(&self) -> &Beside {
         &self.beside
     }
@@ -156,8 +159,7 @@ impl<'a> Bent<'a> {
     /// the image.
     #[inline(always)]
     fn may_touch(&self, center_m: DVec3, radius_m: f64, sigma_m: f64) -> bool {
-        let [moved_m, rolled_rad] = self.moves;
-        let Beside { widest_rad, image_rad, turned_rad, .. } = self.beside;
+        let Beside { widest_rad, image_rad, turned_rad, moved_m, rolled_rad, .. } = self.beside;
         let radius_m = radius_m + moved_m;
         let distance_m = center_m.length();
         if distance_m + radius_m < self.range_m[0] {

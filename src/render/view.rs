@@ -26,6 +26,21 @@ pub struct Rolling {
     pub world_from_camera_first: Pose,
 }
 
+/// A rolling shutter as seen from the exposure's end, where little is lost in f32: what is still to come while
+/// a place of the image is exposed. The way is [`Pose::interpolate`]'s.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StillToCome {
+    /// Of the exposure, at (x, y) of the image in pixels: the share `a x + b y + c`, from 0 to 1.
+    pub(super) share: [f64; 3],
+    /// Of the camera's way, for the whole exposure, in metres in the world and in the camera's frame at the
+    /// end.
+    pub(super) moved_world_m: DVec3,
+    pub(super) moved_m: DVec3,
+    /// Of its turn: about this unit axis of its own, by so many radians.
+    pub(super) axis: DVec3,
+    pub(super) turned_rad: f64,
+}
+
 /// Where a point of the world lands.
 #[derive(Clone, Copy, Debug)]
 pub struct Landing {
@@ -40,9 +55,11 @@ pub struct Landing {
 }
 
 impl View {
-    /// Rounds of the search for the row that sees a point. Each leaves of the error what the image
-    /// moves per row, a tenth of a row for what passes close by: 1e-16 at worst in the end.
-    const ROUNDS: u32 = 16;
+    /// Rounds of the search for the row that sees a point. Each leaves of the error what the image moves per
+    /// row: a tenth for what passes close by. What passes so close that this is above a half is searched by
+    /// halves. Only what keeps up with the rows, and may be on many, is found on one of them or beside the
+    /// image.
+    const ROUNDS: u32 = 32;
 
     /// The search ends when it moves by less than this share of the exposure: 1e-7 of 1 m.
     const STILL: f64 = 1e-7;
@@ -135,15 +152,63 @@ impl View {
         };
         let Some(rolling) = &self.rolling else { return landing(1.0, self.world_from_camera) };
         let mut landed = landing(guess, self.on_the_way(guess));
+        let (mut sooner, mut later, mut off_before) = (0.0, 1.0, f64::INFINITY);
         for _ in 0..Self::ROUNDS {
-            let fraction = rolling.direction.fraction(landed.at_px, &self.camera);
-            let moved = (fraction - landed.fraction).abs();
-            if moved <= Self::STILL {
+            let exposed = rolling.direction.fraction(landed.at_px, &self.camera);
+            let off = exposed - landed.fraction;
+            if off.abs() <= Self::STILL {
                 break;
             }
-            landed = landing(fraction, self.on_the_way(fraction));
+            if off > 0.0 {
+                sooner = landed.fraction;
+            } else {
+                later = landed.fraction;
+            }
+            let closes = off.abs() <= 0.5 * off_before && (sooner..=later).contains(&exposed);
+            let next = if closes { exposed } else { 0.5 * (sooner + later) };
+            off_before = off.abs();
+            landed = landing(next, self.on_the_way(next));
         }
         landed
+    }
+
+    /// Of a rolling shutter, seen from the exposure's end.
+    pub(super) fn still_to_come(&self) -> Option<StillToCome> {
+        let Rolling { direction, world_from_camera_first: first } = self.rolling.as_ref()?;
+        let last = &self.world_from_camera;
+        let Camera { width_px, height_px, .. } = self.camera;
+        // 0 for the last row's middle, 1 for the first's; a single row is the last one.
+        let along = |size_px: u32| {
+            let last_px = f64::from(size_px) - 1.0;
+            if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
+        };
+        let (columns, rows) = (along(width_px), along(height_px));
+        let from_end =
+            |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
+        let share = match direction {
+            Rolls::TopToBottom => [0.0, rows[0], rows[1]],
+            Rolls::BottomToTop => {
+                let [slope, start] = from_end(rows, height_px);
+                [0.0, slope, start]
+            }
+            Rolls::LeftToRight => [columns[0], 0.0, columns[1]],
+            Rolls::RightToLeft => {
+                let [slope, start] = from_end(columns, width_px);
+                [slope, 0.0, start]
+            }
+        };
+        let moved_world_m = last.position_m - first.position_m;
+        let turn = first.rotation.inverse() * last.rotation;
+        // The short way round.
+        let turn = if turn.w < 0.0 { -turn } else { turn };
+        let sine = turn.xyz().length();
+        Some(StillToCome {
+            share,
+            moved_world_m,
+            moved_m: last.rotation.inverse() * moved_world_m,
+            axis: if sine > 0.0 { turn.xyz() / sine } else { DVec3::Z },
+            turned_rad: 2.0 * sine.atan2(turn.w),
+        })
     }
 
     /// Where the camera stands at a fraction of the exposure.

@@ -8,11 +8,12 @@ use wildcity::render::gpu::shaders::Shaders;
 use wildcity::render::gpu::{AdapterChoice, Gpu};
 use wildcity::render::{RenderError, Rolling, View};
 use wildcity::report::points::Points;
+use wildcity::report::stress::blobs::{Blob, scene};
 use wildcity::scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, look, psnr, render, render_one, try_render};
-use crate::lenses::{driven, lands, lenses, meets_what_each_pixels_ray_meets, sizes_of};
+use crate::lenses::{driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of};
 use crate::streets::{demo_street, street};
 
 /// Along a street, as [`crate::streets::street_views`] are.
@@ -105,6 +106,19 @@ fn known_points_land_where_the_model_says() {
             assert!(points >= 2, "{name}: {points} points");
         }
     }
+}
+
+#[test]
+fn what_passes_close_is_drawn_as_by_the_cpu() {
+    let ball = |k: i32| Blob {
+        mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
+        sigma_m: DVec3::splat(0.05),
+        ..Blob::default()
+    };
+    let balls = scene(&[0, 1, 2, 3, 4].map(ball));
+    let profile = RenderProfile::default();
+    let truth = render_one(&cpu(), &balls, &profile, passing());
+    agree(&render_one(&*gpu(), &balls, &profile, passing()), &truth).unwrap();
 }
 
 /// The f-theta cameras of a real car, at full size and at that which a model reads.

@@ -13,7 +13,7 @@ use wildcity::scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{agree, cpu, max_difference, psnr, render, render_one, try_render};
 use crate::lenses::{
-    driven, lands, lenses, meets_what_each_pixels_ray_meets, sizes_of, street_scene,
+    driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of, street_scene,
 };
 
 #[test]
@@ -268,6 +268,28 @@ fn the_cpu_backend_rolls_as_it_is_defined() {
     let ray = view.ray_world(at_px).unwrap();
     let off_rad = ray.angle_between(point_m - pose.position_m);
     assert!(off_rad < 1e-6, "{off_rad:e}");
+}
+
+#[test]
+fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
+    let view = passing();
+    for step in 0..200 {
+        let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
+        let landed = view.land(point_m, 1.0);
+        let exposed = Rolls::LeftToRight.fraction(landed.at_px, &view.camera);
+        assert!((exposed - landed.fraction).abs() < 1e-6, "{point_m}: {landed:?}");
+    }
+    let balls: Vec<Blob> = (0..5)
+        .map(|k| Blob {
+            mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
+            sigma_m: DVec3::splat(0.05),
+            ..Blob::default()
+        })
+        .collect();
+    let profile = RenderProfile::default();
+    let truth = render_one(&Reference, &scene(&balls), &profile, view);
+    assert!(truth.opacity.iter().filter(|&&o| o > 0.5).count() > 50, "little is seen");
+    agree(&render_one(&cpu(), &scene(&balls), &profile, view), &truth).unwrap();
 }
 
 #[test]

@@ -70,6 +70,15 @@ pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
     View { camera, world_from_camera: pose, rolling }
 }
 
+/// A camera to the side at 30 m/s, whose columns are exposed in 100 ms against the way that things pass: what
+/// is 1.5 m away moves by more than the image meanwhile.
+pub(crate) fn passing() -> View {
+    let camera = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let first = Pose { position_m: DVec3::new(-3.0, 0.0, 0.0), ..Pose::IDENTITY };
+    let rolling = Rolling { direction: Rolls::LeftToRight, world_from_camera_first: first };
+    View { rolling: Some(rolling), ..View::new(camera, Pose::IDENTITY) }
+}
+
 /// Of small opaque balls on a wall 2 m ahead, so far apart, each is drawn alone and compared; returns how
 /// many the camera sees.
 pub(crate) fn lands(backend: &dyn Backend, name: &str, camera: Camera, apart_m: f64) -> usize {

@@ -28,8 +28,8 @@ pub(super) struct Behind {
 enum Looks {
     /// Rows that take `(x, y, 1)` in pixels to a direction of any length.
     Ideal([[f32; 3]; 3]),
-    /// Of a round lens.
-    Round(optics::Looks),
+    /// Of a pinhole that moves or is behind a windshield, or of a round lens.
+    Described(optics::Looks),
     /// Pixel by pixel, as the lens and the shutter have it; the matrix is `sky_from_world`.
     Bent(Box<(View, DMat3)>),
 }
@@ -45,7 +45,7 @@ impl Behind {
             let looks = if view.is_ideal() {
                 Looks::Ideal(view.sky_from_pixel(axes))
             } else if let Some(looks) = optics::Looks::of(view, axes) {
-                Looks::Round(looks)
+                Looks::Described(looks)
             } else {
                 Looks::Bent(Box::new((*view, axes)))
             };
@@ -101,7 +101,7 @@ fn add_sky<S: Simd>(
             let row = |[a, b, c]: [f32; 3]| x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
             Vec3x16 { x: row(*first), y: row(*second), z: row(*third) }
         }
-        Looks::Round(looks) => looks.toward(simd, x, y),
+        Looks::Described(looks) => looks.toward(simd, x, y),
         Looks::Bent(bent) => {
             let (view, sky_from_world) = &**bent;
             let [x, y, z] = directions(view, *sky_from_world, &x.to_array(), &y.to_array());

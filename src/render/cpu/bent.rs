@@ -1,12 +1,12 @@
 //! Stage project for lenses and rolling shutters: six points of each Gaussian, where [`Optics`] describes
-//! the lens and all of them are within its field 16 Gaussians at a time in f32, else one by one in f64, where
-//! [`Bent`] says where each lands.
+//! the camera and all of them are within its field 16 Gaussians at a time in f32, else one by one in f64,
+//! where [`Bent`] says where each lands.
 
-use fearless_simd::{f32x16, mask32x16, prelude::*};
+use fearless_simd::{f32x16, f64x8, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::lanes::Vec3x16;
-use super::optics::{Landed, Optics};
+use super::optics::{Exposed, Landed, Optics};
 use super::project::{Ellipse, LOG2_UNIT, SplatLanes, along, color, rotation_columns, shown};
 use crate::geometry::camera::WIDEST_RAD;
 use crate::render::View;
@@ -66,17 +66,11 @@ pub(super) fn project_block<S: Simd>(
     view: &BentView<'_>,
     cutoffs: &Cutoffs,
 ) -> Option<SplatLanes> {
+    let mut toward_m = [[0.0_f32; LANES]; 3];
     let (mut lanes, left) = match view.optics {
-        Some(optics) => project_lanes(simd, columns, (view, optics), cutoffs),
+        Some(optics) => project_lanes(simd, columns, (view, optics), cutoffs, &mut toward_m),
         None => (SplatLanes::default(), (1 << LANES) - 1),
     };
-    // From a camera that stands still all are seen from one place.
-    let mut toward_m = [[0.0_f32; LANES]; 3];
-    if view.optics.is_some() {
-        let mean = Vec3x16::load(simd, columns, column::MEAN);
-        let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
-        toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
-    }
     for lane in (0..LANES).filter(|lane| left >> lane & 1 == 1) {
         if let Some(from_camera_m) =
             project_one(columns, lane, (view.bent, view.origin_m), cutoffs, &mut lanes)
@@ -95,23 +89,45 @@ pub(super) fn project_block<S: Simd>(
     Some(lanes)
 }
 
-/// Projects those of a block whose points are within the lens' field, and tells which others may be
-/// seen.
+/// Projects those of a block whose points are within the lens' field, with the ways from the camera to them
+/// in metres, and tells which others may be seen.
 #[inline(always)]
 fn project_lanes<S: Simd>(
     simd: S,
     columns: &[Lanes],
     (view, optics): (&BentView<'_>, &Optics),
     cutoffs: &Cutoffs,
+    toward_m: &mut [[f32; LANES]; 3],
 ) -> (SplatLanes, u64) {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let (center, depth_m) = to_camera(simd, columns, view);
+    let mean = Vec3x16::load(simd, columns, column::MEAN);
+    let [right, down, forward] = view.camera_from_chunk;
+    let (x, y) = (along(simd, mean, right), along(simd, mean, down));
+    let z = along(simd, mean, forward);
+    let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
+    let at_end_m = [x, y, z];
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
-    let in_range = depth_m.simd_ge(splat(cutoffs.near_m))
-        & depth_m.simd_le(splat(cutoffs.far_m))
-        & log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut));
     let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
-    let in_range = in_range & !beside(simd, center, x.max(y).max(z), view.bent.beside());
+    let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
+        & !beside(simd, center, x.max(y).max(z), view.bent.beside());
+    if in_range.all_false() {
+        return (SplatLanes::default(), 0);
+    }
+    let Exposed { landed, share } = optics.expose(simd, center, splat(0.0));
+    let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
+    let ways_m = optics.ways(simd, share);
+    if let Some([_, way_world_m]) = ways_m {
+        toward = toward.plus(way_world_m);
+    }
+    *toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
+    let depth_m = depth(at_end_m, view.by_distance, ways_m, optics.farther(simd, center, share));
+    let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
+    // While the shutter rolls, it is the depth only of what has found its row.
+    let is_depth = match ways_m {
+        None => splat(0.0).simd_ge(splat(0.0)),
+        Some(_) => landed.within.simd_ge(splat(0.0)),
+    };
+    let in_range = in_range & (in_depth | !is_depth);
     if in_range.all_false() {
         return (SplatLanes::default(), 0);
     }
@@ -121,7 +137,7 @@ fn project_lanes<S: Simd>(
     let right = Vec3x16::splat(simd, right);
     let down = Vec3x16::splat(simd, down);
     let forward = Vec3x16::splat(simd, forward);
-    let mut within = optics.land(simd, center).within;
+    let mut within = landed.within;
     let mut pairs = [[splat(0.0); 4]; 3];
     let [mut mean_x, mut mean_y] = [splat(0.0); 2];
     for axis in 0..3 {
@@ -129,8 +145,9 @@ fn project_lanes<S: Simd>(
         let own = own[axis].scale(sigma);
         let offset = Vec3x16 { x: right.dot(own), y: down.dot(own), z: forward.dot(own) };
         let there = center.plus(offset);
-        let Landed { x_px: ax, y_px: ay, within: a } = optics.land(simd, there);
-        let Landed { x_px: bx, y_px: by, within: b } = optics.land(simd, center.minus(offset));
+        let back = center.minus(offset);
+        let Landed { x_px: ax, y_px: ay, within: a } = optics.expose(simd, there, share).landed;
+        let Landed { x_px: bx, y_px: by, within: b } = optics.expose(simd, back, share).landed;
         within = within.min(a).min(b);
         pairs[axis] = [ax, ay, bx, by];
         (mean_x, mean_y) = (mean_x + (ax + bx), mean_y + (ay + by));
@@ -162,7 +179,7 @@ fn project_lanes<S: Simd>(
     (lanes, in_range.to_bitmask() & !inside.to_bitmask())
 }
 
-/// Which Gaussians surely are not seen from a camera at rest: see [`Beside`].
+/// Which Gaussians surely are not seen: see [`Beside`].
 #[inline(always)]
 fn beside<S: Simd>(
     simd: S,
@@ -180,32 +197,55 @@ fn beside<S: Simd>(
     let low = steep.select(splat(1.0) / t, t);
     let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
     let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
-    let (least_rad, most_rad) = (half + half - splat(0.01), half + half + splat(0.01));
     // asin s is at most s π/3 up to a half.
-    let share = splat(3.0_f64.sqrt()) * sigma_m / distance_m;
-    let spread_rad = share.mul_add(splat(std::f64::consts::FRAC_PI_3), splat(bound.turned_rad));
+    let third_turn = splat(std::f64::consts::FRAC_PI_3);
+    let moved = splat(bound.moved_m) / distance_m;
+    let loose_rad = moved.mul_add(third_turn, splat(0.01 + bound.rolled_rad));
+    let (least_rad, most_rad) = (half + half - loose_rad, half + half + loose_rad);
+    let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.moved_m));
+    let spread_rad = share.mul_add(third_turn, splat(bound.turned_rad));
     let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
     let out_px =
         (least_rad - splat(bound.turned_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
     let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
-    share.simd_lt(splat(0.5)) & (out | least_rad.simd_gt(splat(bound.widest_rad)))
+    let far = moved.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5));
+    far & (out | least_rad.simd_gt(splat(bound.widest_rad)))
 }
 
-/// Centres in the camera's frame, and their depth, in metres: computed in f64 and rounded once, since
-/// splats are blended in order of it.
+/// Sixteen numbers of f64.
+type Wide<S> = (f64x8<S>, f64x8<S>);
+
 #[inline(always)]
-fn to_camera<S: Simd>(simd: S, columns: &[Lanes], view: &BentView<'_>) -> (Vec3x16<S>, f32x16<S>) {
-    let mean = Vec3x16::load(simd, columns, column::MEAN);
-    let [right, down, forward] = view.camera_from_chunk;
-    let (x, y) = (along(simd, mean, right), along(simd, mean, down));
-    let z = along(simd, mean, forward);
-    let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
-    if !view.by_distance {
-        return (center, center.z);
+fn plus<S: Simd>((low, high): Wide<S>, more: Option<f32x16<S>>) -> Wide<S> {
+    match more {
+        None => (low, high),
+        Some(more) => {
+            let more = more.widen();
+            (low + more.0, high + more.1)
+        }
     }
+}
+
+/// Depth of centres, in metres: computed in f64 and rounded once, since splats are blended in order of it.
+/// They are given in the camera's frame at the exposure's end; where they are seen before, the camera had
+/// ways to go, along which they were farther.
+#[inline(always)]
+fn depth<S: Simd>(
+    [x, y, z]: [Wide<S>; 3],
+    by_distance: bool,
+    ways_m: Option<[Vec3x16<S>; 2]>,
+    farther_m: Option<f32x16<S>>,
+) -> f32x16<S> {
+    if !by_distance {
+        let (low, high) = plus(z, farther_m);
+        return low.narrow(high);
+    }
+    let x = plus(x, ways_m.map(|[way_m, _]| way_m.x));
+    let y = plus(y, ways_m.map(|[way_m, _]| way_m.y));
+    let z = plus(z, ways_m.map(|[way_m, _]| way_m.z));
     let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
     let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
-    (center, low.narrow(high))
+    low.narrow(high)
 }
 
 /// Fills one lane, and returns the way from the camera to the centre, in metres; `None` if the

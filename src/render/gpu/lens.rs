@@ -3,18 +3,18 @@
 //! WGSL: `shaders/lens.wgsl`. The models are in `geometry/camera`, the search for rows in `render/view.rs`.
 
 use bytemuck::Zeroable;
-use glam::{DMat2, DVec2, DVec3};
+use glam::{DMat2, DVec2};
 use wgpu::{BindingResource, BufferUsages};
 
 use super::device::Device;
 use super::growing::Growing;
 use super::layout::Lens;
 use crate::geometry::camera::{
-    self, Camera, FTheta, Fisheye, OpenCv, Reference, Rising, Rolls, Windshield,
-    WindshieldReference,
+    self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
 };
 use crate::render::unscented::widest_rad;
-use crate::render::{Frame, MAX_VIEWS, Rolling, View};
+use crate::render::view::StillToCome;
+use crate::render::{Frame, MAX_VIEWS, View};
 
 /// The views' lenses on the device.
 #[derive(Debug, Default)]
@@ -67,8 +67,8 @@ impl Lens {
         if let Some(windshield) = &camera.windshield {
             lens.set_windshield(windshield);
         }
-        if let Some(rolling) = &view.rolling {
-            lens.set_rolling(rolling, view);
+        if let Some(still) = view.still_to_come() {
+            lens.set_rolling(&still);
         }
         lens
     }
@@ -129,35 +129,12 @@ impl Lens {
         }
     }
 
-    /// `Pose::interpolate` seen from the exposure's end: what is still to come of the way and of the turn.
-    fn set_rolling(&mut self, rolling: &Rolling, view: &View) {
-        let Rolling { direction, world_from_camera_first: first } = rolling;
-        let last = &view.world_from_camera;
-        let Camera { width_px, height_px, .. } = view.camera;
-        // 0 for the last row's middle, 1 for the first's; a single row is the last one.
-        let along = |size_px: u32| {
-            let last_px = f64::from(size_px) - 1.0;
-            if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
-        };
-        let (columns, rows) = (along(width_px), along(height_px));
-        let from_end =
-            |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
-        let (x, y) = match direction {
-            Rolls::TopToBottom => ([0.0; 2], rows),
-            Rolls::BottomToTop => ([0.0; 2], from_end(rows, height_px)),
-            Rolls::LeftToRight => (columns, [0.0; 2]),
-            Rolls::RightToLeft => (from_end(columns, width_px), [0.0; 2]),
-        };
-        self.rolls = [x[0], y[0], x[1] + y[1], 0.0].map(|value| value as f32);
-        let moved_m = last.position_m - first.position_m;
-        self.moved_world_m = moved_m.as_vec3().to_array();
-        self.moved_m = (last.rotation.inverse() * moved_m).as_vec3().to_array();
-        let turn = first.rotation.inverse() * last.rotation;
-        // The short way round.
-        let turn = if turn.w < 0.0 { -turn } else { turn };
-        let sine = turn.xyz().length();
-        let axis = if sine > 0.0 { turn.xyz() / sine } else { DVec3::Z };
-        self.turned = axis.extend(2.0 * sine.atan2(turn.w)).as_vec4().to_array();
+    fn set_rolling(&mut self, still: &StillToCome) {
+        let [a, b, c] = still.share.map(|value| value as f32);
+        self.rolls = [a, b, c, 0.0];
+        self.moved_world_m = still.moved_world_m.as_vec3().to_array();
+        self.moved_m = still.moved_m.as_vec3().to_array();
+        self.turned = still.axis.extend(still.turned_rad).as_vec4().to_array();
     }
 }
 

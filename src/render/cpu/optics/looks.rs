@@ -1,4 +1,4 @@
-//! Where the pixels of a lens look.
+//! Where the pixels of a lens or of a rolling shutter look.
 
 use fearless_simd::{f32x16, prelude::*};
 use glam::{DMat2, DMat3, DVec2};
@@ -6,6 +6,7 @@ use glam::{DMat2, DMat3, DVec2};
 use super::glass::{Glass, fades};
 use super::seen_rad;
 use super::series::Series;
+use super::shutter::Shutter;
 use crate::geometry::Camera;
 use crate::geometry::camera::Lens;
 use crate::render::View;
@@ -14,43 +15,44 @@ use crate::render::cpu::lanes::Vec3x16;
 /// What is left out of the tangent of half an angle: f32 tells no more apart.
 const LEFT: f64 = 5e-8;
 
-/// Where the pixels of a round lens look, 16 at a time: what [`super::Optics`] does, the other way.
+/// Where the pixels of a pinhole or of a round lens look, 16 at a time: what [`super::Optics`] does, the other
+/// way.
 #[derive(Clone, Debug)]
 pub(in crate::render::cpu) struct Looks {
+    shutter: Option<Shutter>,
     glass: Option<Glass>,
-    /// Rows that take (x, y, 1) in pixels to what is round, in pixels or focal lengths.
+    /// Rows that take (x, y, 1) in pixels to what is round, in pixels or focal lengths, or to slopes.
     round_from_px: [[f32; 3]; 2],
-    /// `tan(θ/2)/ρ` by the distance ρ from the axis, up to a limit.
-    series: Series,
-    limit: f32,
+    /// Of a round lens: `tan(θ/2)/ρ` by the distance ρ from the axis, up to a limit.
+    round: Option<(Series, f32)>,
     /// Rows that take directions in the camera's frame to other axes.
     axes_from_camera: [[f32; 3]; 3],
 }
 
 impl Looks {
-    /// `None` for what is not round, rolls, or is turned by a windshield as far as that fades.
+    /// `None` for OpenCV's polynomials of slopes, and for what is turned by a windshield as far as that fades.
     pub(in crate::render::cpu) fn of(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        if view.rolling.is_some() {
-            return None;
-        }
+        let shutter = Shutter::of(view)?;
         let glass = match windshield {
             None => None,
             Some(windshield) => Some(Glass::of(windshield).filter(|_| !fades(&view.camera))?),
         };
-        let limit_rad = seen_rad(&view.camera);
-        let (px_from_round, limit, series) = match lens {
-            Lens::Pinhole | Lens::OpenCv(_) => return None,
+        let focal_px = DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy));
+        let round = |limit: f64, angle_rad: &dyn Fn(f64) -> f64| {
+            let half = |radius: f64| (0.5 * angle_rad(radius)).tan();
+            Some(Some((Series::fit(limit, LEFT, &half)?, limit as f32)))
+        };
+        let (px_from_round, round) = match lens {
+            Lens::OpenCv(_) => return None,
+            Lens::Pinhole => (focal_px, None),
             Lens::Fisheye(lens) => {
-                let limit = lens.radius().at(limit_rad);
-                let half = |radius: f64| (0.5 * lens.radius().invert(radius)).tan();
-                let px_from_round = DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy));
-                (px_from_round, limit, Series::fit(limit, LEFT, &half)?)
+                let limit = lens.radius().at(seen_rad(&view.camera));
+                (focal_px, round(limit, &|radius| lens.radius().invert(radius))?)
             }
             Lens::FTheta(lens) => {
-                let limit = lens.radius_px(limit_rad);
-                let half = |radius_px: f64| (0.5 * lens.angle_rad(radius_px)).tan();
-                (lens.linear(), limit, Series::fit(limit, LEFT, &half)?)
+                let limit = lens.radius_px(seen_rad(&view.camera));
+                (lens.linear(), round(limit, &|radius_px| lens.angle_rad(radius_px))?)
             }
         };
         let inverse = px_from_round.inverse();
@@ -60,10 +62,10 @@ impl Looks {
             [row.x, row.y, -center[axis]].map(|value| value as f32)
         };
         Some(Self {
+            shutter,
             glass,
             round_from_px: [row(0), row(1)],
-            series,
-            limit: limit as f32,
+            round,
             axes_from_camera: view.sky_from_camera(axes_from_world),
         })
     }
@@ -80,17 +82,25 @@ impl Looks {
         let [[a, b, c], [d, e, f]] = self.round_from_px;
         let x_round = x.mul_add(splat(a), y.mul_add(splat(b), splat(c)));
         let y_round = x.mul_add(splat(d), y.mul_add(splat(e), splat(f)));
-        let square = x_round.mul_add(x_round, y_round * y_round);
-        let radius = square.sqrt().min(splat(self.limit));
-        // (sin θ, cos θ) is as (2 t, 1 - t²).
-        let per_radius = self.series.at(simd, radius);
-        let t = per_radius * radius;
-        let twice = per_radius + per_radius;
-        let z = splat(1.0) - t * t;
-        let inside = Vec3x16 { x: twice * x_round, y: twice * y_round, z };
-        let away = match &self.glass {
+        let inside = match &self.round {
+            None => Vec3x16 { x: x_round, y: y_round, z: splat(1.0) },
+            Some((series, limit)) => {
+                let square = x_round.mul_add(x_round, y_round * y_round);
+                let radius = square.sqrt().min(splat(*limit));
+                // (sin θ, cos θ) is as (2 t, 1 - t²).
+                let per_radius = series.at(simd, radius);
+                let t = per_radius * radius;
+                let twice = per_radius + per_radius;
+                Vec3x16 { x: twice * x_round, y: twice * y_round, z: splat(1.0) - t * t }
+            }
+        };
+        let then = match &self.glass {
             None => inside,
             Some(glass) => glass.outside(simd, inside),
+        };
+        let away = match &self.shutter {
+            None => then,
+            Some(shutter) => shutter.at_end(simd, then, shutter.share(simd, x, y)),
         };
         let [first, second, third] = self.axes_from_camera;
         Vec3x16 {

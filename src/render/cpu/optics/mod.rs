@@ -1,14 +1,16 @@
-//! Lenses, 16 points at a time in f32, within their field.
+//! Lenses and rolling shutters, 16 points at a time in f32, within the lens' field.
 //!
 //! What is round about its axis needs neither an arc tangent nor Newton's method here: with
 //! `t = tan(θ/2) = |(x, y)|/(|p| + z)`, a radius `r(θ)` divided by t is a smooth function of t, for which a few
 //! Chebyshev terms stand. How many is decided when a lens is prepared: until what they leave is less than
-//! [`LEFT_PX`]. Whatever lies beyond the field, and every lens that this does not describe, is projected one by
-//! one in f64 ([`super::bent`]).
+//! [`LEFT_PX`]. Whatever lies beyond the field, does not find its row, or is before a camera that this does not
+//! describe, is projected one by one in f64 ([`super::bent`]).
 
 mod glass;
 mod looks;
 mod series;
+mod shutter;
+mod sines;
 
 use fearless_simd::{f32x16, prelude::*};
 use glam::DVec2;
@@ -21,6 +23,7 @@ use crate::render::View;
 use glass::Glass;
 pub(super) use looks::Looks;
 use series::Series;
+use shutter::Shutter;
 
 /// What is left out of a series, in pixels: a tenth of what f32 tells apart beside the middle of an image.
 const LEFT_PX: f64 = 1e-5;
@@ -28,6 +31,7 @@ const LEFT_PX: f64 = 1e-5;
 /// A lens, ready for many points.
 #[derive(Clone, Debug)]
 pub(super) struct Optics {
+    shutter: Option<Shutter>,
     glass: Option<Glass>,
     center_px: [f32; 2],
     kind: Kind,
@@ -50,14 +54,20 @@ pub(super) struct Landed<S: Simd> {
     pub(super) within: f32x16<S>,
 }
 
+/// Where points land while the shutter rolls, if it does.
+#[derive(Clone, Copy)]
+pub(super) struct Exposed<S: Simd> {
+    pub(super) landed: Landed<S>,
+    /// Which share of the exposure is still to come then: 0 if nothing rolls.
+    pub(super) share: f32x16<S>,
+}
+
 impl Optics {
-    /// `None` for rolling shutters, windshields whose polynomials lead from inside to outside, and fields
-    /// that a short series does not describe.
+    /// `None` for windshields whose polynomials lead from inside to outside, fields that a short series does
+    /// not describe, and cameras that turn as good as around in one exposure.
     pub(super) fn of(view: &View) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        if view.rolling.is_some() {
-            return None;
-        }
+        let shutter = Shutter::of(view)?;
         let glass = match windshield {
             None => None,
             Some(windshield) => Some(Glass::of(windshield)?),
@@ -66,7 +76,7 @@ impl Optics {
         // Most of what reaches into an image has all its points around it.
         let about_rad = || view.camera.limit_rad().min(1.25 * seen_rad(&view.camera) + 0.1);
         let kind = match lens {
-            // As it is behind a windshield: slopes without a distortion.
+            // As it is behind a windshield or when it moves: slopes without a distortion.
             Lens::Pinhole => {
                 let limit = view.camera.straight_slope().powi(2) as f32 * INSIDE;
                 Kind::Slopes { focal_px, k: [0.0; 6], p: [0.0; 2], s: [0.0; 4], limit }
@@ -93,12 +103,60 @@ impl Optics {
                 round(about_rad(), px_from_round, LEFT_PX, &|angle| lens.radius_px(angle))?
             }
         };
-        Some(Self { glass, center_px: [pinhole.cx as f32, pinhole.cy as f32], kind })
+        Some(Self { shutter, glass, center_px: [pinhole.cx as f32, pinhole.cy as f32], kind })
+    }
+
+    /// Where points of the camera's frame at the exposure's end land. With a rolling shutter the row decides
+    /// where the camera stands, and that decides the row: found by going back and forth, from a first guess
+    /// of which share is still to come. What has not come to rest, or is not within the field, lands anywhere
+    /// and is not within.
+    #[inline(always)]
+    pub(super) fn expose<S: Simd>(
+        &self,
+        simd: S,
+        at_end_m: Vec3x16<S>,
+        guess: f32x16<S>,
+    ) -> Exposed<S> {
+        let Some(shutter) = &self.shutter else {
+            return Exposed { landed: self.land(simd, at_end_m), share: guess };
+        };
+        let none = f32x16::splat(simd, 0.0);
+        let mut share = guess;
+        let mut round = 0;
+        loop {
+            let landed = self.land(simd, shutter.then(simd, at_end_m, share));
+            let next = shutter.share(simd, landed.x_px, landed.y_px);
+            let still = Shutter::is_still(simd, next, share);
+            if round == Shutter::ROUNDS || (still | !landed.within.simd_ge(none)).all_true() {
+                let within = still.select(landed.within, f32x16::splat(simd, -1.0));
+                return Exposed { landed: Landed { within, ..landed }, share };
+            }
+            (share, round) = (next, round + 1);
+        }
+    }
+
+    /// How many metres farther along the camera's axis points are while a share is still to come than at the
+    /// exposure's end, where they are given.
+    #[inline(always)]
+    pub(super) fn farther<S: Simd>(
+        &self,
+        simd: S,
+        at_end_m: Vec3x16<S>,
+        share: f32x16<S>,
+    ) -> Option<f32x16<S>> {
+        self.shutter.as_ref().map(|shutter| shutter.farther(simd, at_end_m, share))
+    }
+
+    /// How far the camera's centre still has to go, in metres: in its frame at the exposure's end, and in the
+    /// world's axes.
+    #[inline(always)]
+    pub(super) fn ways<S: Simd>(&self, simd: S, share: f32x16<S>) -> Option<[Vec3x16<S>; 2]> {
+        self.shutter.as_ref().map(|shutter| shutter.ways(simd, share))
     }
 
     /// Where points of the camera's frame land. What is not within the field lands anywhere.
     #[inline(always)]
-    pub(super) fn land<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> Landed<S> {
+    fn land<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> Landed<S> {
         let Some(glass) = &self.glass else { return self.land_inside(simd, point_m) };
         let (inside, in_full) = glass.inside(simd, point_m);
         let landed = self.land_inside(simd, inside);
@@ -186,7 +244,8 @@ fn seen_rad(camera: &Camera) -> f64 {
 mod tests {
     use super::*;
     use crate::geometry::Pose;
-    use crate::geometry::camera::{Fisheye, OpenCv, Pinhole};
+    use crate::geometry::camera::{Fisheye, OpenCv, Pinhole, Rolls};
+    use crate::render::Rolling;
     use crate::scene::Rig;
     use fearless_simd::{Level, dispatch};
     use glam::{DMat3, DQuat, DVec3};
@@ -213,13 +272,26 @@ mod tests {
         cameras
     }
 
+    /// At rest, and driven by 0.9 m and 0.01 rad during the exposure; turned in the world.
+    fn views(camera: Camera) -> [View; 2] {
+        let pose = Pose { rotation: DQuat::from_rotation_x(0.7), ..Pose::IDENTITY };
+        let still = View::new(camera, pose);
+        let world_from_camera_first = Pose {
+            position_m: pose.rotation * DVec3::new(-0.05, 0.0, -0.9),
+            rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
+        };
+        let direction = Rolls::BottomToTop;
+        [still, View { rolling: Some(Rolling { direction, world_from_camera_first }), ..still }]
+    }
+
     #[test]
     fn pixels_look_where_the_lens_says() {
         let mut most_rad: f64 = 0.0;
         for (name, camera, _) in cameras() {
-            if !matches!(camera.lens, Lens::OpenCv(_) | Lens::Pinhole) {
-                let turned = Pose { rotation: DQuat::from_rotation_x(0.7), ..Pose::IDENTITY };
-                let view = View::new(camera, turned);
+            if matches!(camera.lens, Lens::OpenCv(_)) {
+                continue;
+            }
+            for view in views(camera) {
                 let axes = DMat3::from_rotation_z(1.1);
                 let looks = Looks::of(&view, axes).expect(&name);
                 let mut seen = 0;
@@ -249,31 +321,36 @@ mod tests {
     fn points_land_where_the_lens_says() {
         let mut most_px: f64 = 0.0;
         for (name, camera, least_inside) in cameras() {
-            let optics = Optics::of(&View::new(camera, Pose::IDENTITY)).expect(&name);
-            let mut inside = 0;
-            for step in 0..4_000 {
-                let angle_rad = 1.02 * camera.limit_rad() * f64::from(step) / 4_000.0;
-                let (sin, cos) = angle_rad.sin_cos();
-                let azimuth = 0.37 * f64::from(step);
-                let way = DVec3::new(sin * azimuth.cos(), sin * azimuth.sin(), cos);
-                let point = (17.0 * way).as_vec3();
-                let [x_px, y_px, within] = dispatch!(Level::new(), simd => {
-                    let landed = optics.land(simd, Vec3x16::splat(simd, point.to_array()));
-                    [landed.x_px, landed.y_px, landed.within].map(|v| f64::from(v.to_array()[0]))
-                });
-                let seen = camera.project(point.as_dvec3());
-                match seen {
-                    Some(at_px) if within >= 0.0 => {
-                        let off = at_px - glam::DVec2::new(x_px, y_px);
-                        most_px = most_px.max(off.length());
-                        inside += 1;
+            for view in views(camera) {
+                let optics = Optics::of(&view).expect(&name);
+                let mut inside = 0;
+                for step in 0..4_000 {
+                    let angle_rad = 1.02 * camera.limit_rad() * f64::from(step) / 4_000.0;
+                    let (sin, cos) = angle_rad.sin_cos();
+                    let azimuth = 0.37 * f64::from(step);
+                    let way = DVec3::new(sin * azimuth.cos(), sin * azimuth.sin(), cos);
+                    let point = (17.0 * way).as_vec3();
+                    let [x_px, y_px, within] = dispatch!(Level::new(), simd => {
+                        let point = Vec3x16::splat(simd, point.to_array());
+                        let Exposed { landed, .. } =
+                            optics.expose(simd, point, f32x16::splat(simd, 0.0));
+                        [landed.x_px, landed.y_px, landed.within]
+                            .map(|value| f64::from(value.to_array()[0]))
+                    });
+                    let point_m = view.world_from_camera.transform_point(point.as_dvec3());
+                    match view.project_world(point_m) {
+                        Some(at_px) if within >= 0.0 => {
+                            let off = at_px - DVec2::new(x_px, y_px);
+                            most_px = most_px.max(off.length());
+                            inside += 1;
+                        }
+                        // Left for f64.
+                        Some(_) => {}
+                        None => assert!(within < 0.0, "{name}: {angle_rad} rad is beyond"),
                     }
-                    // Left for f64.
-                    Some(_) => {}
-                    None => assert!(within < 0.0, "{angle_rad} rad is beyond"),
                 }
+                assert!(inside > least_inside, "{name}: {inside}");
             }
-            assert!(inside > least_inside, "{name}: {inside}");
         }
         eprintln!("off by {most_px:.1e} px at most");
         assert!(most_px < 1.5e-3, "{most_px:e} px");
