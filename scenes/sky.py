@@ -152,7 +152,8 @@ def colours(tensors, away, image=None):
 
 def read(path):
     """All tensors of a safetensors file of F32."""
-    data = open(path, "rb").read()
+    with open(path, "rb") as file:
+        data = file.read()
     length = struct.unpack("<Q", data[:8])[0]
     header, body = json.loads(data[8 : 8 + length]), data[8 + length :]
     header.pop("__metadata__", None)

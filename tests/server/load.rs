@@ -146,12 +146,13 @@ async fn two_laps(steps: u64) {
     assert_eq!(laps[0], laps[1], "what is driven twice is the same");
     let (early, late) = (early_bytes.unwrap(), served.rss());
     eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
-    assert!(late < early + (4 << 20), "{early} bytes grew to {late}");
+    // Of 10,000 steps and more, 70 B each would be seen.
+    assert!(late < early + (1 << 20), "{early} bytes grew to {late}");
 }
 
 #[tokio::test]
 async fn a_lap_driven_twice_is_the_same_in_the_same_memory() {
-    two_laps(2_000).await;
+    two_laps(10_000).await;
 }
 
 #[tokio::test]

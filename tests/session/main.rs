@@ -4,6 +4,7 @@
 mod support;
 
 mod appearance;
+mod driving;
 mod ego;
 mod integrators;
 mod long;
