@@ -124,7 +124,7 @@ pub struct Image {
     pub shutter_end_us: i64,
     /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
     pub hash: String,
-    /// How far it may be believed, if asked for; not of earlier frames.
+    /// How far it may be believed, if asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<Trust>,
 }

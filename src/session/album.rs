@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::SessionError;
 use super::engine::{Answers, Hold};
 use super::schedule::Schedule;
+use super::trust::Trust;
 
 /// What cameras took and a decision still looks at, in the order in which it was taken. What is
 /// common to two albums is in memory once.
@@ -20,6 +21,8 @@ pub(super) struct Shown {
     pub(super) time_us: i64,
     /// BLAKE3 of its pixels.
     pub(super) hash: blake3::Hash,
+    /// How far it may be believed, if that was asked for.
+    pub(super) trust: Option<Trust>,
     /// As it travels: a file, or its pixels.
     pub(super) bytes: Vec<u8>,
     /// Its part of the budget for answers.
@@ -32,11 +35,11 @@ impl Album {
         &mut self,
         answers: &Answers,
         (camera, time_us): (usize, i64),
-        hash: blake3::Hash,
+        (hash, trust): (blake3::Hash, Option<Trust>),
         bytes: Vec<u8>,
     ) -> Result<(), SessionError> {
         let _hold = answers.hold(bytes.len() as u64)?;
-        self.0.push(Arc::new(Shown { camera, time_us, hash, bytes, _hold }));
+        self.0.push(Arc::new(Shown { camera, time_us, hash, trust, bytes, _hold }));
         Ok(())
     }
 

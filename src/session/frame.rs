@@ -66,6 +66,8 @@ pub struct PastImage {
     pub time_us: i64,
     /// BLAKE3 of the pixels, `[height, width, 3]`.
     pub hash: blake3::Hash,
+    /// How far it may be believed, if that was asked for.
+    pub trust: Option<Trust>,
 }
 
 /// One tensor of a [`Frame`].

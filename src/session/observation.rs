@@ -80,15 +80,17 @@ pub(super) struct Shot {
 pub(super) struct Drawing {
     pub(super) frame: Frame,
     pub(super) album: Album,
-    /// What was drawn, in order, and the hashes of its images.
+    /// What was drawn, in order, the hashes of its images, and how far they may be believed.
     pub(super) shots: Vec<Shot>,
     pub(super) hashes: Vec<blake3::Hash>,
+    trusts: Vec<Option<Trust>>,
 }
 
 impl Drawing {
-    /// How far each of its images may be believed, as far as that was asked for.
+    /// How far each of its images may be believed, those for later observations included, as far as that
+    /// was asked for.
     pub(super) fn trusts(&self) -> impl Iterator<Item = f64> {
-        self.frame.images.iter().filter_map(|image| image.trust).map(|trust| trust.value)
+        self.trusts.iter().flatten().map(|trust| trust.value)
     }
 }
 
@@ -267,10 +269,11 @@ impl Assembly {
         let layout = self.layout.clone();
         scratch.resize_with(scratch.len().max(views.len()), Vec::new);
 
-        let trained = self.trained.clone().filter(|_| shot.shown);
+        let trained = self.trained.clone();
         // Seen by nobody else: coverage is a part of trust, and normals are computed of depth.
         let Maps { depth, opacity, normals } = layout.maps;
-        let wanted = [trained.is_some() && !opacity, normals && !depth && shot.shown];
+        let wanted =
+            [trained.is_some() && !(opacity && shot.shown), normals && !depth && shot.shown];
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         let images = wanted.iter().filter(|wanted| **wanted).count() as u64;
         let _hold = self.answers.hold(4 * pixels * images)?;
@@ -441,7 +444,8 @@ impl Assembly {
             for (index, &(shot, camera)) in taken.iter().enumerate() {
                 if layout.outlives(shot, camera) {
                     let file = mem::take(&mut files[index]);
-                    album.add(&self.answers, (camera, shot.time_us), hashes[index], file)?;
+                    let known = (hashes[index], trusts[index]);
+                    album.add(&self.answers, (camera, shot.time_us), known, file)?;
                 }
             }
             if layout.schedule.decides(now_us) {
@@ -449,11 +453,11 @@ impl Assembly {
                 let parts: Vec<&[u8]> = earlier.iter().map(|(_, shown)| &shown.bytes[..]).collect();
                 self.buffer.append(&self.answers, &parts)?;
                 for (index, (back, shown)) in earlier.iter().enumerate() {
-                    let Shown { camera, time_us, hash, bytes, .. } = &***shown;
-                    let (camera, time_us, hash) = (*camera, *time_us, *hash);
+                    let Shown { camera, time_us, hash, trust, bytes, .. } = &***shown;
+                    let (camera, time_us, hash, trust) = (*camera, *time_us, *hash, *trust);
                     let shape = layout.shape(camera, bytes.len());
                     tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
-                    history.push(PastImage { camera, back: *back, time_us, hash });
+                    history.push(PastImage { camera, back: *back, time_us, hash, trust });
                 }
             }
             album.forget(&layout.schedule, now_us);
@@ -469,7 +473,7 @@ impl Assembly {
             timings: self.timings,
             residency: Residency { held_bytes, limit_bytes, ..self.residency },
         };
-        Ok(Drawing { frame, album, shots: self.shots, hashes })
+        Ok(Drawing { frame, album, shots: self.shots, hashes, trusts })
     }
 }
 

@@ -47,6 +47,27 @@ fn driven(camera: usize, times: &[i64]) -> Vec<(i64, Vec<u8>)> {
 }
 
 #[tokio::test]
+async fn earlier_frames_are_believed_as_far_as_they_were() {
+    let server = TestServer::start().await;
+    // The drive ends at 9 m.
+    let outputs = json!({ "encoding": "raw", "frames": 3, "trust": true });
+    let mut agent = open(&server, json!({ "outputs": outputs, "decision_us": 200_000 })).await;
+    agent.look(json!({ "type": "reset" })).await;
+    let between = agent.step(29.0).await;
+    assert_eq!(between.meta["images"], json!([]), "nobody decides here");
+    let seen = agent.step(8.0).await;
+    let away_m = |list: &str| -> Vec<f64> {
+        let images = seen.meta[list].as_array().unwrap().iter();
+        let front = images.filter(|image| image["camera"] == "front");
+        front.map(|image| image["trust"]["distance_m"].as_f64().unwrap()).collect()
+    };
+    assert_eq!((away_m("images"), away_m("history")), (vec![0.0], vec![20.0, 0.0]));
+    // Where nobody decided, the ego was off its model all the same.
+    let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
+    assert_eq!(summary["outcome"], "off_model");
+}
+
+#[tokio::test]
 async fn the_last_frames_of_each_camera_newest_first() {
     let server = TestServer::start().await;
     let outputs = json!({ "encoding": "raw", "frames": 3, "depth": true });

@@ -303,8 +303,12 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
         Image { pose, trust, ..image(drawn.camera, tensor, drawn.time_us, &drawn.hash) }
     };
     let past = |past: &PastImage| {
-        let back = past.back as u64;
-        Image { back, ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash) }
+        let (back, trust) = (past.back as u64, past.trust.map(trust));
+        Image {
+            back,
+            trust,
+            ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
+        }
     };
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
