@@ -15,7 +15,7 @@ use super::scene_source::Machine;
 ///
 /// Needles of 10,000 px, depths from a centimetre to ten kilometres, 4,500 km from the origin, NaN, 70
 /// million keys: each has broken a published renderer. Prints one table, and fails if a bound is missed.
-/// What cannot be run is named, with the reason.
+/// What cannot be run is named, with the reason; so is what a device refuses, with how much fits.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Stress {

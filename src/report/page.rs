@@ -235,9 +235,9 @@ fn stress(page: &mut String, report: &Report) {
             let class = match outcome.verdict {
                 Verdict::Held => "text",
                 Verdict::Missed => "text miss",
-                Verdict::NotRun => "text off",
+                Verdict::Refused | Verdict::NotRun => "text off",
             };
-            let (word, told) = (outcome.verdict.word(), text(&outcome.told));
+            let (word, told) = (outcome.word(), text(&outcome.told));
             let _ = write!(page, "<td class=\"{class}\"><b>{word}</b><br>{told}</td>");
         }
         page.push_str("</tr>");

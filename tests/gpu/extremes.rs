@@ -4,16 +4,16 @@ use wildcity::report::stress::{CASES, Verdict};
 
 use crate::gpu::gpu;
 
-/// 70 million keys take gigabytes.
-const NOT_RUN: &[&str] = &["T21"];
-
 #[test]
 fn the_table_holds() {
     let gpu = gpu();
     let outcomes = CASES.iter().map(|case| case.run(&*gpu, false));
-    let wrong = outcomes.filter(|outcome| {
-        let is_limit = NOT_RUN.contains(&outcome.case);
-        outcome.verdict != if is_limit { Verdict::NotRun } else { Verdict::Held }
+    let wrong = outcomes.filter(|outcome| match outcome.case {
+        // 70 million keys take gigabytes.
+        "T21" => outcome.verdict != Verdict::NotRun,
+        // A driver may count to 65,535 only.
+        "T28" => !matches!(outcome.verdict, Verdict::Held | Verdict::Refused),
+        _ => outcome.verdict != Verdict::Held,
     });
     let wrong: Vec<_> = wrong.collect();
     assert!(wrong.is_empty(), "{wrong:#?}");

@@ -95,7 +95,9 @@ pub struct Outcome {
     pub backend: &'static str,
     /// Whether it was run, and how it went.
     pub verdict: Verdict,
-    /// What was compared, the first miss first, else what came closest to its bound.
+    /// What was drawn, where that is less than what the case says.
+    pub only: Option<String>,
+    /// What was compared, the first miss first, else what came closest to its bound; or what was refused.
     pub told: String,
     /// How much of its bound that took: 1 is all of it, 0 none or nothing that has a size.
     pub strain: f64,
@@ -113,6 +115,8 @@ pub enum Verdict {
     Held,
     /// Out of one, or the frame failed.
     Missed,
+    /// More than the device may hold, which it said with how much fits: a limit, and no miss.
+    Refused,
     /// Not run: `told` says why.
     NotRun,
 }
@@ -129,17 +133,18 @@ impl Case {
         let start = Instant::now();
         let mut trial = Trial::new(backend);
         let ended = body(&mut trial);
-        let seconds = start.elapsed().as_secs_f64();
-        let (verdict, told, strain) = match (trial.verdict(), ended) {
-            (_, Err(error)) => (Verdict::Missed, error.to_string(), f64::INFINITY),
-            (None, Ok(())) => (Verdict::Missed, "nothing was compared".to_owned(), f64::INFINITY),
-            (Some(check), Ok(())) => {
-                let verdict = if check.holds() { Verdict::Held } else { Verdict::Missed };
-                (verdict, check.to_string(), check.strain())
-            }
-        };
-        let (case, backend, checks) = (self.number, backend.name(), trial.checks().len());
-        Outcome { case, backend, verdict, told, strain, checks, seconds }
+        Outcome { seconds: start.elapsed().as_secs_f64(), ..trial.outcome(self, ended) }
+    }
+
+    /// Everything that it looks at on a backend, in order.
+    ///
+    /// # Errors
+    /// A frame failed.
+    pub fn checks(&self, backend: &dyn Backend) -> Result<Vec<Check>, RenderError> {
+        let (Run::Light(body) | Run::Heavy(body)) = self.run;
+        let mut trial = Trial::new(backend);
+        body(&mut trial)?;
+        Ok(trial.into_checks())
     }
 
     /// The outcome where it could not be run.
@@ -148,10 +153,21 @@ impl Case {
             case: self.number,
             backend,
             verdict: Verdict::NotRun,
+            only: None,
             told: why.to_owned(),
             strain: 0.0,
             checks: 0,
             seconds: 0.0,
+        }
+    }
+}
+
+impl Outcome {
+    /// Its verdict in a word, with what was drawn where that is less than what the case says.
+    pub fn word(&self) -> String {
+        match &self.only {
+            Some(only) => format!("{} ({only})", self.verdict.word()),
+            None => self.verdict.word().to_owned(),
         }
     }
 }

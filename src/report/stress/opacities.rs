@@ -12,8 +12,8 @@ use crate::scene::{Gaussians, RenderProfile, Scene};
 
 pub(super) const T11: Case = Case {
     number: "T11",
-    what: "opacities of 0, just around 1/255, and 1; logits of ±100 and ±inf",
-    bound: "agrees with f64; monotone; nothing below 1/255, at most the cap",
+    what: "opacities of 0, 1/255, just around it, and 1; logits of ±100 and ±inf",
+    bound: "agrees with f64; monotone; nothing below 1/255, at 1/255 that or nothing, at most the cap",
     run: Run::Light(t11),
 };
 
@@ -34,10 +34,15 @@ fn t11(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         trial.at_most(format!("logit {logit}: opacity"), most.into(), 0.0);
         peaks.push(most);
     }
+    // At the cut itself the last bit of a backend's arithmetic decides, between these two and no other.
+    let at_cut = peak(trial, cut)?;
+    let off = f64::from(at_cut).min((f64::from(at_cut) - 1.0 / 255.0).abs());
+    trial.at_most("the logit of 1/255: off 0 and 1/255 by", off, 1e-7);
+    peaks.push(at_cut);
     for logit in [cut + 1e-3, -5.0, 0.0, 2.0, 6.0, 100.0, f32::INFINITY] {
         peaks.push(peak(trial, logit)?);
     }
-    trial.holds("1e-3 above the logit of 1/255: seen", peaks[4] > 0.0);
+    trial.holds("1e-3 above the logit of 1/255: seen", peaks[5] > 0.0);
     trial.holds("monotone", peaks.is_sorted());
     let cap_off = f64::from(peaks[peaks.len() - 1]) - profile.alpha_cap;
     trial.at_most("logit inf: off the cap by", cap_off.abs(), 1e-6);
@@ -58,7 +63,7 @@ fn t12(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let more = with_one_more(&good, [-18.0, 0.3, 1.6]);
     let seen = trial.draw(&Scene::from_gaussians(&more), &profile, view)?;
     let apart = max_difference(&seen.rgba, &right.rgba);
-    trial.at_least("unpoisoned, it is seen by", apart.into(), 0.1);
+    trial.holds("unpoisoned, it is seen", apart > 0.1);
     for (poison, poisoned) in poisoned(&more) {
         let scene = Scene::from_gaussians(&poisoned);
         let drawing = trial.agreed(poison.clone(), &scene, &profile, view)?;
@@ -113,14 +118,15 @@ fn poisoned(more: &Gaussians) -> Vec<(String, Gaussians)> {
 
 pub(super) const T19: Case = Case {
     number: "T19",
-    what: "layers whose transmittance lands on the stop; 10,000 of them",
+    what: "layers whose transmittance lands on the stop, and layers at the cap; 10,000 of them",
     bound: "agrees with f64; the layer that would reach it is left out, within 1e-6",
     run: Run::Light(t19),
 };
 
 fn t19(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     // Layers of alpha 0.9 at the centre: the transmittance is 0.1, 0.01, 0.001, then 1e-4: the
-    // fourth would reach the stop and is left out. Ten thousand layers change nothing.
+    // fourth would reach the stop and is left out. Ten thousand layers change nothing. Layers of opacity 1
+    // are capped at 0.99: 0.01, then 1e-4, and no more than the cap's rounding to f32 off, 2e-6 of it.
     let layer = |i: i32| Blob {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),
@@ -128,15 +134,19 @@ fn t19(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         ..Blob::default()
     };
     let view = ahead([9, 9], 1000.0);
-    for (count, stop, left) in [
-        (3, 1.0001e-4, 1e-3),
-        (4, 1.0001e-4, 1e-3),
-        (10_000, 1.0001e-4, 1e-3),
-        (10_000, 0.9999e-4, 1e-4),
+    for (count, opacity, stop, left) in [
+        (3, 0.9, 1.0001e-4, 1e-3),
+        (4, 0.9, 1.0001e-4, 1e-3),
+        (10_000, 0.9, 1.0001e-4, 1e-3),
+        (10_000, 0.9, 0.9999e-4, 1e-4),
+        (1, 1.0, 1.0001e-4, 1e-2),
+        (10_000, 1.0, 1.0001e-4, 1e-2),
+        (10_000, 1.0, 0.9999e-4, 1e-4),
     ] {
         let profile = RenderProfile { stop, ..RenderProfile::default() };
+        let layer = |i| Blob { opacity, ..layer(i) };
         let layers = scene(&(0..count).map(layer).collect::<Vec<_>>());
-        let what = format!("{count} layers, stop {stop:e}");
+        let what = format!("{count} layers of {opacity}, stop {stop:e}");
         let drawing = trial.agreed(what.clone(), &layers, &profile, view)?;
         let off = (1.0 - f64::from(drawing.opacity[4 * 9 + 4]) - left).abs();
         trial.at_most(format!("{what}: transmittance off by"), off, 1e-6);
@@ -155,7 +165,7 @@ fn t19(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 pub(super) const T28: Case = Case {
     number: "T28",
     what: "70,000 layers of fog in one tile",
-    bound: "agrees with f64, or is refused with the number that fits (software Vulkan counts to 65,535)",
+    bound: "agrees with f64, or a device refuses it with the number that fits (software Vulkan counts to 65,535)",
     run: Run::Light(t28),
 };
 
@@ -170,11 +180,10 @@ fn t28(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let fog = scene(&fog.collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     match trial.agreed("the fog", &fog, &profile, ahead([16, 16], 4.0)) {
-        Err(error @ RenderError::TooMany { .. }) => trial.holds(format!("refused: {error}"), true),
-        Err(error) => return Err(error),
+        Err(error) => trial.refused(error)?,
         Ok(drawing) => {
             let least = drawing.opacity.iter().fold(1.0_f32, |least, &o| least.min(o));
-            trial.at_least("the fog is opaque", least.into(), 0.999);
+            trial.at_most("the fog lets through", 1.0 - f64::from(least), 1e-3);
         }
     }
     Ok(())

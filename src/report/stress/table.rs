@@ -76,14 +76,23 @@ impl Table {
         let outcomes = self.rows.iter().flat_map(|row| &row.outcomes);
         outcomes.filter(|outcome| outcome.verdict == verdict).count()
     }
+
+    /// Characters of a backend's column, and two between it and the next.
+    fn width(&self, backend: usize) -> usize {
+        let words = self.rows.iter().filter_map(|row| Some(row.outcomes.get(backend)?.word()));
+        words.map(|word| word.chars().count()).fold(8, usize::max) + 2
+    }
 }
 
 impl Row {
-    /// What is worth telling of the row: the first miss, else what came closest to its bound.
+    /// What is worth telling of the row: the first miss, else what came closest to its bound, else why
+    /// nothing was run.
     pub fn tightest(&self) -> Option<&Outcome> {
         let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
-        let closest = || self.outcomes.iter().max_by(|a, b| a.strain.total_cmp(&b.strain));
-        missed.or_else(closest)
+        let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);
+        let closest = || held().max_by(|a, b| a.strain.total_cmp(&b.strain));
+        let not_run = || self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::NotRun);
+        missed.or_else(closest).or_else(not_run)
     }
 }
 
@@ -93,6 +102,7 @@ impl Verdict {
         match self {
             Self::Held => "held",
             Self::Missed => "MISSED",
+            Self::Refused => "refused",
             Self::NotRun => "not run",
         }
     }
@@ -103,25 +113,28 @@ impl fmt::Display for Table {
         for Column { backend, detail } in &self.backends {
             writeln!(f, "{backend:<10} {detail}")?;
         }
+        let widths: Vec<usize> = (0..self.backends.len()).map(|i| self.width(i)).collect();
         write!(f, "\n{:<5}", "case")?;
-        for Column { backend, .. } in &self.backends {
-            write!(f, "{backend:<10}")?;
+        for (Column { backend, .. }, width) in self.backends.iter().zip(&widths) {
+            write!(f, "{backend:<width$}")?;
         }
         writeln!(f, "what; bound; what came closest to it")?;
-        let indent = 5 + 10 * self.backends.len();
+        let indent = 5 + widths.iter().sum::<usize>();
         for row in &self.rows {
             write!(f, "{:<5}", row.case)?;
-            for Outcome { verdict, .. } in &row.outcomes {
-                write!(f, "{:<10}", verdict.word())?;
+            for (outcome, width) in row.outcomes.iter().zip(&widths) {
+                write!(f, "{:<width$}", outcome.word())?;
             }
             writeln!(f, "{}", row.what)?;
             writeln!(f, "{:indent$}{}", "", row.bound)?;
-            if let Some(Outcome { backend, told, .. }) = row.tightest() {
+            let refused = row.outcomes.iter().filter(|o| o.verdict == Verdict::Refused);
+            for Outcome { backend, told, .. } in row.tightest().into_iter().chain(refused) {
                 writeln!(f, "{:indent$}{backend}: {told}", "")?;
             }
         }
-        let [held, missed, not_run] =
-            [Verdict::Held, Verdict::Missed, Verdict::NotRun].map(|verdict| self.count(verdict));
-        writeln!(f, "\n{held} held, {missed} missed, {not_run} not run")
+        let [held, refused, missed, not_run] =
+            [Verdict::Held, Verdict::Refused, Verdict::Missed, Verdict::NotRun]
+                .map(|verdict| self.count(verdict));
+        writeln!(f, "\n{held} held, {refused} refused, {missed} missed, {not_run} not run")
     }
 }

@@ -2,8 +2,9 @@
 
 use std::fmt;
 
+use super::{Case, Outcome, Verdict};
 use crate::render::reference::Reference;
-use crate::render::{Backend, RenderError, View};
+use crate::render::{Backend, Frame, FrameStats, RenderError, Target, View};
 use crate::report::drawing::{AGREED_DB, Drawing, agree, draw};
 use crate::scene::{RenderProfile, Scene};
 
@@ -11,6 +12,8 @@ use crate::scene::{RenderProfile, Scene};
 pub struct Trial<'a> {
     backend: &'a dyn Backend,
     checks: Vec<Check>,
+    refused: Option<RenderError>,
+    only: Option<String>,
 }
 
 /// A measured value and its bound.
@@ -26,19 +29,35 @@ pub struct Check {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Bound {
     Most(f64),
-    Least(f64),
+    /// In dB.
+    LeastDb(f64),
     /// The value is 1 if it is so.
     So,
 }
 
 impl<'a> Trial<'a> {
     pub(super) fn new(backend: &'a dyn Backend) -> Self {
-        Self { backend, checks: Vec::new() }
+        Self { backend, checks: Vec::new(), refused: None, only: None }
     }
 
     /// Everything that was looked at.
-    pub fn checks(&self) -> &[Check] {
-        &self.checks
+    pub(super) fn into_checks(self) -> Vec<Check> {
+        self.checks
+    }
+
+    /// How it went, in the end.
+    pub(super) fn outcome(self, case: &Case, ended: Result<(), RenderError>) -> Outcome {
+        let (verdict, told, strain) = match (self.verdict(), &self.refused, ended) {
+            (_, _, Err(error)) => (Verdict::Missed, error.to_string(), f64::INFINITY),
+            (Some(check), _, _) if !check.holds() => {
+                (Verdict::Missed, check.to_string(), check.strain())
+            }
+            (_, Some(limit), _) => (Verdict::Refused, limit.to_string(), 0.0),
+            (Some(check), None, _) => (Verdict::Held, check.to_string(), check.strain()),
+            (None, None, _) => (Verdict::Missed, "nothing was compared".to_owned(), f64::INFINITY),
+        };
+        let (case, backend, checks) = (case.number, self.backend.name(), self.checks.len());
+        Outcome { case, backend, verdict, only: self.only, told, strain, checks, seconds: 0.0 }
     }
 
     /// The first bound that does not hold, else the one that is closest to not holding.
@@ -53,15 +72,30 @@ impl<'a> Trial<'a> {
         self.checks.push(Check { what: what.into(), measured, bound: Bound::Most(most) });
     }
 
-    /// Looks at a value that must be at least `least`. NaN is not.
-    pub(super) fn at_least(&mut self, what: impl Into<String>, measured: f64, least: f64) {
-        self.checks.push(Check { what: what.into(), measured, bound: Bound::Least(least) });
+    /// Looks at decibels that must be at least `least`. NaN is not.
+    pub(super) fn at_least_db(&mut self, what: impl Into<String>, measured: f64, least: f64) {
+        self.checks.push(Check { what: what.into(), measured, bound: Bound::LeastDb(least) });
     }
 
     /// Looks at something that is so or not.
     pub(super) fn holds(&mut self, what: impl Into<String>, holds: bool) {
         let measured = f64::from(u8::from(holds));
         self.checks.push(Check { what: what.into(), measured, bound: Bound::So });
+    }
+
+    /// Takes a refusal that names how much fits for the limit that it is. Devices have such limits and nothing
+    /// else has: of another backend it is an error as any other.
+    pub(super) fn refused(&mut self, error: RenderError) -> Result<(), RenderError> {
+        if !matches!(error, RenderError::TooMany { .. }) || self.backend.name() != "gpu" {
+            return Err(error);
+        }
+        self.refused = Some(error);
+        Ok(())
+    }
+
+    /// Says what is drawn, where that is less than what the case says.
+    pub(super) fn draws_only(&mut self, what: impl Into<String>) {
+        self.only = Some(what.into());
     }
 
     /// Whether this is the definition itself.
@@ -77,6 +111,19 @@ impl<'a> Trial<'a> {
         view: View,
     ) -> Result<Drawing, RenderError> {
         Ok(draw(self.backend, scene, profile, &[view])?.remove(0))
+    }
+
+    /// What a frame of a view costs.
+    pub(super) fn stats(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: View,
+    ) -> Result<FrameStats, RenderError> {
+        let mut opacity = vec![0.0; view.camera.pixels()];
+        let target = Target { opacity: Some(&mut opacity), ..Target::default() };
+        let frame = Frame { scene, profile, views: &[view] };
+        self.backend.render(&frame, &mut [target], &|_, _| {})
     }
 
     /// What it draws of several in one frame.
@@ -122,8 +169,8 @@ impl<'a> Trial<'a> {
     /// Looks at whether two drawings are of one thing.
     pub(super) fn compare(&mut self, what: impl Into<String>, drawing: &Drawing, truth: &Drawing) {
         match agree(drawing, truth) {
-            Ok(db) => self.at_least(format!("{}: dB", what.into()), db, AGREED_DB),
-            Err(off) => self.holds(format!("{}: {off}", what.into()), false),
+            Ok(db) => self.at_least_db(format!("{}: as f64, dB", what.into()), db, AGREED_DB),
+            Err(off) => self.holds(format!("{}: as f64, {off}", what.into()), false),
         }
     }
 }
@@ -133,17 +180,18 @@ impl Check {
     pub fn holds(&self) -> bool {
         match self.bound {
             Bound::Most(most) => self.measured <= most,
-            Bound::Least(least) => self.measured >= least,
+            Bound::LeastDb(least) => self.measured >= least,
             Bound::So => self.measured == 1.0,
         }
     }
 
-    /// How much of its bound the value takes: 1 is all of it.
+    /// How much of its bound the value takes: 1 is all of it. Of decibels it is the error that counts, a tenth
+    /// for every 20 dB.
     pub fn strain(&self) -> f64 {
         match self.bound {
             Bound::Most(0.0) => self.measured,
             Bound::Most(most) => self.measured / most,
-            Bound::Least(least) => least / self.measured,
+            Bound::LeastDb(least) => 10.0_f64.powf((least - self.measured) / 20.0),
             Bound::So => 0.0,
         }
     }
@@ -165,9 +213,38 @@ impl fmt::Display for Check {
             }
             Bound::So if self.holds() => write!(f, "{what}"),
             Bound::So => write!(f, "not: {what}"),
-            Bound::Least(least) => {
+            Bound::LeastDb(least) => {
                 write!(f, "{what} {}, at least {}", number(*measured), number(least))
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn strain(measured: f64, bound: Bound) -> f64 {
+        Check { what: String::new(), measured, bound }.strain()
+    }
+
+    #[test]
+    fn strain_is_the_share_of_the_bound() {
+        assert_eq!(strain(0.5, Bound::Most(2.0)), 0.25);
+        assert_eq!(strain(70.0, Bound::LeastDb(70.0)), 1.0);
+        assert!((strain(110.0, Bound::LeastDb(70.0)) - 0.01).abs() < 1e-15);
+        assert!((strain(50.0, Bound::LeastDb(70.0)) - 10.0).abs() < 1e-12);
+        assert_eq!(strain(f64::INFINITY, Bound::LeastDb(70.0)), 0.0);
+    }
+
+    #[test]
+    fn what_is_told_is_what_is_closest_to_its_bound() {
+        let mut trial = Trial::new(&Reference);
+        trial.at_least_db("far from its bound, dB", 145.0, 70.0);
+        trial.at_most("close to it", 3e-4, 5e-4);
+        trial.at_least_db("closer, dB", 71.0, 70.0);
+        assert_eq!(trial.verdict().unwrap().what, "closer, dB");
+        trial.at_most("beyond", f64::NAN, 5e-4);
+        assert_eq!(trial.verdict().unwrap().what, "beyond");
     }
 }
