@@ -4,13 +4,13 @@ use serde::Serialize;
 
 use super::ReportError;
 use super::ladder::Family;
-use super::measure::{AtPlace, Measured};
+use super::measure::{AtPlace, Measured, least};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Wanted {
-    /// At every place at least this PSNR, in dB, in as little time as possible.
+    /// In every camera's window at every place at least this PSNR, in dB, in as little time as possible.
     AtLeastDb(f64),
     /// All but one of twenty steps within this time, in milliseconds, with as little error as possible.
     AtMostMs(f64),
@@ -53,10 +53,11 @@ pub fn front(all: &[Measured]) -> Vec<bool> {
         };
         all.iter().filter(is_asked).any(|other| better(point(other)))
     };
-    all.iter().map(|m| is_asked(&m) && !beaten(point(m))).collect()
+    all.iter().map(|m| is_asked(&m) && !m.errors.psnr_db.is_nan() && !beaten(point(m))).collect()
 }
 
-/// The setting for what is wanted, of those that a server can be told to use.
+/// The setting for what is wanted, of those that a server can be told to use and that change something.
+/// Of equals it is the first of the ladder, which begins with the twin as served.
 ///
 /// The worst of the places that choose must be better than wanted by the deviation of their worse half: the
 /// worst of eight values of a normal distribution lies 1.4 deviations from its mean on average, so
@@ -69,7 +70,9 @@ pub fn recommend(
     all: &[Measured],
     backends: &[String],
 ) -> Result<Recommendation, ReportError> {
-    let servable = all.iter().filter(|m| m.setting.can_be_served());
+    let served = all.iter().find(|m| m.setting.family == Family::AsServed);
+    let changes = |m: &&Measured| !served.is_some_and(|served| m.changes_nothing(served));
+    let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(changes);
     let judged = servable.map(|m| (m, wanted.judge(m)));
     let judged: Vec<(&Measured, Judged)> = judged.collect();
     let meets = judged.iter().filter(|(_, judged)| wanted.holds(judged.assured));
@@ -79,7 +82,8 @@ pub fn recommend(
         }
         Wanted::AtMostMs(_) => {
             let db = |m: &Measured| Wanted::AtLeastDb(0.0).judge(m).worst;
-            meets.max_by(|(a, _), (b, _)| db(a).total_cmp(&db(b)))
+            let numbers = meets.filter(|(m, _)| !db(m).is_nan());
+            numbers.reduce(|best, next| if db(next.0) > db(best.0) { next } else { best })
         }
     };
     let Some((best, Judged { worst, margin, verified, .. })) = best.copied() else {
@@ -128,7 +132,8 @@ impl Wanted {
 
     fn judge(self, m: &Measured) -> Judged {
         let value = |place: &AtPlace| match self {
-            Self::AtLeastDb(_) => Some(place.psnr_db.min(MOST_DB)),
+            // NaN stays NaN, and holds nothing.
+            Self::AtLeastDb(_) => Some(place.least_db.clamp(f64::NEG_INFINITY, MOST_DB)),
             Self::AtMostMs(_) => place.p95_ms,
         };
         let of = |chooses: bool| {
@@ -136,11 +141,9 @@ impl Wanted {
             places.filter_map(value).collect::<Vec<f64>>()
         };
         let (choosing, verifying) = (of(true), of(false));
-        // NaN of no place, which holds nothing.
-        let (least, most) = (
-            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::min),
-            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max),
-        );
+        // NaN of no place, too.
+        let least = |values: &[f64]| least(values.iter().copied());
+        let most = |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max);
         match self {
             Self::AtLeastDb(_) => {
                 let (worst, margin) = (least(&choosing), spread(&choosing, f64::lt).max(MARGIN_DB));

@@ -263,7 +263,7 @@ fn only_what_is_needed(page: &mut String, report: &Report) {
 }
 
 fn decibels(db: f64) -> String {
-    if db.is_finite() { format!("{db:.1}") } else { "exact".to_owned() }
+    if db == f64::INFINITY { "exact".to_owned() } else { format!("{db:.1}") }
 }
 
 /// Text as HTML has it.

@@ -42,7 +42,9 @@ fn color(family: Family) -> RGBColor {
 pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError> {
     let on_front = front(all);
     let shown = || {
-        let asked = |(m, _): &(&Measured, &bool)| m.setting.family != Family::Rays;
+        let asked = |(m, _): &(&Measured, &bool)| {
+            m.setting.family != Family::Rays && !m.errors.psnr_db.is_nan()
+        };
         all.iter().zip(&on_front).filter(asked)
     };
     let (least, most) = shown()

@@ -15,7 +15,7 @@ use wildcity::report::believed::believed;
 use wildcity::report::choose::{Wanted, front, recommend};
 use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
 use wildcity::report::measure::{AtPlace, Bench, Measured};
-use wildcity::report::places::{OFFSETS_M, Sampling, places};
+use wildcity::report::places::{OFFSETS_M, Place, Sampling, places};
 use wildcity::report::timing::at_one_speed;
 use wildcity::report::{ReportError, needed};
 use wildcity::residency::{Cache, Resident};
@@ -91,6 +91,17 @@ fn measured(
     (settings.iter().filter(|setting| keep(setting)).map(measure).collect(), left_out)
 }
 
+/// One setting of the ladder on the cpu backend at some places.
+fn one(resident: &Arc<Resident>, places: &[Place], name: &str) -> Measured {
+    let manifest = &resident.version.manifest;
+    let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
+    let bench = Bench { resident, backends: &backends, places, repeat: 1 };
+    let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let Ladder { settings, .. } = ladder(&twin, &["cpu"]);
+    let setting = settings.iter().find(|setting| setting.name == name).unwrap();
+    bench.measure(setting, &bench.truth(Rays::Splats, &mut |_| {}).unwrap()).unwrap()
+}
+
 #[test]
 fn errors_and_costs_go_the_way_they_must() {
     let dir = tempfile::tempdir().unwrap();
@@ -127,6 +138,7 @@ fn errors_and_costs_go_the_way_they_must() {
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
         assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{errors:?}");
         assert!(m.least_db() <= errors.psnr_db, "{}: {errors:?}", m.setting.name);
+        assert!(m.by_place.iter().all(|place| m.least_db() <= place.least_db));
         assert_eq!(m.by_place.len(), 12);
         assert_eq!(m.by_place.iter().filter(|place| place.p95_ms.is_some()).count(), 3);
         let files = &m.worst.files;
@@ -156,7 +168,7 @@ fn errors_and_costs_go_the_way_they_must() {
 /// Least PSNR of the places that choose, or of those that verify.
 fn least_db(m: &Measured, chooses: bool) -> f64 {
     let places = m.by_place.iter().filter(|place| place.chooses == chooses);
-    places.map(|place| place.psnr_db).fold(f64::INFINITY, f64::min)
+    places.map(|place| place.least_db).fold(f64::INFINITY, f64::min)
 }
 
 /// A slow and good setting and a fast one, at places that give so many dB: of each two the first chooses.
@@ -167,6 +179,7 @@ fn two(like: &[Measured], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measured>
         let place = |(index, psnr_db): (usize, f64)| AtPlace {
             chooses: index % 2 == 0,
             psnr_db,
+            least_db: psnr_db,
             p95_ms: Some(ms),
         };
         m.by_place = db.into_iter().enumerate().map(place).collect();
@@ -211,6 +224,86 @@ fn the_margin_is_what_places_differ_by() {
         ["as served", "stop=0.016", "stop=0.016"]
     );
     assert!(recommend(Wanted::AtMostMs(10.9), &all, &names).is_err());
+}
+
+#[test]
+fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
+    let names = ["cpu".to_owned()];
+    let dir = tempfile::tempdir().unwrap();
+    let tried = ["as served", "stop=0.004", "stop=0.016"];
+    let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
+    let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
+    // As exact as each other where it is asked, and each faster than the one before.
+    for (m, ms) in all.iter_mut().zip([30.0, 20.0, 10.0]) {
+        m.cost.step_ms = ms;
+        for place in &mut m.by_place {
+            (place.least_db, place.p95_ms) = (f64::INFINITY, Some(ms));
+        }
+    }
+    let within = |all: &[Measured], ms| recommend(Wanted::AtMostMs(ms), all, &names).unwrap();
+    assert_eq!([100.0, 25.0].map(|ms| within(&all, ms).setting), ["as served", "stop=0.004"]);
+    // One that draws what the twin as served draws seems to be the fastest of all.
+    let mut idle = all[0].clone();
+    (idle.setting.name, idle.setting.family) = ("tau_px=4".to_owned(), Family::Detail);
+    idle.cost.step_ms = 1.0;
+    idle.by_place.iter_mut().for_each(|place| place.p95_ms = Some(1.0));
+    let at_least = |all: &[Measured]| recommend(Wanted::AtLeastDb(60.0), all, &names).unwrap();
+    for first in [true, false] {
+        let mut all = all.clone();
+        all.insert(if first { 0 } else { 3 }, idle.clone());
+        assert_eq!(within(&all, 100.0).setting, "as served");
+        assert!(recommend(Wanted::AtMostMs(5.0), &all, &names).is_err());
+        assert_eq!(at_least(&all).setting, "stop=0.016");
+    }
+    // With fewer Gaussians it is no chance.
+    idle.cost.gaussians -= 1;
+    all.push(idle);
+    assert_eq!(at_least(&all).setting, "tau_px=4");
+}
+
+#[test]
+fn a_place_is_as_good_as_its_worst_camera() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit(dir.path(), vec![drive()]);
+    let sampling = Sampling { stations: 2, window_px: [64, 48] };
+    let both = places(&resident.version.manifest, &rig().cameras, sampling);
+    let at_least_db = |cameras: Option<usize>| {
+        let only = |place: &Place| match cameras {
+            None => place.clone(),
+            Some(i) => Place {
+                views: vec![place.views[i]],
+                windows: vec![place.windows[i]],
+                ..place.clone()
+            },
+        };
+        let places: Vec<Place> = both.iter().map(only).collect();
+        let m = one(&resident, &places, "alpha_cut=0.032");
+        m.by_place.iter().map(|place| (place.least_db, place.psnr_db)).collect::<Vec<_>>()
+    };
+    let [together, first, second] = [None, Some(0), Some(1)].map(at_least_db);
+    for (i, (least_db, psnr_db)) in together.into_iter().enumerate() {
+        let alone_db = first[i].1.min(second[i].1);
+        assert!(
+            (least_db - alone_db).abs() < 1e-6,
+            "place {i}: {least_db} dB, alone {alone_db} dB"
+        );
+        assert!(least_db < psnr_db, "place {i}: {least_db} dB of {psnr_db} dB");
+    }
+    // What one camera of a place lacks, the others do not make good; nor does a number make up for NaN.
+    let names = ["cpu".to_owned()];
+    let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
+    let (like, _) = measured(&resident, &rig(), &keep);
+    let mut all = two(&like, [60.0; 6], [40.0; 6]);
+    let chosen = |all: &[Measured]| recommend(Wanted::AtLeastDb(35.0), all, &names);
+    assert_eq!(chosen(&all).unwrap().setting, "stop=0.016");
+    for least_db in [32.2, f64::NAN] {
+        all[1].by_place[2].least_db = least_db;
+        assert_eq!(chosen(&all).unwrap().setting, "as served", "{least_db}");
+    }
+    all[1].by_place[2].least_db = 40.0;
+    all[1].by_place[3].least_db = f64::NAN;
+    let refused = chosen(&all).unwrap_err();
+    assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
 }
 
 #[test]
