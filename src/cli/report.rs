@@ -164,7 +164,10 @@ impl Command {
         let truth = |rays: Rays, label| -> anyhow::Result<Truth> {
             let bar = progress::count(label);
             bar.set_length(places.len() as u64);
-            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64))?;
+            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64));
+            let truth = truth.context(
+                "the reference draws the whole twin, in full detail and however far it goes",
+            )?;
             bar.finish_and_clear();
             Ok(truth)
         };

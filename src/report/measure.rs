@@ -83,7 +83,7 @@ pub struct Cost {
     pub sent_bytes: u64,
 }
 
-/// What a setting is compared with: the definition, in full detail, by place and window.
+/// What a setting is compared with: the definition, in full detail and however far, by place and window.
 pub struct Truth {
     images: Vec<Vec<Image>>,
     /// Time that a step of all cameras would take, in milliseconds: of the windows, times their share.
@@ -96,7 +96,7 @@ impl Bench<'_> {
     /// # Errors
     /// The twin cannot be read, or a frame cannot be drawn.
     pub fn truth(&self, rays: Rays, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
-        let profile = RenderProfile { tau_px: 0.0, rays, ..self.profile() };
+        let profile = RenderProfile { tau_px: 0.0, reach_m: None, rays, ..self.profile() };
         let (mut images, mut step_ms) = (Vec::new(), 0.0);
         for (done, place) in self.places.iter().enumerate() {
             progress(done);

@@ -34,7 +34,7 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}: error against run \
          time</title><style>{STYLE}</style></head><body><h1>{0}: error against run time</h1><p>Twin \
          {0} version {1}, {2} Gaussians of SH degree {3}, record {4}. Every setting is compared with the \
-         f64 reference at full detail, at {5} places and {6} px of each camera, at full focal length. \
+         f64 reference at full detail and however far, at {5} places and {6} px of each camera, at full focal length. \
          Times are of whole steps of {7} cameras, encoding included: medians of {8} at each place, in turn with \
          the twin as served, and scaled to one speed of the machine.</p>",
         text(&subject.twin),

@@ -29,11 +29,20 @@ use crate::skies::demo_sky;
 
 /// Two cameras of a twin whose levels are seen: a street of 40 m, 30,000 Gaussians.
 fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Arc<Resident> {
+    commit_reaching(dir, trajectories, None)
+}
+
+/// The same, drawn up to a distance from each camera, in metres.
+fn commit_reaching(
+    dir: &std::path::Path,
+    trajectories: Vec<Trajectory>,
+    reach_m: Option<f64>,
+) -> Arc<Resident> {
     let catalog = Catalog::open(dir).unwrap();
     let street = generate::canyon(30_000, &mut |_, _| {});
     let new = NewVersion {
         // Full detail, so that other errors are seen alone.
-        profile: RenderProfile { tau_px: 0.0, ..RenderProfile::DEFAULT },
+        profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
         storage: Storage { record: Record::F32, levels: true },
@@ -107,7 +116,7 @@ fn errors_and_costs_go_the_way_they_must() {
     let dir = tempfile::tempdir().unwrap();
     let (all, left_out) = measured(&commit(dir.path(), vec![drive()]), &rig(), &|_| true);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "sky_error", "rays"]);
+    assert_eq!(left_out, ["tile size", "reach_m", "sky_error", "rays"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     // Full detail on the cpu backend is what the reference draws.
@@ -262,6 +271,20 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
 }
 
 #[test]
+fn what_a_reach_loses_is_seen() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit_reaching(dir.path(), vec![drive()], Some(2.0));
+    let keep = |setting: &Setting| ["as served", "reach_m=none"].contains(&setting.name.as_str());
+    let (all, left_out) = measured(&resident, &rig(), &keep);
+    assert!(left_out.iter().all(|out| out.what != "reach_m"), "{left_out:?}");
+    let [served, whole] = &all[..] else { panic!("{} settings", all.len()) };
+    assert!(whole.errors.psnr_db >= 70.0, "{:?}", whole.errors);
+    assert!(served.errors.psnr_db < 40.0, "{:?}", served.errors);
+    assert!(served.cost.gaussians < whole.cost.gaussians);
+    assert!(whole.setting.can_be_served());
+}
+
+#[test]
 fn a_place_is_as_good_as_its_worst_camera() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), vec![drive()]);
@@ -367,7 +390,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     let keep = |setting: &Setting| names.contains(&setting.name.as_str());
     let (all, left_out) = measured(&resident, &bent, &keep);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "tau_px"]);
+    assert_eq!(left_out, ["tile size", "tau_px", "reach_m"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     assert!(db("as served") > db("sky_error=0.1"), "{:?}", of("sky_error=0.1").errors);
