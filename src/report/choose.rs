@@ -3,8 +3,12 @@
 use serde::Serialize;
 
 use super::ReportError;
-use super::ladder::Family;
+use super::ladder::{Family, Sent};
 use super::measure::{AtPlace, Measured, least};
+use super::numbers::number;
+use crate::config;
+use crate::scene::profile::ProfileError;
+use crate::scene::{ProfileChanges, RenderProfile};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -16,7 +20,9 @@ pub enum Wanted {
     AtMostMs(f64),
 }
 
-/// A setting that was chosen by some places, and what the others say of it.
+/// A setting that was chosen by some places, and what the others say of it. All but
+/// [`Recommendation::encoded`] is of what is rendered, before images are encoded: a profile does not choose
+/// the encoding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
     /// What was wanted.
@@ -33,7 +39,29 @@ pub struct Recommendation {
     pub margin: f64,
     /// The worst at places that were not used to choose it.
     pub verified: f64,
+    /// Where in the way of an image to an agent all of that was measured: [`RENDERED`].
+    pub measured: &'static str,
+    /// What encodings lose and take on top.
+    pub encoded: Vec<Encoded>,
 }
+
+/// What the twin as served loses and takes when its images are encoded.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Encoded {
+    /// The rung, as `jpeg 90`.
+    pub sent: String,
+    /// Whether sessions get their images so unless they ask for another encoding.
+    pub by_default: bool,
+    /// Least PSNR of a window at any place, in dB, of what arrives.
+    #[serde(serialize_with = "number")]
+    pub least_db: f64,
+    /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
+    /// chance can make it less than 0.
+    pub more_ms: f64,
+}
+
+/// What decibels and milliseconds of a recommendation are of.
+pub const RENDERED: &str = "what is rendered, before images are encoded";
 
 /// Least margin: 1 dB, ...
 const MARGIN_DB: f64 = 1.0;
@@ -98,6 +126,7 @@ pub fn recommend(
         let (setting, wanted) = (best.setting.name.clone(), wanted.to_string());
         return Err(ReportError::NotVerified { setting, wanted, verified });
     }
+    let is_sent = |m: &&Measured| m.setting.family == Family::Sent;
     Ok(Recommendation {
         wanted,
         setting: best.setting.name.clone(),
@@ -106,7 +135,61 @@ pub fn recommend(
         chosen_by: worst,
         margin,
         verified,
+        measured: RENDERED,
+        encoded: all.iter().filter(is_sent).map(Encoded::of).collect(),
     })
+}
+
+impl Encoded {
+    fn of(m: &Measured) -> Self {
+        Self {
+            sent: m.setting.name.clone(),
+            by_default: m.setting.sent == Some(Sent::Jpeg(config::JPEG_QUALITY)),
+            least_db: m.least_db(),
+            more_ms: m.cost.step_ms - m.served_ms,
+        }
+    }
+}
+
+impl Recommendation {
+    /// The fields of the profile that it changes, as a profile file has them.
+    ///
+    /// # Errors
+    /// Names the change that cannot be made.
+    pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
+        let mut profile = RenderProfile::default();
+        self.profile.iter().try_for_each(|change| profile.set(change))?;
+        let bad =
+            |field: &str, reason: String| ProfileError::Change { field: field.to_owned(), reason };
+        let all =
+            serde_json::to_value(profile).map_err(|error| bad("profile", error.to_string()))?;
+        let field = |change: &String| {
+            let key = change.split_once('=').map_or(change.as_str(), |(key, _)| key);
+            let value = all.get(key).ok_or_else(|| bad(key, "it is not written".to_owned()))?;
+            Ok((key.to_owned(), value.clone()))
+        };
+        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileChanges::new)
+    }
+
+    /// What starts a server that draws so, with the profile in a file.
+    pub fn serve(&self, profile: &str) -> String {
+        format!("wildcity serve --backend {} --profile {profile}", self.backend)
+    }
+
+    /// What its decibels and milliseconds are of, and what encodings add to them.
+    pub fn of_what(&self) -> String {
+        let one = |encoded: &Encoded| {
+            let Encoded { sent, by_default, least_db, more_ms } = encoded;
+            let default = if *by_default { " (the default)" } else { "" };
+            format!("{sent}{default} {least_db:.1} dB at worst and {more_ms:+.1} ms a step")
+        };
+        let all: Vec<String> = self.encoded.iter().map(one).collect();
+        let encoded = match all.is_empty() {
+            true => String::new(),
+            false => format!("; encoded, the twin as served has: {}", all.join(", ")),
+        };
+        format!("of {}{encoded}", self.measured)
+    }
 }
 
 /// What the places say of a setting, in dB or milliseconds.

@@ -23,7 +23,8 @@ pub struct Setting {
     pub profile: Vec<String>,
     /// Sides of the images, as a share of the cameras'.
     pub scale: f64,
-    /// How images are sent; if absent, values are compared before they are rounded to 8 bits.
+    /// How images are sent; if absent, values are compared before they are rounded to 8 bits, and no
+    /// encoding is timed.
     pub sent: Option<Sent>,
     /// What it is compared with: all but those of [`Family::Rays`] with splats, as they are.
     pub against: Rays,

@@ -10,6 +10,7 @@ use serde::Serialize;
 use super::drawing::{Drawing, draw};
 use super::errors::{Errors, Gathered, Image};
 use super::ladder::{Family, Setting};
+use super::numbers::{number, numbers};
 use super::places::{OFFSETS_M, Place};
 use super::recorded::recorded;
 use super::timing::{Step, Timed, file};
@@ -42,6 +43,7 @@ pub struct Measured {
     /// Errors at all places.
     pub errors: Errors,
     /// PSNR by [`OFFSETS_M`], in dB; one where there is no drive.
+    #[serde(serialize_with = "numbers")]
     pub psnr_db_by_offset: Vec<f64>,
     /// The same place by place.
     pub by_place: Vec<AtPlace>,
@@ -60,8 +62,10 @@ pub struct AtPlace {
     /// Whether a setting may be chosen by it.
     pub chooses: bool,
     /// PSNR of all its windows together, in dB.
+    #[serde(serialize_with = "number")]
     pub psnr_db: f64,
     /// PSNR of the window that has the least, in dB: what a setting is judged by.
+    #[serde(serialize_with = "number")]
     pub least_db: f64,
     /// The 95th percentile of its steps, in milliseconds, which is the longest of fewer than twenty; none
     /// beside the drive, where no step is timed.
@@ -71,7 +75,8 @@ pub struct AtPlace {
 /// What a step costs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Cost {
-    /// Median time of a step of all cameras, encoding included, in milliseconds.
+    /// Median time of a step of all cameras, in milliseconds: of drawing, and of encoding where the setting
+    /// says how images are sent.
     pub step_ms: f64,
     /// Gaussians that a step draws, the most of all places.
     pub gaussians: u64,

@@ -14,6 +14,7 @@
 //! points     whether a camera shows points where its lens says
 //! drawing    what a backend draws of a view, and whether two drawings agree
 //! recorded   what a record makes of a scene
+//! numbers    numbers that JSON has no word for
 //! ```
 
 pub mod believed;
@@ -23,6 +24,7 @@ pub mod errors;
 pub mod ladder;
 pub mod measure;
 pub mod needed;
+mod numbers;
 pub mod page;
 mod pictures;
 pub mod places;
@@ -43,13 +45,14 @@ use crate::scene::profile::ProfileError;
 pub use pictures::Pictures;
 
 use believed::Believed;
-use choose::Recommendation;
+use choose::{Recommendation, Wanted};
 use ladder::LeftOut;
 use measure::Measured;
 use places::Sampling;
 use stress::table::{Column, Table};
 
-/// Everything that was measured of a twin.
+/// Everything that was measured of a twin. Numbers that are infinite or NaN are words in JSON and CSV alike:
+/// a setting that is exact has a PSNR of `inf`.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Of what.
@@ -72,7 +75,11 @@ pub struct Report {
     /// How far images may be believed beside the recorded drive; empty without one.
     pub believed: Vec<Believed>,
     /// What was asked for, if anything was.
-    pub recommendations: Vec<Recommendation>,
+    pub wanted: Option<Wanted>,
+    /// The setting for it.
+    pub recommendation: Option<Recommendation>,
+    /// Why there is none although one was wanted.
+    pub unmet: Option<String>,
     /// Extreme scenes on every backend.
     pub stress: Table,
     /// What scenes with and without each feature hold and run.

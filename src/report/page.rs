@@ -35,8 +35,10 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
          time</title><style>{STYLE}</style></head><body><h1>{0}: error against run time</h1><p>Twin \
          {0} version {1}, {2} Gaussians of SH degree {3}, record {4}. Every setting is compared with the \
          f64 reference at full detail and however far, at {5} places and {6} px of each camera, at full focal length. \
-         Times are of whole steps of {7} cameras, encoding included: medians of {8} at each place, in turn with \
-         the twin as served, and scaled to one speed of the machine.</p>",
+         Times are of whole steps of {7} cameras as they are rendered; only rows of what is as sent have encoding \
+         in them. Each is the median of all steps at all places on the drive (around a twin without one, at all \
+         places), {8} at each, in turn with steps of the twin as served on {9}, and scaled to the speed at which \
+         those took their median time: times of another backend, too, are scaled by those on {9}.</p>",
         text(&subject.twin),
         subject.version,
         subject.gaussians,
@@ -46,6 +48,7 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         report.sampling.window_px.map(|px| px.to_string()).join(" x "),
         subject.cameras,
         subject.repeat,
+        text(report.backends.first().map_or("the first backend", |column| column.backend)),
     );
     for column in &report.backends {
         let _ = write!(page, "<p>{}: {}</p>", text(column.backend), text(&column.detail));
@@ -55,7 +58,7 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         "<p>A whole step of the reference would take {:.0} s: of what was drawn, scaled to all pixels.</p>",
         1e-3 * report.reference_ms
     );
-    recommendations(&mut page, report);
+    recommendation(&mut page, report);
     page.push_str("<h2>Error against time</h2><p>On the line is what nothing else beats in both; what is \
                    beaten is grey. Values are compared before they are rounded to 8 bits, which alone \
                    leaves 59 dB, but for what is as sent.</p>");
@@ -73,8 +76,8 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
     Ok(page)
 }
 
-fn recommendations(page: &mut String, report: &Report) {
-    for r in &report.recommendations {
+fn recommendation(page: &mut String, report: &Report) {
+    if let Some(r) = &report.recommendation {
         let unit = match r.wanted {
             Wanted::AtLeastDb(_) => "dB",
             Wanted::AtMostMs(_) => "ms",
@@ -83,14 +86,21 @@ fn recommendations(page: &mut String, report: &Report) {
             page,
             "<p><b>{}</b>: {} on {}: {:.1} {unit} at the worst place where it was chosen, with a margin of \
              {:.1} {unit} for what places differ by, and {:.1} {unit} at the worst of those that were not \
-             used to choose it.</p>",
+             used to choose it, {}. To draw so: <code>{}</code></p>",
             text(&r.wanted.to_string()),
             text(&r.setting),
             text(&r.backend),
             r.chosen_by,
             r.margin,
-            r.verified
+            r.verified,
+            text(&r.of_what()),
+            text(&r.serve("profile.json"))
         );
+    }
+    if let (Some(wanted), Some(why)) = (report.wanted, &report.unmet) {
+        let (wanted, why) = (text(&wanted.to_string()), text(why));
+        let _ =
+            write!(page, "<p class=\"miss\"><b>{wanted}</b>: nothing is recommended: {why}.</p>");
     }
 }
 

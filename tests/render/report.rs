@@ -2,10 +2,12 @@
 
 use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
+use serde_json::Value;
 use wildcity::generate;
 use wildcity::geometry::Pose;
 use wildcity::geometry::camera::{Fisheye, Lens};
@@ -158,6 +160,17 @@ fn errors_and_costs_go_the_way_they_must() {
 
     let names = ["cpu".to_owned()];
     let best = recommend(Wanted::AtLeastDb(35.0), &all, &names).unwrap();
+    // Beside it, what the encodings that it is not of lose and take.
+    let encoded: Vec<(&str, bool)> =
+        best.encoded.iter().map(|e| (e.sent.as_str(), e.by_default)).collect();
+    let sent = ["8 bits", "jpeg 50", "jpeg 75", "jpeg 90", "jpeg 98"];
+    assert_eq!(encoded, sent.map(|name| (name, name == "jpeg 90")));
+    for encoded in &best.encoded {
+        let m = of(&encoded.sent);
+        assert_eq!(encoded.least_db, m.least_db());
+        assert_eq!(encoded.more_ms, m.cost.step_ms - m.served_ms);
+        assert!(best.of_what().contains(&format!("{:.1} dB", encoded.least_db)), "{best:?}");
+    }
     let chosen = of(&best.setting);
     assert!(best.verified >= 35.0 && best.chosen_by >= 35.0 + best.margin, "{best:?}");
     assert_eq!((least_db(chosen, true), least_db(chosen, false)), (best.chosen_by, best.verified));
@@ -521,19 +534,45 @@ fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
     }
 }
 
+/// The command's report of the street in a directory, in its folder `report`.
+fn report_of(dir: &Path, more: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["report", "street", "--backend", "cpu", "--stations", "2", "--window", "48"])
+        .args(["--repeat", "1", "--no-stress", "--twins"])
+        .args([dir, Path::new("--out"), &dir.join("report")])
+        .args(more)
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn wishes_that_cannot_be_meant_are_refused_at_once() {
+    let nowhere = tempfile::tempdir().unwrap();
+    for (given, fix) in [
+        ("--at-least-db=-inf", "expected 0 to 1000 dB, as 40"),
+        ("--at-least-db=NaN", "expected 0 to 1000 dB, as 40"),
+        ("--at-most-ms=-5", "expected milliseconds, more than 0, as 20"),
+        ("--at-most-ms=inf", "expected milliseconds, more than 0, as 20"),
+        ("--backend=reference", "[possible values: cpu, gpu]"),
+        ("--backend=cpu,cpu", "name each once"),
+    ] {
+        // There is no twin, which is looked for only afterwards.
+        let refused = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+            .args(["report", "street", given, "--twins"])
+            .arg(nowhere.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&refused.stderr);
+        assert!(!refused.status.success() && said.contains(fix), "{given}: {said}");
+    }
+}
+
 #[test]
 fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes() {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), vec![drive()]);
     let out = dir.path().join("report");
-    let run = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-        .args(["report", "street", "--backend", "cpu", "--stations", "2", "--window", "48"])
-        .args(["--repeat", "1", "--no-stress", "--at-least-db", "30", "--twins"])
-        .arg(dir.path())
-        .arg("--out")
-        .arg(&out)
-        .output()
-        .unwrap();
+    let run = report_of(dir.path(), &["--at-least-db", "30"]);
     let said = String::from_utf8_lossy(&run.stderr);
     assert!(run.status.success(), "{said}");
     let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap();
@@ -542,7 +581,7 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     for outside in ["src=\"http", "href=\"http", "<link", "<script", "@import"] {
         assert!(!page.contains(outside), "{outside}");
     }
-    let report: serde_json::Value = serde_json::from_str(&read("report.json")).unwrap();
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     let settings = report["settings"].as_array().unwrap();
     assert_eq!(read("report.csv").lines().count(), settings.len() + 1);
     let families = settings.iter().map(|setting| setting["family"].as_str().unwrap());
@@ -551,13 +590,46 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
         "{:?}",
         families.collect::<Vec<_>>()
     );
-    assert_eq!(report["recommendations"][0]["wanted"]["at_least_db"], 30.0);
+    let best = &report["recommendation"];
+    assert_eq!(best["wanted"]["at_least_db"], 30.0);
+    assert_eq!((&report["wanted"], &report["unmet"]), (&best["wanted"], &Value::Null));
+    assert_eq!(best["measured"], "what is rendered, before images are encoded");
+    assert_eq!(best["encoded"][3]["sent"], "jpeg 90");
+    // On the page and on standard output, with the whole line to use.
+    let said = String::from_utf8_lossy(&run.stdout);
+    let file = out.join("profile.json");
+    let line = format!("wildcity serve --backend cpu --profile {}", file.display());
+    assert!(said.lines().any(|own| own == line), "{said}");
+    assert!(page.contains("wildcity serve --backend cpu --profile profile.json"));
+    for told in [&*said, &page] {
+        assert!(told.contains("before images are encoded"), "{told}");
+        assert!(told.contains("jpeg 90 (the default)"), "{told}");
+    }
     assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
     assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
     let profile: wildcity::scene::ProfileChanges =
         serde_json::from_str(&read("profile.json")).unwrap();
     profile.apply(RenderProfile::default()).unwrap();
+
+    // What cannot be had is said on the page and in JSON, and leaves no profile of an earlier report.
+    let unmet = report_of(dir.path(), &["--at-least-db", "500"]);
+    let said = String::from_utf8_lossy(&unmet.stderr);
+    assert!(!unmet.status.success() && said.contains("at least 500 dB"), "{said}");
+    assert!(!file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(
+        (&report["wanted"]["at_least_db"], &report["recommendation"]),
+        (&500.0.into(), &Value::Null)
+    );
+    assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
+    assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
+    // Nor does a report that nothing was asked of.
+    std::fs::write(&file, "{}").unwrap();
+    assert!(report_of(dir.path(), &[]).status.success() && !file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(report["wanted"], Value::Null);
+
     let bad = dir.path().join("bad.json");
     std::fs::write(&bad, r#"{"tau_px": -2}"#).unwrap();
     let refused = Command::new(env!("CARGO_BIN_EXE_wildcity"))
