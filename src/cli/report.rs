@@ -205,6 +205,7 @@ impl Command {
             backends: &backends,
             places: &places,
             repeat: self.repeat,
+            device: &|| self.device(),
         };
         let truth = |rays: Rays, label| -> anyhow::Result<Truth> {
             let bar = progress::count(label);

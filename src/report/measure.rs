@@ -15,6 +15,7 @@ use super::places::{OFFSETS_M, Place};
 use super::recorded::recorded;
 use super::timing::{Step, Timed, file};
 use super::{Pictures, ReportError, pictures};
+use crate::render::gpu::Gpu;
 use crate::render::reference::Reference;
 use crate::render::{Backend, RenderError, View};
 use crate::residency::{Pinned, Resident};
@@ -32,7 +33,12 @@ pub struct Bench<'a> {
     pub places: &'a [Place],
     /// How often a step is timed at each place, after once that is not.
     pub repeat: u32,
+    /// Opens a device that drew nothing yet, as that of the gpu backend, or says that there is none.
+    pub device: &'a dyn Fn() -> Option<Gpu>,
 }
+
+/// The backend that draws on a device.
+const GPU: &str = "gpu";
 
 /// A setting, measured.
 #[derive(Clone, Debug, Serialize)]
@@ -82,8 +88,11 @@ pub struct Cost {
     pub gaussians: u64,
     /// Memory that they and a baked sky take in the host, in bytes.
     pub scene_bytes: u64,
+    /// Memory that all buffers take on a device that draws these steps and nothing else, in bytes. None on the
+    /// host; nor where the driver does not count it, or a second device beside the backend's has no room.
+    pub device_bytes: Option<u64>,
     /// Bytes of a Gaussian as it is stored, before compression.
-    pub stored_bytes: f64,
+    pub stored_bytes_each: f64,
     /// Bytes of a step's images as they are sent.
     pub sent_bytes: u64,
 }
@@ -126,6 +135,7 @@ impl Bench<'_> {
         let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
         let mut by_place = Vec::new();
         let (mut steps_ms, mut served_ms, mut cost) = (Vec::new(), Vec::new(), Cost::NOTHING);
+        let device = if backend.name() == GPU { (self.device)() } else { None };
         let mut worst = (f64::INFINITY, None);
         for (place, truths) in self.places.iter().zip(&truth.images) {
             let own = place.scaled(setting.scale)?;
@@ -157,7 +167,13 @@ impl Bench<'_> {
                 let bytes = scene.bytes() as u64 + sky_bytes(scene, &profile)?;
                 cost.scene_bytes = cost.scene_bytes.max(bytes);
                 cost.sent_bytes = cost.sent_bytes.max(timed.sent_bytes);
-                cost.stored_bytes = stored_bytes;
+                cost.stored_bytes_each = stored_bytes;
+                if let Some(device) = &device {
+                    let (views, sent) = (&own.views[..], None);
+                    let step = Step { backend: device, scene, profile: &profile, views, sent };
+                    let held = step.draw().ok().and_then(|()| device.usage()?.allocated_bytes);
+                    cost.device_bytes = cost.device_bytes.max(held);
+                }
             }
             let least_db = least(windows_db);
             by_place.push(AtPlace { chooses: place.chooses, psnr_db, least_db, p95_ms });
@@ -223,6 +239,12 @@ impl Measured {
         least(self.by_place.iter().map(|place| place.least_db))
     }
 
+    /// The longest 95th percentile of a place's steps, in milliseconds: what `--at-most-ms` goes by.
+    pub fn p95_ms(&self) -> f64 {
+        let all = self.by_place.iter().filter_map(|place| place.p95_ms);
+        all.fold(f64::NAN, f64::max)
+    }
+
     /// Whether it draws the same images of the same Gaussians as the twin as served, in the same memory:
     /// all that its time can differ by is chance.
     pub fn changes_nothing(&self, served: &Self) -> bool {
@@ -245,8 +267,14 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
 }
 
 impl Cost {
-    const NOTHING: Self =
-        Self { step_ms: 0.0, gaussians: 0, scene_bytes: 0, stored_bytes: 0.0, sent_bytes: 0 };
+    const NOTHING: Self = Self {
+        step_ms: 0.0,
+        gaussians: 0,
+        scene_bytes: 0,
+        device_bytes: None,
+        stored_bytes_each: 0.0,
+        sent_bytes: 0,
+    };
 }
 
 /// What arrives of a drawing, at the size of what it is compared with.

@@ -48,7 +48,7 @@ use believed::Believed;
 use choose::{Recommendation, Wanted};
 use ladder::LeftOut;
 use measure::Measured;
-use places::Sampling;
+use places::{OFFSETS_M, Sampling};
 use stress::table::{Column, Table};
 
 /// Everything that was measured of a twin. Numbers that are infinite or NaN are words in JSON and CSV alike:
@@ -165,29 +165,35 @@ pub enum ReportError {
 }
 
 impl Report {
-    /// One line per setting, with a header; decimal points, no quotes but around names.
+    /// One line per setting, with a header; decimal points, no quotes but around names. Empty is what there
+    /// is not: dB beside a drive where none was recorded, bytes of a device without one.
     pub fn csv(&self) -> String {
-        let mut csv = String::from(
-            "setting,family,backend,step_ms,psnr_db,least_db,ssim,max,p99_9,depth_l1_m,gaussians,\
-             scene_bytes,stored_bytes,sent_bytes,on_front\n",
+        let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
+        let mut csv = format!(
+            "setting,family,backend,step_ms,p95_ms,psnr_db,least_db,{by_offset},ssim,max,p99_9,depth_l1_m,\
+             gaussians,scene_bytes,device_bytes,stored_bytes_each,sent_bytes,on_front\n"
         );
         for (m, is_on) in self.settings.iter().zip(choose::front(&self.settings)) {
             let (e, cost) = (&m.errors, &m.cost);
             let backend = self.backends[m.setting.backend].backend;
+            let at = |offset| m.psnr_db_by_offset.get(offset).map_or(String::new(), f64::to_string);
             csv.push_str(&format!(
-                "\"{}\",{},{backend},{:.3},{},{},{},{},{},{},{},{},{},{},{is_on}\n",
+                "\"{}\",{},{backend},{:.3},{:.3},{},{},{},{},{},{},{},{},{},{},{},{},{is_on}\n",
                 m.setting.name,
                 m.setting.family.name(),
                 cost.step_ms,
+                m.p95_ms(),
                 e.psnr_db,
                 m.least_db(),
+                [0, 1, 2, 3].map(at).join(","),
                 e.ssim,
                 e.max,
                 e.p99_9,
                 e.depth_l1_m,
                 cost.gaussians,
                 cost.scene_bytes,
-                cost.stored_bytes,
+                cost.device_bytes.map_or(String::new(), |bytes| bytes.to_string()),
+                cost.stored_bytes_each,
                 cost.sent_bytes
             ));
         }

@@ -22,23 +22,3 @@ impl Serialize for Number {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[derive(Serialize)]
-    struct Two {
-        #[serde(serialize_with = "number")]
-        one: f64,
-        #[serde(serialize_with = "numbers")]
-        all: Vec<f64>,
-    }
-
-    #[test]
-    fn what_json_has_no_number_for_is_said() {
-        let all = vec![f64::INFINITY, f64::NEG_INFINITY, f64::NAN, 40.5];
-        let text = serde_json::to_string(&Two { one: f64::INFINITY, all }).unwrap();
-        assert_eq!(text, r#"{"one":"inf","all":["inf","-inf","NaN",40.5]}"#);
-    }
-}

@@ -106,21 +106,22 @@ fn recommendation(page: &mut String, report: &Report) {
 
 fn table(page: &mut String, all: &[Measured]) {
     page.push_str(
-        "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>PSNR, dB</th>\
+        "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>95 %, ms</th><th>PSNR, dB</th>\
          <th>least, dB</th><th>SSIM</th><th>largest</th><th>99.9 %</th><th>depth, m</th>\
-         <th>Gaussians</th><th>MB in memory</th><th>B each, stored</th><th>kB sent</th></tr>",
+         <th>Gaussians</th><th>MB, host</th><th>MB, device</th><th>B each, stored</th><th>kB sent</th></tr>",
     );
     for (m, is_on) in all.iter().zip(front(all)) {
         let (e, cost) = (&m.errors, &m.cost);
         let _ = write!(
             page,
-            "<tr class=\"{}\"><td>{}</td><td class=\"text\">{}</td><td>{:.1}</td><td>{}</td><td>{}</td>\
-             <td>{:.5}</td><td>{:.5}</td><td>{:.5}</td><td>{:.4}</td><td>{}</td><td>{:.1}</td>\
-             <td>{:.1}</td><td>{}</td></tr>",
+            "<tr class=\"{}\"><td>{}</td><td class=\"text\">{}</td><td>{:.1}</td><td>{:.1}</td><td>{}</td>\
+             <td>{}</td><td>{:.5}</td><td>{:.5}</td><td>{:.5}</td><td>{:.4}</td><td>{}</td><td>{:.1}</td>\
+             <td>{}</td><td>{:.1}</td><td>{}</td></tr>",
             if is_on { "front" } else { "beaten" },
             text(&m.setting.name),
             m.setting.family.name(),
             cost.step_ms,
+            m.p95_ms(),
             decibels(e.psnr_db),
             decibels(m.least_db()),
             e.ssim,
@@ -129,7 +130,9 @@ fn table(page: &mut String, all: &[Measured]) {
             e.depth_l1_m,
             cost.gaussians,
             cost.scene_bytes as f64 / 1e6,
-            cost.stored_bytes,
+            cost.device_bytes
+                .map_or("none".to_owned(), |bytes| format!("{:.1}", bytes as f64 / 1e6)),
+            cost.stored_bytes_each,
             cost.sent_bytes / 1000,
         );
     }

@@ -48,6 +48,11 @@ impl Step<'_> {
         Ok(timed)
     }
 
+    /// Draws it once.
+    pub(super) fn draw(&self) -> Result<(), ReportError> {
+        self.run(&mut self.images()).map(|_| ())
+    }
+
     /// Its images, in 8 bits.
     fn images(&self) -> Vec<Vec<u8>> {
         self.views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect()

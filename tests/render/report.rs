@@ -11,10 +11,14 @@ use serde_json::Value;
 use wildcity::generate;
 use wildcity::geometry::Pose;
 use wildcity::geometry::camera::{Fisheye, Lens};
-use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::render::psnr::psnr_db;
+use wildcity::render::reference::Reference;
+use wildcity::render::{Backend, View};
 use wildcity::report::believed::believed;
 use wildcity::report::choose::{Wanted, front, recommend};
+use wildcity::report::drawing::{Drawing, draw};
+use wildcity::report::errors::Errors;
 use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
 use wildcity::report::measure::{AtPlace, Bench, Measured};
 use wildcity::report::places::{OFFSETS_M, Place, Sampling, places};
@@ -24,7 +28,10 @@ use wildcity::residency::{Cache, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::RigCamera;
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{Rays, Record, RenderProfile, Rig};
+use wildcity::scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
+use wildcity::session::{
+    Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
+};
 use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
 
 use crate::skies::demo_sky;
@@ -87,7 +94,8 @@ fn measured(
     let manifest = &resident.version.manifest;
     let places = places(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Bench { resident, backends: &backends, places: &places, repeat: 1 };
+    let bench =
+        Bench { resident, backends: &backends, places: &places, repeat: 1, device: &|| None };
     let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let Ladder { settings, left_out } = ladder(&twin, &["cpu"]);
     let truths = [Rays::Splats, Rays::Exact].map(|rays| {
@@ -106,7 +114,7 @@ fn measured(
 fn one(resident: &Arc<Resident>, places: &[Place], name: &str) -> Measured {
     let manifest = &resident.version.manifest;
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Bench { resident, backends: &backends, places, repeat: 1 };
+    let bench = Bench { resident, backends: &backends, places, repeat: 1, device: &|| None };
     let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let Ladder { settings, .. } = ladder(&twin, &["cpu"]);
     let setting = settings.iter().find(|setting| setting.name == name).unwrap();
@@ -143,7 +151,10 @@ fn errors_and_costs_go_the_way_they_must() {
     assert!(of("jpeg 50").cost.sent_bytes < of("jpeg 90").cost.sent_bytes);
     assert_eq!(of("8 bits").cost.sent_bytes, 2 * 3 * 120 * 80);
     assert_eq!(of("scale 0.5").cost.sent_bytes, 2 * 3 * 60 * 40);
-    assert_eq!([of("as served"), of("record q32")].map(|m| m.cost.stored_bytes), [92.0, 31.875]);
+    assert_eq!(
+        [of("as served"), of("record q32")].map(|m| m.cost.stored_bytes_each),
+        [92.0, 31.875]
+    );
     for m in &all {
         let errors = &m.errors;
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
@@ -419,6 +430,22 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
 }
 
 #[test]
+fn json_says_what_it_has_no_number_for() {
+    let errors = Errors {
+        psnr_db: f64::INFINITY,
+        ssim: f64::NAN,
+        max: 0.0,
+        p99_9: 0.25,
+        depth_l1_m: f64::NEG_INFINITY,
+    };
+    let text = serde_json::to_string(&errors).unwrap();
+    assert_eq!(
+        text,
+        r#"{"psnr_db":"inf","ssim":"NaN","max":0.0,"p99_9":0.25,"depth_l1_m":"-inf"}"#
+    );
+}
+
+#[test]
 fn a_setting_is_beaten_by_what_is_faster_and_closer() {
     let dir = tempfile::tempdir().unwrap();
     let keep = |setting: &Setting| setting.family == Family::Detail;
@@ -584,6 +611,36 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     let settings = report["settings"].as_array().unwrap();
     assert_eq!(read("report.csv").lines().count(), settings.len() + 1);
+    // The CSV says what JSON says, in the same words.
+    let csv = read("report.csv");
+    let mut lines = csv.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let names = lines.next().unwrap();
+    for (line, setting) in lines.zip(settings) {
+        let cell = |name: &str| line[names.iter().position(|own| *own == name).unwrap()];
+        let same = |name: &str, value: &Value| match value {
+            Value::String(word) => assert_eq!(cell(name), word, "{name}"),
+            Value::Null => assert_eq!(cell(name), "", "{name}"),
+            number => assert_eq!(cell(name).parse(), Ok(number.as_f64().unwrap()), "{name}"),
+        };
+        for name in ["psnr_db", "ssim", "max", "p99_9", "depth_l1_m"] {
+            same(name, &setting["errors"][name]);
+        }
+        for name in ["gaussians", "scene_bytes", "device_bytes", "stored_bytes_each"] {
+            same(name, &setting["cost"][name]);
+        }
+        for (i, offset_m) in OFFSETS_M.iter().enumerate() {
+            same(&format!("psnr_db_at_{offset_m}_m"), &setting["psnr_db_by_offset"][i]);
+        }
+        let of_places = |name: &str| {
+            let places = setting["by_place"].as_array().unwrap();
+            places.iter().filter_map(|place| place[name].as_f64()).collect::<Vec<f64>>()
+        };
+        let p95_ms: f64 = cell("p95_ms").parse().unwrap();
+        let slowest_ms = of_places("p95_ms").into_iter().fold(0.0, f64::max);
+        assert!((p95_ms - slowest_ms).abs() < 1e-3, "{p95_ms} ms, {slowest_ms} ms");
+        let least_db = of_places("least_db").into_iter().fold(f64::INFINITY, f64::min);
+        assert_eq!(cell("least_db").parse(), Ok(least_db));
+    }
     let families = settings.iter().map(|setting| setting["family"].as_str().unwrap());
     assert!(
         families.clone().any(|family| family == "record"),
@@ -608,27 +665,8 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
     assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
-    let profile: wildcity::scene::ProfileChanges =
-        serde_json::from_str(&read("profile.json")).unwrap();
+    let profile: ProfileChanges = serde_json::from_str(&read("profile.json")).unwrap();
     profile.apply(RenderProfile::default()).unwrap();
-
-    // What cannot be had is said on the page and in JSON, and leaves no profile of an earlier report.
-    let unmet = report_of(dir.path(), &["--at-least-db", "500"]);
-    let said = String::from_utf8_lossy(&unmet.stderr);
-    assert!(!unmet.status.success() && said.contains("at least 500 dB"), "{said}");
-    assert!(!file.exists());
-    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
-    assert_eq!(
-        (&report["wanted"]["at_least_db"], &report["recommendation"]),
-        (&500.0.into(), &Value::Null)
-    );
-    assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
-    assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
-    // Nor does a report that nothing was asked of.
-    std::fs::write(&file, "{}").unwrap();
-    assert!(report_of(dir.path(), &[]).status.success() && !file.exists());
-    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
-    assert_eq!(report["wanted"], Value::Null);
 
     let bad = dir.path().join("bad.json");
     std::fs::write(&bad, r#"{"tau_px": -2}"#).unwrap();
@@ -644,4 +682,34 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
         !refused.status.success() && said.contains("bad.json") && said.contains("tau_px"),
         "{said}"
     );
+}
+
+#[test]
+fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    commit(dir.path(), vec![drive()]);
+    let out = dir.path().join("report");
+    let (file, read) =
+        (out.join("profile.json"), |name: &str| std::fs::read_to_string(out.join(name)).unwrap());
+    let an_earlier_one = || {
+        std::fs::create_dir_all(&out).unwrap();
+        std::fs::write(&file, "{}").unwrap();
+    };
+    an_earlier_one();
+    let unmet = report_of(dir.path(), &["--at-least-db", "500"]);
+    let said = String::from_utf8_lossy(&unmet.stderr);
+    assert!(!unmet.status.success() && said.contains("at least 500 dB"), "{said}");
+    assert!(!file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(
+        (&report["wanted"]["at_least_db"], &report["recommendation"]),
+        (&500.0.into(), &Value::Null)
+    );
+    assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
+    assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
+    // Of one that nothing was asked of neither.
+    an_earlier_one();
+    assert!(report_of(dir.path(), &[]).status.success() && !file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(report["wanted"], Value::Null);
 }
