@@ -353,6 +353,108 @@ fn a_place_is_as_good_as_its_worst_camera() {
     assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
 }
 
+/// Where nothing was measured: stations in metres, and metres beside the drive. Settings are chosen and
+/// verified at 6.5, 19.5 and 32.5 m, on it and 1, 3 and 5 m beside.
+const ELSEWHERE_M: [[f64; 2]; 6] =
+    [[2.0, 0.0], [11.0, 2.0], [15.0, -2.0], [24.0, 0.0], [28.0, 4.0], [36.0, -4.0]];
+
+#[tokio::test]
+async fn a_recommended_profile_holds_for_sessions_elsewhere() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit(dir.path(), vec![drive()]);
+    let names = ["cpu".to_owned()];
+    let (all, _) = measured(&resident, &rig(), &Setting::can_be_served);
+    let poses = ELSEWHERE_M.map(|[station_m, left_m]| {
+        let position_m = DVec3::new(0.0, left_m, 0.0);
+        drive().at_station(station_m) * Pose { position_m, rotation: DQuat::IDENTITY }
+    });
+    let truths = truths(&poses);
+    let engine = Engine::start(EngineSettings {
+        cache: Cache::new(Catalog::open(dir.path()).unwrap()),
+        episodes: dir.path().join("episodes"),
+        backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
+        step_timeout: wildcity::config::STEP_TIMEOUT,
+    });
+    let engine = engine.unwrap();
+    for wanted_db in [35.0, 45.0] {
+        let (mut met, mut least_unmet_db) = (Vec::new(), f64::INFINITY);
+        for fastest in &all {
+            // Whichever is the fastest is recommended, if it is good enough.
+            let mut timed = all.clone();
+            for m in &mut timed {
+                let is_fastest = m.setting.name == fastest.setting.name;
+                m.cost.step_ms = if is_fastest { 1.0 } else { 2.0 };
+            }
+            let best = recommend(Wanted::AtLeastDb(wanted_db), &timed, &names);
+            let own = best.ok().filter(|best| best.setting == fastest.setting.name);
+            let profile = match &own {
+                Some(best) => best.changes().unwrap(),
+                None => changes(&fastest.setting),
+            };
+            let db = least_db_of_session(&engine, profile, &poses, &truths).await;
+            match own {
+                None => least_unmet_db = least_unmet_db.min(db),
+                Some(best) => {
+                    assert!(db >= wanted_db, "{db:.1} dB with {best:?}");
+                    met.push(best.setting);
+                }
+            }
+        }
+        assert!(met.len() >= 3 && met.contains(&"as served".to_owned()), "{met:?}");
+        // Of those that are not recommended, some are indeed not good enough.
+        assert!(least_unmet_db < wanted_db, "{least_unmet_db:.1} dB");
+    }
+}
+
+/// A setting as a session asks for it, whatever it loses.
+fn changes(setting: &Setting) -> ProfileChanges {
+    let field = |change: &String| {
+        let (key, value) = change.split_once('=').unwrap();
+        (key.to_owned(), serde_json::from_str(value).unwrap())
+    };
+    ProfileChanges::new(setting.profile.iter().map(field).collect())
+}
+
+/// What the rig's cameras see from poses by definition, of all Gaussians as they were generated: colours
+/// from 0 to 1.
+fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
+    let scene = Scene::from_gaussians(&generate::canyon(30_000, &mut |_, _| {}));
+    let at = |pose: &Pose| {
+        let views = View::of_rig(&rig().cameras, *pose);
+        draw(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
+    };
+    let colours = |drawing: Drawing| {
+        let rgba = drawing.rgba.chunks_exact(4);
+        rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect()
+    };
+    poses.iter().flat_map(at).map(colours).collect()
+}
+
+/// Least PSNR of an image that an agent gets from any of the poses, in dB.
+async fn least_db_of_session(
+    engine: &Arc<Engine>,
+    profile: ProfileChanges,
+    poses: &[Pose],
+    truths: &[Vec<f32>],
+) -> f64 {
+    let opening = Opening { profile, ..Opening::twin("street", Outputs::colour(Encoding::Raw)) };
+    let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
+    session.reset(0, None).await.unwrap();
+    let mut frame = session.observe(poses.to_vec()).await.unwrap();
+    let header = frame.buffer.header_mut().len();
+    let tensors = &frame.buffer.bytes()[header..];
+    let is_colour = |tensor: &&Tensor| matches!(tensor.kind, TensorKind::Rgb(_));
+    let images: Vec<&Tensor> = frame.tensors.iter().filter(is_colour).collect();
+    assert_eq!(images.len(), truths.len());
+    let db = images.iter().zip(truths).map(|(image, truth)| {
+        let rgb8 = &tensors[image.bytes.clone()];
+        assert_eq!(rgb8.len(), truth.len());
+        let off = rgb8.iter().zip(truth).map(|(&byte, &t)| f64::from(byte) / 255.0 - f64::from(t));
+        psnr_db(off)
+    });
+    db.fold(f64::INFINITY, f64::min)
+}
+
 #[test]
 fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let Some(path) = crate::data::real("scenes/skull/skull.ply") else { return };
