@@ -88,8 +88,8 @@ pub struct Cost {
     pub gaussians: u64,
     /// Memory that they and a baked sky take in the host, in bytes.
     pub scene_bytes: u64,
-    /// Memory that all buffers take on a device that draws these steps and nothing else, in bytes. None on the
-    /// host; nor where the driver does not count it, or a second device beside the backend's has no room.
+    /// Memory that all buffers take on a device that draws these steps and nothing else, in bytes. None on
+    /// the host; nor where the driver does not count it, or a second device beside the backend's has no room.
     pub device_bytes: Option<u64>,
     /// Bytes of a Gaussian as it is stored, before compression.
     pub stored_bytes_each: f64,

@@ -34,11 +34,12 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}: error against run \
          time</title><style>{STYLE}</style></head><body><h1>{0}: error against run time</h1><p>Twin \
          {0} version {1}, {2} Gaussians of SH degree {3}, record {4}. Every setting is compared with the \
-         f64 reference at full detail and however far, at {5} places and {6} px of each camera, at full focal length. \
-         Times are of whole steps of {7} cameras as they are rendered; only rows of what is as sent have encoding \
-         in them. Each is the median of all steps at all places on the drive (around a twin without one, at all \
-         places), {8} at each, in turn with steps of the twin as served on {9}, and scaled to the speed at which \
-         those took their median time: times of another backend, too, are scaled by those on {9}.</p>",
+         f64 reference at full detail and however far, at {5} places and {6} px of each camera, at full \
+         focal length. Times are of whole steps of {7} cameras as they are rendered; only rows of what is \
+         as sent have encoding in them. Each is the median of all steps at all places on the drive (around \
+         a twin without one, at all places), {8} at each, in turn with steps of the twin as served on {9}, \
+         and scaled to the speed at which those took their median time: times of another backend, too, are \
+         scaled by those on {9}.</p>",
         text(&subject.twin),
         subject.version,
         subject.gaussians,
@@ -61,7 +62,8 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
     recommendation(&mut page, report);
     page.push_str("<h2>Error against time</h2><p>On the line is what nothing else beats in both; what is \
                    beaten is grey. Values are compared before they are rounded to 8 bits, which alone \
-                   leaves 59 dB, but for what is as sent.</p>");
+                   leaves 59 dB, but for what is as sent. Least is the \
+                   PSNR of one camera's window at one place, where it is least.</p>");
     page.push_str(&plots::error_against_time(&report.settings)?);
     table(&mut page, &report.settings);
     left_out(&mut page, report);
