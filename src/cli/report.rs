@@ -1,10 +1,10 @@
 //! `wildcity report`.
 
-use std::io::{self, Write};
-use std::path::PathBuf;
+use std::fs;
+use std::io::{self, ErrorKind, Write};
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
-use serde_json::{Map, Value};
+use anyhow::{Context, bail, ensure};
 
 use crate::config;
 use crate::render::gpu::Gpu;
@@ -19,7 +19,7 @@ use crate::report::stress::table::{self, Candidate, Column};
 use crate::report::timing::at_one_speed;
 use crate::report::{Report, ReportError, Subject, needed, page};
 use crate::residency::Cache;
-use crate::scene::{Rays, RenderProfile, Rig};
+use crate::scene::{Rays, Rig};
 
 use super::places::{TwinVersion, Twins};
 use super::rig::rig_of;
@@ -37,7 +37,12 @@ use super::{demo, output, progress};
 /// which needs nothing else, report.json and report.csv.
 ///
 /// With --at-least-db or --at-most-ms it recommends a setting, verified at places that were not used to
-/// choose it, and writes it as profile.json for `wildcity serve --profile`.
+/// choose it, and writes it as profile.json for `wildcity serve --profile`; where it cannot, the report
+/// says why, and a profile.json of an earlier one is removed. Its decibels and milliseconds are of what is
+/// rendered, before images are encoded: a profile does not choose the encoding. What encodings lose and
+/// take is measured, and told beside it.
+///
+/// The reference draws the whole twin in full detail, however far it goes: it must fit into memory.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Command {
@@ -53,13 +58,16 @@ pub(super) struct Command {
     #[arg(long, value_name = "DIR", default_value = "wildcity-report")]
     out: PathBuf,
 
-    /// Recommend the fastest setting with at least this PSNR at every place, in dB.
-    #[arg(long, value_name = "DB")]
-    at_least_db: Option<f64>,
+    /// Recommend the fastest setting with at least this PSNR in every camera's window at every place, in
+    /// dB, before images are encoded.
+    #[arg(long, value_name = "DB", value_parser = at_least_db, allow_negative_numbers = true)]
+    at_least_db: Option<Wanted>,
 
-    /// Recommend the most exact setting of which all but one of twenty steps take at most this time.
-    #[arg(long, value_name = "MS", conflicts_with = "at_least_db")]
-    at_most_ms: Option<f64>,
+    /// Recommend the most exact setting of which all but one of twenty steps take at most this time, in
+    /// milliseconds, before images are encoded.
+    #[arg(long, value_name = "MS", value_parser = at_most_ms, allow_negative_numbers = true)]
+    #[arg(conflicts_with = "at_least_db")]
+    at_most_ms: Option<Wanted>,
 
     /// Stations along the drive, each on it and 1, 3 and 5 m beside; around a twin without a drive, four
     /// times as many places. The reference takes about a second for each place and camera.
@@ -79,8 +87,8 @@ pub(super) struct Command {
     rig: Option<String>,
 
     /// Backends beside the reference, the one that draws all settings first.
-    #[arg(long = "backend", value_name = "NAME", value_delimiter = ',', value_enum, default_values_t = [Name::Cpu, Name::Gpu])]
-    backends: Vec<Name>,
+    #[arg(long = "backend", value_name = "NAME", value_delimiter = ',', value_enum, default_values_t = [Measurable::Cpu, Measurable::Gpu])]
+    backends: Vec<Measurable>,
 
     /// Leave out the stress table.
     #[arg(long)]
@@ -95,23 +103,60 @@ Examples:
   wildcity report
   wildcity report street --at-least-db 40 --out report
   wildcity report street --rig alpamayo2
-  wildcity report street --backend gpu,cpu --at-most-ms 20 && \\
-    wildcity serve --profile wildcity-report/profile.json";
+  wildcity report street --backend gpu --at-most-ms 20 && \\
+    wildcity serve --backend gpu --profile wildcity-report/profile.json";
+
+/// Backends that can be measured: the reference is what they are compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Measurable {
+    Cpu,
+    Gpu,
+}
+
+impl From<Measurable> for Name {
+    fn from(measurable: Measurable) -> Self {
+        match measurable {
+            Measurable::Cpu => Self::Cpu,
+            Measurable::Gpu => Self::Gpu,
+        }
+    }
+}
+
+fn at_least_db(text: &str) -> Result<Wanted, String> {
+    match text.parse() {
+        Ok(db) if (0.0..=1000.0).contains(&db) => Ok(Wanted::AtLeastDb(db)),
+        _ => Err("expected 0 to 1000 dB, as 40".to_owned()),
+    }
+}
+
+fn at_most_ms(text: &str) -> Result<Wanted, String> {
+    match text.parse() {
+        Ok(ms) if ms > 0.0 && f64::is_finite(ms) => Ok(Wanted::AtMostMs(ms)),
+        _ => Err("expected milliseconds, more than 0, as 20".to_owned()),
+    }
+}
 
 impl Command {
     pub(super) fn run(mut self) -> anyhow::Result<()> {
+        let again = |(index, name)| self.backends[..index].contains(name);
+        let twice = self.backends.iter().enumerate().any(again);
+        ensure!(!twice, "--backend names one twice: name each once");
         if self.twin.name == demo::TWIN {
             self.twin.name = demo::exact(&self.twins.dir()?)?.manifest.twin;
         }
-        let (report, unmet) = self.measure()?;
+        let report = self.measure()?;
         output::make_dir(&self.out)?;
         let mut files = vec![
             ("report.html", page::html(&report)?),
             ("report.json", format!("{:#}\n", serde_json::to_value(&report)?)),
             ("report.csv", report.csv()),
         ];
-        if let Some(best) = report.recommendations.first() {
-            files.push(("profile.json", format!("{:#}\n", profile_of(best)?)));
+        // It would be another report's beside this one.
+        let profile = self.out.join("profile.json");
+        remove(&profile)?;
+        if let Some(best) = &report.recommendation {
+            let changes = serde_json::to_value(best.changes()?)?;
+            files.push(("profile.json", format!("{changes:#}\n")));
         }
         let mut out = io::stdout().lock();
         for (name, text) in files {
@@ -122,22 +167,22 @@ impl Command {
         for LeftOut { what, why } in &report.left_out {
             writeln!(out, "not compared: {what} ({why})")?;
         }
-        for Recommendation { wanted, setting, backend, chosen_by, margin, verified, .. } in
-            &report.recommendations
-        {
+        if let Some(best) = &report.recommendation {
+            let Recommendation { wanted, setting, backend, chosen_by, margin, verified, .. } = best;
             writeln!(
                 out,
                 "{wanted}: {setting} on {backend}, {chosen_by:.1} at worst where it was chosen, with a \
-                 margin of {margin:.1}, and {verified:.1} at worst at other places"
+                 margin of {margin:.1}, and {verified:.1} at worst at other places, {}",
+                best.of_what()
             )?;
+            writeln!(out, "{}", best.serve(&profile.display().to_string()))?;
         }
-        // What was measured is on disk: it says why.
-        unmet.map_or(Ok(()), |unmet| Err(unmet.into()))
+        // What was measured is on disk, and says so, too.
+        report.unmet.map_or(Ok(()), |why| bail!(why))
     }
 
-    /// The report, and why there is no recommendation in it although one was wanted.
-    fn measure(&self) -> anyhow::Result<(Report, Option<ReportError>)> {
-        let candidates = self.backends.iter().map(|name| candidate(*name, &self.machine));
+    fn measure(&self) -> anyhow::Result<Report> {
+        let candidates = self.backends.iter().map(|name| candidate((*name).into(), &self.machine));
         let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
         let (mut backends, mut absent): (Vec<Box<dyn Backend>>, _) = (Vec::new(), Vec::new());
         for candidate in candidates {
@@ -160,11 +205,15 @@ impl Command {
             backends: &backends,
             places: &places,
             repeat: self.repeat,
+            device: &|| self.device(),
         };
         let truth = |rays: Rays, label| -> anyhow::Result<Truth> {
             let bar = progress::count(label);
             bar.set_length(places.len() as u64);
-            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64))?;
+            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64));
+            let truth = truth.context(
+                "the reference draws the whole twin, in full detail and however far it goes",
+            )?;
             bar.finish_and_clear();
             Ok(truth)
         };
@@ -198,15 +247,14 @@ impl Command {
         bar.finish_and_clear();
         at_one_speed(&mut measured);
 
-        let wanted = (self.at_least_db.map(Wanted::AtLeastDb))
-            .or_else(|| self.at_most_ms.map(Wanted::AtMostMs));
+        let wanted = self.at_least_db.or(self.at_most_ms);
         let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
         let recommended = wanted.map(|wanted| recommend(wanted, &measured, &names)).transpose();
         let (recommendation, unmet) = match recommended {
             Ok(recommendation) => (recommendation, None),
-            Err(unmet) => (None, Some(unmet)),
+            Err(unmet) => (None, Some(unmet.to_string())),
         };
-        let report = Report {
+        Ok(Report {
             subject: Subject {
                 twin: manifest.twin.clone(),
                 version: resident.version.number,
@@ -229,21 +277,23 @@ impl Command {
             left_out,
             exact_rays_ms: rays.map(|rays| rays.step_ms),
             believed: believed(&resident, &*backends[0], &places)?,
-            recommendations: recommendation.into_iter().collect(),
+            wanted,
+            recommendation,
+            unmet,
             stress: self.stress()?,
             needed: needed::rows(&self.machine.cpu()?, &|| self.device())?,
-        };
-        Ok((report, unmet))
+        })
     }
 
     /// A device that drew nothing yet, if one is wanted and there.
     fn device(&self) -> Option<Gpu> {
-        if self.backends.contains(&Name::Gpu) { self.machine.gpu().ok() } else { None }
+        if self.backends.contains(&Measurable::Gpu) { self.machine.gpu().ok() } else { None }
     }
 
     /// The stress table on every backend of the report, and on the definition.
     fn stress(&self) -> anyhow::Result<table::Table> {
-        let names = [Name::Reference].into_iter().chain(self.backends.iter().copied());
+        let backends = self.backends.iter().map(|name| Name::from(*name));
+        let names = [Name::Reference].into_iter().chain(backends);
         let names = names.filter(|_| !self.no_stress);
         let candidates = names.map(|name| candidate(name, &self.machine));
         let candidates = candidates.collect::<anyhow::Result<Vec<_>>>()?;
@@ -259,12 +309,10 @@ impl Command {
     }
 }
 
-/// The fields of the profile that a recommendation changes, as a profile file has them.
-fn profile_of(best: &Recommendation) -> anyhow::Result<Value> {
-    let mut profile = RenderProfile::default();
-    best.profile.iter().try_for_each(|change| profile.set(change))?;
-    let all = serde_json::to_value(profile)?;
-    let keys = best.profile.iter().filter_map(|change| Some(change.split_once('=')?.0));
-    let fields: Map<String, Value> = keys.map(|key| (key.to_owned(), all[key].clone())).collect();
-    Ok(Value::Object(fields))
+/// Removes a file, if it is there.
+fn remove(path: &Path) -> anyhow::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        removed => removed.with_context(|| format!("cannot remove {}", path.display())),
+    }
 }

@@ -3,20 +3,26 @@
 use serde::Serialize;
 
 use super::ReportError;
-use super::ladder::Family;
-use super::measure::{AtPlace, Measured};
+use super::ladder::{Family, Sent};
+use super::measure::{AtPlace, Measured, least};
+use super::numbers::number;
+use crate::config;
+use crate::scene::profile::ProfileError;
+use crate::scene::{ProfileChanges, RenderProfile};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Wanted {
-    /// At every place at least this PSNR, in dB, in as little time as possible.
+    /// In every camera's window at every place at least this PSNR, in dB, in as little time as possible.
     AtLeastDb(f64),
     /// All but one of twenty steps within this time, in milliseconds, with as little error as possible.
     AtMostMs(f64),
 }
 
-/// A setting that was chosen by some places, and what the others say of it.
+/// A setting that was chosen by some places, and what the others say of it. All but
+/// [`Recommendation::encoded`] is of what is rendered, before images are encoded: a profile does not choose
+/// the encoding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
     /// What was wanted.
@@ -33,7 +39,29 @@ pub struct Recommendation {
     pub margin: f64,
     /// The worst at places that were not used to choose it.
     pub verified: f64,
+    /// Where in the way of an image to an agent all of that was measured: [`RENDERED`].
+    pub measured: &'static str,
+    /// What encodings lose and take on top.
+    pub encoded: Vec<Encoded>,
 }
+
+/// What the twin as served loses and takes when its images are encoded.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Encoded {
+    /// The rung, as `jpeg 90`.
+    pub sent: String,
+    /// Whether sessions get their images so unless they ask for another encoding.
+    pub by_default: bool,
+    /// Least PSNR of a window at any place, in dB, of what arrives.
+    #[serde(serialize_with = "number")]
+    pub least_db: f64,
+    /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
+    /// chance can make it less than 0.
+    pub more_ms: f64,
+}
+
+/// What decibels and milliseconds of a recommendation are of.
+pub const RENDERED: &str = "what is rendered, before images are encoded";
 
 /// Least margin: 1 dB, ...
 const MARGIN_DB: f64 = 1.0;
@@ -53,10 +81,11 @@ pub fn front(all: &[Measured]) -> Vec<bool> {
         };
         all.iter().filter(is_asked).any(|other| better(point(other)))
     };
-    all.iter().map(|m| is_asked(&m) && !beaten(point(m))).collect()
+    all.iter().map(|m| is_asked(&m) && !m.errors.psnr_db.is_nan() && !beaten(point(m))).collect()
 }
 
-/// The setting for what is wanted, of those that a server can be told to use.
+/// The setting for what is wanted, of those that a server can be told to use and that change something.
+/// Of equals it is the first of the ladder, which begins with the twin as served.
 ///
 /// The worst of the places that choose must be better than wanted by the deviation of their worse half: the
 /// worst of eight values of a normal distribution lies 1.4 deviations from its mean on average, so
@@ -69,7 +98,9 @@ pub fn recommend(
     all: &[Measured],
     backends: &[String],
 ) -> Result<Recommendation, ReportError> {
-    let servable = all.iter().filter(|m| m.setting.can_be_served());
+    let served = all.iter().find(|m| m.setting.family == Family::AsServed);
+    let changes = |m: &&Measured| !served.is_some_and(|served| m.changes_nothing(served));
+    let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(changes);
     let judged = servable.map(|m| (m, wanted.judge(m)));
     let judged: Vec<(&Measured, Judged)> = judged.collect();
     let meets = judged.iter().filter(|(_, judged)| wanted.holds(judged.assured));
@@ -79,7 +110,8 @@ pub fn recommend(
         }
         Wanted::AtMostMs(_) => {
             let db = |m: &Measured| Wanted::AtLeastDb(0.0).judge(m).worst;
-            meets.max_by(|(a, _), (b, _)| db(a).total_cmp(&db(b)))
+            let numbers = meets.filter(|(m, _)| !db(m).is_nan());
+            numbers.reduce(|best, next| if db(next.0) > db(best.0) { next } else { best })
         }
     };
     let Some((best, Judged { worst, margin, verified, .. })) = best.copied() else {
@@ -94,6 +126,7 @@ pub fn recommend(
         let (setting, wanted) = (best.setting.name.clone(), wanted.to_string());
         return Err(ReportError::NotVerified { setting, wanted, verified });
     }
+    let is_sent = |m: &&Measured| m.setting.family == Family::Sent;
     Ok(Recommendation {
         wanted,
         setting: best.setting.name.clone(),
@@ -102,7 +135,61 @@ pub fn recommend(
         chosen_by: worst,
         margin,
         verified,
+        measured: RENDERED,
+        encoded: all.iter().filter(is_sent).map(Encoded::of).collect(),
     })
+}
+
+impl Encoded {
+    fn of(m: &Measured) -> Self {
+        Self {
+            sent: m.setting.name.clone(),
+            by_default: m.setting.sent == Some(Sent::Jpeg(config::JPEG_QUALITY)),
+            least_db: m.least_db(),
+            more_ms: m.cost.step_ms - m.served_ms,
+        }
+    }
+}
+
+impl Recommendation {
+    /// The fields of the profile that it changes, as a profile file has them.
+    ///
+    /// # Errors
+    /// Names the change that cannot be made.
+    pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
+        let mut profile = RenderProfile::default();
+        self.profile.iter().try_for_each(|change| profile.set(change))?;
+        let bad =
+            |field: &str, reason: String| ProfileError::Change { field: field.to_owned(), reason };
+        let all =
+            serde_json::to_value(profile).map_err(|error| bad("profile", error.to_string()))?;
+        let field = |change: &String| {
+            let key = change.split_once('=').map_or(change.as_str(), |(key, _)| key);
+            let value = all.get(key).ok_or_else(|| bad(key, "it is not written".to_owned()))?;
+            Ok((key.to_owned(), value.clone()))
+        };
+        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileChanges::new)
+    }
+
+    /// What starts a server that draws so, with the profile in a file.
+    pub fn serve(&self, profile: &str) -> String {
+        format!("wildcity serve --backend {} --profile {profile}", self.backend)
+    }
+
+    /// What its decibels and milliseconds are of, and what encodings add to them.
+    pub fn of_what(&self) -> String {
+        let one = |encoded: &Encoded| {
+            let Encoded { sent, by_default, least_db, more_ms } = encoded;
+            let default = if *by_default { " (the default)" } else { "" };
+            format!("{sent}{default} {least_db:.1} dB at worst and {more_ms:+.1} ms a step")
+        };
+        let all: Vec<String> = self.encoded.iter().map(one).collect();
+        let encoded = match all.is_empty() {
+            true => String::new(),
+            false => format!("; encoded, the twin as served has: {}", all.join(", ")),
+        };
+        format!("of {}{encoded}", self.measured)
+    }
 }
 
 /// What the places say of a setting, in dB or milliseconds.
@@ -128,7 +215,8 @@ impl Wanted {
 
     fn judge(self, m: &Measured) -> Judged {
         let value = |place: &AtPlace| match self {
-            Self::AtLeastDb(_) => Some(place.psnr_db.min(MOST_DB)),
+            // NaN stays NaN, and holds nothing.
+            Self::AtLeastDb(_) => Some(place.least_db.clamp(f64::NEG_INFINITY, MOST_DB)),
             Self::AtMostMs(_) => place.p95_ms,
         };
         let of = |chooses: bool| {
@@ -136,11 +224,9 @@ impl Wanted {
             places.filter_map(value).collect::<Vec<f64>>()
         };
         let (choosing, verifying) = (of(true), of(false));
-        // NaN of no place, which holds nothing.
-        let (least, most) = (
-            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::min),
-            |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max),
-        );
+        // NaN of no place, too.
+        let least = |values: &[f64]| least(values.iter().copied());
+        let most = |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max);
         match self {
             Self::AtLeastDb(_) => {
                 let (worst, margin) = (least(&choosing), spread(&choosing, f64::lt).max(MARGIN_DB));

@@ -2,20 +2,26 @@
 
 use serde::Serialize;
 
+use super::numbers::number;
 use crate::render::psnr::psnr_db;
 
 /// How far off a set of images is. Values are those of colour, clamped to [0, 1] as they are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Errors {
     /// Peak signal-to-noise ratio of all values together, in dB; infinite where none differs.
+    #[serde(serialize_with = "number")]
     pub psnr_db: f64,
     /// Mean structural similarity of the images' luma; 1 where nothing differs.
+    #[serde(serialize_with = "number")]
     pub ssim: f64,
     /// Largest error of a value.
+    #[serde(serialize_with = "number")]
     pub max: f64,
     /// The error that all but one of a thousand values keep below.
+    #[serde(serialize_with = "number")]
     pub p99_9: f64,
     /// Mean error of the depth, in metres, where both images cover at least half of the pixel.
+    #[serde(serialize_with = "number")]
     pub depth_l1_m: f64,
 }
 

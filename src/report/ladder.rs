@@ -23,7 +23,8 @@ pub struct Setting {
     pub profile: Vec<String>,
     /// Sides of the images, as a share of the cameras'.
     pub scale: f64,
-    /// How images are sent; if absent, values are compared before they are rounded to 8 bits.
+    /// How images are sent; if absent, values are compared before they are rounded to 8 bits, and no
+    /// encoding is timed.
     pub sent: Option<Sent>,
     /// What it is compared with: all but those of [`Family::Rays`] with splats, as they are.
     pub against: Rays,
@@ -100,6 +101,8 @@ pub enum Family {
     Backend,
     /// Levels of detail.
     Detail,
+    /// How far blocks are drawn.
+    Reach,
     /// How Gaussians are stored.
     Record,
     /// What a small splat's opacity is.
@@ -122,10 +125,11 @@ pub enum Family {
 
 impl Family {
     /// All of them, in the order of the report.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::AsServed,
         Self::Backend,
         Self::Detail,
+        Self::Reach,
         Self::Record,
         Self::Antialiasing,
         Self::AlphaCut,
@@ -143,6 +147,7 @@ impl Family {
             Self::AsServed => "as served",
             Self::Backend => "backend",
             Self::Detail => "levels of detail",
+            Self::Reach => "reach",
             Self::Record => "record",
             Self::Antialiasing => "antialiasing",
             Self::AlphaCut => "alpha cut",
@@ -205,6 +210,10 @@ pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
         all.extend(taus.map(|tau_px| changed(Family::Detail, &[tau(tau_px)])));
     } else {
         left_out.push(LeftOut::new("tau_px", "the twin has no levels of detail"));
+    }
+    match profile.reach_m {
+        None => left_out.push(LeftOut::new("reach_m", "the twin is drawn however far it goes")),
+        Some(_) => all.push(changed(Family::Reach, &["reach_m=none".to_owned()])),
     }
     let mut coarser =
         Record::ALL.into_iter().skip_while(|record| *record != twin.stored).skip(1).peekable();

@@ -9,11 +9,13 @@ use serde::Serialize;
 
 use super::drawing::{Drawing, draw};
 use super::errors::{Errors, Gathered, Image};
-use super::ladder::Setting;
+use super::ladder::{Family, Setting};
+use super::numbers::{number, numbers};
 use super::places::{OFFSETS_M, Place};
 use super::recorded::recorded;
 use super::timing::{Step, Timed, file};
 use super::{Pictures, ReportError, pictures};
+use crate::render::gpu::Gpu;
 use crate::render::reference::Reference;
 use crate::render::{Backend, RenderError, View};
 use crate::residency::{Pinned, Resident};
@@ -31,7 +33,12 @@ pub struct Bench<'a> {
     pub places: &'a [Place],
     /// How often a step is timed at each place, after once that is not.
     pub repeat: u32,
+    /// Opens a device that drew nothing yet, as that of the gpu backend, or says that there is none.
+    pub device: &'a dyn Fn() -> Option<Gpu>,
 }
+
+/// The backend that draws on a device.
+const GPU: &str = "gpu";
 
 /// A setting, measured.
 #[derive(Clone, Debug, Serialize)]
@@ -42,6 +49,7 @@ pub struct Measured {
     /// Errors at all places.
     pub errors: Errors,
     /// PSNR by [`OFFSETS_M`], in dB; one where there is no drive.
+    #[serde(serialize_with = "numbers")]
     pub psnr_db_by_offset: Vec<f64>,
     /// The same place by place.
     pub by_place: Vec<AtPlace>,
@@ -59,8 +67,12 @@ pub struct Measured {
 pub struct AtPlace {
     /// Whether a setting may be chosen by it.
     pub chooses: bool,
-    /// PSNR in dB.
+    /// PSNR of all its windows together, in dB.
+    #[serde(serialize_with = "number")]
     pub psnr_db: f64,
+    /// PSNR of the window that has the least, in dB: what a setting is judged by.
+    #[serde(serialize_with = "number")]
+    pub least_db: f64,
     /// The 95th percentile of its steps, in milliseconds, which is the longest of fewer than twenty; none
     /// beside the drive, where no step is timed.
     pub p95_ms: Option<f64>,
@@ -69,19 +81,23 @@ pub struct AtPlace {
 /// What a step costs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Cost {
-    /// Median time of a step of all cameras, encoding included, in milliseconds.
+    /// Median time of a step of all cameras, in milliseconds: of drawing, and of encoding where the setting
+    /// says how images are sent.
     pub step_ms: f64,
     /// Gaussians that a step draws, the most of all places.
     pub gaussians: u64,
     /// Memory that they and a baked sky take in the host, in bytes.
     pub scene_bytes: u64,
+    /// Memory that all buffers take on a device that draws these steps and nothing else, in bytes. None on
+    /// the host; nor where the driver does not count it, or a second device beside the backend's has no room.
+    pub device_bytes: Option<u64>,
     /// Bytes of a Gaussian as it is stored, before compression.
-    pub stored_bytes: f64,
+    pub stored_bytes_each: f64,
     /// Bytes of a step's images as they are sent.
     pub sent_bytes: u64,
 }
 
-/// What a setting is compared with: the definition, in full detail, by place and window.
+/// What a setting is compared with: the definition, in full detail and however far, by place and window.
 pub struct Truth {
     images: Vec<Vec<Image>>,
     /// Time that a step of all cameras would take, in milliseconds: of the windows, times their share.
@@ -94,7 +110,7 @@ impl Bench<'_> {
     /// # Errors
     /// The twin cannot be read, or a frame cannot be drawn.
     pub fn truth(&self, rays: Rays, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
-        let profile = RenderProfile { tau_px: 0.0, rays, ..self.profile() };
+        let profile = RenderProfile { tau_px: 0.0, reach_m: None, rays, ..self.profile() };
         let (mut images, mut step_ms) = (Vec::new(), 0.0);
         for (done, place) in self.places.iter().enumerate() {
             progress(done);
@@ -119,6 +135,7 @@ impl Bench<'_> {
         let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
         let mut by_place = Vec::new();
         let (mut steps_ms, mut served_ms, mut cost) = (Vec::new(), Vec::new(), Cost::NOTHING);
+        let device = if backend.name() == GPU { (self.device)() } else { None };
         let mut worst = (f64::INFINITY, None);
         for (place, truths) in self.places.iter().zip(&truth.images) {
             let own = place.scaled(setting.scale)?;
@@ -128,10 +145,11 @@ impl Bench<'_> {
             let offset = OFFSETS_M.iter().position(|o| *o == place.offset_m).unwrap_or(0);
 
             let drawings = draw(backend, scene, &profile, &own.windows)?;
-            let mut here = Gathered::default();
+            let (mut here, mut windows_db) = (Gathered::default(), Vec::new());
             for ((view, drawing), truth) in own.windows.iter().zip(&drawings).zip(truths) {
                 let image = arrived(setting, view, drawing, truth.size_px)?;
                 let db = here.add(&image, truth);
+                windows_db.push(db);
                 if db < worst.0 {
                     worst = (db, Some((place.name.clone(), image, truth.clone())));
                 }
@@ -149,9 +167,16 @@ impl Bench<'_> {
                 let bytes = scene.bytes() as u64 + sky_bytes(scene, &profile)?;
                 cost.scene_bytes = cost.scene_bytes.max(bytes);
                 cost.sent_bytes = cost.sent_bytes.max(timed.sent_bytes);
-                cost.stored_bytes = stored_bytes;
+                cost.stored_bytes_each = stored_bytes;
+                if let Some(device) = &device {
+                    let (views, sent) = (&own.views[..], None);
+                    let step = Step { backend: device, scene, profile: &profile, views, sent };
+                    let held = step.draw().ok().and_then(|()| device.usage()?.allocated_bytes);
+                    cost.device_bytes = cost.device_bytes.max(held);
+                }
             }
-            by_place.push(AtPlace { chooses: place.chooses, psnr_db, p95_ms });
+            let least_db = least(windows_db);
+            by_place.push(AtPlace { chooses: place.chooses, psnr_db, least_db, p95_ms });
         }
         let mut all = Gathered::default();
         by_offset.iter().for_each(|gathered| all.merge(gathered));
@@ -209,9 +234,26 @@ impl Bench<'_> {
 }
 
 impl Measured {
-    /// Least PSNR of all places, in dB.
+    /// Least PSNR of a window at any place, in dB.
     pub fn least_db(&self) -> f64 {
-        self.by_place.iter().map(|place| place.psnr_db).fold(f64::INFINITY, f64::min)
+        least(self.by_place.iter().map(|place| place.least_db))
+    }
+
+    /// The longest 95th percentile of a place's steps, in milliseconds: what `--at-most-ms` goes by.
+    pub fn p95_ms(&self) -> f64 {
+        let all = self.by_place.iter().filter_map(|place| place.p95_ms);
+        all.fold(f64::NAN, f64::max)
+    }
+
+    /// Whether it draws the same images of the same Gaussians as the twin as served, in the same memory:
+    /// all that its time can differ by is chance.
+    pub fn changes_nothing(&self, served: &Self) -> bool {
+        let db = |m: &Self| -> Vec<[f64; 2]> {
+            m.by_place.iter().map(|place| [place.psnr_db, place.least_db]).collect()
+        };
+        let held = |m: &Self| (m.setting.backend, m.cost.gaussians, m.cost.scene_bytes);
+        let same_images = self.errors == served.errors && db(self) == db(served);
+        self.setting.family != Family::AsServed && same_images && held(self) == held(served)
     }
 }
 
@@ -225,8 +267,14 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
 }
 
 impl Cost {
-    const NOTHING: Self =
-        Self { step_ms: 0.0, gaussians: 0, scene_bytes: 0, stored_bytes: 0.0, sent_bytes: 0 };
+    const NOTHING: Self = Self {
+        step_ms: 0.0,
+        gaussians: 0,
+        scene_bytes: 0,
+        device_bytes: None,
+        stored_bytes_each: 0.0,
+        sent_bytes: 0,
+    };
 }
 
 /// What arrives of a drawing, at the size of what it is compared with.
@@ -266,6 +314,12 @@ fn shown(view: &View, drawing: &Drawing) -> Image {
         depth_m: drawing.depth_m.clone(),
         opacity: drawing.opacity.clone(),
     }
+}
+
+/// The least of them; NaN if one is, or of none.
+pub(super) fn least(values: impl IntoIterator<Item = f64>) -> f64 {
+    let lesser = |a: f64, b: f64| if a.is_nan() || a <= b { a } else { b };
+    values.into_iter().reduce(lesser).unwrap_or(f64::NAN)
 }
 
 /// The value that a share of all keeps below; NaN of none.

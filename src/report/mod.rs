@@ -14,6 +14,7 @@
 //! points     whether a camera shows points where its lens says
 //! drawing    what a backend draws of a view, and whether two drawings agree
 //! recorded   what a record makes of a scene
+//! numbers    numbers that JSON has no word for
 //! ```
 
 pub mod believed;
@@ -23,6 +24,7 @@ pub mod errors;
 pub mod ladder;
 pub mod measure;
 pub mod needed;
+mod numbers;
 pub mod page;
 mod pictures;
 pub mod places;
@@ -43,13 +45,14 @@ use crate::scene::profile::ProfileError;
 pub use pictures::Pictures;
 
 use believed::Believed;
-use choose::Recommendation;
+use choose::{Recommendation, Wanted};
 use ladder::LeftOut;
 use measure::Measured;
-use places::Sampling;
+use places::{OFFSETS_M, Sampling};
 use stress::table::{Column, Table};
 
-/// Everything that was measured of a twin.
+/// Everything that was measured of a twin. Numbers that are infinite or NaN are words in JSON and CSV alike:
+/// a setting that is exact has a PSNR of `inf`.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Of what.
@@ -72,7 +75,11 @@ pub struct Report {
     /// How far images may be believed beside the recorded drive; empty without one.
     pub believed: Vec<Believed>,
     /// What was asked for, if anything was.
-    pub recommendations: Vec<Recommendation>,
+    pub wanted: Option<Wanted>,
+    /// The setting for it.
+    pub recommendation: Option<Recommendation>,
+    /// Why there is none although one was wanted.
+    pub unmet: Option<String>,
     /// Extreme scenes on every backend.
     pub stress: Table,
     /// What scenes with and without each feature hold and run.
@@ -158,29 +165,35 @@ pub enum ReportError {
 }
 
 impl Report {
-    /// One line per setting, with a header; decimal points, no quotes but around names.
+    /// One line per setting, with a header; decimal points, no quotes but around names. Empty is what there
+    /// is not: dB beside a drive where none was recorded, bytes of a device without one.
     pub fn csv(&self) -> String {
-        let mut csv = String::from(
-            "setting,family,backend,step_ms,psnr_db,least_db,ssim,max,p99_9,depth_l1_m,gaussians,\
-             scene_bytes,stored_bytes,sent_bytes,on_front\n",
+        let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
+        let mut csv = format!(
+            "setting,family,backend,step_ms,p95_ms,psnr_db,least_db,{by_offset},ssim,max,p99_9,depth_l1_m,\
+             gaussians,scene_bytes,device_bytes,stored_bytes_each,sent_bytes,on_front\n"
         );
         for (m, is_on) in self.settings.iter().zip(choose::front(&self.settings)) {
             let (e, cost) = (&m.errors, &m.cost);
             let backend = self.backends[m.setting.backend].backend;
+            let at = |offset| m.psnr_db_by_offset.get(offset).map_or(String::new(), f64::to_string);
             csv.push_str(&format!(
-                "\"{}\",{},{backend},{:.3},{},{},{},{},{},{},{},{},{},{},{is_on}\n",
+                "\"{}\",{},{backend},{:.3},{:.3},{},{},{},{},{},{},{},{},{},{},{},{},{is_on}\n",
                 m.setting.name,
                 m.setting.family.name(),
                 cost.step_ms,
+                m.p95_ms(),
                 e.psnr_db,
                 m.least_db(),
+                [0, 1, 2, 3].map(at).join(","),
                 e.ssim,
                 e.max,
                 e.p99_9,
                 e.depth_l1_m,
                 cost.gaussians,
                 cost.scene_bytes,
-                cost.stored_bytes,
+                cost.device_bytes.map_or(String::new(), |bytes| bytes.to_string()),
+                cost.stored_bytes_each,
                 cost.sent_bytes
             ));
         }

@@ -34,9 +34,12 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}: error against run \
          time</title><style>{STYLE}</style></head><body><h1>{0}: error against run time</h1><p>Twin \
          {0} version {1}, {2} Gaussians of SH degree {3}, record {4}. Every setting is compared with the \
-         f64 reference at full detail, at {5} places and {6} px of each camera, at full focal length. \
-         Times are of whole steps of {7} cameras, encoding included: medians of {8} at each place, in turn with \
-         the twin as served, and scaled to one speed of the machine.</p>",
+         f64 reference at full detail and however far, at {5} places and {6} px of each camera, at full \
+         focal length. Times are of whole steps of {7} cameras as they are rendered; only rows of what is \
+         as sent have encoding in them. Each is the median of all steps at all places on the drive (around \
+         a twin without one, at all places), {8} at each, in turn with steps of the twin as served on {9}, \
+         and scaled to the speed at which those took their median time: times of another backend, too, are \
+         scaled by those on {9}.</p>",
         text(&subject.twin),
         subject.version,
         subject.gaussians,
@@ -46,6 +49,7 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         report.sampling.window_px.map(|px| px.to_string()).join(" x "),
         subject.cameras,
         subject.repeat,
+        text(report.backends.first().map_or("the first backend", |column| column.backend)),
     );
     for column in &report.backends {
         let _ = write!(page, "<p>{}: {}</p>", text(column.backend), text(&column.detail));
@@ -55,10 +59,11 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         "<p>A whole step of the reference would take {:.0} s: of what was drawn, scaled to all pixels.</p>",
         1e-3 * report.reference_ms
     );
-    recommendations(&mut page, report);
+    recommendation(&mut page, report);
     page.push_str("<h2>Error against time</h2><p>On the line is what nothing else beats in both; what is \
                    beaten is grey. Values are compared before they are rounded to 8 bits, which alone \
-                   leaves 59 dB, but for what is as sent.</p>");
+                   leaves 59 dB, but for what is as sent. Least is the \
+                   PSNR of one camera's window at one place, where it is least.</p>");
     page.push_str(&plots::error_against_time(&report.settings)?);
     table(&mut page, &report.settings);
     left_out(&mut page, report);
@@ -73,8 +78,8 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
     Ok(page)
 }
 
-fn recommendations(page: &mut String, report: &Report) {
-    for r in &report.recommendations {
+fn recommendation(page: &mut String, report: &Report) {
+    if let Some(r) = &report.recommendation {
         let unit = match r.wanted {
             Wanted::AtLeastDb(_) => "dB",
             Wanted::AtMostMs(_) => "ms",
@@ -83,34 +88,42 @@ fn recommendations(page: &mut String, report: &Report) {
             page,
             "<p><b>{}</b>: {} on {}: {:.1} {unit} at the worst place where it was chosen, with a margin of \
              {:.1} {unit} for what places differ by, and {:.1} {unit} at the worst of those that were not \
-             used to choose it.</p>",
+             used to choose it, {}. To draw so: <code>{}</code></p>",
             text(&r.wanted.to_string()),
             text(&r.setting),
             text(&r.backend),
             r.chosen_by,
             r.margin,
-            r.verified
+            r.verified,
+            text(&r.of_what()),
+            text(&r.serve("profile.json"))
         );
+    }
+    if let (Some(wanted), Some(why)) = (report.wanted, &report.unmet) {
+        let (wanted, why) = (text(&wanted.to_string()), text(why));
+        let _ =
+            write!(page, "<p class=\"miss\"><b>{wanted}</b>: nothing is recommended: {why}.</p>");
     }
 }
 
 fn table(page: &mut String, all: &[Measured]) {
     page.push_str(
-        "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>PSNR, dB</th>\
+        "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>95 %, ms</th><th>PSNR, dB</th>\
          <th>least, dB</th><th>SSIM</th><th>largest</th><th>99.9 %</th><th>depth, m</th>\
-         <th>Gaussians</th><th>MB in memory</th><th>B each, stored</th><th>kB sent</th></tr>",
+         <th>Gaussians</th><th>MB, host</th><th>MB, device</th><th>B each, stored</th><th>kB sent</th></tr>",
     );
     for (m, is_on) in all.iter().zip(front(all)) {
         let (e, cost) = (&m.errors, &m.cost);
         let _ = write!(
             page,
-            "<tr class=\"{}\"><td>{}</td><td class=\"text\">{}</td><td>{:.1}</td><td>{}</td><td>{}</td>\
-             <td>{:.5}</td><td>{:.5}</td><td>{:.5}</td><td>{:.4}</td><td>{}</td><td>{:.1}</td>\
-             <td>{:.1}</td><td>{}</td></tr>",
+            "<tr class=\"{}\"><td>{}</td><td class=\"text\">{}</td><td>{:.1}</td><td>{:.1}</td><td>{}</td>\
+             <td>{}</td><td>{:.5}</td><td>{:.5}</td><td>{:.5}</td><td>{:.4}</td><td>{}</td><td>{:.1}</td>\
+             <td>{}</td><td>{:.1}</td><td>{}</td></tr>",
             if is_on { "front" } else { "beaten" },
             text(&m.setting.name),
             m.setting.family.name(),
             cost.step_ms,
+            m.p95_ms(),
             decibels(e.psnr_db),
             decibels(m.least_db()),
             e.ssim,
@@ -119,7 +132,9 @@ fn table(page: &mut String, all: &[Measured]) {
             e.depth_l1_m,
             cost.gaussians,
             cost.scene_bytes as f64 / 1e6,
-            cost.stored_bytes,
+            cost.device_bytes
+                .map_or("none".to_owned(), |bytes| format!("{:.1}", bytes as f64 / 1e6)),
+            cost.stored_bytes_each,
             cost.sent_bytes / 1000,
         );
     }
@@ -263,7 +278,7 @@ fn only_what_is_needed(page: &mut String, report: &Report) {
 }
 
 fn decibels(db: f64) -> String {
-    if db.is_finite() { format!("{db:.1}") } else { "exact".to_owned() }
+    if db == f64::INFINITY { "exact".to_owned() } else { format!("{db:.1}") }
 }
 
 /// Text as HTML has it.

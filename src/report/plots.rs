@@ -26,6 +26,7 @@ fn color(family: Family) -> RGBColor {
         Family::AsServed => RGBColor(0, 0, 0),
         Family::Backend => RGBColor(230, 159, 0),
         Family::Detail => RGBColor(0, 114, 178),
+        Family::Reach => RGBColor(90, 90, 170),
         Family::Record => RGBColor(0, 158, 115),
         Family::Antialiasing => RGBColor(120, 94, 240),
         Family::AlphaCut => RGBColor(213, 94, 0),
@@ -42,7 +43,9 @@ fn color(family: Family) -> RGBColor {
 pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError> {
     let on_front = front(all);
     let shown = || {
-        let asked = |(m, _): &(&Measured, &bool)| m.setting.family != Family::Rays;
+        let asked = |(m, _): &(&Measured, &bool)| {
+            m.setting.family != Family::Rays && !m.errors.psnr_db.is_nan()
+        };
         all.iter().zip(&on_front).filter(asked)
     };
     let (least, most) = shown()

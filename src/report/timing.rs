@@ -10,7 +10,7 @@ use crate::render::{Backend, Frame, Target, View};
 use crate::scene::{RenderProfile, Scene};
 use crate::session;
 
-/// A step of all cameras, encoding included.
+/// A step of all cameras: drawn, and encoded if it says how images are sent.
 #[derive(Clone, Copy)]
 pub(super) struct Step<'a> {
     pub backend: &'a dyn Backend,
@@ -48,12 +48,17 @@ impl Step<'_> {
         Ok(timed)
     }
 
+    /// Draws it once.
+    pub(super) fn draw(&self) -> Result<(), ReportError> {
+        self.run(&mut self.images()).map(|_| ())
+    }
+
     /// Its images, in 8 bits.
     fn images(&self) -> Vec<Vec<u8>> {
         self.views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect()
     }
 
-    /// Draws and encodes all images: milliseconds, and bytes to send.
+    /// Draws all images, and encodes them if they are sent so: milliseconds, and bytes to send.
     fn run(&self, images: &mut [Vec<u8>]) -> Result<(f64, u64), ReportError> {
         let target = |rgb8| Target { rgb8: Some(rgb8), ..Target::default() };
         let mut targets: Vec<Target<'_>> =
@@ -89,7 +94,8 @@ pub(super) fn file(
 }
 
 /// Scales all times to one speed of the machine: that at which the twin as served took its median time.
-/// A setting that was measured while others compiled is then no slower than the rest.
+/// A setting that was measured while others compiled is then no slower than the rest. It is the first
+/// backend's time that says how fast the machine was, for settings of the others too.
 pub fn at_one_speed(all: &mut [Measured]) {
     let served_ms: Vec<f64> = all.iter().map(|m| m.served_ms).collect();
     let usual_ms = quantile(&served_ms, 0.5);

@@ -4,10 +4,16 @@ use std::cell::Cell;
 
 use glam::DVec3;
 use wildcity::geometry::camera::{Fisheye, Lens};
-use wildcity::render::View;
 use wildcity::render::gpu::{AdapterChoice, Gpu};
+use wildcity::render::{Backend, Frame, Target, View};
+use wildcity::report::ladder::{Ladder, Traits, ladder};
+use wildcity::report::measure::Bench;
 use wildcity::report::needed::{self, DeviceCounts};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity::report::places::{Sampling, places};
+use wildcity::residency::Cache;
+use wildcity::scene::manifest::Provenance;
+use wildcity::scene::{Rays, Record, RenderProfile, Scene};
+use wildcity::store::{Catalog, NewVersion, Storage};
 
 use crate::gpu::gpu;
 use crate::images::{cpu, look, render_one};
@@ -16,6 +22,48 @@ use crate::streets::street;
 
 /// Kernels that the base compiles, and that a step of it starts: one more is one that it does not need.
 const BASE: [u64; 2] = [26, 45];
+
+#[test]
+fn a_report_tells_what_a_device_holds_of_what_it_draws() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let scene = street(20_000, 1, 5);
+    let new = NewVersion {
+        storage: Storage { record: Record::F32, levels: false },
+        ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new, &mut |_, _| {}).unwrap();
+    let resident = Cache::new(catalog).open("street", None).unwrap();
+    let manifest = &resident.version.manifest;
+    let places = places(manifest, &[], Sampling { stations: 2, window_px: [32, 32] });
+    let open = || Gpu::new(&AdapterChoice::Best, 0).ok();
+    let backends: [Box<dyn Backend>; 2] = [Box::new(cpu()), Box::new(open().unwrap())];
+    let twin = Traits::of(manifest, None, &places[0].views);
+    let Ladder { settings, .. } = ladder(&twin, &["cpu", "gpu"]);
+    let held_bytes = |name: &str, device: &dyn Fn() -> Option<Gpu>| {
+        let (backends, places) = (&backends[..], &places[..]);
+        let bench = Bench { resident: &resident, backends, places, repeat: 1, device };
+        let truth = bench.truth(Rays::Splats, &mut |_| {}).unwrap();
+        let setting = settings.iter().find(|setting| setting.name == name).unwrap();
+        bench.measure(setting, &truth).unwrap().cost.device_bytes
+    };
+    assert_eq!(held_bytes("as served", &open), None);
+    assert_eq!(held_bytes("gpu", &|| None), None);
+    // As much as the same images take on a device of the test's own: the Gaussians, and what stages need.
+    let (device, scene) = (open().unwrap(), Scene::from_gaussians(&scene));
+    let mut rgb8 = vec![0; 3 * 640 * 480];
+    for place in &places {
+        let (profile, views) = (RenderProfile::default(), &place.views[..]);
+        let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
+        let frame = Frame { scene: &scene, profile: &profile, views };
+        device.render(&frame, &mut [target], &|_, _| {}).unwrap();
+    }
+    let usage = device.usage().unwrap();
+    let held = held_bytes("gpu", &open).unwrap();
+    assert!(held >= usage.mirror_bytes + 4 * 640 * 480, "{held} B of {usage:?}");
+    let (held, own) = (held as f64, usage.allocated_bytes.unwrap() as f64);
+    assert!((0.9..1.1).contains(&(held / own)), "{held} B, {own} B on the test's own");
+}
 
 #[test]
 fn features_pay_for_themselves_and_the_base_for_none() {

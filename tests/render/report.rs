@@ -2,38 +2,56 @@
 
 use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
+use serde_json::Value;
 use wildcity::generate;
 use wildcity::geometry::Pose;
 use wildcity::geometry::camera::{Fisheye, Lens};
-use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
+use wildcity::render::psnr::psnr_db;
+use wildcity::render::reference::Reference;
+use wildcity::render::{Backend, View};
 use wildcity::report::believed::believed;
 use wildcity::report::choose::{Wanted, front, recommend};
+use wildcity::report::drawing::{Drawing, draw};
+use wildcity::report::errors::Errors;
 use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
 use wildcity::report::measure::{AtPlace, Bench, Measured};
-use wildcity::report::places::{OFFSETS_M, Sampling, places};
+use wildcity::report::places::{OFFSETS_M, Place, Sampling, places};
 use wildcity::report::timing::at_one_speed;
 use wildcity::report::{ReportError, needed};
 use wildcity::residency::{Cache, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::RigCamera;
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{Rays, Record, RenderProfile, Rig};
+use wildcity::scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
+use wildcity::session::{
+    Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
+};
 use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
 
 use crate::skies::demo_sky;
 
 /// Two cameras of a twin whose levels are seen: a street of 40 m, 30,000 Gaussians.
 fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Arc<Resident> {
+    commit_reaching(dir, trajectories, None)
+}
+
+/// The same, drawn up to a distance from each camera, in metres.
+fn commit_reaching(
+    dir: &std::path::Path,
+    trajectories: Vec<Trajectory>,
+    reach_m: Option<f64>,
+) -> Arc<Resident> {
     let catalog = Catalog::open(dir).unwrap();
     let street = generate::canyon(30_000, &mut |_, _| {});
     let new = NewVersion {
         // Full detail, so that other errors are seen alone.
-        profile: RenderProfile { tau_px: 0.0, ..RenderProfile::DEFAULT },
+        profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
         storage: Storage { record: Record::F32, levels: true },
@@ -76,7 +94,8 @@ fn measured(
     let manifest = &resident.version.manifest;
     let places = places(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Bench { resident, backends: &backends, places: &places, repeat: 1 };
+    let bench =
+        Bench { resident, backends: &backends, places: &places, repeat: 1, device: &|| None };
     let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let Ladder { settings, left_out } = ladder(&twin, &["cpu"]);
     let truths = [Rays::Splats, Rays::Exact].map(|rays| {
@@ -91,12 +110,23 @@ fn measured(
     (settings.iter().filter(|setting| keep(setting)).map(measure).collect(), left_out)
 }
 
+/// One setting of the ladder on the cpu backend at some places.
+fn one(resident: &Arc<Resident>, places: &[Place], name: &str) -> Measured {
+    let manifest = &resident.version.manifest;
+    let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
+    let bench = Bench { resident, backends: &backends, places, repeat: 1, device: &|| None };
+    let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let Ladder { settings, .. } = ladder(&twin, &["cpu"]);
+    let setting = settings.iter().find(|setting| setting.name == name).unwrap();
+    bench.measure(setting, &bench.truth(Rays::Splats, &mut |_| {}).unwrap()).unwrap()
+}
+
 #[test]
 fn errors_and_costs_go_the_way_they_must() {
     let dir = tempfile::tempdir().unwrap();
     let (all, left_out) = measured(&commit(dir.path(), vec![drive()]), &rig(), &|_| true);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "sky_error", "rays"]);
+    assert_eq!(left_out, ["tile size", "reach_m", "sky_error", "rays"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     // Full detail on the cpu backend is what the reference draws.
@@ -121,12 +151,16 @@ fn errors_and_costs_go_the_way_they_must() {
     assert!(of("jpeg 50").cost.sent_bytes < of("jpeg 90").cost.sent_bytes);
     assert_eq!(of("8 bits").cost.sent_bytes, 2 * 3 * 120 * 80);
     assert_eq!(of("scale 0.5").cost.sent_bytes, 2 * 3 * 60 * 40);
-    assert_eq!([of("as served"), of("record q32")].map(|m| m.cost.stored_bytes), [92.0, 31.875]);
+    assert_eq!(
+        [of("as served"), of("record q32")].map(|m| m.cost.stored_bytes_each),
+        [92.0, 31.875]
+    );
     for m in &all {
         let errors = &m.errors;
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
         assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{errors:?}");
         assert!(m.least_db() <= errors.psnr_db, "{}: {errors:?}", m.setting.name);
+        assert!(m.by_place.iter().all(|place| m.least_db() <= place.least_db));
         assert_eq!(m.by_place.len(), 12);
         assert_eq!(m.by_place.iter().filter(|place| place.p95_ms.is_some()).count(), 3);
         let files = &m.worst.files;
@@ -137,6 +171,17 @@ fn errors_and_costs_go_the_way_they_must() {
 
     let names = ["cpu".to_owned()];
     let best = recommend(Wanted::AtLeastDb(35.0), &all, &names).unwrap();
+    // Beside it, what the encodings that it is not of lose and take.
+    let encoded: Vec<(&str, bool)> =
+        best.encoded.iter().map(|e| (e.sent.as_str(), e.by_default)).collect();
+    let sent = ["8 bits", "jpeg 50", "jpeg 75", "jpeg 90", "jpeg 98"];
+    assert_eq!(encoded, sent.map(|name| (name, name == "jpeg 90")));
+    for encoded in &best.encoded {
+        let m = of(&encoded.sent);
+        assert_eq!(encoded.least_db, m.least_db());
+        assert_eq!(encoded.more_ms, m.cost.step_ms - m.served_ms);
+        assert!(best.of_what().contains(&format!("{:.1} dB", encoded.least_db)), "{best:?}");
+    }
     let chosen = of(&best.setting);
     assert!(best.verified >= 35.0 && best.chosen_by >= 35.0 + best.margin, "{best:?}");
     assert_eq!((least_db(chosen, true), least_db(chosen, false)), (best.chosen_by, best.verified));
@@ -156,7 +201,7 @@ fn errors_and_costs_go_the_way_they_must() {
 /// Least PSNR of the places that choose, or of those that verify.
 fn least_db(m: &Measured, chooses: bool) -> f64 {
     let places = m.by_place.iter().filter(|place| place.chooses == chooses);
-    places.map(|place| place.psnr_db).fold(f64::INFINITY, f64::min)
+    places.map(|place| place.least_db).fold(f64::INFINITY, f64::min)
 }
 
 /// A slow and good setting and a fast one, at places that give so many dB: of each two the first chooses.
@@ -167,6 +212,7 @@ fn two(like: &[Measured], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measured>
         let place = |(index, psnr_db): (usize, f64)| AtPlace {
             chooses: index % 2 == 0,
             psnr_db,
+            least_db: psnr_db,
             p95_ms: Some(ms),
         };
         m.by_place = db.into_iter().enumerate().map(place).collect();
@@ -211,6 +257,202 @@ fn the_margin_is_what_places_differ_by() {
         ["as served", "stop=0.016", "stop=0.016"]
     );
     assert!(recommend(Wanted::AtMostMs(10.9), &all, &names).is_err());
+}
+
+#[test]
+fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
+    let names = ["cpu".to_owned()];
+    let dir = tempfile::tempdir().unwrap();
+    let tried = ["as served", "stop=0.004", "stop=0.016"];
+    let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
+    let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
+    // As exact as each other where it is asked, and each faster than the one before.
+    for (m, ms) in all.iter_mut().zip([30.0, 20.0, 10.0]) {
+        m.cost.step_ms = ms;
+        for place in &mut m.by_place {
+            (place.least_db, place.p95_ms) = (f64::INFINITY, Some(ms));
+        }
+    }
+    let within = |all: &[Measured], ms| recommend(Wanted::AtMostMs(ms), all, &names).unwrap();
+    assert_eq!([100.0, 25.0].map(|ms| within(&all, ms).setting), ["as served", "stop=0.004"]);
+    // One that draws what the twin as served draws seems to be the fastest of all.
+    let mut idle = all[0].clone();
+    (idle.setting.name, idle.setting.family) = ("tau_px=4".to_owned(), Family::Detail);
+    idle.cost.step_ms = 1.0;
+    idle.by_place.iter_mut().for_each(|place| place.p95_ms = Some(1.0));
+    let at_least = |all: &[Measured]| recommend(Wanted::AtLeastDb(60.0), all, &names).unwrap();
+    for first in [true, false] {
+        let mut all = all.clone();
+        all.insert(if first { 0 } else { 3 }, idle.clone());
+        assert_eq!(within(&all, 100.0).setting, "as served");
+        assert!(recommend(Wanted::AtMostMs(5.0), &all, &names).is_err());
+        assert_eq!(at_least(&all).setting, "stop=0.016");
+    }
+    // With fewer Gaussians it is no chance.
+    idle.cost.gaussians -= 1;
+    all.push(idle);
+    assert_eq!(at_least(&all).setting, "tau_px=4");
+}
+
+#[test]
+fn what_a_reach_loses_is_seen() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit_reaching(dir.path(), vec![drive()], Some(2.0));
+    let keep = |setting: &Setting| ["as served", "reach_m=none"].contains(&setting.name.as_str());
+    let (all, left_out) = measured(&resident, &rig(), &keep);
+    assert!(left_out.iter().all(|out| out.what != "reach_m"), "{left_out:?}");
+    let [served, whole] = &all[..] else { panic!("{} settings", all.len()) };
+    assert!(whole.errors.psnr_db >= 70.0, "{:?}", whole.errors);
+    assert!(served.errors.psnr_db < 40.0, "{:?}", served.errors);
+    assert!(served.cost.gaussians < whole.cost.gaussians);
+    assert!(whole.setting.can_be_served());
+}
+
+#[test]
+fn a_place_is_as_good_as_its_worst_camera() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit(dir.path(), vec![drive()]);
+    let sampling = Sampling { stations: 2, window_px: [64, 48] };
+    let both = places(&resident.version.manifest, &rig().cameras, sampling);
+    let at_least_db = |cameras: Option<usize>| {
+        let only = |place: &Place| match cameras {
+            None => place.clone(),
+            Some(i) => Place {
+                views: vec![place.views[i]],
+                windows: vec![place.windows[i]],
+                ..place.clone()
+            },
+        };
+        let places: Vec<Place> = both.iter().map(only).collect();
+        let m = one(&resident, &places, "alpha_cut=0.032");
+        m.by_place.iter().map(|place| (place.least_db, place.psnr_db)).collect::<Vec<_>>()
+    };
+    let [together, first, second] = [None, Some(0), Some(1)].map(at_least_db);
+    for (i, (least_db, psnr_db)) in together.into_iter().enumerate() {
+        let alone_db = first[i].1.min(second[i].1);
+        assert!(
+            (least_db - alone_db).abs() < 1e-6,
+            "place {i}: {least_db} dB, alone {alone_db} dB"
+        );
+        assert!(least_db < psnr_db, "place {i}: {least_db} dB of {psnr_db} dB");
+    }
+    // What one camera of a place lacks, the others do not make good; nor does a number make up for NaN.
+    let names = ["cpu".to_owned()];
+    let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
+    let (like, _) = measured(&resident, &rig(), &keep);
+    let mut all = two(&like, [60.0; 6], [40.0; 6]);
+    let chosen = |all: &[Measured]| recommend(Wanted::AtLeastDb(35.0), all, &names);
+    assert_eq!(chosen(&all).unwrap().setting, "stop=0.016");
+    for least_db in [32.2, f64::NAN] {
+        all[1].by_place[2].least_db = least_db;
+        assert_eq!(chosen(&all).unwrap().setting, "as served", "{least_db}");
+    }
+    all[1].by_place[2].least_db = 40.0;
+    all[1].by_place[3].least_db = f64::NAN;
+    let refused = chosen(&all).unwrap_err();
+    assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
+}
+
+/// Where nothing was measured: stations in metres, and metres beside the drive. Settings are chosen and
+/// verified at 6.5, 19.5 and 32.5 m, on it and 1, 3 and 5 m beside.
+const ELSEWHERE_M: [[f64; 2]; 6] =
+    [[2.0, 0.0], [11.0, 2.0], [15.0, -2.0], [24.0, 0.0], [28.0, 4.0], [36.0, -4.0]];
+
+#[tokio::test]
+async fn a_recommended_profile_holds_for_sessions_elsewhere() {
+    let dir = tempfile::tempdir().unwrap();
+    let resident = commit(dir.path(), vec![drive()]);
+    let names = ["cpu".to_owned()];
+    let (all, _) = measured(&resident, &rig(), &Setting::can_be_served);
+    let poses = ELSEWHERE_M.map(|[station_m, left_m]| {
+        let position_m = DVec3::new(0.0, left_m, 0.0);
+        drive().at_station(station_m) * Pose { position_m, rotation: DQuat::IDENTITY }
+    });
+    let truths = truths(&poses);
+    let engine = Engine::start(EngineSettings {
+        cache: Cache::new(Catalog::open(dir.path()).unwrap()),
+        episodes: dir.path().join("episodes"),
+        backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
+        step_timeout: wildcity::config::STEP_TIMEOUT,
+    });
+    let engine = engine.unwrap();
+    for wanted_db in [35.0, 45.0] {
+        let (mut met, mut least_unmet_db) = (Vec::new(), f64::INFINITY);
+        for fastest in &all {
+            // Whichever is the fastest is recommended, if it is good enough.
+            let mut timed = all.clone();
+            for m in &mut timed {
+                let is_fastest = m.setting.name == fastest.setting.name;
+                m.cost.step_ms = if is_fastest { 1.0 } else { 2.0 };
+            }
+            let best = recommend(Wanted::AtLeastDb(wanted_db), &timed, &names);
+            let own = best.ok().filter(|best| best.setting == fastest.setting.name);
+            let profile = match &own {
+                Some(best) => best.changes().unwrap(),
+                None => changes(&fastest.setting),
+            };
+            let db = least_db_of_session(&engine, profile, &poses, &truths).await;
+            match own {
+                None => least_unmet_db = least_unmet_db.min(db),
+                Some(best) => {
+                    assert!(db >= wanted_db, "{db:.1} dB with {best:?}");
+                    met.push(best.setting);
+                }
+            }
+        }
+        assert!(met.len() >= 3 && met.contains(&"as served".to_owned()), "{met:?}");
+        // Of those that are not recommended, some are indeed not good enough.
+        assert!(least_unmet_db < wanted_db, "{least_unmet_db:.1} dB");
+    }
+}
+
+/// A setting as a session asks for it, whatever it loses.
+fn changes(setting: &Setting) -> ProfileChanges {
+    let field = |change: &String| {
+        let (key, value) = change.split_once('=').unwrap();
+        (key.to_owned(), serde_json::from_str(value).unwrap())
+    };
+    ProfileChanges::new(setting.profile.iter().map(field).collect())
+}
+
+/// What the rig's cameras see from poses by definition, of all Gaussians as they were generated: colours
+/// from 0 to 1.
+fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
+    let scene = Scene::from_gaussians(&generate::canyon(30_000, &mut |_, _| {}));
+    let at = |pose: &Pose| {
+        let views = View::of_rig(&rig().cameras, *pose);
+        draw(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
+    };
+    let colours = |drawing: Drawing| {
+        let rgba = drawing.rgba.chunks_exact(4);
+        rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect()
+    };
+    poses.iter().flat_map(at).map(colours).collect()
+}
+
+/// Least PSNR of an image that an agent gets from any of the poses, in dB.
+async fn least_db_of_session(
+    engine: &Arc<Engine>,
+    profile: ProfileChanges,
+    poses: &[Pose],
+    truths: &[Vec<f32>],
+) -> f64 {
+    let opening = Opening { profile, ..Opening::twin("street", Outputs::colour(Encoding::Raw)) };
+    let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
+    session.reset(0, None).await.unwrap();
+    let mut frame = session.observe(poses.to_vec()).await.unwrap();
+    let header = frame.buffer.header_mut().len();
+    let tensors = &frame.buffer.bytes()[header..];
+    let is_colour = |tensor: &&Tensor| matches!(tensor.kind, TensorKind::Rgb(_));
+    let images: Vec<&Tensor> = frame.tensors.iter().filter(is_colour).collect();
+    assert_eq!(images.len(), truths.len());
+    let db = images.iter().zip(truths).map(|(image, truth)| {
+        let rgb8 = &tensors[image.bytes.clone()];
+        assert_eq!(rgb8.len(), truth.len());
+        let off = rgb8.iter().zip(truth).map(|(&byte, &t)| f64::from(byte) / 255.0 - f64::from(t));
+        psnr_db(off)
+    });
+    db.fold(f64::INFINITY, f64::min)
 }
 
 #[test]
@@ -274,7 +516,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     let keep = |setting: &Setting| names.contains(&setting.name.as_str());
     let (all, left_out) = measured(&resident, &bent, &keep);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "tau_px"]);
+    assert_eq!(left_out, ["tile size", "tau_px", "reach_m"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     assert!(db("as served") > db("sky_error=0.1"), "{:?}", of("sky_error=0.1").errors);
@@ -287,6 +529,22 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     assert!(!rays.setting.can_be_served());
     assert!(rays.errors.psnr_db < db("as served"), "{:?}", rays.errors);
     assert!(!front(std::slice::from_ref(rays))[0]);
+}
+
+#[test]
+fn json_says_what_it_has_no_number_for() {
+    let errors = Errors {
+        psnr_db: f64::INFINITY,
+        ssim: f64::NAN,
+        max: 0.0,
+        p99_9: 0.25,
+        depth_l1_m: f64::NEG_INFINITY,
+    };
+    let text = serde_json::to_string(&errors).unwrap();
+    assert_eq!(
+        text,
+        r#"{"psnr_db":"inf","ssim":"NaN","max":0.0,"p99_9":0.25,"depth_l1_m":"-inf"}"#
+    );
 }
 
 #[test]
@@ -405,19 +663,45 @@ fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
     }
 }
 
+/// The command's report of the street in a directory, in its folder `report`.
+fn report_of(dir: &Path, more: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["report", "street", "--backend", "cpu", "--stations", "2", "--window", "48"])
+        .args(["--repeat", "1", "--no-stress", "--twins"])
+        .args([dir, Path::new("--out"), &dir.join("report")])
+        .args(more)
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn wishes_that_cannot_be_meant_are_refused_at_once() {
+    let nowhere = tempfile::tempdir().unwrap();
+    for (given, fix) in [
+        ("--at-least-db=-inf", "expected 0 to 1000 dB, as 40"),
+        ("--at-least-db=NaN", "expected 0 to 1000 dB, as 40"),
+        ("--at-most-ms=-5", "expected milliseconds, more than 0, as 20"),
+        ("--at-most-ms=inf", "expected milliseconds, more than 0, as 20"),
+        ("--backend=reference", "[possible values: cpu, gpu]"),
+        ("--backend=cpu,cpu", "name each once"),
+    ] {
+        // There is no twin, which is looked for only afterwards.
+        let refused = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+            .args(["report", "street", given, "--twins"])
+            .arg(nowhere.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&refused.stderr);
+        assert!(!refused.status.success() && said.contains(fix), "{given}: {said}");
+    }
+}
+
 #[test]
 fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes() {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), vec![drive()]);
     let out = dir.path().join("report");
-    let run = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-        .args(["report", "street", "--backend", "cpu", "--stations", "2", "--window", "48"])
-        .args(["--repeat", "1", "--no-stress", "--at-least-db", "30", "--twins"])
-        .arg(dir.path())
-        .arg("--out")
-        .arg(&out)
-        .output()
-        .unwrap();
+    let run = report_of(dir.path(), &["--at-least-db", "30"]);
     let said = String::from_utf8_lossy(&run.stderr);
     assert!(run.status.success(), "{said}");
     let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap();
@@ -426,22 +710,66 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     for outside in ["src=\"http", "href=\"http", "<link", "<script", "@import"] {
         assert!(!page.contains(outside), "{outside}");
     }
-    let report: serde_json::Value = serde_json::from_str(&read("report.json")).unwrap();
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     let settings = report["settings"].as_array().unwrap();
     assert_eq!(read("report.csv").lines().count(), settings.len() + 1);
+    // The CSV says what JSON says, in the same words.
+    let csv = read("report.csv");
+    let mut lines = csv.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let names = lines.next().unwrap();
+    for (line, setting) in lines.zip(settings) {
+        let cell = |name: &str| line[names.iter().position(|own| *own == name).unwrap()];
+        let same = |name: &str, value: &Value| match value {
+            Value::String(word) => assert_eq!(cell(name), word, "{name}"),
+            Value::Null => assert_eq!(cell(name), "", "{name}"),
+            number => assert_eq!(cell(name).parse(), Ok(number.as_f64().unwrap()), "{name}"),
+        };
+        for name in ["psnr_db", "ssim", "max", "p99_9", "depth_l1_m"] {
+            same(name, &setting["errors"][name]);
+        }
+        for name in ["gaussians", "scene_bytes", "device_bytes", "stored_bytes_each"] {
+            same(name, &setting["cost"][name]);
+        }
+        for (i, offset_m) in OFFSETS_M.iter().enumerate() {
+            same(&format!("psnr_db_at_{offset_m}_m"), &setting["psnr_db_by_offset"][i]);
+        }
+        let of_places = |name: &str| {
+            let places = setting["by_place"].as_array().unwrap();
+            places.iter().filter_map(|place| place[name].as_f64()).collect::<Vec<f64>>()
+        };
+        let p95_ms: f64 = cell("p95_ms").parse().unwrap();
+        let slowest_ms = of_places("p95_ms").into_iter().fold(0.0, f64::max);
+        assert!((p95_ms - slowest_ms).abs() < 1e-3, "{p95_ms} ms, {slowest_ms} ms");
+        let least_db = of_places("least_db").into_iter().fold(f64::INFINITY, f64::min);
+        assert_eq!(cell("least_db").parse(), Ok(least_db));
+    }
     let families = settings.iter().map(|setting| setting["family"].as_str().unwrap());
     assert!(
         families.clone().any(|family| family == "record"),
         "{:?}",
         families.collect::<Vec<_>>()
     );
-    assert_eq!(report["recommendations"][0]["wanted"]["at_least_db"], 30.0);
+    let best = &report["recommendation"];
+    assert_eq!(best["wanted"]["at_least_db"], 30.0);
+    assert_eq!((&report["wanted"], &report["unmet"]), (&best["wanted"], &Value::Null));
+    assert_eq!(best["measured"], "what is rendered, before images are encoded");
+    assert_eq!(best["encoded"][3]["sent"], "jpeg 90");
+    // On the page and on standard output, with the whole line to use.
+    let said = String::from_utf8_lossy(&run.stdout);
+    let file = out.join("profile.json");
+    let line = format!("wildcity serve --backend cpu --profile {}", file.display());
+    assert!(said.lines().any(|own| own == line), "{said}");
+    assert!(page.contains("wildcity serve --backend cpu --profile profile.json"));
+    for told in [&*said, &page] {
+        assert!(told.contains("before images are encoded"), "{told}");
+        assert!(told.contains("jpeg 90 (the default)"), "{told}");
+    }
     assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
     assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
-    let profile: wildcity::scene::ProfileChanges =
-        serde_json::from_str(&read("profile.json")).unwrap();
+    let profile: ProfileChanges = serde_json::from_str(&read("profile.json")).unwrap();
     profile.apply(RenderProfile::default()).unwrap();
+
     let bad = dir.path().join("bad.json");
     std::fs::write(&bad, r#"{"tau_px": -2}"#).unwrap();
     let refused = Command::new(env!("CARGO_BIN_EXE_wildcity"))
@@ -456,4 +784,34 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
         !refused.status.success() && said.contains("bad.json") && said.contains("tau_px"),
         "{said}"
     );
+}
+
+#[test]
+fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    commit(dir.path(), vec![drive()]);
+    let out = dir.path().join("report");
+    let (file, read) =
+        (out.join("profile.json"), |name: &str| std::fs::read_to_string(out.join(name)).unwrap());
+    let an_earlier_one = || {
+        std::fs::create_dir_all(&out).unwrap();
+        std::fs::write(&file, "{}").unwrap();
+    };
+    an_earlier_one();
+    let unmet = report_of(dir.path(), &["--at-least-db", "500"]);
+    let said = String::from_utf8_lossy(&unmet.stderr);
+    assert!(!unmet.status.success() && said.contains("at least 500 dB"), "{said}");
+    assert!(!file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(
+        (&report["wanted"]["at_least_db"], &report["recommendation"]),
+        (&500.0.into(), &Value::Null)
+    );
+    assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
+    assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
+    // Of one that nothing was asked of neither.
+    an_earlier_one();
+    assert!(report_of(dir.path(), &[]).status.success() && !file.exists());
+    let report: Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(report["wanted"], Value::Null);
 }
