@@ -169,8 +169,12 @@ impl Camera {
             let seen = (0..256).filter(|&i| self.unproject(at(i)).is_some()).count();
             let value = seen as f64 / 256.0;
             if value < Self::LEAST_SHARE {
+                let field = match &self.lens {
+                    Lens::OpenCv(lens) => lens.at_fault(),
+                    _ => "lens",
+                };
                 let must = "the lens sees at least an eighth of its image";
-                return Err(CameraError::Intrinsic { field: "lens", value, must });
+                return Err(CameraError::Intrinsic { field, value, must });
             }
         }
         Ok(())
@@ -404,12 +408,12 @@ fn check_max_angle(max_angle_rad: Option<f64>) -> Result<(), CameraError> {
 /// A lens that sees less than this, in radians off its axis, has a polynomial that falls from the start.
 const LEAST_FIELD_RAD: f64 = 1e-3;
 
-fn check_field(value: f64) -> Result<(), CameraError> {
+fn check_field(field: &'static str, value: f64) -> Result<(), CameraError> {
     let usable = value >= LEAST_FIELD_RAD;
     if usable {
         return Ok(());
     }
-    let must = "rad off the axis is all that its coefficients give before the image folds back; at \
-                least 0.001 rad are needed";
-    Err(CameraError::Intrinsic { field: "lens", value, must })
+    let must = "rad off the axis is all that its coefficients give before the image folds back or is torn; \
+                at least 0.001 rad are needed";
+    Err(CameraError::Intrinsic { field, value, must })
 }
