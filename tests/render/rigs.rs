@@ -88,9 +88,9 @@ fn a_camera_that_does_not_show_what_it_says_fails_the_check() {
     let coarse = r#""width": 48, "height": 32, "fx": 8, "fy": 8, "cx": 24, "cy": 16,
         "lens": {"model": "fisheye", "k": [0, 0, 0, 0], "max_angle": 2.8}"#;
     let fine = r#""width": 160, "height": 100, "fx": 90, "fy": 90, "cx": 80, "cy": 50"#;
-    let rig = format!(
-        r#"{{"name": "car", "cameras": [{{"name": "fine", {fine}, {place}}}, {{"name": "coarse", {coarse}, {place}}}]}}"#
-    );
+    let cameras = [("fine", fine), ("coarse", coarse)]
+        .map(|(name, camera)| format!(r#"{{"name": "{name}", {camera}, {place}}}"#));
+    let rig = format!(r#"{{"name": "car", "cameras": [{}]}}"#, cameras.join(", "));
     std::fs::write(&path, rig).unwrap();
     let checked = wildcity(&["check", path.to_str().unwrap(), "--backend", "cpu"]);
     assert_eq!(checked.status.code(), Some(1), "{}", said(&checked));
