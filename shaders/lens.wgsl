@@ -155,14 +155,56 @@ fn jacobian(of_view: u32, slope: vec2f) -> mat2x2f {
     );
 }
 
-// The slope that is distorted to this one, by Newton's steps.
+// The slope that is distorted to this one: Newton's steps from where the radial part alone would be, halved
+// until they lead nearer.
 fn undistort(of_view: u32, plane: vec2f) -> vec2f {
     let most = lenses[of_view].end;
-    var slope = plane * min(most / max(length(plane), 1e-30), 1.0);
+    let away = length(plane);
+    var slope = plane * (radial_slope(of_view, away) / max(away, 1e-30));
+    var off = distort(of_view, slope) - plane;
     for (var step = 0u; step < 32u; step++) {
-        var next = slope - solve(jacobian(of_view, slope), distort(of_view, slope) - plane);
-        next *= min(1.01 * most / max(length(next), 1e-30), 1.0);
-        let done = distance(next, slope) <= 1e-7;
+        var by = solve(jacobian(of_view, slope), off);
+        var next = slope;
+        var next_off = off;
+        for (var halved = 0u; halved < 12u; halved++) {
+            next = slope - by;
+            next *= min(1.01 * most / max(length(next), 1e-30), 1.0);
+            next_off = distort(of_view, next) - plane;
+            if length(next_off) < length(off) {
+                break;
+            }
+            by *= 0.5;
+        }
+        let nearer = length(next_off) < length(off);
+        let done = !nearer || distance(next, slope) <= 1e-7;
+        if nearer {
+            slope = next;
+            off = next_off;
+        }
+        if done {
+            break;
+        }
+    }
+    return slope;
+}
+
+// Where `r icD(r)` reaches a distance, or the end if that is sooner: Newton's steps, and halves of what is
+// left where one would leave it.
+fn radial_slope(of_view: u32, away: f32) -> f32 {
+    var low = 0.0;
+    var high = lenses[of_view].end;
+    var slope = min(away, high);
+    for (var step = 0u; step < 24u; step++) {
+        let factor = radial(of_view, slope * slope);
+        let off = slope * factor.x - away;
+        if off > 0.0 {
+            high = slope;
+        } else {
+            low = slope;
+        }
+        let newton = slope - off / (factor.x + 2.0 * slope * slope * factor.y);
+        let next = select(0.5 * (low + high), newton, newton > low && newton < high);
+        let done = abs(next - slope) <= 1e-6;
         slope = next;
         if done {
             break;

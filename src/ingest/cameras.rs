@@ -5,6 +5,7 @@ use std::path::Path;
 
 use glam::{DMat3, DQuat};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use crate::config;
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
@@ -84,6 +85,17 @@ pub enum CamerasError {
         /// What is wrong.
         cause: PoseError,
     },
+    /// What only cameras of a rig have.
+    #[error(
+        "camera {name:?}: a camera list has no {field}: its cameras are at rest, and drawn as they \
+         are; leave {field} out, or mount the camera on a rig"
+    )]
+    OfRigs {
+        /// The camera.
+        name: String,
+        /// `shutter`, `exposure` or `overlay`.
+        field: &'static str,
+    },
     /// The size or an intrinsic cannot be used.
     #[error("camera {name:?}: {cause}")]
     Camera {
@@ -108,6 +120,9 @@ struct Entry {
     cy: f64,
     lens: Option<LensFields>,
     windshield: Option<WindshieldFields>,
+    shutter: Option<IgnoredAny>,
+    exposure: Option<IgnoredAny>,
+    overlay: Option<IgnoredAny>,
     near: Option<f64>,
     position: Option<[f64; 3]>,
     position_ply: Option<[f64; 3]>,
@@ -150,6 +165,14 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
 
 fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, .. } = entry;
+    let of_rigs = [
+        ("shutter", entry.shutter.is_some()),
+        ("exposure", entry.exposure.is_some()),
+        ("overlay", entry.overlay.is_some()),
+    ];
+    if let Some((field, _)) = of_rigs.into_iter().find(|(_, given)| *given) {
+        return Err(CamerasError::OfRigs { name, field });
+    }
     let position = match (entry.position, entry.position_ply) {
         (Some(position), None) | (None, Some(position)) => position,
         _ => return Err(CamerasError::Position { name }),

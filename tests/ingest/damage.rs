@@ -111,6 +111,11 @@ fn camera_lists_say_what_is_wrong() {
     assert_eq!(mirror, "camera \"a\": R_world_to_cam is a mirror; flip one of its axes");
     let hidden = refusal(good.replace("\"a\"", "\".a\""));
     assert!(hidden.ends_with("not starting with ."), "{hidden}");
+    for field in ["shutter", "exposure", "overlay"] {
+        let of_rigs = refusal(good.replacen('{', &format!("{{\"{field}\": {{}}, "), 1));
+        assert!(of_rigs.starts_with("camera \"a\": a camera list has no "), "{of_rigs}");
+        assert!(of_rigs.contains(&format!("leave {field} out")), "{of_rigs}");
+    }
     assert_eq!(refusal("[]".into()), "the camera list is empty");
 }
 

@@ -5,9 +5,16 @@ use wildcity::geometry::camera::{
     Bivariate, FTheta, Field, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
     WindshieldReference,
 };
-use wildcity::geometry::{Camera, CameraError};
+use wildcity::geometry::{Camera, CameraError, Pose};
+use wildcity::render::reference;
+use wildcity::render::{Backend, View};
+use wildcity::report::points::centroid;
+use wildcity::report::stress::blobs::{Blob, scene};
+use wildcity::scene::{Rays, RenderProfile, Rig};
 
-use crate::lenses::lenses;
+use crate::images::{cpu, psnr, render_one};
+use crate::lenses::{lenses, street_scene};
+use crate::scene_files::Random;
 
 #[test]
 fn every_pixel_comes_back_to_where_it_was() {
@@ -180,6 +187,7 @@ fn absurd_coefficients_are_refused_with_the_reason() {
         (error.field(), error.to_string())
     };
     let opencv = |k| Lens::opencv(OpenCv::new(k, [0.0; 2], [0.0; 4]));
+    let skewed = |p, s| Lens::opencv(OpenCv::new([0.0; 6], p, s));
     let fisheye = |k, most| Lens::Fisheye(Fisheye::new(k, most));
     let ftheta =
         |polynomial, cde| Lens::FTheta(FTheta::new(Reference::AngleToPixel, polynomial, cde, 1.2));
@@ -188,6 +196,11 @@ fn absurd_coefficients_are_refused_with_the_reason() {
         (opencv([1e12, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens.k", "1e9"),
         (opencv([-1e8, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens", "folds back"),
         (opencv([-50.0, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens", "an eighth"),
+        (skewed([f64::NAN, 0.0], [0.0; 4]), "lens.p", "finite"),
+        (skewed([3.0, 0.0], [0.0; 4]), "lens.p", "an eighth"),
+        (skewed([0.0, 1e8], [0.0; 4]), "lens.p", "folds back"),
+        (skewed([0.001, 0.0], [0.0, 0.0, -9.0, 0.0]), "lens.s", "an eighth"),
+        (skewed([0.0; 2], [0.0, 1e9, 0.0, 0.0]), "lens.s", "folds back"),
         (fisheye([-1e9, 0.0, 0.0, 0.0], None), "lens", "folds back"),
         (fisheye([0.0; 4], Some(3.1)), "lens.max_angle", "2.8"),
         (fisheye([0.0; 4], Some(f64::NAN)), "lens.max_angle", "2.8"),
@@ -211,4 +224,210 @@ fn absurd_coefficients_are_refused_with_the_reason() {
     assert!(bends(&[0.0, 1.3, 1.0]).is_err());
     assert!(bends(&[f64::INFINITY, 1.0, 0.0]).is_err());
     assert!(Bivariate::new("horizontal", &[0.0; 4]).is_err());
+}
+
+/// An OpenCV lens with its axis in the middle of an image.
+fn distorted([width, height]: [u32; 2], f: f64, lens: OpenCv) -> Camera {
+    let pinhole = Pinhole { fx: f, fy: f, cx: f64::from(width) / 2.0, cy: f64::from(height) / 2.0 };
+    Camera { lens: Lens::opencv(lens), ..Camera::ideal(width, height, pinhole) }
+}
+
+/// A direction, by how far off the axis and along it, and its azimuth.
+fn ray([off_axis, along]: [f64; 2], azimuth_rad: f64) -> DVec3 {
+    DVec3::new(off_axis * azimuth_rad.cos(), off_axis * azimuth_rad.sin(), along)
+}
+
+#[test]
+fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
+    let mut random = Random(5);
+    let mut within = |most: f64| most * (2.0 * random.unit() - 1.0);
+    let mut accepted = 0;
+    for set in 0..600 {
+        let size = |of: usize, sizes: [f64; 4]| sizes[set / of % 4];
+        let (radial, tangential, prism) = (
+            size(1, [0.01, 0.1, 1.0, 10.0]),
+            size(4, [0.0, 1e-3, 0.02, 0.3]),
+            size(16, [0.0, 1e-3, 0.02, 0.3]),
+        );
+        let k = [0; 6].map(|_| within(radial));
+        let rational = if set % 3 == 0 { 0.0 } else { 1.0 };
+        let k = [k[0], k[1], k[2], rational * k[3], rational * k[4], rational * k[5]];
+        let lens =
+            OpenCv::new(k, [0; 2].map(|_| within(tangential)), [0; 4].map(|_| within(prism)));
+        let camera = distorted([300, 300], 100.0, lens);
+        let limit = lens.limit_slope();
+        if limit < 1e-3 {
+            continue;
+        }
+        accepted += 1;
+        let mut before: Option<(DVec3, DVec2)> = None;
+        for i in 0..100 {
+            // To the very limit, close to it, and anywhere.
+            let share = [1.0 - 1e-9, 1.0 - 1e-3 * within(1.0).abs(), within(1.0).abs()][i % 3];
+            let slope = ray([share * limit, 1.0], within(3.2));
+            let at_px = camera.project(slope).unwrap();
+            let back = camera.unproject(at_px).unwrap_or_else(|| panic!("{lens:?} lost {slope}"));
+            let off = back.distance(slope.normalize());
+            assert!(off < 1e-9, "{lens:?}: {slope} came back off by {off:e}");
+            // Of two directions the one farther along their difference lands farther along it.
+            if let Some((other, other_px)) = before {
+                let apart = (slope - other).truncate();
+                assert!(apart.dot(at_px - other_px) > 0.0, "{lens:?} mirrors {slope}, {other}");
+            }
+            let h = 1e-6 * limit;
+            let [x, y] = [DVec3::X, DVec3::Y].map(|axis| {
+                let inwards = slope - 2.0 * h * slope.truncate().normalize().extend(0.0);
+                camera.project(inwards + h * axis).unwrap() - camera.project(inwards).unwrap()
+            });
+            assert!(x.perp_dot(y) > 0.0, "{lens:?} mirrors around {slope}");
+            before = Some((slope, at_px));
+        }
+    }
+    assert!(accepted > 500, "{accepted} of 600");
+}
+
+/// Against every pixel's own ray, on both backends.
+fn least_db(camera: Camera) -> f64 {
+    assert_eq!(camera.check(), Ok(()));
+    let (street, pose) = street_scene();
+    let view = View::new(camera, pose);
+    let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
+    let truth = render_one(&reference::Reference, &street, &exact, view);
+    let backends = [&reference::Reference as &dyn Backend, &cpu()];
+    let db = backends.map(|backend| {
+        let drawn = render_one(backend, &street, &RenderProfile::default(), view);
+        psnr(&drawn.rgba, &truth.rgba)
+    });
+    db[0].min(db[1])
+}
+
+#[test]
+fn a_pole_beyond_the_image_tears_nothing_over_it() {
+    // 1 + k4 r² + k5 r⁴ + k6 r⁶ is 0 at 1.22; the image's corner is at 0.83.
+    let pole = OpenCv::new([-4.9, 17.6, -9.5, -5.0, 17.7, -9.9], [0.0; 2], [0.0; 4]);
+    let db = least_db(distorted([160, 90], 110.0, pole));
+    eprintln!("a pole beyond the image: {db:.1} dB against every pixel's ray");
+    assert!(db >= 45.0, "{db:.1} dB");
+    // As of an Azure Kinect: what is no pole keeps its field.
+    let k = [0.462, -2.41, 1.42, 0.341, -2.24, 1.35];
+    let kinect = OpenCv::new(k, [5e-4, -2e-4], [0.0; 4]);
+    assert!(kinect.limit_slope() > 7.9, "{}", kinect.limit_slope());
+    let db = least_db(distorted([160, 90], 75.0, kinect));
+    eprintln!("a rational lens: {db:.1} dB against every pixel's ray");
+    assert!(db >= 45.0, "{db:.1} dB");
+}
+
+#[test]
+fn tangential_distortion_mirrors_nothing_into_the_image() {
+    let lens = OpenCv::new([0.0; 6], [0.3, 0.0], [0.0; 4]);
+    let camera = distorted([160, 100], 50.0, lens);
+    assert_eq!(camera.check(), Ok(()));
+    let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
+    for backend in [&reference::Reference as &dyn Backend, &cpu()] {
+        let row_of = |slope: f64| {
+            let ball = Blob {
+                mean_m: DVec3::new(0.0, 2.0 * slope, 2.0),
+                sigma_m: DVec3::splat(0.003),
+                ..Blob::default()
+            };
+            let view = View::new(camera, Pose::IDENTITY);
+            let image = render_one(backend, &scene(&[ball]), &fine, view);
+            let middle_px = camera.size_px() / 2.0;
+            centroid(&image.opacity, [160, 100], middle_px, f64::INFINITY).map(|at_px| at_px.y)
+        };
+        let within = row_of(-0.3).expect("within the field");
+        let expected = 50.0 + 50.0 * (-0.3 + 0.3 * 3.0 * 0.09);
+        assert!((within - expected).abs() < 0.1, "{within}, not {expected}");
+        for beyond in [-0.6, -0.8, -1.0, -2.0] {
+            let row = row_of(beyond).unwrap_or(0.0);
+            assert!(row < within - 1.0, "{}: {beyond} at row {row}", backend.name());
+        }
+    }
+}
+
+#[test]
+fn a_lens_shows_all_of_its_field() {
+    for (f, k) in [(100.0, [0.75, -0.27, -0.096]), (40.0, [0.2, 0.05, -0.01])] {
+        let lens = OpenCv::new([k[0], k[1], k[2], 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
+        let camera = distorted([300, 300], f, lens);
+        assert_eq!(camera.check(), Ok(()));
+        let edge_px = f * {
+            let r2 = lens.limit_slope().powi(2);
+            lens.limit_slope() * (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2])))
+        };
+        let view = View::new(camera, Pose::IDENTITY);
+        for backend in [&reference::Reference as &dyn Backend, &cpu()] {
+            let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
+            let image = render_one(backend, &scene(&[wall]), &RenderProfile::default(), view);
+            for (pixel, &opacity) in image.opacity.iter().enumerate() {
+                let from_axis = DVec2::new((pixel % 300) as f64, (pixel / 300) as f64) - 149.5;
+                let seen = from_axis.length() < edge_px;
+                assert_eq!(opacity > 0.0, seen, "{} at {from_axis}", backend.name());
+            }
+        }
+    }
+}
+
+/// A fisheye behind a windshield, which sees so far off its axis.
+fn behind(windshield: Windshield, max_angle_rad: f64) -> Camera {
+    let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(max_angle_rad)));
+    let pinhole = Pinhole { fx: 55.0, fy: 55.0, cx: 100.0, cy: 100.0 };
+    Camera { lens, windshield: Some(windshield), ..Camera::ideal(200, 200, pinhole) }
+}
+
+#[test]
+fn a_windshield_that_folds_where_it_fades_is_refused() {
+    let straight = Bivariate::new("vertical", &[0.0, 0.0, 1.0]).unwrap();
+    let turned = Bivariate::new("horizontal", &[0.15, 1.0, 0.0]).unwrap();
+    let windshield = Windshield::new(WindshieldReference::Forward, turned, straight);
+    let refused = behind(windshield, 1.7).check().unwrap_err();
+    assert_eq!(refused.field(), "windshield");
+    assert!(refused.to_string().contains("87 degrees"), "{refused}");
+    // Before a lens that sees less of what it turns, it may stay.
+    assert_eq!(behind(windshield, 0.9).check(), Ok(()));
+    for name in Rig::preset_names() {
+        assert_eq!(Rig::preset(name).unwrap().check(), Ok(()), "{name}");
+    }
+}
+
+#[test]
+fn windshields_neither_fold_nor_lose_what_is_behind_them() {
+    let mut random = Random(9);
+    let mut within = |most: f64| most * (2.0 * random.unit() - 1.0);
+    let (mut accepted, mut fading) = (0, 0);
+    for set in 0..240 {
+        let most = [1e-3, 0.01, 0.05, 0.1][set % 4];
+        let limit_rad = [1.0, 1.3, 1.5, 1.7][set / 4 % 4];
+        let [h, v] = [1, 3].map(|own| {
+            let mut c = [0; 6].map(|_| within(most));
+            c[own] += 1.0;
+            Bivariate::new("windshield", &c).unwrap()
+        });
+        let way = [WindshieldReference::Forward, WindshieldReference::Backward][set / 16 % 2];
+        let camera = behind(Windshield::new(way, h, v), limit_rad);
+        if camera.check().is_err() {
+            continue;
+        }
+        accepted += 1;
+        fading += u32::from(limit_rad > 1.4);
+        let bare = Camera { windshield: None, ..camera };
+        for _ in 0..200 {
+            let off_axis_rad = limit_rad * (1.0 - 1e-9) * within(1.0).abs();
+            let (sin, cos) = off_axis_rad.sin_cos();
+            let at_px = bare.project(ray([sin, cos], within(3.2))).unwrap();
+            if (at_px - 100.0).abs().max_element() > 100.0 {
+                continue;
+            }
+            let outside = camera.unproject(at_px).unwrap();
+            let back_px = camera.project(outside).unwrap_or(DVec2::INFINITY);
+            assert!(back_px.distance(at_px) < 1e-9, "{camera:?}: {at_px} came back {back_px}");
+            let (right, down) = outside.any_orthonormal_pair();
+            let [x, y] = [right, down].map(|across| {
+                let beside = 1e-5 * across;
+                camera.project_beyond(outside + beside) - camera.project_beyond(outside - beside)
+            });
+            assert!(x.perp_dot(y) * outside.dot(right.cross(down)) > 0.0, "{camera:?}: {at_px}");
+        }
+    }
+    assert!(accepted > 80 && fading > 20, "{accepted} accepted, {fading} with fading");
 }

@@ -51,7 +51,7 @@ impl Fisheye {
     pub(super) fn check(&self) -> Result<(), CameraError> {
         super::check_numbers("lens.k", &self.k)?;
         super::check_max_angle(self.max_angle_rad)?;
-        super::check_field(self.limit_rad())
+        super::check_field("lens", self.limit_rad())
     }
 
     /// Where a direction lands, in focal lengths; beyond the limit it goes on straight.

@@ -146,7 +146,7 @@ impl FTheta {
             let must = "the determinant of [[c, d], [e, 1]] is above 0.001, and so is c";
             return Err(CameraError::Intrinsic { field: "lens.linear_cde", value: upright, must });
         }
-        super::check_field(self.limit_rad())
+        super::check_field("lens", self.limit_rad())
     }
 
     /// Where a direction lands, in pixels from the principal point; beyond the limit it goes on straight.

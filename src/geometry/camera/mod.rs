@@ -160,7 +160,7 @@ impl Camera {
             }
         }
         if let Some(windshield) = &self.windshield {
-            windshield.check(self.most_slope())?;
+            windshield.check(self.corner_rad())?;
         }
         if self.lens != Lens::Pinhole {
             // Middles of 16 x 16 parts.
@@ -169,8 +169,12 @@ impl Camera {
             let seen = (0..256).filter(|&i| self.unproject(at(i)).is_some()).count();
             let value = seen as f64 / 256.0;
             if value < Self::LEAST_SHARE {
+                let field = match &self.lens {
+                    Lens::OpenCv(lens) => lens.at_fault(),
+                    _ => "lens",
+                };
                 let must = "the lens sees at least an eighth of its image";
-                return Err(CameraError::Intrinsic { field: "lens", value, must });
+                return Err(CameraError::Intrinsic { field, value, must });
             }
         }
         Ok(())
@@ -335,12 +339,16 @@ impl Camera {
         }
     }
 
-    /// The steepest slopes x/z and y/z of the rays that the image shows, as far as a pinhole tells.
-    fn most_slope(&self) -> DVec2 {
-        let Pinhole { fx, fy, cx, cy } = self.pinhole;
-        let center_px = DVec2::new(cx, cy);
-        let most_px = center_px.abs().max((self.size_px() - center_px).abs());
-        (most_px / DVec2::new(fx, fy)).min(DVec2::splat(self.limit_rad().min(1.2).tan()))
+    /// How far off the axis the corners of the image look behind the windshield, in radians: as far as the
+    /// lens sees, where it does not see them.
+    fn corner_rad(&self) -> f64 {
+        let bare = Self { windshield: None, ..*self };
+        let corners = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
+        let angles_rad = corners.map(|corner| {
+            let ray = bare.unproject(DVec2::from(corner) * self.size_px());
+            ray.map_or(self.limit_rad(), |ray| ray.truncate().length().atan2(ray.z))
+        });
+        angles_rad.into_iter().fold(0.0, f64::max)
     }
 
     /// An f-theta lens has its focal lengths from its polynomial; what else is said must agree.
@@ -400,12 +408,12 @@ fn check_max_angle(max_angle_rad: Option<f64>) -> Result<(), CameraError> {
 /// A lens that sees less than this, in radians off its axis, has a polynomial that falls from the start.
 const LEAST_FIELD_RAD: f64 = 1e-3;
 
-fn check_field(value: f64) -> Result<(), CameraError> {
+fn check_field(field: &'static str, value: f64) -> Result<(), CameraError> {
     let usable = value >= LEAST_FIELD_RAD;
     if usable {
         return Ok(());
     }
-    let must = "rad off the axis is all that its coefficients give before the image folds back; at \
-                least 0.001 rad are needed";
-    Err(CameraError::Intrinsic { field: "lens", value, must })
+    let must = "rad off the axis is all that its coefficients give before the image folds back or is torn; \
+                at least 0.001 rad are needed";
+    Err(CameraError::Intrinsic { field, value, must })
 }

@@ -46,11 +46,16 @@ impl Windshield {
     const MOST_RAD: f64 = 0.2;
 
     /// How much the turning may differ between two rays, as a share of the angle between them: what
-    /// leaves the inversion halving its error at each step. Real ones have 0.02.
+    /// leaves the inversion halving its error at each step. Real ones have 0.02, and 0.26 far above
+    /// and below their image.
     const MOST_CHANGE: f64 = 0.5;
 
     /// Steps of the inversion: 2^-52 at worst.
     const STEPS: u32 = 52;
+
+    /// Angles off the axis, up to 87°, and azimuths at which it is checked.
+    const RINGS: u32 = 128;
+    const AZIMUTHS: u32 = 64;
 
     /// With coefficients in the order of [`Bivariate`].
     pub fn new(reference: WindshieldReference, horizontal: Bivariate, vertical: Bivariate) -> Self {
@@ -72,35 +77,49 @@ impl Windshield {
         &self.vertical
     }
 
-    /// Checks it over a pyramid of rays, whose slopes are at most these.
-    pub(super) fn check(&self, most_slope: DVec2) -> Result<(), CameraError> {
+    /// Checks it over every ray that is within an angle off the axis, in radians, on one side or the other:
+    /// with all of them turned evenly, none is met twice.
+    pub(super) fn check(&self, corner_rad: f64) -> Result<(), CameraError> {
         super::check_numbers("windshield.horizontal", self.horizontal.coefficients())?;
         super::check_numbers("windshield.vertical", self.vertical.coefficients())?;
-        let refused =
-            |value, must| Err(CameraError::Intrinsic { field: "windshield", value, must });
-        let h = 1e-4;
-        for i in -8..=8 {
-            for j in -8..=8 {
-                let slope = most_slope * DVec2::new(f64::from(i), f64::from(j)) / 8.0;
-                let at = angles(slope.extend(1.0).normalize());
-                let turned = |at: DVec2| self.polynomials(at) - at;
-                let most = turned(at).length();
-                let little = most <= Self::MOST_RAD;
-                if !little {
-                    return refused(most, "a windshield turns rays by at most 0.2 rad");
-                }
-                let change = [DVec2::X, DVec2::Y].map(|axis| {
-                    (turned(at + h * axis) - turned(at - h * axis)).length() / (2.0 * h)
-                });
-                let change = change[0].hypot(change[1]);
-                let even = change <= Self::MOST_CHANGE;
-                if !even {
-                    return refused(
-                        change,
-                        "neighbouring rays are turned by less than half their angle apart",
-                    );
+        let widest_rad = Self::FADES_Z[0].acos();
+        let least_z = corner_rad.min(widest_rad).cos();
+        let ring_rad = widest_rad / f64::from(Self::RINGS);
+        let turn_rad = std::f64::consts::TAU / f64::from(Self::AZIMUTHS);
+        for ring in 0..=Self::RINGS {
+            let (sin, cos) = (f64::from(ring) * ring_rad).sin_cos();
+            for azimuth in 0..Self::AZIMUTHS {
+                let (y, x) = (f64::from(azimuth) * turn_rad).sin_cos();
+                let at = angles(DVec3::new(x * sin, y * sin, cos));
+                let within = cos >= least_z || z(self.turned(at)) >= least_z;
+                if within {
+                    self.check_at(at)?;
                 }
             }
+        }
+        Ok(())
+    }
+
+    fn check_at(&self, at: DVec2) -> Result<(), CameraError> {
+        let refused =
+            |value, must| Err(CameraError::Intrinsic { field: "windshield", value, must });
+        let by = |at: DVec2| self.turned(at) - at;
+        let most = by(at).length();
+        let little = most <= Self::MOST_RAD;
+        if !little {
+            return refused(most, "a windshield turns rays by at most 0.2 rad");
+        }
+        let h = 1e-4;
+        let change = [DVec2::X, DVec2::Y]
+            .map(|axis| (by(at + h * axis) - by(at - h * axis)).length() / (2.0 * h));
+        let change = change[0].hypot(change[1]);
+        let even = change <= Self::MOST_CHANGE;
+        if !even {
+            return refused(
+                change,
+                "neighbouring rays are turned by less than half their angle apart, also where the turning \
+                 fades out, from 81 to 87 degrees off the axis; a max_angle below that leaves those out",
+            );
         }
         Ok(())
     }
@@ -118,23 +137,17 @@ impl Windshield {
 
     fn turn(&self, direction: DVec3, way: WindshieldReference) -> DVec3 {
         let unit = direction.normalize();
-        let [none, all] = Self::FADES_Z;
-        if unit.z < none {
+        if unit.z < Self::FADES_Z[0] {
             return unit;
         }
         let from = angles(unit);
-        let turned = |at: DVec2| {
-            let z = (1.0 - at.x.sin().powi(2) - at.y.sin().powi(2)).max(0.0).sqrt();
-            let share = ((z - none) / (all - none)).clamp(0.0, 1.0);
-            at + share * (self.polynomials(at) - at)
-        };
         let to = if way == self.reference {
-            turned(from)
+            self.turned(from)
         } else {
             // turned(x) = from, where x is nearly from.
             let mut x = from;
             for _ in 0..Self::STEPS {
-                let off = turned(x) - from;
+                let off = self.turned(x) - from;
                 x -= off;
                 if off.length_squared() <= 1e-32 {
                     break;
@@ -146,6 +159,13 @@ impl Windshield {
         DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).normalize()
     }
 
+    /// What becomes of a ray's angles: what the polynomials say, and less of it where the turning fades.
+    fn turned(&self, at: DVec2) -> DVec2 {
+        let [none, all] = Self::FADES_Z;
+        let share = ((z(at) - none) / (all - none)).clamp(0.0, 1.0);
+        at + share * (self.polynomials(at) - at)
+    }
+
     fn polynomials(&self, angles_rad: DVec2) -> DVec2 {
         DVec2::new(self.horizontal.at(angles_rad), self.vertical.at(angles_rad))
     }
@@ -153,6 +173,11 @@ impl Windshield {
 
 fn angles(unit: DVec3) -> DVec2 {
     DVec2::new(unit.x.clamp(-1.0, 1.0).asin(), unit.y.clamp(-1.0, 1.0).asin())
+}
+
+/// Of the unit direction with these angles; 0 where there is none.
+fn z(angles_rad: DVec2) -> f64 {
+    (1.0 - angles_rad.x.sin().powi(2) - angles_rad.y.sin().powi(2)).max(0.0).sqrt()
 }
 
 impl Bivariate {

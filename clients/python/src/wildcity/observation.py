@@ -27,9 +27,10 @@ DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("u1"), "F32": np.dtype("<f4")
 class Observation:
     """What the ego sees. Arrays are read-only views of the frame; images are decoded when read.
 
-    `images["front"]` is uint8 [height, width, 3]; `depth` (camera z in metres) and `opacity` are
-    float32 [height, width], where asked for. They are those of the first pose; after an `observe`
-    of several poses, `views` has them all.
+    `images["front"]` is uint8 [height, width, 3]; `depth` (metres) and `opacity` are float32
+    [height, width], where asked for. Depth is camera z, or distance for lenses that may see 90° and
+    more: fisheye and f-theta. All are those of the first pose; after an `observe` of several poses,
+    `views` has them all.
     """
 
     def __init__(self, frame: bytes) -> None:
@@ -67,7 +68,7 @@ class Observation:
 
     @property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
-        """Expected camera z by camera, in metres, 0 where opacity is 0."""
+        """Expected camera z (distance for fisheye and f-theta) by camera, in metres, 0 where opacity is 0."""
         return self.views[0].depth
 
     @property
@@ -159,7 +160,7 @@ class View:
 
     @cached_property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
-        """float32 [height, width] by camera: expected camera z in metres, where asked for."""
+        """float32 [height, width] by camera: camera z (distance for fisheye and f-theta), in metres."""
         return self._floats("depth")
 
     @cached_property
