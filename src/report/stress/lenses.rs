@@ -210,7 +210,7 @@ mod tests {
         let land = |unit: DVec3| {
             camera.project_beyond(blob.mean_m + blob.rotation * (blob.sigma_m * unit))
         };
-        let side = |i: usize| if i % 2 == 0 { scale.sqrt() } else { -scale.sqrt() };
+        let side = |i: usize| if i.is_multiple_of(2) { scale.sqrt() } else { -scale.sqrt() };
         let center_px = land(DVec3::ZERO);
         let points_px = [0, 1, 2, 3, 4, 5].map(|i| land(side(i) * DVec3::AXES[i / 2]));
         let mean_px = w0 * center_px + w * points_px.iter().sum::<DVec2>();
