@@ -14,7 +14,7 @@
 //! | [`render`] | six images per step: `gpu`, `cpu`, `reference` | config, geometry, scene |
 //! | [`sim`] | what moves: the ego | config, geometry, scene |
 //! | [`session`] | episodes: reset, step, observe, record, replay | config, geometry, scene, store, residency, render, sim |
-//! | [`report`] | error against run time, and what happens at the extremes | geometry, scene, generate, residency, render, session |
+//! | [`report`] | error against run time, and what happens at the extremes | geometry, scene, generate, residency, render, session, config |
 //! | [`protocol`] | the wire, and only the wire | nothing |
 //! | [`server`] | WebSocket and HTTP | config, geometry, scene, ingest, store, residency, render, sim, session, protocol |
 //! | [`client`] | the Rust client of the protocol | config, protocol |
