@@ -2,9 +2,9 @@
 
 use std::io::{self, Write};
 
-use crate::render::psnr::RIGHT_DB;
-use crate::render::relay::bisect;
-use crate::render::{Backend, Frame};
+use wildcity_render::compare::psnr::RIGHT_DB;
+use wildcity_render::relay::bisect;
+use wildcity_render::{Backend, Frame};
 
 use super::progress;
 use super::scene_source::{Machine, SceneSource};

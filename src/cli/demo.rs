@@ -11,13 +11,13 @@ use std::time::Instant;
 use glam::DMat3;
 use serde_json::json;
 
-use crate::client::{Client, Observation, Open, Pose};
-use crate::generate::{self, StreetSettings};
-use crate::ingest::sky;
-use crate::scene::manifest::Provenance;
-use crate::scene::{ProfileChanges, Record, Rig, Trajectory};
-use crate::server::{self, Limits};
-use crate::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
+use wildcity_client::{Client, Observation, Open, Pose};
+use wildcity_generate::StreetSettings;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
+use wildcity_server::Limits;
+use wildcity_twin::ingest::sky;
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -68,7 +68,7 @@ impl Demo {
         let twins = self.twins.dir()?;
         let version = demo_twin(&twins, TWIN, Storage::default())?;
         output::make_dir(&self.out)?;
-        let config = server::Config {
+        let config = wildcity_server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             twins,
             cache: self.twins.cache(),
@@ -81,7 +81,7 @@ impl Demo {
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let drive = runtime.block_on(async {
-            let running = server::start(config).await?;
+            let running = wildcity_server::start(config).await?;
             let drive = self.drive(&running.url(), &version).await;
             running.stop().await;
             drive
@@ -196,7 +196,7 @@ pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
 fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
-    let revision = generate::REVISION;
+    let revision = wildcity_generate::REVISION;
     let settings_json = serde_json::to_string(&settings)?;
     let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
     let why = match built(&catalog, name, &provenance)? {
@@ -204,8 +204,8 @@ fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Versi
         Err(why) => why,
     };
     writeln!(io::stderr(), "building the demo twin in {} ({why})", twins.display())?;
-    let street = generate::street(&settings)?;
-    let sky = sky::read_bytes(generate::SKY, None)?;
+    let street = wildcity_generate::street(&settings)?;
+    let sky = sky::read_bytes(wildcity_generate::SKY, None)?;
     let bar = progress::count("writing");
     let version = catalog.commit(
         NewVersion {

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde_json::json;
 
-use crate::render::gpu::{DeviceInfo, devices};
+use wildcity_render::gpu::{DeviceInfo, devices};
 
 /// List the devices that the gpu backend could use, the fastest kind first.
 ///

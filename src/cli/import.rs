@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use serde::de::DeserializeOwned;
 
-use crate::config;
-use crate::ingest::{self, Axes};
-use crate::scene::manifest::Provenance;
-use crate::scene::rig::is_name;
-use crate::scene::{Record, RenderProfile, Rig, Trajectory};
-use crate::store::{NewSky, NewVersion, Storage, StoreError};
+use crate::cli::limits;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::rig::is_name;
+use wildcity_scene::{Record, RenderProfile, Rig, Trajectory};
+use wildcity_twin::ingest::{self, Axes};
+use wildcity_twin::store::{NewSky, NewVersion, Storage, StoreError};
 
 use super::places::Twins;
 use super::progress;
@@ -215,7 +215,7 @@ pub(super) fn read_trajectory(path: &Path) -> anyhow::Result<Trajectory> {
 }
 
 fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let text = ingest::read_whole(path, config::SETTINGS_FILE_BYTES);
+    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES);
     let text = text.with_context(|| format!("{}", path.display()))?;
     // serde would take a list for the object's values in order, and count them.
     if text.trim_ascii_start().first() == Some(&b'[') {

@@ -2,9 +2,9 @@
 
 use std::io::{self, Write};
 
-use crate::geometry::Bounds;
-use crate::scene::Manifest;
-use crate::store::Version;
+use wildcity_scene::Manifest;
+use wildcity_scene::geometry::Bounds;
+use wildcity_twin::store::Version;
 
 use super::places::{TwinVersion, Twins};
 use super::time::utc;

@@ -5,8 +5,8 @@ mod pictures;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use crate::scene::Manifest;
-use crate::store::Version;
+use wildcity_scene::Manifest;
+use wildcity_twin::store::Version;
 
 use super::places::{TwinVersion, Twins};
 use super::scene_source::Engine;

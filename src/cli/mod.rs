@@ -8,6 +8,7 @@ mod demo;
 mod devices;
 mod import;
 mod inspect;
+mod limits;
 mod lod;
 mod output;
 mod places;

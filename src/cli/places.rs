@@ -3,8 +3,8 @@
 use std::env;
 use std::path::PathBuf;
 
-use crate::config;
-use crate::store::{CacheSettings, Catalog};
+use crate::cli::limits;
+use wildcity_twin::store::{CacheSettings, Catalog};
 
 /// `--twins`, for every command that has it.
 #[derive(Debug, clap::Args)]
@@ -21,7 +21,7 @@ pub(super) struct Twins {
     cache_dir: Option<PathBuf>,
 
     /// How much it keeps, in GiB; 0 for nothing.
-    #[arg(long, value_name = "N", default_value_t = config::CACHE_GIB)]
+    #[arg(long, value_name = "N", default_value_t = limits::CACHE_GIB)]
     cache_gib: u32,
 }
 

@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
-use crate::client::{
+use crate::cli::limits;
+use wildcity_client::{
     All, Cells, Golden, HttpClient, NewPush, Push as Pushed, PushFile, PushReport, PushState,
 };
-use crate::config;
-use crate::ingest;
+use wildcity_twin::ingest;
 
 use super::progress;
 
@@ -75,7 +75,7 @@ pub(super) struct Push {
 #[derive(Debug, clap::Args)]
 pub(super) struct Server {
     /// The server, as http://HOST:PORT.
-    #[arg(long, value_name = "URL", default_value = config::SERVER_URL)]
+    #[arg(long, value_name = "URL", default_value = limits::SERVER_URL)]
     server: String,
 
     /// File that holds the token [default: $WILDCITY_TOKEN, or none]
@@ -164,7 +164,8 @@ impl Server {
 
 fn read_token(path: &Path) -> anyhow::Result<String> {
     let cannot = || format!("--token-file {}", path.display());
-    let text = ingest::read_whole(path, config::TOKENS_FILE_BYTES).with_context(cannot)?;
+    let text = ingest::read_whole(path, wildcity_server::limits::TOKENS_FILE_BYTES)
+        .with_context(cannot)?;
     Ok(String::from_utf8(text).with_context(cannot)?.trim().to_owned())
 }
 
@@ -194,7 +195,7 @@ fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         writeln!(out, "scales      {thin:.2e} to {wide:.2e} m")?;
     }
     if !report.cells.is_empty() {
-        let count = |of: fn(&crate::client::CellReport) -> u64| -> u64 {
+        let count = |of: fn(&wildcity_client::CellReport) -> u64| -> u64 {
             report.cells.iter().map(of).sum()
         };
         let (before, after) = (count(|cell| cell.before), count(|cell| cell.after));

@@ -5,9 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use crate::config;
-use crate::render::{Frame, Target};
-use crate::session;
+use wildcity_render::{Frame, Target};
 
 use super::scene_source::{Renderer, SceneSource, Shot};
 use super::{output, progress};
@@ -104,8 +102,10 @@ impl Format {
     fn file(self, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> Result<Vec<u8>, String> {
         let (width, height) = (shot.view.camera.width_px, shot.view.camera.height_px);
         match self {
-            Self::Png => session::png(rgb8, width, height),
-            Self::Jpeg => session::jpeg(rgb8, width, height, config::JPEG_QUALITY),
+            Self::Png => wildcity_session::png(rgb8, width, height),
+            Self::Jpeg => {
+                wildcity_session::jpeg(rgb8, width, height, wildcity_session::limits::JPEG_QUALITY)
+            }
             Self::Npy => Ok(npy([height, width, 4], rgba)),
         }
     }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
-use crate::residency::Cache;
-use crate::session::{self, Extent, FrameRequest, Recording, Redrawn};
+use wildcity_session::{Extent, FrameRequest, Recording, Redrawn};
+use wildcity_twin::residency::Cache;
 
 use super::places::Twins;
 use super::scene_source::Engine;
@@ -137,6 +137,6 @@ fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
     };
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
     let (width, height) = (camera.camera.width_px, camera.camera.height_px);
-    let file = session::png(rgb8, width, height).map_err(anyhow::Error::msg);
+    let file = wildcity_session::png(rgb8, width, height).map_err(anyhow::Error::msg);
     output::write(&path, &file.with_context(|| format!("cannot write {}", path.display()))?)
 }

@@ -6,20 +6,20 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 
-use crate::config;
-use crate::render::gpu::Gpu;
-use crate::render::{Backend, RenderError};
-use crate::report::believed::believed;
-use crate::report::choose::{Recommendation, Wanted, recommend};
-use crate::report::ladder::{Ladder, LeftOut, Traits, ladder};
-use crate::report::measure::{Bench, Truth};
-use crate::report::places::{Sampling, places};
-use crate::report::stress::CASES;
-use crate::report::stress::table::{self, Candidate, Column};
-use crate::report::timing::at_one_speed;
-use crate::report::{Report, ReportError, Subject, needed, page};
-use crate::residency::Cache;
-use crate::scene::{Rays, Rig};
+use crate::cli::limits;
+use wildcity_render::gpu::Gpu;
+use wildcity_render::{Backend, RenderError};
+use wildcity_report::believed::believed;
+use wildcity_report::choose::{Recommendation, Wanted, recommend};
+use wildcity_report::ladder::{Ladder, LeftOut, Traits, ladder};
+use wildcity_report::measure::{Bench, Truth};
+use wildcity_report::places::{Sampling, places};
+use wildcity_report::timing::at_one_speed;
+use wildcity_report::{Report, ReportError, Subject, needed, page};
+use wildcity_scene::{Rays, Rig};
+use wildcity_stress::CASES;
+use wildcity_stress::table::{self, Candidate, Column};
+use wildcity_twin::residency::Cache;
 
 use super::places::{TwinVersion, Twins};
 use super::rig::rig_of;
@@ -71,11 +71,11 @@ pub(super) struct Command {
 
     /// Stations along the drive, each on it and 1, 3 and 5 m beside; around a twin without a drive, four
     /// times as many places. The reference takes about a second for each place and camera.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=config::REPORT_STATIONS))]
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=limits::REPORT_STATIONS))]
     stations: u32,
 
     /// Side of the window that is compared of each image, in pixels.
-    #[arg(long, value_name = "PX", default_value_t = 96, value_parser = clap::value_parser!(u32).range(16..=config::REPORT_WINDOW_PX))]
+    #[arg(long, value_name = "PX", default_value_t = 96, value_parser = clap::value_parser!(u32).range(16..=limits::REPORT_WINDOW_PX))]
     window: u32,
 
     /// Steps to time at each place, after one that is not counted.
@@ -195,7 +195,7 @@ impl Command {
         let resident = Cache::new(self.twins.catalog()?).open(&self.twin.name, self.twin.number)?;
         let manifest = &resident.version.manifest;
         let named = self.rig.as_deref().map(rig_of).transpose()?;
-        let own = || manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+        let own = || manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = named.or_else(own).context("no rig")?;
         let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
         let places = places(manifest, &rig.cameras, sampling);

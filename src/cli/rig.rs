@@ -8,9 +8,9 @@ use std::path::Path;
 
 use glam::DVec2;
 
-use crate::render::View;
-use crate::scene::Rig;
-use crate::scene::rig::RigCamera;
+use wildcity_render::View;
+use wildcity_scene::Rig;
+use wildcity_scene::rig::RigCamera;
 
 use super::import::read_rig;
 

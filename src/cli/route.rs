@@ -10,8 +10,9 @@ use std::path::Path;
 
 use anyhow::Context;
 
-use crate::scene::Trajectory;
-use crate::{config, ingest};
+use crate::cli::limits;
+use wildcity_scene::Trajectory;
+use wildcity_twin::ingest;
 
 /// Measure a recorded drive, cut it, and match its clock with another one.
 ///
@@ -46,7 +47,7 @@ impl Route {
 
 /// Reads the times of another clock: a JSON list of whole microseconds.
 fn read_times_us(path: &Path) -> anyhow::Result<Vec<i64>> {
-    let text = ingest::read_whole(path, config::SETTINGS_FILE_BYTES);
+    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES);
     let text = text.with_context(|| format!("{}", path.display()))?;
     serde_json::from_slice(&text).with_context(|| {
         format!("cannot read {} as a JSON list of whole microseconds", path.display())

@@ -9,19 +9,17 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::ValueEnum;
 
-use crate::config;
-use crate::ingest::cameras::{self, ListedCamera};
-use crate::ingest::{self};
-use crate::render::automatic::{Automatic, automatic};
-use crate::render::cpu::{Cpu, Simd};
-use crate::render::gpu::{AdapterChoice, Gpu, Limits};
-use crate::render::reference::Reference;
-use crate::render::relay::Relay;
-use crate::render::stage::Stage;
-use crate::render::{Backend, View};
-use crate::residency::{Cache, Pinned, Resident};
-use crate::scene::{RenderProfile, Scene};
-use crate::session;
+use wildcity_render::automatic::{Automatic, automatic};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gpu::{AdapterChoice, Gpu, Limits};
+use wildcity_render::reference::Reference;
+use wildcity_render::relay::Relay;
+use wildcity_render::stage::Stage;
+use wildcity_render::{Backend, View};
+use wildcity_scene::{RenderProfile, Scene};
+use wildcity_twin::ingest::cameras::{self, ListedCamera};
+use wildcity_twin::ingest::{self};
+use wildcity_twin::residency::{Cache, Pinned, Resident};
 
 use super::places::{TwinVersion, Twins};
 use super::progress;
@@ -223,8 +221,8 @@ impl Renderer {
 
 fn threads(text: &str) -> Result<usize, String> {
     match text.parse() {
-        Ok(threads) if threads <= config::RENDER_THREADS => Ok(threads),
-        _ => Err(format!("expected 0 to {}", config::RENDER_THREADS)),
+        Ok(threads) if threads <= wildcity_render::limits::RENDER_THREADS => Ok(threads),
+        _ => Err(format!("expected 0 to {}", wildcity_render::limits::RENDER_THREADS)),
     }
 }
 
@@ -284,7 +282,7 @@ impl Source {
         let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
         Ok(match (self, shots) {
             (Self::Twin(resident), [first, ..]) => {
-                Drawn::Needed(resident.scene(&session::eyes(&views), &first.profile)?)
+                Drawn::Needed(resident.scene(&wildcity_session::eyes(&views), &first.profile)?)
             }
             (Self::Twin(_), []) => Drawn::Whole(Cow::default()),
             (Self::File(scene), _) => Drawn::Whole(Cow::Borrowed(scene)),

@@ -8,10 +8,10 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
-use crate::config;
-use crate::ingest;
-use crate::scene::{ProfileChanges, RenderProfile};
-use crate::server::{self, Limits, Tokens};
+use crate::cli::limits;
+use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_server::{Limits, Tokens};
+use wildcity_twin::ingest;
 
 use super::places::{Episodes, Twins, Uploads};
 use super::scene_source::{Engine, bytes_of_gib, gib};
@@ -37,7 +37,7 @@ pub(super) struct Serve {
     tokens: Option<PathBuf>,
 
     /// Address and port to listen on; port 0 takes a free one. Not loopback only with --tokens.
-    #[arg(long, value_name = "ADDR", default_value = config::LISTEN, value_parser = address)]
+    #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
     /// Memory that the Gaussians of all twins may take, in GiB, as 2 or 0.5 [default: three quarters of
@@ -94,7 +94,7 @@ impl Serve {
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
         let tokens = self.tokens.as_deref().map(read_tokens).transpose()?;
-        let config = server::Config {
+        let config = wildcity_server::Config {
             listen: self.listen,
             twins,
             cache: self.twins.cache(),
@@ -112,8 +112,8 @@ impl Serve {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let served = runtime.block_on(async {
             // Before anybody is told of the server: they may tell it to stop at once.
-            let stop = server::stop_signal()?;
-            let running = server::start(config).await?;
+            let stop = wildcity_server::stop_signal()?;
+            let running = wildcity_server::start(config).await?;
             writeln!(io::stdout(), "listening on {}", running.url())?;
             stop.await;
             tracing::info!("stopping");
@@ -128,14 +128,15 @@ impl Serve {
 
 fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
     let cannot = || format!("--tokens {}", path.display());
-    let text = ingest::read_whole(path, config::TOKENS_FILE_BYTES).with_context(cannot)?;
+    let text = ingest::read_whole(path, wildcity_server::limits::TOKENS_FILE_BYTES)
+        .with_context(cannot)?;
     Tokens::parse(&text).with_context(cannot)
 }
 
 /// A profile file, which must fit a profile: it need not fit every twin's.
 fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
     let cannot = || format!("--profile {}", path.display());
-    let text = ingest::read_whole(path, config::PROFILE_FILE_BYTES).with_context(cannot)?;
+    let text = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
     let changes: ProfileChanges = serde_json::from_slice(&text).with_context(cannot)?;
     changes.apply(RenderProfile::default()).with_context(cannot)?;
     Ok(changes)

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::Context;
 use glam::DMat3;
 
-use crate::ingest::{Axes, sky};
-use crate::scene::sky::Model;
-use crate::store::SkyBytes;
+use wildcity_scene::sky::Model;
+use wildcity_twin::ingest::{Axes, sky};
+use wildcity_twin::store::SkyBytes;
 
 /// A sky, and how it is looked at.
 #[derive(Clone, Debug, clap::Args)]

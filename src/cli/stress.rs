@@ -4,9 +4,9 @@ use std::io::{self, Write};
 
 use anyhow::ensure;
 
-use crate::render::reference::Reference;
-use crate::report::stress::table::{self, Candidate};
-use crate::report::stress::{CASES, Case, Verdict};
+use wildcity_render::reference::Reference;
+use wildcity_stress::table::{self, Candidate};
+use wildcity_stress::{CASES, Case, Verdict};
 
 use super::progress;
 use super::scene_source::Machine;

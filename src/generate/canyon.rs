@@ -4,7 +4,7 @@
 //! detail, as in a larger capture.
 
 use super::random::Random;
-use crate::scene::Gaussians;
+use wildcity_scene::Gaussians;
 
 /// Half the length of the road, and half its width, in metres.
 const HALF_M: [f64; 2] = [60.0, 8.0];

@@ -9,9 +9,9 @@ use std::collections::{BTreeMap, VecDeque};
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::geometry::Pose;
-use crate::scene::chunk::{self, CELL_M};
-use crate::scene::{Gaussians, Trajectory};
+use wildcity_scene::chunk::{self, CELL_M};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{Gaussians, Trajectory};
 
 use super::light::Light;
 use super::random::Random;
@@ -35,7 +35,7 @@ const INDENT_M: f64 = 8.0;
 /// The Gaussians of one cell, all of them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// Grid cell (x, y), as in [`crate::scene::Chunk::cell`].
+    /// Grid cell (x, y), as in [`wildcity_scene::Chunk::cell`].
     pub cell: [i32; 2],
     /// Raw Gaussians of SH degree 1, in world axes.
     pub gaussians: Gaussians,

@@ -4,9 +4,9 @@ use std::f64::consts::TAU;
 
 use glam::{DQuat, DVec3};
 
-use crate::geometry::Pose;
-use crate::scene::Trajectory;
-use crate::scene::trajectory::Keyframe;
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::trajectory::Keyframe;
 
 /// How far the street goes on beyond both ends of the drive, in metres.
 pub(super) const BEYOND_M: f64 = 80.0;

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, sh};
 
 use super::light::Light;
 

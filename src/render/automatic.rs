@@ -3,13 +3,13 @@
 //! A driver may be wrong in ways that no error tells. So a device draws a card first, twice, and is
 //! taken only if both drawings have the same bytes and are what the cpu backend draws.
 
-use crate::geometry::camera::Pinhole;
-use crate::geometry::{Camera, Pose};
-use crate::scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
+use super::compare::psnr::{RIGHT_DB, psnr_db};
 use super::cpu::{Cpu, CpuError, Simd};
 use super::gpu::{AdapterChoice, Gpu, GpuError, Limits};
-use super::psnr::{RIGHT_DB, psnr_db};
 use super::{Backend, Frame, RenderError, Target, View};
 
 /// A backend, and why it and no other.
@@ -135,9 +135,9 @@ mod tests {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
     use super::*;
-    use crate::render::gpu::shaders::Shaders;
-    use crate::render::reference::Reference;
-    use crate::render::{Finished, FrameStats};
+    use crate::gpu::shaders::Shaders;
+    use crate::reference::Reference;
+    use crate::{Finished, FrameStats};
 
     fn broken(stage: &str, part: &str, slip: &str) -> Gpu {
         let shaders = Shaders::default().with_slip(stage, part, slip).unwrap();

@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3};
 
 use super::View;
 use super::constants::{DEPTH_BITS, SLOPE_SLACK};
-use crate::scene::{Chunk, RenderProfile};
+use wildcity_scene::{Chunk, RenderProfile};
 
 /// A splat: a Gaussian on the screen of one view (48 bytes).
 ///

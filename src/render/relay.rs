@@ -1,8 +1,8 @@
 //! The cpu backend up to a stage, and the gpu backend from there: to find which stage is wrong.
 
+use super::compare::psnr::{RIGHT_DB, psnr_db, psnr_db_of_bytes};
 use super::cpu::Cpu;
 use super::gpu::Gpu;
-use super::psnr::{RIGHT_DB, psnr_db, psnr_db_of_bytes};
 use super::stage::Stage;
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
 

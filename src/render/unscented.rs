@@ -9,9 +9,9 @@
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{Rolling, View};
-use crate::geometry::camera::{Cone, WIDEST_RAD};
-use crate::geometry::{Camera, Pose};
-use crate::scene::RenderProfile;
+use wildcity_scene::RenderProfile;
+use wildcity_scene::geometry::camera::{Cone, WIDEST_RAD};
+use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole
 /// of 62° draws what is beside it, up to its plane.

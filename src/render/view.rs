@@ -2,9 +2,9 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::geometry::camera::Rolls;
-use crate::geometry::{Camera, Pose};
-use crate::scene::rig::RigCamera;
+use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::rig::RigCamera;
 
 /// A camera somewhere in the world.
 #[derive(Clone, Copy, Debug, PartialEq)]

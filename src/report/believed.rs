@@ -7,10 +7,10 @@ use serde::Serialize;
 use super::ReportError;
 use super::ladder::scaled;
 use super::places::{OFFSETS_M, Place};
-use crate::geometry::CameraError;
-use crate::render::{Backend, Frame, Target, View};
-use crate::residency::Resident;
-use crate::session::{self, Trained, Trust};
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::geometry::CameraError;
+use wildcity_session::{Trained, Trust};
+use wildcity_twin::residency::Resident;
 
 /// Trust at one distance from the recorded drive: of all cameras at all stations.
 #[derive(Clone, Debug, Serialize)]
@@ -96,7 +96,7 @@ impl Seen {
         let views = place.views.iter().map(|view| scaled(*view, share));
         let views = views.collect::<Result<Vec<View>, CameraError>>()?;
         let profile = &resident.version.manifest.profile;
-        let scene = resident.scene(&session::eyes(&views), profile)?;
+        let scene = resident.scene(&wildcity_session::eyes(&views), profile)?;
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut rgb8: Vec<Vec<u8>> = pixels().map(|count| vec![0; 3 * count]).collect();
         let mut opacity: Vec<Vec<f32>> = pixels().map(|count| vec![0.0; count]).collect();
@@ -118,7 +118,7 @@ impl Seen {
 
     fn picture(&self, place: &Place) -> Result<Picture, ReportError> {
         let (width_px, height_px) = (self.first.camera.width_px, self.first.camera.height_px);
-        let file = session::jpeg(&self.rgb8, width_px, height_px, QUALITY);
+        let file = wildcity_session::jpeg(&self.rgb8, width_px, height_px, QUALITY);
         let file = file.map_err(|reason| ReportError::Encode { reason })?;
         Ok(Picture { place: place.name.clone(), file })
     }

@@ -5,10 +5,9 @@ use serde::Serialize;
 use super::ReportError;
 use super::ladder::{Family, Sent};
 use super::measure::{AtPlace, Measured, least};
-use super::numbers::number;
-use crate::config;
-use crate::scene::profile::ProfileError;
-use crate::scene::{ProfileChanges, RenderProfile};
+use wildcity_render::compare::numbers::number;
+use wildcity_scene::profile::ProfileError;
+use wildcity_scene::{ProfileChanges, RenderProfile};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -144,7 +143,7 @@ impl Encoded {
     fn of(m: &Measured) -> Self {
         Self {
             sent: m.setting.name.clone(),
-            by_default: m.setting.sent == Some(Sent::Jpeg(config::JPEG_QUALITY)),
+            by_default: m.setting.sent == Some(Sent::Jpeg(wildcity_session::limits::JPEG_QUALITY)),
             least_db: m.least_db(),
             more_ms: m.cost.step_ms - m.served_ms,
         }

@@ -2,11 +2,11 @@
 
 use serde::Serialize;
 
-use crate::geometry::CameraError;
-use crate::render::View;
-use crate::scene::profile::ProfileError;
-use crate::scene::sky::{Model, Sky};
-use crate::scene::{Manifest, Rays, Record, RenderProfile};
+use wildcity_render::View;
+use wildcity_scene::geometry::CameraError;
+use wildcity_scene::profile::ProfileError;
+use wildcity_scene::sky::{Model, Sky};
+use wildcity_scene::{Manifest, Rays, Record, RenderProfile};
 
 /// One way to draw a twin.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -7,21 +7,20 @@ use std::time::Instant;
 use image::ImageReader;
 use serde::Serialize;
 
-use super::drawing::{Drawing, draw};
-use super::errors::{Errors, Gathered, Image};
 use super::ladder::{Family, Setting};
-use super::numbers::{number, numbers};
 use super::places::{OFFSETS_M, Place};
-use super::recorded::recorded;
 use super::timing::{Step, Timed, file};
 use super::{Pictures, ReportError, pictures};
-use crate::render::gpu::Gpu;
-use crate::render::reference::Reference;
-use crate::render::{Backend, RenderError, View};
-use crate::residency::{Pinned, Resident};
-use crate::scene::sky::Drawn;
-use crate::scene::{Rays, RenderProfile, Scene};
-use crate::session;
+use wildcity_render::compare::drawing::{Drawing, draw};
+use wildcity_render::compare::errors::{Errors, Gathered, Image};
+use wildcity_render::compare::numbers::{number, numbers};
+use wildcity_render::gpu::Gpu;
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, RenderError, View};
+use wildcity_scene::record::recorded;
+use wildcity_scene::sky::Drawn;
+use wildcity_scene::{Rays, RenderProfile, Scene};
+use wildcity_twin::residency::{Pinned, Resident};
 
 /// What is measured, and on what.
 pub struct Bench<'a> {
@@ -216,7 +215,7 @@ impl Bench<'_> {
     }
 
     fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
-        Ok(self.resident.scene(&session::eyes(views), profile)?)
+        Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
     }
 
     /// The scene in the setting's record, if it is another one, and bytes of a Gaussian in it.

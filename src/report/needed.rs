@@ -9,16 +9,17 @@ use glam::{DMat3, DVec3};
 use serde::Serialize;
 
 use super::ReportError;
-use super::drawing::look;
 use super::measure::sky_bytes;
-use crate::generate;
-use crate::geometry::camera::{Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference};
-use crate::render::cpu::Cpu;
-use crate::render::gpu::{Gpu, GpuUse};
-use crate::render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
-use crate::scene::appearance::{Appearance, Exposure, Overlay};
-use crate::scene::sky::{CubeMap, Layer, Model, Network};
-use crate::scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
+use wildcity_render::compare::drawing::look;
+use wildcity_render::cpu::Cpu;
+use wildcity_render::gpu::{Gpu, GpuUse};
+use wildcity_render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
+use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
+use wildcity_scene::geometry::camera::{
+    Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference,
+};
+use wildcity_scene::sky::{CubeMap, Layer, Model, Network};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -141,7 +142,7 @@ pub fn rows(cpu: &Cpu, device: &dyn Fn() -> Option<Gpu>) -> Result<Vec<Row>, Rep
 
 /// A street with colours of a degree, as flat where the base is.
 fn street(degree: u8) -> Gaussians {
-    let mut street = generate::canyon(20_000, &mut |_, _| {});
+    let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
     let flat = street.sh.chunks_exact(12).flat_map(|colour| colour[..3].to_vec()).collect();
     (street.sh, street.sh_degree) = (flat, 0);
     street.raise_sh_degree(degree);

@@ -9,8 +9,8 @@ use super::ladder::{Family, LeftOut};
 use super::measure::Measured;
 use super::pictures::{HEAT_RGB, HEAT_STEPS, Pictures};
 use super::places::OFFSETS_M;
-use super::stress::Verdict;
 use super::{Report, ReportError, needed, plots};
+use wildcity_stress::Verdict;
 
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}

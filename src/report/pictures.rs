@@ -1,8 +1,7 @@
 //! An image, what it should be, and a map of how far off it is, as PNG.
 
 use super::ReportError;
-use super::errors::Image;
-use crate::session;
+use wildcity_render::compare::errors::Image;
 
 /// Where a setting is worst.
 #[derive(Clone, Debug, Default)]
@@ -28,7 +27,7 @@ pub(super) const HEAT_RGB: [[u8; 3]; 6] =
 pub(super) fn of(place: String, image: &Image, truth: &Image) -> Result<Pictures, ReportError> {
     let [width, height] = image.size_px;
     let png = |rgb8: Vec<u8>| {
-        session::png(&rgb8, width, height).map_err(|reason| ReportError::Encode { reason })
+        wildcity_session::png(&rgb8, width, height).map_err(|reason| ReportError::Encode { reason })
     };
     let bytes = |image: &Image| image.rgb.iter().map(|v| (255.0 * v).round() as u8).collect();
     let off = image.rgb.chunks_exact(3).zip(truth.rgb.chunks_exact(3)).flat_map(|(a, b)| {

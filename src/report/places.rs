@@ -2,12 +2,12 @@
 
 use glam::{DQuat, DVec3};
 
-use super::drawing::{crop, look};
 use super::ladder::scaled;
-use crate::geometry::{Bounds, CameraError, Pose};
-use crate::render::View;
-use crate::scene::rig::RigCamera;
-use crate::scene::{Manifest, Trajectory};
+use wildcity_render::View;
+use wildcity_render::compare::drawing::{crop, look};
+use wildcity_scene::geometry::{Bounds, CameraError, Pose};
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{Manifest, Trajectory};
 
 /// Somewhere that all settings are measured.
 #[derive(Clone, Debug)]

@@ -6,9 +6,8 @@ use std::time::Instant;
 use super::ReportError;
 use super::ladder::Sent;
 use super::measure::{Measured, quantile};
-use crate::render::{Backend, Frame, Target, View};
-use crate::scene::{RenderProfile, Scene};
-use crate::session;
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 /// A step of all cameras: drawn, and encoded if it says how images are sent.
 #[derive(Clone, Copy)]
@@ -88,7 +87,7 @@ pub(super) fn file(
 ) -> Result<Option<Vec<u8>>, String> {
     let (width, height) = (view.camera.width_px, view.camera.height_px);
     match sent {
-        Some(Sent::Jpeg(quality)) => session::jpeg(rgb8, width, height, quality).map(Some),
+        Some(Sent::Jpeg(quality)) => wildcity_session::jpeg(rgb8, width, height, quality).map(Some),
         Some(Sent::Raw) | None => Ok(None),
     }
 }

@@ -9,8 +9,8 @@ use std::sync::Arc;
 
 use tokio::time::{Instant, sleep_until, timeout};
 
-use crate::config;
-use crate::session::{Frame, Outcome, Session, SessionError};
+use crate::limits;
+use wildcity_session::{Frame, Outcome, Session, SessionError};
 
 use super::Server;
 use super::auth::Grant;
@@ -99,7 +99,7 @@ impl Connection {
     }
 
     async fn handle(&mut self, text: &str) -> Result<(), Lost> {
-        let parsed = if text.len() <= config::INLINE_REQUEST_BYTES {
+        let parsed = if text.len() <= limits::INLINE_REQUEST_BYTES {
             convert::parse(text)
         } else {
             let text = text.to_owned();

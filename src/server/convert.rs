@@ -14,4 +14,4 @@ pub(super) use http::{new_push, new_upload, push, rollback, sessions, upload, ve
 pub(super) use request::{Command, Parsed, parse};
 
 /// The WebSocket subprotocol.
-pub(super) const SUBPROTOCOL: &str = crate::protocol::PROTOCOL;
+pub(super) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;

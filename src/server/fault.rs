@@ -2,12 +2,12 @@
 
 use std::io;
 
-use crate::geometry::{CameraError, PoseError};
-use crate::ingest::IngestError;
-use crate::scene::appearance::AppearanceError;
-use crate::scene::rig::RigError;
-use crate::session::SessionError;
-use crate::store::StoreError;
+use wildcity_scene::appearance::AppearanceError;
+use wildcity_scene::geometry::{CameraError, PoseError};
+use wildcity_scene::rig::RigError;
+use wildcity_session::SessionError;
+use wildcity_twin::ingest::IngestError;
+use wildcity_twin::store::StoreError;
 
 /// Why a request was refused.
 #[derive(Debug, thiserror::Error)]

@@ -12,14 +12,14 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout};
 
-use crate::config;
+use crate::limits;
 
 use super::{Server, router};
 
 /// Serves connections until the server stops. When all places are taken, further connections wait
 /// in the kernel's backlog.
 pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
-    let places = Arc::new(Semaphore::new(server.limits.connections + config::SPARE_CONNECTIONS));
+    let places = Arc::new(Semaphore::new(server.limits.connections + limits::SPARE_CONNECTIONS));
     let app = router::router(server.clone());
     loop {
         let accepted = async {
@@ -106,7 +106,7 @@ impl Patience {
 
 /// Small messages at once, and dead peers noticed.
 fn prepare(stream: &TcpStream) {
-    let (idle, interval, retries) = config::KEEPALIVE;
+    let (idle, interval, retries) = limits::KEEPALIVE;
     let keepalive =
         TcpKeepalive::new().with_time(idle).with_interval(interval).with_retries(retries);
     let set =

@@ -17,7 +17,7 @@ use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
 
-use crate::session::Engine;
+use wildcity_session::Engine;
 
 use super::Server;
 use super::auth::{Grant, Role};

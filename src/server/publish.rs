@@ -7,13 +7,13 @@ use std::sync::Arc;
 
 use tokio::time::timeout;
 
-use crate::config;
-use crate::ingest::{self, IngestError};
-use crate::scene::chunk::cell_at;
-use crate::scene::manifest::Provenance;
-use crate::scene::{Gaussians, RenderProfile};
-use crate::session::{Changed, Engine, HeldLatest};
-use crate::store::{Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version};
+use crate::limits;
+use wildcity_scene::chunk::cell_at;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{Gaussians, RenderProfile};
+use wildcity_session::{Changed, Engine, HeldLatest};
+use wildcity_twin::ingest::{self, IngestError};
+use wildcity_twin::store::{Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version};
 
 use super::Server;
 use super::fault::Fault;
@@ -87,7 +87,7 @@ async fn publish(
     let driving = server.sessions.list().into_iter().filter(|(_, about, _)| about.twin == ask.twin);
     let frames = driving.map(|(_, about, _)| about.eyes).collect();
     let prepared = server.engine.prepare(&ask.twin, version.number, frames);
-    match timeout(config::PREFETCH_TIMEOUT, prepared).await {
+    match timeout(wildcity_session::limits::PREFETCH_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}
         // It is committed and sound: whoever opens it waits, or is told why it does not fit.
         Ok(Err(error)) => tracing::warn!(twin = ask.twin, "not loaded ahead: {error}"),
@@ -150,7 +150,7 @@ fn read(push: &Push, ask: &Ask, uploads: &[Arc<Upload>]) -> Result<Scene, Fault>
 
 /// Whether a push may have so many Gaussians, counted up to one of its files.
 fn fits(name: &str, count: u64) -> Result<(), Fault> {
-    let most = config::PUSH_GAUSSIANS;
+    let most = limits::PUSH_GAUSSIANS;
     if count <= most {
         return Ok(());
     }
@@ -240,10 +240,10 @@ fn changes(
     (report.cells, report.left_out) = (replaced, left_out);
     push.tell(report.clone());
 
-    let fits = gaussians.len() <= config::GOLDEN_GAUSSIANS;
+    let fits = gaussians.len() <= limits::GOLDEN_GAUSSIANS;
     let wants = ask.poses.is_some() || ask.min_psnr_db.is_some();
     if wants && !fits {
-        let most = config::GOLDEN_GAUSSIANS;
+        let most = limits::GOLDEN_GAUSSIANS;
         let must = format!("set, for {} Gaussians; at most {most} are compared", gaussians.len());
         return Err(Fault::OutOfRange { field: "golden".to_owned(), must });
     }
@@ -385,8 +385,8 @@ mod tests {
 
     #[test]
     fn a_push_has_a_largest_size() {
-        assert!(fits("a.ply", config::PUSH_GAUSSIANS).is_ok());
-        let error = fits("b.ply", config::PUSH_GAUSSIANS + 1).unwrap_err();
+        assert!(fits("a.ply", limits::PUSH_GAUSSIANS).is_ok());
+        let error = fits("b.ply", limits::PUSH_GAUSSIANS + 1).unwrap_err();
         assert!(error.is_content());
         let text = error.to_string();
         assert!(text.starts_with("b.ply") && text.contains("250000001"), "{text}");

@@ -10,11 +10,11 @@ use axum::response::{IntoResponse as _, Response};
 use axum::{Extension, Json};
 use tokio::sync::Semaphore;
 
-use crate::config;
-use crate::geometry::Pose;
-use crate::ingest::Axes;
-use crate::scene::Record;
-use crate::store::{Catalog, StoreError};
+use crate::limits;
+use wildcity_scene::Record;
+use wildcity_scene::geometry::Pose;
+use wildcity_twin::ingest::Axes;
+use wildcity_twin::store::{Catalog, StoreError};
 
 use super::auth::{Grant, Role};
 use super::fault::Fault;
@@ -206,8 +206,8 @@ impl Pushes {
                 return Ok((push.clone(), false));
             }
         }
-        if entries.pushes.values().filter(|push| push.is_open()).count() >= config::PUSHES {
-            return Err(Fault::Busy { what: "pushes", limit: config::PUSHES });
+        if entries.pushes.values().filter(|push| push.is_open()).count() >= limits::PUSHES {
+            return Err(Fault::Busy { what: "pushes", limit: limits::PUSHES });
         }
         entries.begun += 1;
         let status = Status {
@@ -240,7 +240,7 @@ impl Pushes {
 impl Entries {
     /// The oldest that ended go, when there are too many.
     fn forget(&mut self) {
-        while self.pushes.len() > config::PUSHES_REMEMBERED {
+        while self.pushes.len() > limits::PUSHES_REMEMBERED {
             let ended = self.pushes.iter().filter(|(_, push)| !push.is_open());
             let Some(oldest) = ended.min_by_key(|(_, push)| push.number) else { return };
             let key = oldest.0.clone();

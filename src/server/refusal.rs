@@ -4,9 +4,9 @@ use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use crate::residency::ResidencyError;
-use crate::session::SessionError;
-use crate::store::StoreError;
+use wildcity_session::SessionError;
+use wildcity_twin::residency::ResidencyError;
+use wildcity_twin::store::StoreError;
 
 use super::convert;
 use super::fault::Fault;

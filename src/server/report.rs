@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::config;
-use crate::ingest::BadGaussian;
-use crate::scene::{Gaussians, Manifest};
-use crate::session::Golden;
+use crate::limits;
+use wildcity_scene::{Gaussians, Manifest};
+use wildcity_session::Golden;
+use wildcity_twin::ingest::BadGaussian;
 
 use super::fault::Fault;
 use super::push::AskedCells;
@@ -135,7 +135,7 @@ pub(super) fn cells(
         }
         AskedCells::Touched => {
             let shrinks = |change: &&CellChange| {
-                (change.after as f64) < config::SHRUNK_SHARE * change.before as f64
+                (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64
             };
             let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
             if let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() {

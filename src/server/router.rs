@@ -14,8 +14,6 @@ use tokio::net::TcpStream;
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
-use crate::config;
-
 use super::auth::{Grant, Role};
 use super::fault::Fault;
 use super::refusal::{Answered, Refusal};
@@ -24,7 +22,7 @@ use super::{Server, connection, convert, metrics, push, twins, uploads};
 
 /// The routes of a server.
 pub(super) fn router(server: Arc<Server>) -> Router {
-    let json = DefaultBodyLimit::max(config::INBOUND_MESSAGE_BYTES);
+    let json = DefaultBodyLimit::max(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES);
     Router::new()
         .route("/v1/session", get(session))
         .route("/v1/sessions", get(sessions))

@@ -7,9 +7,9 @@ use std::time::Duration;
 use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
-use crate::geometry::Pose;
-use crate::residency::Eye;
-use crate::session::{Frame, Outcome, Session};
+use wildcity_scene::geometry::Pose;
+use wildcity_session::{Frame, Outcome, Session};
+use wildcity_twin::residency::Eye;
 
 use super::fault::Fault;
 

@@ -10,7 +10,6 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::{Server, listen};
-use crate::config;
 
 /// A server that listens. Dropping it stops it without waiting.
 pub struct Running {
@@ -36,7 +35,7 @@ async fn reap_uploads(server: &Server) {
 /// Keeps what sessions use from garbage collection, until dropped.
 async fn renew_leases(server: &Server) {
     loop {
-        tokio::time::sleep(config::LEASE_RENEWAL).await;
+        tokio::time::sleep(wildcity_session::limits::LEASE_RENEWAL).await;
         if let Err(error) = server.engine.renew_leases().await {
             tracing::warn!("leases were not renewed: {error}");
         }

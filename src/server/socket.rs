@@ -12,7 +12,7 @@ use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::config;
+use crate::limits;
 
 use super::fault::Fault;
 
@@ -49,13 +49,13 @@ impl Socket {
         send_timeout: Duration,
     ) -> Self {
         let limits = WebSocketConfig::default()
-            .max_message_size(Some(config::INBOUND_MESSAGE_BYTES))
-            .max_frame_size(Some(config::INBOUND_MESSAGE_BYTES))
+            .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
+            .max_frame_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
             // Requests are short, and 1,000 connections hold a buffer each.
             .read_buffer_size(4 << 10)
             // Answers pass it by: only pongs and the goodbye go through it.
             .write_buffer_size(0)
-            .max_write_buffer_size(config::PONGS_BYTES);
+            .max_write_buffer_size(limits::PONGS_BYTES);
         let (role, limits) = (Role::Server, Some(limits));
         let stream = WebSocketStream::from_partially_read(stream, read_ahead, role, limits).await;
         Self { stream, send_timeout }
@@ -134,7 +134,7 @@ impl Socket {
             io::Result::Ok(())
         };
         // Whether the client heard it does not matter.
-        let _ = timeout(config::LINGER, goodbye).await;
+        let _ = timeout(limits::LINGER, goodbye).await;
     }
 }
 

@@ -24,11 +24,11 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::timeout;
 
-use crate::config;
+use crate::limits;
 
 use super::fault::{Fault, is_full};
 
-/// How much a server keeps of uploads; see the constants in [`crate::config`] that are the defaults.
+/// How much a server keeps of uploads; see the constants in [`crate::limits`] that are the defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SpoolLimits {
     /// Uploads at once, finished or not.
@@ -41,7 +41,7 @@ pub struct SpoolLimits {
 
 impl Default for SpoolLimits {
     fn default() -> Self {
-        let (uploads, bytes, age) = (config::UPLOADS, config::SPOOL_BYTES, config::UPLOAD_AGE);
+        let (uploads, bytes, age) = (limits::UPLOADS, limits::SPOOL_BYTES, limits::UPLOAD_AGE);
         Self { uploads, bytes, age }
     }
 }
@@ -110,8 +110,8 @@ impl Spool {
 
     /// The upload of a file, begun if it is new; what is too old makes room.
     pub(super) fn begin(&self, announced: Announced) -> Result<Arc<Upload>, Fault> {
-        if announced.size > config::UPLOAD_BYTES {
-            let must = format!("{}; at most {} are accepted", announced.size, config::UPLOAD_BYTES);
+        if announced.size > limits::UPLOAD_BYTES {
+            let must = format!("{}; at most {} are accepted", announced.size, limits::UPLOAD_BYTES);
             return Err(Fault::OutOfRange { field: "size".to_owned(), must });
         }
         let id = announced.digest.id();
@@ -310,7 +310,7 @@ impl Upload {
     /// network the client knows long before the server that it is dead.
     pub(super) async fn write(self: &Arc<Self>) -> Result<Writer, Fault> {
         self.leave.notify_waiters();
-        let held = timeout(config::UPLOAD_SILENCE, self.writing.clone().lock_owned()).await;
+        let held = timeout(limits::UPLOAD_SILENCE, self.writing.clone().lock_owned()).await;
         let held = held.map_err(|_| Fault::Busy { what: "connections that write it", limit: 1 })?;
         Ok(Writer { upload: self.clone(), _held: held, file: None })
     }

@@ -13,7 +13,7 @@ use http_body_util::BodyExt as _;
 use sha2::{Digest as _, Sha256};
 use tokio::time::timeout;
 
-use crate::config;
+use crate::limits;
 
 use super::auth::{Grant, Role};
 use super::fault::Fault;
@@ -118,7 +118,7 @@ async fn receive(
     let mut leave = pin!(upload.leave());
     loop {
         let frame = tokio::select! {
-            frame = timeout(config::UPLOAD_SILENCE, body.frame()) => frame,
+            frame = timeout(limits::UPLOAD_SILENCE, body.frame()) => frame,
             () = &mut leave => return Err(Fault::Replaced),
             () = server.stopped() => return Err(Fault::ShuttingDown),
         };
@@ -143,7 +143,7 @@ async fn receive(
             blocking(move || writer.cut(start)).await?;
             return Err(fault);
         }
-        if is_last || gathered.len() >= config::UPLOAD_WRITE_BYTES {
+        if is_last || gathered.len() >= limits::UPLOAD_WRITE_BYTES {
             let full = std::mem::take(&mut gathered);
             server.metrics.uploaded_bytes.inc_by(full.len() as u64);
             found.update(&full);

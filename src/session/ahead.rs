@@ -3,11 +3,11 @@
 
 use glam::DVec3;
 
-use crate::config;
-use crate::geometry::{Bounds, Pose};
-use crate::residency::Urgency;
-use crate::scene::Trajectory;
-use crate::scene::route::Boxes;
+use crate::limits;
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::{Bounds, Pose};
+use wildcity_scene::route::Boxes;
+use wildcity_twin::residency::Urgency;
 
 /// A recorded drive that the ego may follow.
 #[derive(Debug)]
@@ -42,7 +42,7 @@ impl Ahead<'_> {
     /// as it is now; else it is taken to go straight on.
     pub(super) fn places(&self) -> Vec<(Urgency, Pose)> {
         let step_m = self.last_step_m.length();
-        let moves = step_m > config::STANDING_M;
+        let moves = step_m > limits::STANDING_M;
         let mut places = Vec::new();
         let followed = self.followed();
         let after = |way_m: f64| match followed {
@@ -57,7 +57,7 @@ impl Ahead<'_> {
         };
         let mut way_m = 0.0;
         if moves {
-            for _ in 0..self.steps.min(config::IMMINENT_STEPS) {
+            for _ in 0..self.steps.min(limits::IMMINENT_STEPS) {
                 way_m += step_m;
                 places.push((Urgency::Imminent, after(way_m)));
             }
@@ -65,11 +65,11 @@ impl Ahead<'_> {
         let far_m = match (moves, followed) {
             (true, _) => step_m * self.steps as f64,
             // It stands where a drive goes on.
-            (false, Some(_)) => config::STANDING_AHEAD_M,
+            (false, Some(_)) => limits::STANDING_AHEAD_M,
             (false, None) => 0.0,
         };
-        while way_m < far_m && places.len() < config::PREFETCH_PLACES {
-            way_m += config::PREFETCH_SPACING_M;
+        while way_m < far_m && places.len() < limits::PREFETCH_PLACES {
+            way_m += limits::PREFETCH_SPACING_M;
             places.push((Urgency::Speculative, after(way_m)));
         }
         places.extend(along(self.hint).into_iter().map(|pose| (Urgency::Speculative, pose)));
@@ -82,7 +82,7 @@ impl Ahead<'_> {
         let (station_m, distance_m) = route.nearest(self.now.position_m)?;
         let on = route.at(station_m + 1.0).position_m - route.at(station_m).position_m;
         let along = on.dot(self.last_step_m) >= 0.0;
-        (distance_m <= config::ROUTE_NEAR_M && along).then_some((route, station_m))
+        (distance_m <= limits::ROUTE_NEAR_M && along).then_some((route, station_m))
     }
 }
 
@@ -90,7 +90,7 @@ impl Ahead<'_> {
 /// near is done. A pose that is much farther along the hint than from its front to the ego is still to
 /// come, however near: a hint may lead back to its start.
 pub(super) fn rest(hint: &[Pose], now: Pose) -> &[Pose] {
-    let near_m = 2.0 * config::PREFETCH_SPACING_M;
+    let near_m = 2.0 * limits::PREFETCH_SPACING_M;
     let Some(front) = hint.first() else { return hint };
     let most_m = 2.0 * front.position_m.distance(now.position_m) + near_m;
     let (mut way_m, mut before, mut done) = (0.0, front, 0);
@@ -112,12 +112,12 @@ fn along(corners: &[Pose]) -> Vec<Pose> {
     let mut poses: Vec<Pose> = corners.first().copied().into_iter().collect();
     for pair in corners.windows(2) {
         let length_m = pair[0].position_m.distance(pair[1].position_m);
-        let parts = (length_m / config::PREFETCH_SPACING_M).ceil().max(1.0);
-        let left = config::PREFETCH_PLACES.saturating_sub(poses.len());
+        let parts = (length_m / limits::PREFETCH_SPACING_M).ceil().max(1.0);
+        let left = limits::PREFETCH_PLACES.saturating_sub(poses.len());
         let between = (1..=(parts as usize).min(left)).map(|part| part as f64 / parts);
         poses.extend(between.map(|t| pair[0].interpolate(&pair[1], t)));
     }
-    poses.truncate(config::PREFETCH_PLACES);
+    poses.truncate(limits::PREFETCH_PLACES);
     poses
 }
 
@@ -178,8 +178,8 @@ impl Route {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::trajectory::Keyframe;
     use glam::DQuat;
+    use wildcity_scene::trajectory::Keyframe;
 
     /// 100 m east, then 100 m north.
     fn route() -> Route {
@@ -213,12 +213,12 @@ mod tests {
     #[test]
     fn straight_on_without_a_drive_the_next_steps_to_the_metre() {
         let places = ahead(at(10.0, 5.0), DVec3::X * 3.0, None, &[]);
-        for (k, pose) in places[..config::IMMINENT_STEPS].iter().enumerate() {
+        for (k, pose) in places[..limits::IMMINENT_STEPS].iter().enumerate() {
             let wanted = DVec3::new(13.0 + 3.0 * k as f64, 5.0, 0.0);
             assert!(pose.position_m.distance(wanted) < 1e-9, "{pose:?}");
         }
         let last = places[places.len() - 1].position_m.x;
-        assert!((70.0..=70.0 + config::PREFETCH_SPACING_M).contains(&last), "20 steps: {last}");
+        assert!((70.0..=70.0 + limits::PREFETCH_SPACING_M).contains(&last), "20 steps: {last}");
         assert_eq!(ahead(at(10.0, 5.0), DVec3::ZERO, None, &[]), [], "who stands stays");
     }
 
@@ -257,6 +257,6 @@ mod tests {
         assert_eq!(rest(&block[1..], at(0.0, 30.0)), &block[2..]);
         assert_eq!(rest(&block[4..], at(3.0, 0.0)), []);
         let long = [at(0.0, 0.0), at(1e6, 0.0)];
-        assert_eq!(along(&long).len(), config::PREFETCH_PLACES);
+        assert_eq!(along(&long).len(), limits::PREFETCH_PLACES);
     }
 }

@@ -10,13 +10,13 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, sleep, timeout_at};
 
-use crate::config;
-use crate::render::Backend;
-use crate::residency::{
+use crate::limits;
+use wildcity_render::Backend;
+use wildcity_scene::RenderProfile;
+use wildcity_twin::residency::{
     Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
 };
-use crate::scene::RenderProfile;
-use crate::store::Catalog;
+use wildcity_twin::store::Catalog;
 
 use super::SessionError;
 use super::leases::Leases;
@@ -83,7 +83,7 @@ impl Engine {
     /// A thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { cache, episodes, backend, step_timeout } = settings;
-        let (jobs, queue) = mpsc::channel::<Job>(config::QUEUED_FRAMES);
+        let (jobs, queue) = mpsc::channel::<Job>(limits::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
         for number in 0..backend.frames_at_once().max(1) {
             let queue = queue.clone();
@@ -135,10 +135,10 @@ impl Engine {
     }
 
     /// Tells the store which versions are still in use, so that no garbage is made of them. For a server
-    /// to call every [`config::LEASE_RENEWAL`].
+    /// to call every [`limits::LEASE_RENEWAL`].
     ///
     /// # Errors
-    /// The store cannot be told. What it was told before holds for [`config::LEASE`].
+    /// The store cannot be told. What it was told before holds for [`limits::LEASE`].
     pub async fn renew_leases(&self) -> Result<(), SessionError> {
         let leases = self.leases.clone();
         let renewed = tokio::task::spawn_blocking(move || leases.renew());
@@ -170,7 +170,7 @@ impl Engine {
 
     /// Opens a version and loads what frames of it need, for those who will switch to it where they
     /// are: they need not wait. Only as far as there is room beside what sessions look at and expect,
-    /// whose frames go first, and for no longer than `config::PREFETCH_TIMEOUT`.
+    /// whose frames go first, and for no longer than `limits::PREFETCH_TIMEOUT`.
     ///
     /// # Errors
     /// It cannot be opened.
@@ -181,7 +181,7 @@ impl Engine {
         frames: Vec<Vec<Eye>>,
     ) -> Result<(), SessionError> {
         let resident = self.resident(twin.to_owned(), Some(number)).await?;
-        let deadline = Instant::now() + config::PREFETCH_TIMEOUT;
+        let deadline = Instant::now() + limits::PREFETCH_TIMEOUT;
         let expectation = Arc::new(Expectation::new(resident));
         let expected = expectation.clone();
         let expect = move || {
@@ -190,7 +190,7 @@ impl Engine {
         };
         tokio::task::spawn_blocking(expect).await.map_err(|_| SessionError::Crashed)?;
         while expectation.coming() > 0 && Instant::now() < deadline {
-            sleep(config::PREPARE_POLL).await;
+            sleep(limits::PREPARE_POLL).await;
         }
         Ok(())
     }
@@ -335,7 +335,7 @@ fn draw_all(queue: &Mutex<mpsc::Receiver<Job>>) {
 
 /// Gives back what one session's huge images left behind.
 fn shrink(scratch: &mut Scratch) {
-    scratch.retain(|image| image.capacity() <= config::SCRATCH_IMAGE_BYTES);
+    scratch.retain(|image| image.capacity() <= limits::SCRATCH_IMAGE_BYTES);
 }
 
 impl Answers {
@@ -344,7 +344,7 @@ impl Answers {
     /// # Errors
     /// [`SessionError::Busy`] if it is used up.
     pub(super) fn hold(&self, bytes: u64) -> Result<Hold, SessionError> {
-        let limit = config::ANSWERS_BYTES;
+        let limit = limits::ANSWERS_BYTES;
         let fits = |held: u64| held.checked_add(bytes).filter(|&sum| sum <= limit);
         self.0
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits)
@@ -369,11 +369,11 @@ impl Drop for Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render;
+    use wildcity_render;
 
     #[test]
     fn huge_images_are_not_kept() {
-        let mut scratch = vec![vec![0; config::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
+        let mut scratch = vec![vec![0; limits::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
         shrink(&mut scratch);
         assert_eq!(scratch, [vec![0; 1000]]);
     }
@@ -407,14 +407,14 @@ mod tests {
                 cache: Cache::new(Catalog::open(dir.path()).unwrap()),
                 episodes: dir.path().to_owned(),
                 backend: Arc::new(Takes(at_once)),
-                step_timeout: config::STEP_TIMEOUT,
+                step_timeout: limits::STEP_TIMEOUT,
             });
             let engine = engine.unwrap();
             // How many run now, and how many ever ran at once.
             let counts = Arc::new(Mutex::new((0, 0)));
             let jobs = (0..at_once + 3).map(|_| {
                 let counts = counts.clone();
-                engine.run(Instant::now() + config::STEP_TIMEOUT, move |_, _| {
+                engine.run(Instant::now() + limits::STEP_TIMEOUT, move |_, _| {
                     let begun = Instant::now();
                     let most = || {
                         let mut counts = counts.lock().unwrap();
@@ -441,12 +441,12 @@ mod tests {
     fn the_budget_for_answers_comes_back() {
         let answers = Answers::default();
         for _ in 0..3 {
-            let mut half = answers.hold(config::ANSWERS_BYTES / 2).unwrap();
-            half.join(answers.hold(config::ANSWERS_BYTES / 2).unwrap());
+            let mut half = answers.hold(limits::ANSWERS_BYTES / 2).unwrap();
+            half.join(answers.hold(limits::ANSWERS_BYTES / 2).unwrap());
             assert!(matches!(answers.hold(2), Err(SessionError::Busy { .. })));
         }
-        assert!(answers.hold(config::ANSWERS_BYTES).is_ok());
-        assert!(answers.hold(config::ANSWERS_BYTES + 1).is_err());
+        assert!(answers.hold(limits::ANSWERS_BYTES).is_ok());
+        assert!(answers.hold(limits::ANSWERS_BYTES + 1).is_err());
         assert!(answers.hold(u64::MAX).is_err());
     }
 }

@@ -4,11 +4,11 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{self, HISTORY_POSES, HISTORY_STEP_US};
-use crate::geometry::Pose;
-use crate::render::View;
-use crate::scene::rig::RigCamera;
-use crate::sim::{Command, Ego, Ground};
+use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
+use wildcity_render::View;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::RigCamera;
+use wildcity_sim::{Command, Ego, Ground};
 
 use super::SessionError;
 
@@ -40,7 +40,7 @@ pub enum Outcome {
     /// The agent closed it, or ended it.
     Completed,
     /// The same, and on its way the images could not be believed: it left what was recorded
-    /// (`config::OFF_MODEL_TRUST`). Told only where observations say their trust.
+    /// (`limits::OFF_MODEL_TRUST`). Told only where observations say their trust.
     OffModel,
     /// The agent broke the protocol beyond repair.
     AgentError,
@@ -197,7 +197,7 @@ impl Episode {
     pub fn summary(&self, outcome: Outcome) -> Summary {
         let outcome = match (self.terminated, outcome) {
             (true, _) | (_, Outcome::Completed) => match self.least_trust {
-                Some(trust) if trust < config::OFF_MODEL_TRUST => Outcome::OffModel,
+                Some(trust) if trust < limits::OFF_MODEL_TRUST => Outcome::OffModel,
                 _ => Outcome::Completed,
             },
             (false, outcome) => outcome,
@@ -254,10 +254,10 @@ impl Episode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Camera;
-    use crate::geometry::camera::{Pinhole, Rolls, Shutter};
-    use crate::sim::Dynamics;
     use glam::{DQuat, DVec3};
+    use wildcity_scene::geometry::Camera;
+    use wildcity_scene::geometry::camera::{Pinhole, Rolls, Shutter};
+    use wildcity_sim::Dynamics;
 
     fn at(x_m: f64, yaw_rad: f64) -> Pose {
         Pose { position_m: DVec3::new(x_m, 0.0, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) }

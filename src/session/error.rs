@@ -1,12 +1,12 @@
 //! What can go wrong with a session.
 
-use crate::render::RenderError;
-use crate::residency::ResidencyError;
-use crate::scene::profile::ProfileError;
-use crate::scene::route::RouteError;
-use crate::scene::sky::SkyError;
-use crate::sim::EgoError;
-use crate::store::StoreError;
+use wildcity_render::RenderError;
+use wildcity_scene::profile::ProfileError;
+use wildcity_scene::route::RouteError;
+use wildcity_scene::sky::SkyError;
+use wildcity_sim::EgoError;
+use wildcity_twin::residency::ResidencyError;
+use wildcity_twin::store::StoreError;
 
 use super::record::RecordError;
 

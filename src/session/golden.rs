@@ -5,15 +5,15 @@ use std::sync::Arc;
 
 use tokio::time::Instant;
 
-use crate::config;
-use crate::geometry::{Camera, Pose};
-use crate::render::psnr::psnr_db_of_bytes;
-use crate::render::{Frame, Target, View};
-use crate::residency::{Needed, demand};
-use crate::scene::chunk::cell_at;
-use crate::scene::rig::RigCamera;
-use crate::scene::{Chunk, Gaussians, Manifest, RenderProfile, Rig, Scene};
-use crate::store::{Catalog, Version};
+use crate::limits;
+use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::{Frame, Target, View};
+use wildcity_scene::chunk::cell_at;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{Chunk, Gaussians, Manifest, RenderProfile, Rig, Scene};
+use wildcity_twin::residency::{Needed, demand};
+use wildcity_twin::store::{Catalog, Version};
 
 use super::{Engine, SessionError, observation};
 
@@ -52,7 +52,7 @@ impl Engine {
     ) -> Result<Vec<Golden>, SessionError> {
         let poses = poses.unwrap_or_else(|| stations(&changed));
         let manifest = &changed.before.manifest;
-        let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+        let rig = manifest.rig.clone().or_else(|| Rig::preset(limits::RIG));
         let cameras: Vec<_> = rig.iter().flat_map(|rig| rig.cameras.iter().map(small)).collect();
         let cameras = cameras.into_iter().collect::<Option<Vec<_>>>().unwrap_or_default();
         if poses.is_empty() || cameras.is_empty() {
@@ -159,7 +159,7 @@ fn stations(changed: &Changed) -> Vec<Pose> {
     let keyframes: Vec<Pose> = log.keyframes.iter().map(|key| key.world_from_rig).collect();
     let near: Vec<&Pose> = keyframes.iter().filter(changes).collect();
     let from = if near.is_empty() { keyframes.iter().collect() } else { near };
-    let count = config::GOLDEN_STATIONS.min(from.len());
+    let count = limits::GOLDEN_STATIONS.min(from.len());
     // The middles of as many equal parts.
     (0..count).map(|k| *from[(2 * k + 1) * from.len() / (2 * count)]).collect()
 }
@@ -167,7 +167,7 @@ fn stations(changed: &Changed) -> Vec<Pose> {
 /// A camera with the same field of view, and fewer pixels.
 fn small(camera: &RigCamera) -> Option<RigCamera> {
     let Camera { width_px, height_px, .. } = camera.camera;
-    let scale = f64::from(config::GOLDEN_SIDE_PX) / f64::from(width_px.max(height_px));
+    let scale = f64::from(limits::GOLDEN_SIDE_PX) / f64::from(width_px.max(height_px));
     if scale >= 1.0 {
         return Some(camera.clone());
     }

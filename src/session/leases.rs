@@ -4,9 +4,9 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
-use crate::config;
-use crate::residency::Resident;
-use crate::store::{Catalog, Lease, StoreError};
+use crate::limits;
+use wildcity_twin::residency::Resident;
+use wildcity_twin::store::{Catalog, Lease, StoreError};
 
 /// Leases of the versions that are open, by twin and number.
 #[derive(Debug)]
@@ -40,7 +40,7 @@ impl Leases {
             held.resident = Arc::downgrade(resident);
             return;
         }
-        match self.catalog.lease(name, number, &self.holder, config::LEASE) {
+        match self.catalog.lease(name, number, &self.holder, limits::LEASE) {
             Ok(lease) => {
                 let resident = Arc::downgrade(resident);
                 held.insert((name.clone(), number), Held { resident, lease });

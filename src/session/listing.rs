@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::scene::Trajectory;
-use crate::store::{Catalog, StoreError, Version};
+use wildcity_scene::Trajectory;
+use wildcity_twin::store::{Catalog, StoreError, Version};
 
 /// The latest version of a twin, in a few numbers.
 #[derive(Clone, Debug, PartialEq)]

@@ -14,13 +14,13 @@ use std::mem;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use crate::config;
-use crate::geometry::Pose;
-use crate::geometry::camera::Field;
-use crate::render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
-use crate::residency::Eye;
-use crate::scene::rig::{Rig, RigCamera};
-use crate::scene::{RenderProfile, Scene};
+use crate::limits;
+use wildcity_render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::Field;
+use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::{RenderProfile, Scene};
+use wildcity_twin::residency::Eye;
 
 use super::album::{Album, Shown};
 use super::buffer::Buffer;
@@ -43,12 +43,12 @@ const HEADER_BASE_BYTES: usize = 4096;
 const HEADER_IMAGE_BYTES: usize = 3584;
 
 /// Images of one answer at most, of as many poses or frames.
-const IMAGES: usize = config::OBSERVE_POSES * Rig::MAX_CAMERAS;
-const _: () = assert!(config::BUNDLE_FRAMES <= config::OBSERVE_POSES);
+const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
+const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer draws every rig in one frame.
 const _: () = assert!(
-    HEADER_BASE_BYTES + IMAGES * HEADER_IMAGE_BYTES <= config::OBSERVATION_HEADER_BYTES as usize
+    HEADER_BASE_BYTES + IMAGES * HEADER_IMAGE_BYTES <= limits::OBSERVATION_HEADER_BYTES as usize
 );
 const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 
@@ -198,8 +198,8 @@ impl Layout {
     fn check_size(&self, times: usize) -> Result<(), SessionError> {
         let pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
         let pixel_bytes = 3 + 4 * self.maps.values() as u64;
-        let room_bytes = config::OBSERVATION_BYTES as u64 - config::OBSERVATION_HEADER_BYTES;
-        let limit = config::ANSWER_PIXELS.min(room_bytes / pixel_bytes);
+        let room_bytes = limits::OBSERVATION_BYTES as u64 - limits::OBSERVATION_HEADER_BYTES;
+        let limit = limits::ANSWER_PIXELS.min(room_bytes / pixel_bytes);
         let pixels = pixels * times as u64;
         if pixels > limit {
             return Err(SessionError::AnswerTooLarge { pixels, limit });
@@ -392,16 +392,14 @@ impl Assembly {
         limit_bytes: u64,
     ) -> Result<Drawing, SessionError> {
         let layout = self.layout;
-        let hashes: Vec<blake3::Hash> = self.drawn.iter().map(|drawn| drawn.hash).collect();
-        let trusts: Vec<Option<Trust>> = self.drawn.iter().map(|drawn| drawn.trust).collect();
-        let mut files: Vec<Vec<u8>> = self.drawn.into_iter().map(|drawn| drawn.file).collect();
+        let mut drawn = self.drawn;
         let (mut taken, mut images, mut shown_files) = (Vec::new(), Vec::new(), Vec::new());
         let mut pose = 0;
         for shot in &self.shots {
             for &camera in &shot.cameras {
                 let (index, time_us) = (taken.len(), shot.time_us);
                 if shot.shown {
-                    let (hash, trust) = (hashes[index], trusts[index]);
+                    let Drawn { hash, trust, .. } = drawn[index];
                     images.push(Image { camera, pose, time_us, hash, trust });
                     shown_files.push(index);
                 }
@@ -412,13 +410,13 @@ impl Assembly {
         let appended: Vec<&[u8]> = match layout.encoding {
             Encoding::Raw => Vec::new(),
             Encoding::Jpeg(_) | Encoding::Png => {
-                shown_files.iter().map(|&index| &files[index][..]).collect()
+                shown_files.iter().map(|&index| &drawn[index].file[..]).collect()
             }
         };
         self.buffer.append(&self.answers, &appended)?;
 
         let mut tensors = Tensors { list: Vec::new(), end: 0 };
-        let poses = config::HISTORY_POSES;
+        let poses = limits::HISTORY_POSES;
         tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
         tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
         for (index, image) in images.iter().enumerate() {
@@ -434,7 +432,7 @@ impl Assembly {
             }
         }
         for (index, (image, &file)) in images.iter().zip(&shown_files).enumerate() {
-            let shape = layout.shape(image.camera, files[file].len());
+            let shape = layout.shape(image.camera, drawn[file].file.len());
             tensors.push(TensorKind::Rgb(index), DType::U8, shape);
         }
 
@@ -443,8 +441,8 @@ impl Assembly {
         if bundled && let Some(now_us) = self.shots.last().map(|shot| shot.time_us) {
             for (index, &(shot, camera)) in taken.iter().enumerate() {
                 if layout.outlives(shot, camera) {
-                    let file = mem::take(&mut files[index]);
-                    let known = (hashes[index], trusts[index]);
+                    let Drawn { hash, trust, file, .. } = &mut drawn[index];
+                    let (known, file) = ((*hash, *trust), mem::take(file));
                     album.add(&self.answers, (camera, shot.time_us), known, file)?;
                 }
             }
@@ -462,6 +460,8 @@ impl Assembly {
             }
             album.forget(&layout.schedule, now_us);
         }
+        let hashes = drawn.iter().map(|drawn| drawn.hash).collect();
+        let trusts = drawn.iter().map(|drawn| drawn.trust).collect();
         let frame_hash = frame_hash(images.iter().map(|image| image.hash));
         let frame = Frame {
             buffer: self.buffer,
@@ -505,7 +505,7 @@ impl Layout {
 }
 
 /// What decides how much detail the views need.
-pub(crate) fn eyes(views: &[View]) -> Vec<Eye> {
+pub fn eyes(views: &[View]) -> Vec<Eye> {
     // Of a rolling shutter the end of its way: detail is chosen by distance alone, in every direction.
     let eye = |view: &View| Eye {
         position_m: view.world_from_camera.position_m,

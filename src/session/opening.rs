@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::config;
-use crate::geometry::Pose;
-use crate::residency::Resident;
-use crate::scene::ProfileChanges;
-use crate::scene::Trajectory;
-use crate::scene::rig::{Rig, RigCamera, check_overlay_pixels};
-use crate::scene::route::Route;
-use crate::sim::Dynamics;
+use crate::limits;
+use wildcity_scene::ProfileChanges;
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels};
+use wildcity_scene::route::Route;
+use wildcity_sim::Dynamics;
+use wildcity_twin::residency::Resident;
 
 use super::{Encoding, SessionError};
 
@@ -199,7 +199,7 @@ fn whole_cameras(
         Some(RigChoice::Preset(name)) => preset(&name)?,
         None => match &resident.version.manifest.rig {
             Some(rig) => rig.clone(),
-            None => preset(config::RIG)?,
+            None => preset(limits::RIG)?,
         },
     };
     let Some(names) = &outputs.cameras else { return Ok((rig.name, rig.cameras)) };
@@ -233,7 +233,7 @@ pub(super) fn resolve_start(
     warm_up_us: i64,
 ) -> Result<Track, SessionError> {
     let logs = &resident.version.manifest.trajectories;
-    let limits_us = 0..=config::WARM_UP_US;
+    let limits_us = 0..=limits::WARM_UP_US;
     if !limits_us.contains(&warm_up_us) {
         return Err(no_warm_up(format!("{warm_up_us} µs; {limits_us:?} µs are accepted")));
     }

@@ -19,10 +19,10 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::Pose;
-use crate::scene::{RenderProfile, Rig};
-use crate::sim::ego::{Action, TimedPose};
-use crate::sim::{Command, Dynamics};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{RenderProfile, Rig};
+use wildcity_sim::ego::{Action, TimedPose};
+use wildcity_sim::{Command, Dynamics};
 
 use super::{Encoding, Summary};
 
@@ -258,7 +258,7 @@ pub(super) fn profile_hash(profile: &RenderProfile) -> blake3::Hash {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::session::Outcome;
+    use crate::Outcome;
 
     fn end(steps: u64) -> Line {
         let (outcome, least_trust) = (Outcome::Completed, None);

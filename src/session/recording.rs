@@ -8,7 +8,7 @@ use super::record::{
     Recorder,
 };
 use super::{Session, SessionError};
-use crate::scene::Rig;
+use wildcity_scene::Rig;
 
 impl Session {
     /// Writes what was rendered to the episode's file, which begins with its first frame.

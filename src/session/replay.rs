@@ -5,13 +5,13 @@ use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::config::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
-use crate::render::{Backend, Frame as RenderFrame, RenderError, Target};
-use crate::residency::{ResidencyError, Resident};
-use crate::scene::RenderProfile;
-use crate::scene::appearance::Overlay;
-use crate::scene::rig::{RigCamera, RigError};
-use crate::sim::Ground;
+use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
+use wildcity_render::{Backend, Frame as RenderFrame, RenderError, Target};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::appearance::Overlay;
+use wildcity_scene::rig::{RigCamera, RigError};
+use wildcity_sim::Ground;
+use wildcity_twin::residency::{ResidencyError, Resident};
 
 use super::record::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,

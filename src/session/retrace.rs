@@ -1,8 +1,8 @@
 //! Drives a recorded episode again, command by command, and compares where that leads.
 
-use crate::geometry::Pose;
-use crate::sim::ego::Path;
-use crate::sim::{Command, Ego, Ground};
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::ego::Path;
+use wildcity_sim::{Command, Ego, Ground};
 
 use super::record::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
 use super::{Episode, SessionError};

@@ -5,8 +5,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::config;
-use crate::scene::rig::RigCamera;
+use crate::limits;
+use wildcity_scene::rig::RigCamera;
 
 use super::SessionError;
 
@@ -36,7 +36,7 @@ impl Schedule {
         decision_us: Option<i64>,
     ) -> Result<Self, SessionError> {
         let frames = frames.unwrap_or(1);
-        let most = config::BUNDLE_FRAMES as u64;
+        let most = limits::BUNDLE_FRAMES as u64;
         if !(1..=most).contains(&frames) {
             let must = format!("{frames}; 1 to {most} are accepted");
             return Err(SessionError::OutOfRange { field: "outputs.frames", must });
@@ -98,10 +98,10 @@ impl Schedule {
 }
 
 fn check_steps(field: &'static str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
-    if value_us % dt_us == 0 && (dt_us..=config::BUNDLE_PERIOD_US.max(dt_us)).contains(&value_us) {
+    if value_us % dt_us == 0 && (dt_us..=limits::BUNDLE_PERIOD_US.max(dt_us)).contains(&value_us) {
         return Ok(());
     }
-    let most_us = config::BUNDLE_PERIOD_US;
+    let most_us = limits::BUNDLE_PERIOD_US;
     let must = format!("{value_us} µs; whole steps of {dt_us} µs up to {most_us} µs are accepted");
     Err(SessionError::OutOfRange { field, must })
 }
@@ -109,7 +109,7 @@ fn check_steps(field: &'static str, value_us: i64, dt_us: i64) -> Result<(), Ses
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Rig;
+    use wildcity_scene::Rig;
 
     fn schedule(frames: u64, rear_us: i64, decision_us: i64) -> Schedule {
         let cameras = Rig::preset("vehicle6").unwrap().cameras;

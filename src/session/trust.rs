@@ -10,11 +10,11 @@ use std::collections::HashMap;
 
 use glam::{DVec2, DVec3};
 
-use crate::geometry::{Bounds, Pose};
-use crate::render::View;
-use crate::scene::Manifest;
-use crate::scene::chunk::{BLOCK_M, CELL_M};
-use crate::scene::route::Boxes;
+use wildcity_render::View;
+use wildcity_scene::Manifest;
+use wildcity_scene::chunk::{BLOCK_M, CELL_M};
+use wildcity_scene::geometry::{Bounds, Pose};
+use wildcity_scene::route::Boxes;
 
 /// Distance from the recorded places at which 1/e is left, in metres: half at 3.5 m, in the next lane.
 const FADES_M: f64 = 5.0;

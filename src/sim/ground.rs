@@ -6,9 +6,9 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::config;
-use crate::geometry::Pose;
-use crate::scene::Trajectory;
+use crate::limits;
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
 
 /// What drives tell of the ground.
 #[derive(Clone, Copy, Debug)]
@@ -29,7 +29,7 @@ impl<'a> Ground<'a> {
     }
 
     /// A pose (`world_from_rig`) set on the ground: straight down or up onto it, level with it, heading
-    /// as it did. A pose that no drive comes within [`config::GROUND_NEAR_M`] of stays as it is.
+    /// as it did. A pose that no drive comes within [`limits::GROUND_NEAR_M`] of stays as it is.
     ///
     /// The nearest drive counts, in space and not in the plane: a bridge is not the street below it.
     /// Between keyframes the plane is between theirs. Every keyframe is looked at: 170,000 take a
@@ -42,7 +42,7 @@ impl<'a> Ground<'a> {
     }
 
     fn under(&self, point_m: DVec3) -> Option<Plane> {
-        let mut nearest_m = config::GROUND_NEAR_M;
+        let mut nearest_m = limits::GROUND_NEAR_M;
         let mut under = None;
         for drive in self.drives {
             let poses = drive.keyframes.iter().map(|keyframe| &keyframe.world_from_rig);
@@ -68,7 +68,7 @@ impl Plane {
     fn settle(&self, world_from_rig: Pose) -> Pose {
         let Self { point_m, up } = *self;
         // A drive on its side, or upside down, is no ground.
-        if up.z < config::GROUND_UP {
+        if up.z < limits::GROUND_UP {
             return world_from_rig;
         }
         let mut position_m = world_from_rig.position_m;
@@ -87,7 +87,7 @@ impl Plane {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::trajectory::Keyframe;
+    use wildcity_scene::trajectory::Keyframe;
 
     /// Uphill along x by a tenth, above a level street along y.
     fn drives() -> Vec<Trajectory> {

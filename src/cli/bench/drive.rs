@@ -12,12 +12,11 @@ use anyhow::Context;
 use crate::cli::places::{TwinVersion, Twins};
 use crate::cli::scene_source::{self, Engine};
 use crate::cli::{output, progress};
-use crate::config;
-use crate::geometry::Pose;
-use crate::residency::{Cache, Stats};
-use crate::scene::route::Route;
-use crate::scene::{Manifest, Rig};
-use crate::session::{self, Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::route::Route;
+use wildcity_scene::{Manifest, Rig};
+use wildcity_session::{Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use wildcity_twin::residency::{Cache, Stats};
 
 use report::{Report, Row};
 
@@ -102,11 +101,11 @@ impl Drive {
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         let limit_bytes = self.memory_gib.map(scene_source::bytes_of_gib);
         let scratch = Scratch::new()?;
-        let engine = session::Engine::start(EngineSettings {
+        let engine = wildcity_session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
             episodes: scratch.0.clone(),
             backend: Arc::from(self.engine.backend()?),
-            step_timeout: config::STEP_TIMEOUT,
+            step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
         })?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let report = runtime.block_on(self.drive(engine, &version.manifest))?;
@@ -118,7 +117,7 @@ impl Drive {
 
     async fn drive(
         &self,
-        engine: Arc<session::Engine>,
+        engine: Arc<wildcity_session::Engine>,
         manifest: &Manifest,
     ) -> anyhow::Result<Report> {
         let trajectory = manifest.trajectories.first();
@@ -135,7 +134,7 @@ impl Drive {
         let first = first.elapsed();
         driven.last = driven.engine.residency();
 
-        let step_m = self.speed_m_s * config::DT_US as f64 * 1e-6;
+        let step_m = self.speed_m_s * wildcity_session::limits::DT_US as f64 * 1e-6;
         let to_the_end = ((route.length_m() - self.from_m) / step_m).max(0.0) as u32;
         let count = self.steps.unwrap_or(to_the_end).min(to_the_end);
         let bar = progress::count("driving");
@@ -144,7 +143,9 @@ impl Drive {
         let begun = tokio::time::Instant::now();
         for number in 1..=count {
             if !self.unpaced {
-                let due = Duration::from_micros(u64::from(number) * config::DT_US as u64);
+                let due = Duration::from_micros(
+                    u64::from(number) * wildcity_session::limits::DT_US as u64,
+                );
                 tokio::time::sleep_until(begun + due).await;
             }
             let station_m = self.from_m + f64::from(number) * step_m;
@@ -179,9 +180,9 @@ impl Drive {
     }
 
     fn opening(&self, manifest: &Manifest) -> Opening {
-        let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+        let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = rig.map(|rig| cropped(rig, self.crop));
-        let outputs = Outputs::colour(Encoding::Jpeg(config::JPEG_QUALITY));
+        let outputs = Outputs::colour(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY));
         Opening {
             version: self.twin.number,
             rig: rig.map(RigChoice::Full),
@@ -193,7 +194,7 @@ impl Drive {
 /// A session that is driven, and what its engine had counted before the next step.
 struct Driven {
     session: Session,
-    engine: Arc<session::Engine>,
+    engine: Arc<wildcity_session::Engine>,
     last: Stats,
 }
 

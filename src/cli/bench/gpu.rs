@@ -8,14 +8,13 @@ use anyhow::{Context, ensure};
 
 use self::report::{Images, Report, SceneReport, StageReport};
 use super::timed::{Timed, time};
+use crate::cli::limits;
 use crate::cli::progress;
-use crate::config;
-use crate::generate;
-use crate::geometry::Pose;
-use crate::render::cpu::{Cpu, Simd};
-use crate::render::gpu::{self, AdapterChoice, FrameWork, Roofline};
-use crate::render::{Backend, Frame, View};
-use crate::scene::{RenderProfile, Rig, Scene};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gpu::{self, AdapterChoice, FrameWork, Roofline};
+use wildcity_render::{Backend, Frame, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{RenderProfile, Rig, Scene};
 
 /// Measure a device: steps of six full cameras in streets of several sizes, stage by stage, beside
 /// what its memory and arithmetic allow.
@@ -37,7 +36,7 @@ pub(super) struct Gpu {
         value_name = "COUNT,...",
         value_delimiter = ',',
         default_value = "1000000,5000000,20000000",
-        value_parser = clap::value_parser!(u32).range(1..=config::BENCH_GAUSSIANS)
+        value_parser = clap::value_parser!(u32).range(1..=limits::BENCH_GAUSSIANS)
     )]
     gaussians: Vec<u32>,
 
@@ -96,8 +95,10 @@ impl Gpu {
         roofline: &Roofline,
     ) -> anyhow::Result<SceneReport> {
         let bar = progress::count("making");
-        let scene =
-            Scene::from_gaussians(&generate::canyon(gaussians as usize, &mut progress::show(&bar)));
+        let scene = Scene::from_gaussians(&wildcity_generate::canyon(
+            gaussians as usize,
+            &mut progress::show(&bar),
+        ));
         bar.finish_and_clear();
         let views = views()?;
         let usage = || device.usage().context("the device was lost");

@@ -10,9 +10,9 @@ use std::time::Instant;
 use anyhow::Context;
 
 use crate::cli::places::{TwinVersion, Twins};
-use crate::ingest;
-use crate::scene::manifest::{ChunkEntry, Section};
-use crate::store::{Catalog, Version};
+use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_twin::ingest;
+use wildcity_twin::store::{Catalog, Version};
 
 /// Time reading a twin: every section, checked against its hash and decoded, against the bare bytes.
 ///

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde_json::json;
 
-use crate::render::{Backend, Frame, View};
+use wildcity_render::{Backend, Frame, View};
 
 use super::timed::{Timed, time};
 use crate::cli::scene_source::{Renderer, SceneSource};
@@ -61,7 +61,7 @@ impl Step {
 
     fn report(
         &self,
-        scene: &crate::scene::Scene,
+        scene: &wildcity_scene::Scene,
         views: &[View],
         backend: &dyn Backend,
         timed: &Timed,

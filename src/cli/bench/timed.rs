@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use crate::cli::progress;
-use crate::render::{Backend, Frame, FrameStats, Target};
+use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 /// So many frames.
 pub(super) struct Timed {

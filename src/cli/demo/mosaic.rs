@@ -6,8 +6,7 @@ use anyhow::Context;
 use image::RgbImage;
 use image::imageops::{self, FilterType};
 
-use crate::client::{ImageView, Observation};
-use crate::session;
+use wildcity_client::{ImageView, Observation};
 
 use super::output;
 
@@ -31,7 +30,7 @@ pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
             imageops::replace(&mut mosaic, &cell, x.into(), y.into());
         }
     }
-    let file = session::png(&mosaic, mosaic.width(), mosaic.height());
+    let file = wildcity_session::png(&mosaic, mosaic.width(), mosaic.height());
     output::write(path, &file.map_err(anyhow::Error::msg)?)
 }
 

@@ -7,14 +7,12 @@ use anyhow::Context;
 use image::RgbImage;
 use image::imageops;
 
-use crate::config;
-use crate::ingest::cameras;
-use crate::render::psnr::psnr_db_of_bytes;
-use crate::render::{Backend, Frame, Target, View};
-use crate::residency::Cache;
-use crate::scene::{RenderProfile, Rig, Scene};
-use crate::session;
-use crate::store::{Catalog, Version};
+use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::{RenderProfile, Rig, Scene};
+use wildcity_twin::ingest::cameras;
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, Version};
 
 use super::super::{output, progress};
 use super::Lod;
@@ -40,7 +38,7 @@ pub(super) fn draw(
     let backend = lod.engine.backend()?;
     let resident = Cache::new(catalog).open(&version.manifest.twin, Some(version.number))?;
     output::make_dir(out)?;
-    let eyes = session::eyes(&views);
+    let eyes = wildcity_session::eyes(&views);
     let bar = progress::count("rendering");
     bar.set_length(profiles.len() as u64);
     let mut drawn: Vec<Vec<RgbImage>> = Vec::new();
@@ -67,7 +65,7 @@ pub(super) fn draw(
         let path = out.join(format!("{name}.png"));
         let row: Vec<&RgbImage> = drawn.iter().map(|images| &images[camera]).collect();
         let picture = side_by_side(&row);
-        let file = session::png(&picture, picture.width(), picture.height());
+        let file = wildcity_session::png(&picture, picture.width(), picture.height());
         output::write(&path, &file.map_err(anyhow::Error::msg)?)?;
         writeln!(said, "{}", path.display())?;
     }
@@ -90,7 +88,7 @@ fn shots(lod: &Lod, version: &Version) -> anyhow::Result<Vec<(String, View)>> {
         .first()
         .with_context(|| format!("twin {:?} has no trajectory: give --cameras", manifest.twin))?;
     let world_from_rig = log.at_station(0.5 * log.length_m());
-    let rig = manifest.rig.clone().or_else(|| Rig::preset(config::RIG));
+    let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
     let rig = rig.context("no rig")?;
     let names = rig.cameras.iter().map(|camera| camera.name.clone());
     Ok(names.zip(View::of_rig(&rig.cameras, world_from_rig)).collect())

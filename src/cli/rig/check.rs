@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use super::{rig_of, view_of};
 use crate::cli::scene_source::Engine;
-use crate::report::points::Points;
+use wildcity_render::compare::points::Points;
 
 /// Render points that each camera must show at known pixels, and find them there.
 ///

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use glam::{DVec2, DVec3};
 
 use super::{between_deg, rig_of, view_of};
-use crate::scene::Rig;
+use wildcity_scene::Rig;
 
 /// Print what a rig's cameras see; without RIG, the presets' names.
 ///

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::read_times_us;
 use crate::cli::import::read_trajectory;
-use crate::scene::route;
+use wildcity_scene::route;
 
 /// Find which keyframe belongs to each time of another clock, as to the images of a camera.
 ///

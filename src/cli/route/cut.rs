@@ -9,7 +9,7 @@ use serde_json::json;
 use super::to_json;
 use crate::cli::import::read_trajectory;
 use crate::cli::output;
-use crate::scene::route::{self, Route};
+use wildcity_scene::route::{self, Route};
 
 /// Cut a drive into sub-trajectories of given lengths, all in the drive's own world.
 ///

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use super::{read_times_us, to_json};
 use crate::cli::import::read_trajectory;
 use crate::cli::output;
-use crate::scene::Trajectory;
-use crate::scene::route::Route;
-use crate::scene::trajectory::Keyframe;
+use wildcity_scene::Trajectory;
+use wildcity_scene::route::Route;
+use wildcity_scene::trajectory::Keyframe;
 
 /// Write where a drive was at given times: position linear, rotation spherical between keyframes.
 ///

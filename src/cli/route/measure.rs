@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::json;
 
 use crate::cli::import::read_trajectory;
-use crate::scene::route::Route;
+use wildcity_scene::route::Route;
 
 /// Show how long a drive is, and its chunks of 5 km.
 #[derive(Debug, clap::Args)]
@@ -30,7 +30,7 @@ impl Measure {
         let chunks = route.chunks();
         let mut out = io::stdout().lock();
         if self.json {
-            let chunk = |chunk: &crate::scene::route::RouteChunk| {
+            let chunk = |chunk: &wildcity_scene::route::RouteChunk| {
                 json!({
                     "number": chunk.number,
                     "keyframes": [chunk.keyframes.start, chunk.keyframes.end],

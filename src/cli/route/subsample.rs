@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use super::to_json;
 use crate::cli::import::read_trajectory;
 use crate::cli::output;
-use crate::scene::route::{self, Route};
+use wildcity_scene::route::{self, Route};
 
 /// Keep the recorded poses of a drive that are so far apart, and drop those between.
 #[derive(Debug, clap::Args)]

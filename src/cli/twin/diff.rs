@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use crate::cli::places::Twins;
-use crate::store::{CellDiff, CellSize, Diff as Differences};
+use wildcity_twin::store::{CellDiff, CellSize, Diff as Differences};
 
 /// Show which cells differ between two versions of a twin: Gaussians and bytes, before and after.
 #[derive(Debug, clap::Args)]

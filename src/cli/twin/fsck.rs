@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::places::Twins;
 use crate::cli::progress;
-use crate::store::Checked;
+use wildcity_twin::store::Checked;
 
 /// Read every object of every version of a twin again and compare it with its hash; and look for what
 /// the log lost, and what no version names.

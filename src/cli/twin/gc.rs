@@ -3,9 +3,9 @@
 use std::io::{self, Write};
 use std::time::Duration;
 
+use crate::cli::limits;
 use crate::cli::places::Twins;
-use crate::config;
-use crate::store::Keep;
+use wildcity_twin::store::Keep;
 
 /// Remove objects of a twin that no version to be kept names.
 ///
@@ -22,12 +22,12 @@ pub(super) struct Gc {
     twin: String,
 
     /// How many of the latest versions are kept.
-    #[arg(long, value_name = "N", default_value_t = config::GC_KEEP,
+    #[arg(long, value_name = "N", default_value_t = limits::GC_KEEP,
           value_parser = clap::value_parser!(u32).range(1..))]
     keep: u32,
 
     /// How long an object stays after it was found to be garbage, as 90s, 30m, 24h or 7d.
-    #[arg(long, value_name = "TIME", default_value = config::GC_GRACE, value_parser = duration)]
+    #[arg(long, value_name = "TIME", default_value = limits::GC_GRACE, value_parser = duration)]
     grace: Duration,
 
     /// Only says what would be done.

@@ -8,10 +8,10 @@ use anyhow::Context;
 
 use crate::cli::places::Twins;
 use crate::cli::progress;
-use crate::generate::{self, CitySettings};
-use crate::scene::manifest::Provenance;
-use crate::scene::{RenderProfile, Rig};
-use crate::store::{Kind, Settings, Storage};
+use wildcity_generate::CitySettings;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{RenderProfile, Rig};
+use wildcity_twin::store::{Kind, Settings, Storage};
 
 /// Make a twin of a procedural city: a route of any length between houses, cars and trees.
 ///
@@ -74,7 +74,7 @@ impl Generate {
             millions_per_km: self.density,
             speed_m_s: self.speed_m_s,
         };
-        let city = generate::city(&settings)?;
+        let city = wildcity_generate::city(&settings)?;
         let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
         let in_directory = catalog.traffic().is_none();
@@ -93,11 +93,11 @@ impl Generate {
         let parts = Settings {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
-            trajectories: vec![generate::city_drive(&settings)?],
+            trajectories: vec![wildcity_generate::city_drive(&settings)?],
             sky: None,
             provenance: Provenance::of(format!(
                 "city {}: {}",
-                generate::REVISION,
+                wildcity_generate::REVISION,
                 serde_json::to_string(&settings)?
             )),
         };

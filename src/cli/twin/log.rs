@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::places::Twins;
 use crate::cli::time::utc;
-use crate::store::LogEntry;
+use wildcity_twin::store::LogEntry;
 
 /// Show all versions of a twin, from the first on: when, how, and made from which.
 #[derive(Debug, clap::Args)]

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::places::{TwinVersion, Twins};
 use crate::cli::sky_source::SkySource;
-use crate::store::{Change, Kind, NewSky, Storage};
+use wildcity_twin::store::{Change, Kind, NewSky, Storage};
 
 /// Put a sky behind a twin, another in its place, or take it away: a new version with the same
 /// Gaussians.

@@ -4,9 +4,9 @@ use fearless_simd::{f32x16, prelude::*};
 
 use super::lanes::Vec3x16;
 use super::resolve::TileSums;
-use crate::render::constants::BLOCK_PX;
-use crate::scene::appearance::{Appearance, Exposure, Overlay};
-use crate::scene::chunk::LANES;
+use crate::constants::BLOCK_PX;
+use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
+use wildcity_scene::chunk::LANES;
 
 /// Blocks of a tile.
 const BLOCKS: usize = 16;

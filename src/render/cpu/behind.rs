@@ -8,10 +8,10 @@ use glam::{DMat3, DVec2};
 use super::lanes::Vec3x16;
 use super::optics;
 use super::resolve::TileSums;
-use crate::render::constants::BLOCK_PX;
-use crate::render::{Frame, RenderError, View};
-use crate::scene::chunk::LANES;
-use crate::scene::sky::{CubeMap, Drawn, SKY_CUT, Scratch};
+use crate::constants::BLOCK_PX;
+use crate::{Frame, RenderError, View};
+use wildcity_scene::chunk::LANES;
+use wildcity_scene::sky::{CubeMap, Drawn, SKY_CUT, Scratch};
 
 /// Blocks of a tile.
 const BLOCKS: usize = 16;

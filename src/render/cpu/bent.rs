@@ -8,13 +8,13 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use super::lanes::Vec3x16;
 use super::optics::{Exposed, Landed, Optics};
 use super::project::{Ellipse, LOG2_UNIT, SplatLanes, along, color, rotation_columns, shown};
-use crate::geometry::camera::WIDEST_RAD;
-use crate::render::View;
-use crate::render::constants::EXTENT_SLACK_PX;
-use crate::render::layout::Cutoffs;
-use crate::render::unscented::{Bent, Beside, Footprint};
-use crate::scene::Chunk;
-use crate::scene::chunk::{LANES, Lanes, column};
+use crate::View;
+use crate::constants::EXTENT_SLACK_PX;
+use crate::layout::Cutoffs;
+use crate::unscented::{Bent, Beside, Footprint};
+use wildcity_scene::Chunk;
+use wildcity_scene::chunk::{LANES, Lanes, column};
+use wildcity_scene::geometry::camera::WIDEST_RAD;
 
 /// A chunk as a lens sees it.
 #[derive(Clone, Copy)]
@@ -115,15 +115,14 @@ fn project_lanes<S: Simd>(
     }
     let Exposed { landed, share } = optics.expose(simd, center, splat(0.0));
     let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
-    let ways_m = optics.ways(simd, share);
-    if let Some([_, way_world_m]) = ways_m {
-        toward = toward.plus(way_world_m);
+    if let Some(shutter) = optics.shutter() {
+        toward = toward.plus(shutter.way_world(simd, share));
     }
     *toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
-    let depth_m = depth(at_end_m, view.by_distance, ways_m, optics.farther(simd, center, share));
+    let depth_m = depth(simd, at_end_m, (view, optics), center, share);
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
     // While the shutter rolls, it is the depth only of what has found its row.
-    let is_depth = match ways_m {
+    let is_depth = match optics.shutter() {
         None => splat(0.0).simd_ge(splat(0.0)),
         Some(_) => landed.within.simd_ge(splat(0.0)),
     };
@@ -216,33 +215,32 @@ fn beside<S: Simd>(
 type Wide<S> = (f64x8<S>, f64x8<S>);
 
 #[inline(always)]
-fn plus<S: Simd>((low, high): Wide<S>, more: Option<f32x16<S>>) -> Wide<S> {
-    match more {
-        None => (low, high),
-        Some(more) => {
-            let more = more.widen();
-            (low + more.0, high + more.1)
-        }
-    }
+fn plus<S: Simd>((low, high): Wide<S>, more: f32x16<S>) -> Wide<S> {
+    let more = more.widen();
+    (low + more.0, high + more.1)
 }
 
 /// Depth of centres, in metres: computed in f64 and rounded once, since splats are blended in order of it.
-/// They are given in the camera's frame at the exposure's end; where they are seen before, the camera had
-/// ways to go, along which they were farther.
+/// They are given in the camera's frame at the exposure's end, and once more in f32; where a share of it is
+/// still to come when they are seen, they are farther by what the camera had yet to go.
 #[inline(always)]
 fn depth<S: Simd>(
-    [x, y, z]: [Wide<S>; 3],
-    by_distance: bool,
-    ways_m: Option<[Vec3x16<S>; 2]>,
-    farther_m: Option<f32x16<S>>,
+    simd: S,
+    [mut x, mut y, mut z]: [Wide<S>; 3],
+    (view, optics): (&BentView<'_>, &Optics),
+    center: Vec3x16<S>,
+    share: f32x16<S>,
 ) -> f32x16<S> {
-    if !by_distance {
-        let (low, high) = plus(z, farther_m);
-        return low.narrow(high);
+    if !view.by_distance {
+        if let Some(shutter) = optics.shutter() {
+            z = plus(z, shutter.farther(simd, center, share));
+        }
+        return z.0.narrow(z.1);
     }
-    let x = plus(x, ways_m.map(|[way_m, _]| way_m.x));
-    let y = plus(y, ways_m.map(|[way_m, _]| way_m.y));
-    let z = plus(z, ways_m.map(|[way_m, _]| way_m.z));
+    if let Some(shutter) = optics.shutter() {
+        let way_m = shutter.way(simd, share);
+        (x, y, z) = (plus(x, way_m.x), plus(y, way_m.y), plus(z, way_m.z));
+    }
     let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
     let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
     low.narrow(high)

@@ -11,9 +11,9 @@ use rayon::prelude::*;
 
 use super::project::Projected;
 use super::sort::Sorted;
-use crate::render::constants::{EXTENT_SLACK_PX, MAX_INSTANCES, TILE_PX};
-use crate::render::layout::{Cutoffs, Splat};
-use crate::render::{RenderError, View};
+use crate::constants::{EXTENT_SLACK_PX, MAX_INSTANCES, TILE_PX};
+use crate::layout::{Cutoffs, Splat};
+use crate::{RenderError, View};
 
 /// Splats of a parallel block: enough to outweigh its histogram of a view's tiles.
 const BLOCK: usize = 1 << 14;

@@ -1,8 +1,8 @@
 //! What the stages have left so far, for another backend to go on with.
 
 use super::Scratch;
-use crate::render::layout::Cutoffs;
-use crate::render::stage::{Between, Stage, Tiles};
+use crate::layout::Cutoffs;
+use crate::stage::{Between, Stage, Tiles};
 
 /// Copies what the stages up to `last` left, with splats side by side instead of on pages.
 pub(super) fn between(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> Between {

@@ -5,7 +5,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use crate::scene::chunk::Lanes;
+use wildcity_scene::chunk::Lanes;
 
 /// Sixteen three-vectors.
 #[derive(Clone, Copy)]

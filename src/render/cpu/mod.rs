@@ -21,7 +21,7 @@ use std::time::Instant;
 use fearless_simd::Level;
 use rayon::ThreadPool;
 
-use crate::config;
+use crate::limits;
 
 use self::behind::Behind;
 use super::layout::Cutoffs;
@@ -57,7 +57,7 @@ pub enum CpuError {
     #[error("this machine has no {0:?}")]
     NoSuchSimd(Simd),
     /// More threads than any machine has cores.
-    #[error("{threads} render threads; 0 to {} are accepted", config::RENDER_THREADS)]
+    #[error("{threads} render threads; 0 to {} are accepted", limits::RENDER_THREADS)]
     TooManyThreads {
         /// How many were asked for.
         threads: usize,
@@ -81,7 +81,7 @@ impl Cpu {
     /// # Errors
     /// The machine lacks the instruction set, or the threads; or there are too many of them.
     pub fn new(threads: usize, simd: Simd) -> Result<Self, CpuError> {
-        if threads > config::RENDER_THREADS {
+        if threads > limits::RENDER_THREADS {
             return Err(CpuError::TooManyThreads { threads });
         }
         let best = Level::new();

@@ -11,12 +11,12 @@ use rayon::prelude::*;
 use super::bent::{self, BentView};
 use super::lanes::Vec3x16;
 use super::optics::Optics;
-use crate::render::Frame;
-use crate::render::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
-use crate::render::layout::{ChunkView, Cutoffs, Frustum, Splat};
-use crate::render::unscented::Bent;
-use crate::scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
-use crate::scene::{Chunk, sh};
+use crate::Frame;
+use crate::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
+use crate::layout::{ChunkView, Cutoffs, Frustum, Splat};
+use crate::unscented::Bent;
+use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
+use wildcity_scene::{Chunk, sh};
 
 /// Clusters of a unit: 4096 Gaussians take some 100 µs, long enough to be worth handing out.
 const UNIT_CLUSTERS: usize = 16;

@@ -14,10 +14,10 @@ use super::behind::Behind;
 use super::bin::{Bins, Grid};
 use super::project::Projected;
 use super::resolve::{self, Band, TileSums};
-use crate::render::constants::{BLOCK_PX, TILE_PX};
-use crate::render::layout::{Cutoffs, Splat};
-use crate::render::{Finished, Target, View};
-use crate::scene::chunk::LANES;
+use crate::constants::{BLOCK_PX, TILE_PX};
+use crate::layout::{Cutoffs, Splat};
+use crate::{Finished, Target, View};
+use wildcity_scene::chunk::LANES;
 
 /// Splats of a batch: 64 of 308 B stay in the first-level cache beside the sums.
 const BATCH: usize = 64;

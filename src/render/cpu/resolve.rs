@@ -2,10 +2,10 @@
 
 use fearless_simd::{f32x16, prelude::*, u32x16};
 
-use crate::render::constants::{BLOCK_PX, TILE_PX};
-use crate::render::{Target, View};
-use crate::scene::appearance::Appearance;
-use crate::scene::chunk::LANES;
+use crate::constants::{BLOCK_PX, TILE_PX};
+use crate::{Target, View};
+use wildcity_scene::appearance::Appearance;
+use wildcity_scene::chunk::LANES;
 
 const BLOCKS: usize = 16;
 

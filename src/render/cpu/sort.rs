@@ -3,8 +3,8 @@
 use rayon::prelude::*;
 
 use super::project::Projected;
-use crate::render::constants::DEPTH_BITS;
-use crate::render::layout::Cutoffs;
+use crate::constants::DEPTH_BITS;
+use crate::layout::Cutoffs;
 
 /// The order of a frame's splats.
 #[derive(Debug, Default)]

@@ -16,9 +16,9 @@ use super::kernel::{Kernel, module};
 use super::layout;
 use super::resolve::Planes;
 use super::shaders::Shaders;
-use crate::render::{Frame, MAX_VIEWS, RenderError, View};
-use crate::scene::appearance::{Appearance, Exposure, Overlay};
-use crate::scene::sky::{Drawn, Folded};
+use crate::{Frame, MAX_VIEWS, RenderError, View};
+use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
+use wildcity_scene::sky::{Drawn, Folded};
 
 /// What is behind the Gaussians of the frame at hand.
 #[derive(Debug)]

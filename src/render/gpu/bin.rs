@@ -17,7 +17,7 @@ use super::project::Splats;
 use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::Columns;
-use crate::render::constants::MAX_INSTANCES;
+use crate::constants::MAX_INSTANCES;
 
 /// The stage on the device, and the lists that it leaves.
 #[derive(Debug)]

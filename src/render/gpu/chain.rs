@@ -25,10 +25,10 @@ use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::{Columns, Sort};
 use super::traffic::FrameWork;
-use crate::render::constants::{DEPTH_BITS, TILE_PX};
-use crate::render::layout::Cutoffs;
-use crate::render::stage::{Between, Stage};
-use crate::render::{Frame, FrameStats, RenderError};
+use crate::constants::{DEPTH_BITS, TILE_PX};
+use crate::layout::Cutoffs;
+use crate::stage::{Between, Stage};
+use crate::{Frame, FrameStats, RenderError};
 
 /// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
 const FIRST_SPLATS: u64 = 1 << 15;

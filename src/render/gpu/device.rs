@@ -14,7 +14,7 @@ use wgpu::{
 };
 
 use super::layout::{EXPAND_BATCH, MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
-use crate::render::RenderError;
+use crate::RenderError;
 
 /// Why there is no GPU to render on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -7,8 +7,8 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
 use super::parts::{Part, Rows};
-use crate::render::layout::{ChunkView as CpuChunkView, Cutoffs};
-use crate::render::{MAX_VIEWS, View, constants};
+use crate::layout::{ChunkView as CpuChunkView, Cutoffs};
+use crate::{MAX_VIEWS, View, constants};
 
 /// Threads of a workgroup: what wgpu by default asks of every device. Vulkan alone promises 128.
 pub const WORKGROUP: u32 = 256;

@@ -9,12 +9,12 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growing::Growing;
 use super::layout::Lens;
-use crate::geometry::camera::{
+use crate::unscented::widest_rad;
+use crate::view::StillToCome;
+use crate::{Frame, MAX_VIEWS, View};
+use wildcity_scene::geometry::camera::{
     self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
 };
-use crate::render::unscented::widest_rad;
-use crate::render::view::StillToCome;
-use crate::render::{Frame, MAX_VIEWS, View};
 
 /// The views' lenses on the device.
 #[derive(Debug, Default)]

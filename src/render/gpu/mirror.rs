@@ -19,8 +19,8 @@ use self::encode::{LINE_BYTES, MOST_LINES};
 use self::free::Free;
 use super::device::Device;
 use super::layout::STRIP;
-use crate::render::RenderError;
-use crate::scene::{Chunk, Scene};
+use crate::RenderError;
+use wildcity_scene::{Chunk, Scene};
 
 /// Lines encoded at a time: 64 MiB, the most of staging memory.
 const UPLOAD_LINES: u32 = 1 << 19;

@@ -45,7 +45,7 @@ use self::shaders::Shaders;
 use self::turns::Turns;
 use super::stage::{Between, Stage};
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
-use crate::config;
+use crate::limits;
 
 /// The wgpu backend.
 #[derive(Debug)]
@@ -70,7 +70,7 @@ pub struct Gpu {
 pub struct Limits {
     /// Bytes of resident Gaussians: what was not drawn for longest goes when there would be more.
     pub mirror_bytes: u64,
-    /// Bytes that a binding may hold; below `config::BINDING_BYTES_MIN` it is that. Frames that need
+    /// Bytes that a binding may hold; below `limits::BINDING_BYTES_MIN` it is that. Frames that need
     /// more are drawn part by part.
     pub binding_bytes: u64,
 }
@@ -140,13 +140,13 @@ impl Gpu {
         shaders: Shaders,
         limits: Limits,
     ) -> Result<Self, GpuError> {
-        if threads > config::RENDER_THREADS {
-            let limit = config::RENDER_THREADS;
+        if threads > limits::RENDER_THREADS {
+            let limit = limits::RENDER_THREADS;
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
         let limits =
-            Limits { binding_bytes: limits.binding_bytes.max(config::BINDING_BYTES_MIN), ..limits };
+            Limits { binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN), ..limits };
         let device = Device::open(choice, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
@@ -327,7 +327,7 @@ impl Backend for Gpu {
     }
 
     fn frames_at_once(&self) -> usize {
-        config::GPU_FRAMES
+        limits::GPU_FRAMES
     }
 
     fn render(
@@ -345,10 +345,10 @@ impl Backend for Gpu {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::Pinhole;
-    use crate::geometry::{Camera, Pose};
-    use crate::render::View;
-    use crate::scene::{RenderProfile, Scene};
+    use crate::View;
+    use wildcity_scene::geometry::camera::Pinhole;
+    use wildcity_scene::geometry::{Camera, Pose};
+    use wildcity_scene::{RenderProfile, Scene};
 
     #[test]
     fn a_lost_device_fails_its_frame_and_not_the_next() {

@@ -6,9 +6,9 @@
 
 use std::ops::Range;
 
-use crate::config;
-use crate::render::Frame;
-use crate::render::constants::TILE_PX;
+use crate::Frame;
+use crate::constants::TILE_PX;
+use crate::limits;
 
 /// Rows of tiles, counted through all views of a frame.
 pub(super) type Part = Range<u32>;
@@ -63,7 +63,7 @@ impl Rows {
     /// The rows of a frame.
     pub(super) fn of(frame: &Frame<'_>) -> Self {
         let mut end = 0;
-        let view_end = |view: &crate::render::View| {
+        let view_end = |view: &crate::View| {
             end += view.camera.height_px.div_ceil(TILE_PX);
             end
         };
@@ -124,7 +124,7 @@ pub(super) struct Subject {
 
 impl Subject {
     pub(super) fn of(frame: &Frame<'_>) -> Self {
-        let size = |view: &crate::render::View| [view.camera.width_px, view.camera.height_px];
+        let size = |view: &crate::View| [view.camera.width_px, view.camera.height_px];
         Self {
             gaussians: frame.scene.gaussians(),
             sizes_px: frame.views.iter().map(size).collect(),
@@ -157,7 +157,7 @@ impl Cuts {
         if merged.len() > 1 {
             let parts = merged.into_iter().map(|(part, _)| part).collect();
             self.known.insert(0, (subject, parts));
-            self.known.truncate(config::REMEMBERED_CUTS);
+            self.known.truncate(limits::REMEMBERED_CUTS);
         }
     }
 }

@@ -17,11 +17,11 @@ use super::mirror::Mirror;
 use super::plan::{Plan, job};
 use super::scan::Scan;
 use super::shaders::Shaders;
-use crate::render::layout::{ChunkView as CpuChunkView, Frustum};
-use crate::render::unscented::Bent;
-use crate::render::{Frame, View};
-use crate::scene::Chunk;
-use crate::scene::chunk::Cluster;
+use crate::layout::{ChunkView as CpuChunkView, Frustum};
+use crate::unscented::Bent;
+use crate::{Frame, View};
+use wildcity_scene::Chunk;
+use wildcity_scene::chunk::Cluster;
 
 /// What a frame projects.
 #[derive(Debug, Default)]

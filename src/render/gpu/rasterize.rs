@@ -22,9 +22,9 @@ use super::plan::Plan;
 use super::project::Splats;
 use super::resolve::Planes;
 use super::shaders::Shaders;
-use crate::render::{Frame, RenderError};
-use crate::scene::appearance::Appearance;
-use crate::scene::sky::{CubeMap, Drawn};
+use crate::{Frame, RenderError};
+use wildcity_scene::appearance::Appearance;
+use wildcity_scene::sky::{CubeMap, Drawn};
 
 /// The stage on the device, and its output.
 #[derive(Debug)]

@@ -13,8 +13,8 @@ use super::kernel::TICKS_BYTES;
 use super::layout::{Counters, FrameView};
 use super::rasterize::pages;
 use super::resolve::Planes;
-use crate::config;
-use crate::render::{FrameStats, RenderError};
+use crate::limits;
+use crate::{FrameStats, RenderError};
 
 /// How long a frame may take on the device before it counts as lost.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
@@ -60,7 +60,7 @@ impl Drawn {
         drop(pages);
         read_back.unmap();
         let mut unused = ring.lock();
-        if unused.len() < config::GPU_FRAMES {
+        if unused.len() < limits::GPU_FRAMES {
             unused.push(read_back);
         }
     }

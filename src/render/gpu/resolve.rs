@@ -7,9 +7,9 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::layout::FrameView;
-use crate::render::Target;
-use crate::render::constants::TILE_PX;
-use crate::scene::appearance::Appearance;
+use crate::Target;
+use crate::constants::TILE_PX;
+use wildcity_scene::appearance::Appearance;
 
 /// Pixels of a tile.
 const PLANE: usize = (TILE_PX * TILE_PX) as usize;

@@ -10,7 +10,7 @@ use super::growing::Growing;
 use super::kernel::{Groups, Kernel, Recorder, TICKS_BYTES, clock, module};
 use super::layout::{Span, WORKGROUP};
 use super::shaders::Shaders;
-use crate::render::RenderError;
+use crate::RenderError;
 
 /// Bytes that are copied: five times the cache of a large card, if a binding holds as many.
 const COPY_BYTES: u64 = 256 << 20;

@@ -108,9 +108,9 @@ mod tests {
     use wgpu::{Buffer, MapMode, PollType};
 
     use super::*;
-    use crate::render::gpu::AdapterChoice;
-    use crate::render::gpu::kernel::Recorder;
-    use crate::render::gpu::layout::{JobSlot, MAX_GROUPS, SCAN_BLOCK};
+    use crate::gpu::AdapterChoice;
+    use crate::gpu::kernel::Recorder;
+    use crate::gpu::layout::{JobSlot, MAX_GROUPS, SCAN_BLOCK};
 
     /// Bits of the keys.
     const BITS: u32 = 31;

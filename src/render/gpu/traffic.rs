@@ -5,10 +5,10 @@ use super::layout::{
 };
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
-use crate::render::Frame;
-use crate::render::constants::{DEPTH_BITS, TILE_PX};
-use crate::scene::chunk::CLUSTER;
-use crate::scene::sh;
+use crate::Frame;
+use crate::constants::{DEPTH_BITS, TILE_PX};
+use wildcity_scene::chunk::CLUSTER;
+use wildcity_scene::sh;
 
 /// What the last frame counted.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

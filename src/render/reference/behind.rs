@@ -3,8 +3,8 @@
 use glam::{DVec2, DVec3};
 
 use super::blend::Pixel;
-use crate::render::{Frame, View};
-use crate::scene::sky::SKY_CUT;
+use crate::{Frame, View};
+use wildcity_scene::sky::SKY_CUT;
 
 /// Adds the sky, or the background where there is none, to one row of pixels.
 pub(super) fn add(frame: &Frame<'_>, view: &View, row: u32, pixels: &mut [Pixel]) {

@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::project::Splat;
-use crate::scene::RenderProfile;
+use wildcity_scene::RenderProfile;
 
 /// What a pixel has gathered.
 #[derive(Clone, Copy, Debug)]

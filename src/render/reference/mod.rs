@@ -15,10 +15,10 @@ use rayon::prelude::*;
 
 pub use project::{Splat, project};
 
-use crate::scene::appearance::{Appearance, Exposure};
+use wildcity_scene::appearance::{Appearance, Exposure};
 
 use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
-use crate::scene::Rays;
+use wildcity_scene::Rays;
 
 /// The f64 backend.
 #[derive(Clone, Copy, Debug, Default)]

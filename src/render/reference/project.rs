@@ -6,11 +6,11 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::geometry::Camera;
-use crate::render::View;
-use crate::render::unscented::widest_rad;
-use crate::scene::chunk::column;
-use crate::scene::{Chunk, RenderProfile, Scene, sh};
+use crate::View;
+use crate::unscented::widest_rad;
+use wildcity_scene::chunk::column;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 
 /// A Gaussian on screen.
 #[derive(Clone, Copy, Debug)]

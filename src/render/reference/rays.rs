@@ -8,8 +8,8 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::blend::Pixel;
 use super::project::{Splat, placed};
-use crate::render::View;
-use crate::scene::{RenderProfile, Scene};
+use crate::View;
+use wildcity_scene::{RenderProfile, Scene};
 
 /// A Gaussian in the world.
 #[derive(Clone, Copy, Debug)]
@@ -31,7 +31,7 @@ pub(super) fn solids(scene: &Scene, splats: &[Splat]) -> Vec<Solid> {
         let (mean_m, axes_m) = placed(chunk, index);
         let lengths_m = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(DVec3::length);
         let sigma_m = lengths_m.into_iter().fold(0.0, f64::max);
-        let log2_opacity = chunk.value(index, crate::scene::chunk::column::LOG2_OPACITY);
+        let log2_opacity = chunk.value(index, wildcity_scene::chunk::column::LOG2_OPACITY);
         Solid { mean_m, axes_m, sigma_m, opacity: f64::from(log2_opacity).exp2() }
     };
     splats.iter().map(solid).collect()

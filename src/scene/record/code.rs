@@ -4,7 +4,7 @@ use std::f32::consts::SQRT_2;
 
 use half::f16;
 
-use crate::scene::chunk::LANES;
+use crate::chunk::LANES;
 
 /// A field's code.
 #[derive(Clone, Copy, Debug, PartialEq)]

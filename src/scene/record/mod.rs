@@ -10,6 +10,7 @@
 //! the ground or independent of the direction stays exactly so.
 
 mod code;
+mod recorded;
 
 use std::ops::Range;
 
@@ -19,6 +20,8 @@ use super::chunk::{Chunk, LANES, Lanes, column, columns};
 use super::sh;
 
 use code::{Code, Measure};
+
+pub use recorded::{Recorded, recorded};
 
 /// Gaussians that share ranges, at most: raw, 65,536 of Q32 at degree 3 are 7.9 MB, of F32 15 MB.
 /// A multiple of a cluster.

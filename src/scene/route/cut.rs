@@ -1,7 +1,7 @@
 //! Sub-trajectories: pieces of a drive of one length, in the drive's own frame.
 
 use super::{Route, RouteError, positive};
-use crate::scene::Trajectory;
+use crate::Trajectory;
 
 /// A piece of a drive.
 #[derive(Clone, Debug, PartialEq)]

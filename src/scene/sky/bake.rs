@@ -19,7 +19,7 @@ use fearless_simd::{Level as Simd, dispatch, f32x16, prelude::*};
 use rayon::prelude::*;
 
 use super::{CubeMap, FACES, Folded, SkyError};
-use crate::scene::chunk::LANES;
+use crate::chunk::LANES;
 
 /// Values along an edge of the first grid.
 const FIRST_EDGE: usize = 129;

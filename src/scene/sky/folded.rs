@@ -6,7 +6,7 @@
 use fearless_simd::{f32x16, i32x16, prelude::*};
 
 use super::Network;
-use crate::scene::chunk::{LANES, Lanes};
+use crate::chunk::{LANES, Lanes};
 
 /// Outputs that are summed side by side.
 const GROUP: usize = 8;

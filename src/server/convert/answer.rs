@@ -5,41 +5,40 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use crate::config;
-use crate::geometry::camera::Pinhole;
-use crate::geometry::{Camera, Pose};
-use crate::protocol::http::Refusal;
-use crate::protocol::message::{
+use crate::Limits as ServerLimits;
+use crate::fault::Fault;
+use wildcity_protocol::http::Refusal;
+use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use crate::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
-use crate::scene::Rig;
-use crate::server::Limits as ServerLimits;
-use crate::server::fault::Fault;
-use crate::session::{
+use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
+use wildcity_scene::Rig;
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_session::{
     self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Maps, Outcome, PastImage, Session, Summary,
     TensorKind, TrajectorySummary, TwinSummary,
 };
-use crate::sim::{Dynamics, Model};
-use crate::store::Version;
+use wildcity_sim::{Dynamics, Model};
+use wildcity_twin::store::Version;
 
 use super::SUBPROTOCOL;
 use super::camera::{beyond, exposure_to, shutter_to};
 use super::fault::{cells, code_and_field};
 
 /// To `hello`.
-pub(in crate::server) fn welcome(
+pub(crate) fn welcome(
     seq: u64,
     server: &ServerLimits,
     backend: &str,
     twins: &[Arc<TwinSummary>],
 ) -> Result<String, Fault> {
     let limits = Limits {
-        message_bytes: config::INBOUND_MESSAGE_BYTES as u64,
-        observe_poses: config::OBSERVE_POSES as u64,
+        message_bytes: wildcity_protocol::limits::INBOUND_MESSAGE_BYTES as u64,
+        observe_poses: wildcity_session::limits::OBSERVE_POSES as u64,
         cameras: Rig::MAX_CAMERAS as u64,
         side_px: Camera::MAX_SIDE_PX.into(),
-        answer_pixels: config::ANSWER_PIXELS,
+        answer_pixels: wildcity_session::limits::ANSWER_PIXELS,
         idle_ms: server.idle.as_millis() as u64,
         resume_ms: server.resume_grace.as_millis() as u64,
     };
@@ -57,7 +56,7 @@ pub(in crate::server) fn welcome(
 }
 
 /// To `open`.
-pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
+pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = profile(session)?;
@@ -106,23 +105,19 @@ pub(in crate::server) fn opened(seq: u64, session: &Session) -> Result<String, F
 }
 
 /// To `resume`.
-pub(in crate::server) fn resumed(
-    seq: u64,
-    last_seq: u64,
-    session: &Session,
-) -> Result<String, Fault> {
+pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<String, Fault> {
     let episode = session.episode();
     let (step, time_us) = (episode.step(), episode.time_us());
     text(&Answer::Resumed { seq, session: session.name().to_owned(), last_seq, step, time_us })
 }
 
 /// To `prefetch`.
-pub(in crate::server) fn ok(seq: u64) -> Result<String, Fault> {
+pub(crate) fn ok(seq: u64) -> Result<String, Fault> {
     text(&Answer::Ok { seq })
 }
 
 /// To `switch_version`.
-pub(in crate::server) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
+pub(crate) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
     let Version { number, hash, .. } = &*session.resident().version;
     text(&Answer::Switched {
         seq,
@@ -134,7 +129,7 @@ pub(in crate::server) fn switched(seq: u64, session: &Session) -> Result<String,
 }
 
 /// To `close`.
-pub(in crate::server) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
+pub(crate) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
     let Summary { outcome, steps, time_us, distance_m, least_trust } = *summary;
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
@@ -149,7 +144,7 @@ pub(in crate::server) fn closed(seq: u64, summary: &Summary) -> Result<String, F
 }
 
 /// To a request that was refused.
-pub(in crate::server) fn refused(seq: Option<u64>, fault: &Fault) -> String {
+pub(crate) fn refused(seq: Option<u64>, fault: &Fault) -> String {
     let (code, field) = code_and_field(fault);
     let (message, fatal) = (fault.to_string(), fault.is_fatal());
     // An error of strings and flags always has JSON.
@@ -158,16 +153,16 @@ pub(in crate::server) fn refused(seq: Option<u64>, fault: &Fault) -> String {
 
 /// The code of a fault as it stands on the wire.
 #[derive(Clone, Debug)]
-pub(in crate::server) struct WireCode(pub(in crate::server) String);
+pub(crate) struct WireCode(pub(crate) String);
 
 /// The code of a fault.
-pub(in crate::server) fn code(fault: &Fault) -> WireCode {
+pub(crate) fn code(fault: &Fault) -> WireCode {
     let code = serde_json::to_value(code_and_field(fault).0);
     WireCode(code.ok().and_then(|code| code.as_str().map(str::to_owned)).unwrap_or_default())
 }
 
 /// The body of an HTTP answer that refuses.
-pub(in crate::server) fn refusal_body(fault: &Fault) -> serde_json::Value {
+pub(crate) fn refusal_body(fault: &Fault) -> serde_json::Value {
     let (code, field) = code_and_field(fault);
     let offset = match fault {
         Fault::UploadOffset { held, .. } => Some(*held),
@@ -178,21 +173,17 @@ pub(in crate::server) fn refusal_body(fault: &Fault) -> serde_json::Value {
 }
 
 /// The body of `GET /v1/twins`.
-pub(in crate::server) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
+pub(crate) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
     serde_json::json!({ "twins": twins.iter().map(|twin| twin_info(twin)).collect::<Vec<_>>() })
 }
 
 /// The body of `GET /v1/twins/{twin}`.
-pub(in crate::server) fn twin(twin: &TwinSummary) -> serde_json::Value {
+pub(crate) fn twin(twin: &TwinSummary) -> serde_json::Value {
     serde_json::json!(twin_info(twin))
 }
 
 /// Completes an observation: writes the header that says what its bytes are.
-pub(in crate::server) fn observation(
-    seq: u64,
-    session: &Session,
-    mut frame: Frame,
-) -> Result<Frame, Fault> {
+pub(crate) fn observation(seq: u64, session: &Session, mut frame: Frame) -> Result<Frame, Fault> {
     let image_names = image_names(session, &frame);
     let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
     for tensor in &frame.tensors {
@@ -247,7 +238,7 @@ struct TensorInfo<'a> {
 /// Where an image's tensors are, without the `/rgb` at the end.
 fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
     let several = frame.images.iter().any(|image| image.pose > 0);
-    let name = |image: &crate::session::Image| {
+    let name = |image: &wildcity_session::Image| {
         let camera = &session.cameras()[image.camera].name;
         if several {
             format!("pose/{}/camera/{camera}", image.pose)
@@ -296,7 +287,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             trust: None,
         }
     };
-    let drawn = |(drawn, name): (&crate::session::Image, &String)| {
+    let drawn = |(drawn, name): (&wildcity_session::Image, &String)| {
         let tensor = format!("{name}/rgb");
         let pose = drawn.pose as u64;
         let trust = drawn.trust.map(trust);
@@ -351,8 +342,8 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     }
 }
 
-fn trust(trust: session::Trust) -> Trust {
-    let session::Trust { value, distance_m, angle_rad, low_coverage, outside } = trust;
+fn trust(trust: wildcity_session::Trust) -> Trust {
+    let wildcity_session::Trust { value, distance_m, angle_rad, low_coverage, outside } = trust;
     Trust { value, distance_m, angle_rad, low_coverage, outside }
 }
 
@@ -389,7 +380,7 @@ fn trajectory_info(log: TrajectorySummary) -> TrajectoryInfo {
     TrajectoryInfo { name, length_m, keyframes }
 }
 
-fn camera(camera: &crate::scene::rig::RigCamera) -> RigCamera {
+fn camera(camera: &wildcity_scene::rig::RigCamera) -> RigCamera {
     let Camera { width_px, height_px, pinhole, .. } = camera.camera;
     let (lens, windshield) = beyond(&camera.camera);
     RigCamera {

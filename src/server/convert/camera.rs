@@ -1,11 +1,11 @@
 //! Cameras, both ways.
 
-use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
-use crate::geometry::camera::{
+use wildcity_protocol::camera as wire;
+use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
+use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
+use wildcity_scene::geometry::camera::{
     Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
 };
-use crate::protocol::camera as wire;
-use crate::scene::appearance::{Appearance, AppearanceError, Exposure};
 
 /// Wire to lens.
 pub(super) fn lens_of(lens: wire::Lens) -> LensFields {

@@ -1,14 +1,14 @@
 //! Faults to the closed list of codes.
 
-use crate::geometry::PoseError;
-use crate::protocol::error::Code;
-use crate::render::RenderError;
-use crate::residency::ResidencyError;
-use crate::scene::rig::RigError;
-use crate::server::fault::{Fault, is_content, is_full};
-use crate::session::SessionError;
-use crate::sim::EgoError;
-use crate::store::StoreError;
+use crate::fault::{Fault, is_content, is_full};
+use wildcity_protocol::error::Code;
+use wildcity_render::RenderError;
+use wildcity_scene::geometry::PoseError;
+use wildcity_scene::rig::RigError;
+use wildcity_session::SessionError;
+use wildcity_sim::EgoError;
+use wildcity_twin::residency::ResidencyError;
+use wildcity_twin::store::StoreError;
 
 /// The code of a fault, and the field at fault where one is.
 pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
@@ -143,7 +143,7 @@ mod tests {
     use std::io;
 
     use super::*;
-    use crate::scene::Record;
+    use wildcity_scene::Record;
 
     /// Only what lies in the push itself is refused for good.
     #[test]

@@ -5,27 +5,27 @@ use std::collections::BTreeSet;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
-use crate::config;
-use crate::ingest::{Axes, BadGaussian};
-use crate::protocol::http;
-use crate::scene::RenderProfile;
-use crate::scene::rig::is_name;
-use crate::server::fault::Fault;
-use crate::server::push::{Ask, AskedCells, AskedFile, Status};
-use crate::server::report::{CellChange, FileReport, Report, State};
-use crate::server::sessions::About;
-use crate::server::spool::{Announced, Upload};
-use crate::store::{LogEntry, Version};
+use crate::fault::Fault;
+use crate::limits;
+use crate::push::{Ask, AskedCells, AskedFile, Status};
+use crate::report::{CellChange, FileReport, Report, State};
+use crate::sessions::About;
+use crate::spool::{Announced, Upload};
+use wildcity_protocol::http;
+use wildcity_scene::RenderProfile;
+use wildcity_scene::rig::is_name;
+use wildcity_twin::ingest::{Axes, BadGaussian};
+use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
 use super::request::pose_of;
 
 /// The body of `POST /v1/uploads`.
-pub(in crate::server) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
+pub(crate) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
     let http::NewUpload { name, size, digest } = parse(body)?;
     let is_plain = |c: char| !c.is_control() && c != '/' && c != '\\';
-    if name.is_empty() || name.len() > config::UPLOAD_NAME_BYTES || !name.chars().all(is_plain) {
-        let most = config::UPLOAD_NAME_BYTES;
+    if name.is_empty() || name.len() > limits::UPLOAD_NAME_BYTES || !name.chars().all(is_plain) {
+        let most = limits::UPLOAD_NAME_BYTES;
         let must = format!("{name:?}; 1 to {most} bytes without / and \\ are accepted");
         return Err(Fault::OutOfRange { field: "name".to_owned(), must });
     }
@@ -37,7 +37,7 @@ pub(in crate::server) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
 }
 
 /// An upload.
-pub(in crate::server) fn upload(upload: &Upload) -> Value {
+pub(crate) fn upload(upload: &Upload) -> Value {
     let Announced { name, size, .. } = upload.announced();
     json!(http::Upload {
         id: upload.id().to_owned(),
@@ -49,7 +49,7 @@ pub(in crate::server) fn upload(upload: &Upload) -> Value {
 }
 
 /// The body of `POST /v1/twins/{twin}/pushes`.
-pub(in crate::server) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
+pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
     let asked: http::NewPush = parse(body)?;
     // What was understood, not what was sent: spaces make no other push.
     let content = blake3::hash(json!([&twin, &asked]).to_string().as_bytes());
@@ -60,8 +60,8 @@ pub(in crate::server) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Faul
     };
     let out_of_range =
         |field: &str, must: String| Err(Fault::OutOfRange { field: field.to_owned(), must });
-    if !(1..=config::PUSH_FILES).contains(&files.len()) {
-        let must = format!("{} entries; 1 to {} are accepted", files.len(), config::PUSH_FILES);
+    if !(1..=limits::PUSH_FILES).contains(&files.len()) {
+        let must = format!("{} entries; 1 to {} are accepted", files.len(), limits::PUSH_FILES);
         return out_of_range("files", must);
     }
     let file = |(index, file): (usize, http::PushFile)| {
@@ -100,13 +100,13 @@ pub(in crate::server) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Faul
             reason: format!("profile[{index}]: {error}"),
         })?;
     }
-    if note.as_ref().is_some_and(|note| note.chars().count() > config::NOTE_CHARS) {
-        let must = format!("longer than {} characters", config::NOTE_CHARS);
+    if note.as_ref().is_some_and(|note| note.chars().count() > limits::NOTE_CHARS) {
+        let must = format!("longer than {} characters", limits::NOTE_CHARS);
         return out_of_range("note", must);
     }
     let poses = match golden.poses {
-        Some(poses) if poses.len() > config::GOLDEN_POSES => {
-            let must = format!("{} poses; at most {}", poses.len(), config::GOLDEN_POSES);
+        Some(poses) if poses.len() > limits::GOLDEN_POSES => {
+            let must = format!("{} poses; at most {}", poses.len(), limits::GOLDEN_POSES);
             return out_of_range("golden.poses", must);
         }
         Some(poses) => {
@@ -132,7 +132,7 @@ pub(in crate::server) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Faul
 }
 
 /// A push.
-pub(in crate::server) fn push(id: &str, twin: &str, status: &Status) -> Value {
+pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
     let state = match status.state {
         State::Queued => http::PushState::Queued,
         State::Ingesting => http::PushState::Ingesting,
@@ -205,12 +205,12 @@ fn file(file: &FileReport) -> http::FileReport {
 }
 
 /// The body of `POST /v1/twins/{twin}/rollback`: the old version.
-pub(in crate::server) fn rollback(body: &[u8]) -> Result<u64, Fault> {
+pub(crate) fn rollback(body: &[u8]) -> Result<u64, Fault> {
     parse::<http::Rollback>(body).map(|rollback| rollback.version)
 }
 
 /// The versions of a twin, the latest last. Those after one that is held are not ready.
-pub(in crate::server) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
+pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
     let version = |entry: &LogEntry| http::VersionInfo {
         version: entry.number,
         version_hash: entry.hash.clone(),
@@ -223,12 +223,12 @@ pub(in crate::server) fn versions(versions: &[LogEntry], held: Option<u64>) -> V
 }
 
 /// One version that was just made.
-pub(in crate::server) fn version(version: &Version) -> Value {
+pub(crate) fn version(version: &Version) -> Value {
     json!({ "version": version.number, "version_hash": version.hash })
 }
 
 /// All sessions.
-pub(in crate::server) fn sessions(sessions: &[(String, About, bool)]) -> Value {
+pub(crate) fn sessions(sessions: &[(String, About, bool)]) -> Value {
     let session = |(name, about, connected): &(String, About, bool)| http::SessionInfo {
         session: name.clone(),
         twin: about.twin.clone(),

@@ -4,24 +4,25 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use crate::config;
-use crate::geometry::Pose;
-use crate::geometry::camera::json::Intrinsics;
-use crate::protocol::message::{self, Request};
-use crate::protocol::unknown_field;
-use crate::scene::ProfileChanges;
-use crate::scene::rig::{Rig, RigCamera, check_overlays, is_name};
-use crate::server::fault::Fault;
-use crate::session::{Encoding, ImagePart, Maps, Opening, Outputs, RigChoice, SessionError, Start};
-use crate::sim::ego::{Action, Path, TimedPose};
-use crate::sim::{self, Dynamics, Model};
+use crate::fault::Fault;
+use wildcity_protocol::message::{self, Request};
+use wildcity_protocol::unknown_field;
+use wildcity_scene::ProfileChanges;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::json::Intrinsics;
+use wildcity_scene::rig::{Rig, RigCamera, check_overlays, is_name};
+use wildcity_session::{
+    Encoding, ImagePart, Maps, Opening, Outputs, RigChoice, SessionError, Start,
+};
+use wildcity_sim::ego::{Action, Path, TimedPose};
+use wildcity_sim::{Dynamics, Model};
 
 use super::SUBPROTOCOL;
 use super::camera::{appearance_of, lens_of, shutter_of, windshield_of};
 
 /// A text frame, checked as far as it can be on its own.
 #[derive(Debug)]
-pub(in crate::server) enum Parsed {
+pub(crate) enum Parsed {
     /// A request, or something with the number of one.
     Numbered {
         /// Its number.
@@ -35,7 +36,7 @@ pub(in crate::server) enum Parsed {
 
 /// What a client wants.
 #[derive(Debug)]
-pub(in crate::server) enum Command {
+pub(crate) enum Command {
     /// To be welcomed.
     Hello {
         /// Name and version of the client.
@@ -51,7 +52,7 @@ pub(in crate::server) enum Command {
     /// A step.
     Step {
         /// How the ego is to move.
-        movement: sim::Command,
+        movement: wildcity_sim::Command,
         /// Whether it is the last.
         terminate: bool,
     },
@@ -89,7 +90,7 @@ pub(in crate::server) enum Command {
 }
 
 /// Reads a text frame.
-pub(in crate::server) fn parse(text: &str) -> Parsed {
+pub(crate) fn parse(text: &str) -> Parsed {
     use serde_json::error::Category;
     let error = match serde_json::from_str::<Request>(text) {
         Ok(request) => return checked(text, request),
@@ -191,11 +192,11 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, movement.map(|movement| Command::Step { movement, terminate }))
         }
         Request::Observe { seq, poses } => {
-            let poses = poses_of(&poses, config::OBSERVE_POSES);
+            let poses = poses_of(&poses, wildcity_session::limits::OBSERVE_POSES);
             (seq, poses.map(|poses| Command::Observe { poses }))
         }
         Request::Prefetch { seq, poses } => {
-            let poses = poses_of(&poses, config::PREFETCH_POSES);
+            let poses = poses_of(&poses, wildcity_session::limits::PREFETCH_POSES);
             (seq, poses.map(|poses| Command::Prefetch { poses }))
         }
         Request::Reset { seq, seed, start } => {
@@ -234,7 +235,9 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
     let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
     let (trust, periods_us) = (trust.unwrap_or(false), period_us.unwrap_or_default());
     let encoding = match encoding {
-        message::Encoding::Jpeg => Encoding::Jpeg(quality.unwrap_or(config::JPEG_QUALITY)),
+        message::Encoding::Jpeg => {
+            Encoding::Jpeg(quality.unwrap_or(wildcity_session::limits::JPEG_QUALITY))
+        }
         message::Encoding::Png => Encoding::Png,
         message::Encoding::Raw => Encoding::Raw,
     };
@@ -282,22 +285,22 @@ fn movement_of(
     pose: Option<message::Pose>,
     trajectory: Option<Vec<message::TimedPose>>,
     action: Option<message::Action>,
-) -> Result<sim::Command, Fault> {
+) -> Result<wildcity_sim::Command, Fault> {
     match (pose, trajectory, action) {
-        (Some(pose), None, None) => pose_of("pose", &pose).map(sim::Command::Pose),
+        (Some(pose), None, None) => pose_of("pose", &pose).map(wildcity_sim::Command::Pose),
         (None, Some(poses), None) => {
             // One more than is accepted tells the check that there are too many.
-            let poses = poses.iter().take(config::PATH_POSES + 1).enumerate();
+            let poses = poses.iter().take(wildcity_sim::limits::PATH_POSES + 1).enumerate();
             let timed = |(index, timed): (usize, &message::TimedPose)| {
                 let start_from_rig = pose_of(&format!("trajectory[{index}].pose"), &timed.pose)?;
                 Ok(TimedPose { time_us: timed.time_us, start_from_rig })
             };
             let path = Path::checked(poses.map(timed).collect::<Result<_, Fault>>()?);
-            Ok(sim::Command::Path(path.map_err(SessionError::from)?))
+            Ok(wildcity_sim::Command::Path(path.map_err(SessionError::from)?))
         }
         (None, None, Some(message::Action { acceleration, curvature })) => {
             let action = Action::checked(acceleration, curvature);
-            Ok(sim::Command::Action(action.map_err(SessionError::from)?))
+            Ok(wildcity_sim::Command::Action(action.map_err(SessionError::from)?))
         }
         _ => {
             let reason = "a step has exactly one of pose, trajectory and action".to_owned();

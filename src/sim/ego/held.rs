@@ -94,7 +94,7 @@ fn exponential(matrix: DMat2) -> DMat2 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sim::ego::vehicle::Vehicle;
+    use crate::ego::vehicle::Vehicle;
 
     fn series(matrix: DMat2) -> DMat2 {
         let scaled = matrix * 2f64.powi(-12);

@@ -17,8 +17,8 @@ mod vehicle;
 use glam::{DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::config;
-use crate::geometry::Pose;
+use crate::limits;
+use wildcity_scene::geometry::Pose;
 
 use super::Ground;
 
@@ -72,9 +72,9 @@ impl From<Pose> for Command {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Action {
-    /// Along the car, in m/s²; at most [`config::EGO_ACCELERATION_M_S2`] either way.
+    /// Along the car, in m/s²; at most [`limits::EGO_ACCELERATION_M_S2`] either way.
     pub acceleration_m_s2: f64,
-    /// Of the way of the rear axle, in 1/m, to the left; at most [`config::EGO_CURVATURE_1_M`] either
+    /// Of the way of the rear axle, in 1/m, to the left; at most [`limits::EGO_CURVATURE_1_M`] either
     /// way. A dynamic car steers so that it comes to drive it.
     pub curvature_1_m: f64,
 }
@@ -200,8 +200,8 @@ impl Dynamics {
 
     /// Between which speeds it stays, in m/s.
     fn bounds_m_s(&self) -> [f64; 2] {
-        let back_m_s = if self.reverse { -config::EGO_REVERSE_M_S } else { 0.0 };
-        [back_m_s, config::EGO_SPEED_M_S]
+        let back_m_s = if self.reverse { -limits::EGO_REVERSE_M_S } else { 0.0 };
+        [back_m_s, limits::EGO_SPEED_M_S]
     }
 }
 
@@ -212,8 +212,8 @@ impl Action {
     /// A number is not finite or beyond its limit.
     pub fn checked(acceleration_m_s2: f64, curvature_1_m: f64) -> Result<Self, EgoError> {
         for (field, value, most) in [
-            ("action.acceleration", acceleration_m_s2, config::EGO_ACCELERATION_M_S2),
-            ("action.curvature", curvature_1_m, config::EGO_CURVATURE_1_M),
+            ("action.acceleration", acceleration_m_s2, limits::EGO_ACCELERATION_M_S2),
+            ("action.curvature", curvature_1_m, limits::EGO_CURVATURE_1_M),
         ] {
             in_range(field, value, [-most, most])?;
         }
@@ -360,7 +360,7 @@ impl Ego {
             return unicycle::rolled(car, &vehicle, action, step_s, bounds_m_s);
         }
         let steering_rad = vehicle.steering_rad(action.curvature_1_m, car.speed_m_s);
-        let most_rad = config::EGO_STEERING_RAD;
+        let most_rad = limits::EGO_STEERING_RAD;
         let told = Told {
             acceleration_m_s2: action.acceleration_m_s2,
             steering_rad: steering_rad.clamp(-most_rad, most_rad),
@@ -374,7 +374,7 @@ impl Ego {
             Model::Dynamic => Vehicle::DEFAULT.lag_s,
             Model::Teleport | Model::Kinematic => 0.0,
         };
-        let ticks = (step_us as u64).div_ceil(config::TRACKER_TICK_US);
+        let ticks = (step_us as u64).div_ceil(limits::TRACKER_TICK_US);
         let tick_s = step_us as f64 * 1e-6 / ticks as f64;
         (0..ticks).fold(self.car, |car, tick| {
             let action = tracker::track(&wishes, tick as f64 * tick_s, lag_s, &car);

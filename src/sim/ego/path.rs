@@ -3,8 +3,8 @@
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::config;
-use crate::geometry::Pose;
+use crate::limits;
+use wildcity_scene::geometry::Pose;
 
 use super::EgoError;
 
@@ -18,7 +18,7 @@ pub struct TimedPose {
     pub start_from_rig: Pose,
 }
 
-/// 1 to [`config::PATH_POSES`] poses in order of time; it begins where the rig is, at time 0.
+/// 1 to [`limits::PATH_POSES`] poses in order of time; it begins where the rig is, at time 0.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Path {
     poses: Vec<TimedPose>,
@@ -50,16 +50,16 @@ impl Path {
     ///
     /// # Errors
     /// There are no poses or too many, or their times do not rise from above 0 to at most
-    /// [`config::PATH_US`].
+    /// [`limits::PATH_US`].
     pub fn checked(poses: Vec<TimedPose>) -> Result<Self, EgoError> {
-        if !(1..=config::PATH_POSES).contains(&poses.len()) {
-            return Err(EgoError::PathCount { count: poses.len(), limit: config::PATH_POSES });
+        if !(1..=limits::PATH_POSES).contains(&poses.len()) {
+            return Err(EgoError::PathCount { count: poses.len(), limit: limits::PATH_POSES });
         }
         let mut before_us = 0;
         for (index, pose) in poses.iter().enumerate() {
             let time_us = pose.time_us;
-            if time_us <= before_us || time_us > config::PATH_US {
-                let limit_us = config::PATH_US;
+            if time_us <= before_us || time_us > limits::PATH_US {
+                let limit_us = limits::PATH_US;
                 return Err(EgoError::PathTime { index, time_us, before_us, limit_us });
             }
             before_us = time_us;

@@ -2,7 +2,7 @@
 
 use glam::DVec2;
 
-use crate::config;
+use crate::limits;
 
 use super::Action;
 use super::path::{Wanted, Wishes, wrapped};
@@ -41,7 +41,7 @@ pub(super) fn track(wishes: &Wishes, time_s: f64, lag_s: f64, car: &SingleTrack)
     let curvature_1_m = curvature(&soon)
         + ahead_m.y / (reach_m * reach_m)
         + 2.0 * off_rad / reach_m * direction(car.speed_m_s, now.speed_m_s);
-    let (most_m_s2, most_1_m) = (config::EGO_ACCELERATION_M_S2, config::EGO_CURVATURE_1_M);
+    let (most_m_s2, most_1_m) = (limits::EGO_ACCELERATION_M_S2, limits::EGO_CURVATURE_1_M);
     Action {
         acceleration_m_s2: acceleration_m_s2.clamp(-most_m_s2, most_m_s2),
         curvature_1_m: curvature_1_m.clamp(-most_1_m, most_1_m),

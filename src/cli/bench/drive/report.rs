@@ -7,8 +7,8 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::Step;
-use crate::residency::Stats;
-use crate::scene::rig::RigCamera;
+use wildcity_scene::rig::RigCamera;
+use wildcity_twin::residency::Stats;
 
 /// Steps that may wait before a drive is warm: 3 s, in which the pager learns how fast it is.
 const WARM_UP: usize = 30;

@@ -5,8 +5,8 @@ use std::fmt;
 use anyhow::ensure;
 use serde::Serialize;
 
-use crate::render::gpu::Roofline;
-use crate::render::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::gpu::Roofline;
 
 /// The goal: a step of six full cameras, from asking to images on the host, at as many visible pairs.
 const GOAL_MS: f64 = 4.7;

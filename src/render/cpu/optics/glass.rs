@@ -5,9 +5,9 @@ use glam::DVec3;
 
 use super::seen_rad;
 use super::sines::{asin, sin};
-use crate::geometry::Camera;
-use crate::geometry::camera::{Bivariate, Windshield, WindshieldReference};
-use crate::render::cpu::lanes::Vec3x16;
+use crate::cpu::lanes::Vec3x16;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
 /// A windshield that turns rays as they come, at angles where it does so in full.
 #[derive(Clone, Debug)]

@@ -7,10 +7,10 @@ use super::glass::{Glass, fades};
 use super::seen_rad;
 use super::series::Series;
 use super::shutter::Shutter;
-use crate::geometry::Camera;
-use crate::geometry::camera::Lens;
-use crate::render::View;
-use crate::render::cpu::lanes::Vec3x16;
+use crate::View;
+use crate::cpu::lanes::Vec3x16;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::Lens;
 
 /// What is left out of the tangent of half an angle: f32 tells no more apart.
 const LEFT: f64 = 5e-8;
@@ -18,7 +18,7 @@ const LEFT: f64 = 5e-8;
 /// Where the pixels of a pinhole or of a round lens look, 16 at a time: what [`super::Optics`] does, the other
 /// way.
 #[derive(Clone, Debug)]
-pub(in crate::render::cpu) struct Looks {
+pub(in crate::cpu) struct Looks {
     shutter: Option<Shutter>,
     glass: Option<Glass>,
     /// Rows that take (x, y, 1) in pixels to what is round, in pixels or focal lengths, or to slopes.
@@ -31,9 +31,12 @@ pub(in crate::render::cpu) struct Looks {
 
 impl Looks {
     /// `None` for OpenCV's polynomials of slopes, and for what is turned by a windshield as far as that fades.
-    pub(in crate::render::cpu) fn of(view: &View, axes_from_world: DMat3) -> Option<Self> {
+    pub(in crate::cpu) fn of(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        let shutter = Shutter::of(view)?;
+        let shutter = match view.still_to_come() {
+            None => None,
+            Some(still) => Some(Shutter::of(&still)?),
+        };
         let glass = match windshield {
             None => None,
             Some(windshield) => Some(Glass::of(windshield).filter(|_| !fades(&view.camera))?),
@@ -72,7 +75,7 @@ impl Looks {
 
     /// Directions, of any length, of places of the image in pixels. Beyond the field they are some direction.
     #[inline(always)]
-    pub(in crate::render::cpu) fn toward<S: Simd>(
+    pub(in crate::cpu) fn toward<S: Simd>(
         &self,
         simd: S,
         x: f32x16<S>,

@@ -13,12 +13,11 @@ mod shutter;
 mod sines;
 
 use fearless_simd::{f32x16, prelude::*};
-use glam::DVec2;
 
 use super::lanes::Vec3x16;
-use crate::geometry::Camera;
-use crate::geometry::camera::Lens;
-use crate::render::View;
+use crate::View;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::Lens;
 
 use glass::Glass;
 pub(super) use looks::Looks;
@@ -67,7 +66,10 @@ impl Optics {
     /// not describe, and cameras that turn as good as around in one exposure.
     pub(super) fn of(view: &View) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        let shutter = Shutter::of(view)?;
+        let shutter = match view.still_to_come() {
+            None => None,
+            Some(still) => Some(Shutter::of(&still)?),
+        };
         let glass = match windshield {
             None => None,
             Some(windshield) => Some(Glass::of(windshield)?),
@@ -135,23 +137,10 @@ impl Optics {
         }
     }
 
-    /// How many metres farther along the camera's axis points are while a share is still to come than at the
-    /// exposure's end, where they are given.
+    /// What rolls while the camera moves, if anything does.
     #[inline(always)]
-    pub(super) fn farther<S: Simd>(
-        &self,
-        simd: S,
-        at_end_m: Vec3x16<S>,
-        share: f32x16<S>,
-    ) -> Option<f32x16<S>> {
-        self.shutter.as_ref().map(|shutter| shutter.farther(simd, at_end_m, share))
-    }
-
-    /// How far the camera's centre still has to go, in metres: in its frame at the exposure's end, and in the
-    /// world's axes.
-    #[inline(always)]
-    pub(super) fn ways<S: Simd>(&self, simd: S, share: f32x16<S>) -> Option<[Vec3x16<S>; 2]> {
-        self.shutter.as_ref().map(|shutter| shutter.ways(simd, share))
+    pub(super) fn shutter(&self) -> Option<&Shutter> {
+        self.shutter.as_ref()
     }
 
     /// Where points of the camera's frame land. What is not within the field lands anywhere.
@@ -229,26 +218,18 @@ fn round(
 /// How far off the axis what an image shows is behind its windshield, in radians: a field may be far wider, and
 /// the wider, the more terms.
 fn seen_rad(camera: &Camera) -> f64 {
-    let bare = Camera { windshield: None, ..*camera };
-    let DVec2 { x: right, y: bottom } = camera.size_px();
-    let limit_rad = camera.limit_rad();
-    let corners = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]];
-    let angle_rad = |corner| match bare.unproject(DVec2::from_array(corner)) {
-        Some(ray) => ray.truncate().length().atan2(ray.z),
-        None => limit_rad,
-    };
-    corners.map(angle_rad).into_iter().fold(0.0, f64::max).min(limit_rad)
+    camera.corner_rad().min(camera.limit_rad())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
-    use crate::geometry::camera::{Fisheye, OpenCv, Pinhole, Rolls};
-    use crate::render::Rolling;
-    use crate::scene::Rig;
+    use crate::Rolling;
     use fearless_simd::{Level, dispatch};
-    use glam::{DMat3, DQuat, DVec3};
+    use glam::{DMat3, DQuat, DVec2, DVec3};
+    use wildcity_scene::Rig;
+    use wildcity_scene::geometry::Pose;
+    use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, Rolls};
 
     /// The real cameras, one of them behind its windshield, and one of each other model: with how many of
     /// 4,000 directions up to the end of its field are surely within.

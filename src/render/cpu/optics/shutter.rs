@@ -1,15 +1,14 @@
-//! Rolling shutters, 16 points at a time: what [`View::land`] does, seen from the exposure's end.
+//! Rolling shutters, 16 points at a time: what [`crate::View::land`] does, seen from the exposure's end.
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 
 use super::sines::sin;
-use crate::render::View;
-use crate::render::cpu::lanes::Vec3x16;
-use crate::render::view::StillToCome;
+use crate::cpu::lanes::Vec3x16;
+use crate::view::StillToCome;
 
 /// A shutter that rolls while the camera moves, for many points.
 #[derive(Clone, Debug)]
-pub(super) struct Shutter {
+pub(in crate::cpu) struct Shutter {
     share: [f32; 3],
     moved_world_m: [f32; 3],
     moved_m: [f32; 3],
@@ -27,18 +26,15 @@ impl Shutter {
     /// Beyond this turn in one exposure, in radians, the sine here does not hold.
     const MOST_RAD: f64 = 1.5;
 
-    /// `None` within if nothing rolls; `None` if the camera turns farther than is accounted for.
-    pub(super) fn of(view: &View) -> Option<Option<Self>> {
-        let Some(still) = view.still_to_come() else { return Some(None) };
-        let StillToCome { share, moved_world_m, moved_m, axis, turned_rad } = still;
-        (turned_rad <= Self::MOST_RAD).then(|| {
-            Some(Self {
-                share: share.map(|value| value as f32),
-                moved_world_m: moved_world_m.as_vec3().to_array(),
-                moved_m: moved_m.as_vec3().to_array(),
-                axis: axis.as_vec3().to_array(),
-                turned_rad: turned_rad as f32,
-            })
+    /// `None` if the camera turns farther than is accounted for.
+    pub(super) fn of(still: &StillToCome) -> Option<Self> {
+        let StillToCome { share, moved_world_m, moved_m, axis, turned_rad } = *still;
+        (turned_rad <= Self::MOST_RAD).then(|| Self {
+            share: share.map(|value| value as f32),
+            moved_world_m: moved_world_m.as_vec3().to_array(),
+            moved_m: moved_m.as_vec3().to_array(),
+            axis: axis.as_vec3().to_array(),
+            turned_rad: turned_rad as f32,
         })
     }
 
@@ -71,21 +67,26 @@ impl Shutter {
 
     /// How many metres farther along the camera's axis that is.
     #[inline(always)]
-    pub(super) fn farther<S: Simd>(
+    pub(in crate::cpu) fn farther<S: Simd>(
         &self,
         simd: S,
         at_end_m: Vec3x16<S>,
         share: f32x16<S>,
     ) -> f32x16<S> {
-        let [way_m, _] = self.ways(simd, share);
+        let way_m = self.way(simd, share);
         way_m.z + self.turning(simd, at_end_m.plus(way_m), share).z
     }
 
-    /// How far the camera's centre still has to go, in metres: in its frame at the exposure's end, and in the
-    /// world's axes.
+    /// How far the camera's centre still has to go, in metres, in its frame at the exposure's end.
     #[inline(always)]
-    pub(super) fn ways<S: Simd>(&self, simd: S, share: f32x16<S>) -> [Vec3x16<S>; 2] {
-        [self.moved_m, self.moved_world_m].map(|way_m| Vec3x16::splat(simd, way_m).scale(share))
+    pub(in crate::cpu) fn way<S: Simd>(&self, simd: S, share: f32x16<S>) -> Vec3x16<S> {
+        Vec3x16::splat(simd, self.moved_m).scale(share)
+    }
+
+    /// The same in the world's axes.
+    #[inline(always)]
+    pub(in crate::cpu) fn way_world<S: Simd>(&self, simd: S, share: f32x16<S>) -> Vec3x16<S> {
+        Vec3x16::splat(simd, self.moved_world_m).scale(share)
     }
 
     /// Directions in the camera's frame while a share is still to come, in its frame at the end.

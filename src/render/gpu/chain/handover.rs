@@ -5,23 +5,23 @@ use rayon::ThreadPool;
 use wgpu::{Buffer, CommandEncoderDescriptor};
 
 use super::{Chain, Source};
-use crate::render::gpu::kernel::{Recorder, TICKS_BYTES};
-use crate::render::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
-use crate::render::gpu::parts::Needs;
-use crate::render::gpu::plan::Counts;
-use crate::render::gpu::project::Work;
-use crate::render::gpu::read_back::{Drawn, ReadBack, TICKS_OFFSET};
-use crate::render::gpu::resolve::Wanted;
-use crate::render::layout::{Cutoffs, Splat};
-use crate::render::stage::{Between, Stage, Tiles};
-use crate::render::{Frame, FrameStats, RenderError};
+use crate::gpu::kernel::{Recorder, TICKS_BYTES};
+use crate::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
+use crate::gpu::parts::Needs;
+use crate::gpu::plan::Counts;
+use crate::gpu::project::Work;
+use crate::gpu::read_back::{Drawn, ReadBack, TICKS_OFFSET};
+use crate::gpu::resolve::Wanted;
+use crate::layout::{Cutoffs, Splat};
+use crate::stage::{Between, Stage, Tiles};
+use crate::{Frame, FrameStats, RenderError};
 
 impl Chain {
     /// Draws the rest of a frame.
     ///
     /// # Errors
     /// The device fails, or the frame needs more than it can hold.
-    pub(in crate::render::gpu) fn go_on(
+    pub(in crate::gpu) fn go_on(
         &mut self,
         between: &Between,
         frame: &Frame<'_>,
@@ -43,7 +43,7 @@ impl Chain {
     ///
     /// # Errors
     /// The device fails, or the frame needs more than it can hold.
-    pub(in crate::render::gpu) fn through(
+    pub(in crate::gpu) fn through(
         &mut self,
         frame: &Frame<'_>,
         done: Option<&Between>,

@@ -7,9 +7,9 @@
 
 use std::ops::Range;
 
-use crate::render::gpu::layout::{GEOMETRY_WORDS, STRIP};
-use crate::scene::chunk::{CLUSTER, column};
-use crate::scene::{Chunk, sh};
+use crate::gpu::layout::{GEOMETRY_WORDS, STRIP};
+use wildcity_scene::chunk::{CLUSTER, column};
+use wildcity_scene::{Chunk, sh};
 
 /// Bytes of a line.
 pub(super) const LINE_BYTES: u64 = 4 * STRIP as u64;

@@ -1,0 +1,17 @@
+//! Limits and defaults of this package, with the arithmetic behind each.
+
+/// Most render threads: above any machine's cores, below what exhausts a machine's processes.
+pub const RENDER_THREADS: usize = 1024;
+
+/// Frames that a GPU has in hand at once: one is drawn, one is encoded, and one is ready to be drawn
+/// the moment the first is done. Six JPEGs take longer than a fast GPU takes to draw them. Each
+/// holds its images, 27 MB of six full cameras.
+pub const GPU_FRAMES: usize = 3;
+
+/// Frames that did not fit a GPU at once, and are known in which parts they do: a few kB, for more
+/// rigs than drive at once.
+pub const REMEMBERED_CUTS: usize = 64;
+
+/// Smallest limit of a binding that the gpu backend is made to live with: one cluster of SH degree 3
+/// takes 34 kB of one.
+pub const BINDING_BYTES_MIN: u64 = 64 << 10;

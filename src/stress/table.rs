@@ -1,0 +1,140 @@
+//! Cases on backends, as one table.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::{Case, Outcome, Verdict};
+use wildcity_render::Backend;
+
+/// What cases were run on what, and how they went.
+#[derive(Clone, Debug, Serialize)]
+pub struct Table {
+    /// The backends, in order of the columns.
+    pub backends: Vec<Column>,
+    /// One row per case.
+    pub rows: Vec<Row>,
+}
+
+/// A backend of the table.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Column {
+    /// Its name.
+    pub backend: &'static str,
+    /// The device or instruction set, or why it is not there.
+    pub detail: String,
+}
+
+/// A case, and how it went on each backend, in order of the columns.
+#[derive(Clone, Debug, Serialize)]
+pub struct Row {
+    /// The case's number.
+    pub case: &'static str,
+    /// What is drawn.
+    pub what: &'static str,
+    /// What must hold.
+    pub bound: &'static str,
+    /// One per backend.
+    pub outcomes: Vec<Outcome>,
+}
+
+/// A backend to run cases on, or its name and why it is not there.
+pub type Candidate = Result<Box<dyn Backend>, (&'static str, String)>;
+
+/// Runs cases on backends; heavy ones only if `heavy`. Tells `progress` before each run how many are
+/// done, and which case is next.
+pub fn run(
+    cases: &[&Case],
+    backends: &[Candidate],
+    heavy: bool,
+    progress: &mut dyn FnMut(usize, &str),
+) -> Table {
+    let mut done = 0;
+    let rows = cases.iter().map(|case| {
+        let outcomes = backends.iter().map(|candidate| {
+            progress(done, case.number);
+            done += 1;
+            match candidate {
+                Ok(backend) => case.run(&**backend, heavy),
+                Err((name, why)) => case.not_run(name, why),
+            }
+        });
+        let outcomes = outcomes.collect();
+        Row { case: case.number, what: case.what, bound: case.bound, outcomes }
+    });
+    let rows = rows.collect();
+    let column = |candidate: &Candidate| match candidate {
+        Ok(backend) => Column { backend: backend.name(), detail: backend.detail() },
+        Err((name, why)) => Column { backend: name, detail: why.clone() },
+    };
+    Table { backends: backends.iter().map(column).collect(), rows }
+}
+
+impl Table {
+    /// How many runs went so.
+    pub fn count(&self, verdict: Verdict) -> usize {
+        let outcomes = self.rows.iter().flat_map(|row| &row.outcomes);
+        outcomes.filter(|outcome| outcome.verdict == verdict).count()
+    }
+
+    /// Characters of a backend's column, and two between it and the next.
+    fn width(&self, backend: usize) -> usize {
+        let words = self.rows.iter().filter_map(|row| Some(row.outcomes.get(backend)?.word()));
+        words.map(|word| word.chars().count()).fold(8, usize::max) + 2
+    }
+}
+
+impl Row {
+    /// What is worth telling of the row: the first miss, else what came closest to its bound, else why
+    /// nothing was run.
+    pub fn tightest(&self) -> Option<&Outcome> {
+        let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
+        let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);
+        let closest = || held().max_by(|a, b| a.strain.total_cmp(&b.strain));
+        let not_run = || self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::NotRun);
+        missed.or_else(closest).or_else(not_run)
+    }
+}
+
+impl Verdict {
+    /// A word for it.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Held => "held",
+            Self::Missed => "MISSED",
+            Self::Refused => "refused",
+            Self::NotRun => "not run",
+        }
+    }
+}
+
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for Column { backend, detail } in &self.backends {
+            writeln!(f, "{backend:<10} {detail}")?;
+        }
+        let widths: Vec<usize> = (0..self.backends.len()).map(|i| self.width(i)).collect();
+        write!(f, "\n{:<5}", "case")?;
+        for (Column { backend, .. }, width) in self.backends.iter().zip(&widths) {
+            write!(f, "{backend:<width$}")?;
+        }
+        writeln!(f, "what; bound; what came closest to it")?;
+        let indent = 5 + widths.iter().sum::<usize>();
+        for row in &self.rows {
+            write!(f, "{:<5}", row.case)?;
+            for (outcome, width) in row.outcomes.iter().zip(&widths) {
+                write!(f, "{:<width$}", outcome.word())?;
+            }
+            writeln!(f, "{}", row.what)?;
+            writeln!(f, "{:indent$}{}", "", row.bound)?;
+            let refused = row.outcomes.iter().filter(|o| o.verdict == Verdict::Refused);
+            for Outcome { backend, told, .. } in row.tightest().into_iter().chain(refused) {
+                writeln!(f, "{:indent$}{backend}: {told}", "")?;
+            }
+        }
+        let [held, refused, missed, not_run] =
+            [Verdict::Held, Verdict::Refused, Verdict::Missed, Verdict::NotRun]
+                .map(|verdict| self.count(verdict));
+        writeln!(f, "\n{held} held, {refused} refused, {missed} missed, {not_run} not run")
+    }
+}

@@ -1,0 +1,93 @@
+//! Scenes in a zip archive: SOG, by itself or streamed, and NuRec's USDZ.
+
+use std::io::{Cursor, Read};
+
+use zip::ZipArchive;
+use zip::result::ZipError;
+
+use crate::limits;
+use wildcity_scene::Gaussians;
+
+use super::parts::Parts;
+use super::unpacked::Budget;
+use super::{IngestError, nurec, sog};
+
+/// Reads the scene of an archive, by the first file in it that is known.
+pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
+    let mut archive = Archive::open(bytes)?;
+    if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
+        let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
+        return nurec::read(&payload, archive.budget());
+    }
+    let Some(name) = archive.find(|name| ["lod-meta.json", "meta.json"].contains(&name)) else {
+        let reason = match archive.find(|name| name == "data.pkl") {
+            Some(_) => "it is a checkpoint of PyTorch: python -m wildcity.convert makes \
+                        safetensors of it"
+                .into(),
+            None => "it holds no meta.json or lod-meta.json, as SOG does, and no .nurec, as USDZ of NuRec \
+                     does".into(),
+        };
+        return Err(error("directory", reason));
+    };
+    let folder = name.rfind('/').map_or("", |slash| &name[..=slash]).to_owned();
+    let json = archive.read(&name, limits::SCENE_JSON_BYTES)?;
+    sog::read(&json, &folder, &mut archive)
+}
+
+/// An archive in memory.
+struct Archive {
+    zip: ZipArchive<Cursor<Vec<u8>>>,
+    budget: Budget,
+}
+
+impl Archive {
+    fn open(bytes: Vec<u8>) -> Result<Self, IngestError> {
+        let mut budget = Budget::default();
+        budget.read(bytes.len() as u64);
+        let zip =
+            ZipArchive::new(Cursor::new(bytes)).map_err(|e| error("directory", damaged(&e)))?;
+        Ok(Self { zip, budget })
+    }
+
+    /// The first file of such a name, whatever folder it is in; the fewest folders count first.
+    fn find(&self, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
+        let names = self.zip.file_names();
+        let wanted = names.filter(|name| is_wanted(name.rsplit('/').next().unwrap_or(name)));
+        wanted.min_by_key(|name| (name.matches('/').count(), *name)).map(str::to_owned)
+    }
+}
+
+impl Parts for Archive {
+    fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError> {
+        let file = self.zip.by_name(name).map_err(|e| error(name, damaged(&e)))?;
+        let size = file.size();
+        if size > limit_bytes {
+            return Err(error(name, format!("{size} bytes; at most {limit_bytes} are read")));
+        }
+        self.budget.unpack("zip", name, size.into())?;
+        let mut bytes = Vec::new();
+        // One more, so that the checksum is compared, and a file that is longer than it says fails.
+        let read = file.take(size + 1).read_to_end(&mut bytes);
+        read.map_err(|e| error(name, format!("it is damaged: {e}; copy the archive again")))?;
+        if bytes.len() as u64 != size {
+            let held = bytes.len();
+            return Err(error(name, format!("the directory says {size} bytes, there are {held}")));
+        }
+        Ok(bytes)
+    }
+
+    fn budget(&mut self) -> &mut Budget {
+        &mut self.budget
+    }
+}
+
+fn damaged(cause: &ZipError) -> String {
+    match cause {
+        ZipError::FileNotFound => "is not in the archive".into(),
+        cause => format!("{cause}; copy the archive again"),
+    }
+}
+
+fn error(place: &str, reason: String) -> IngestError {
+    IngestError::Body { format: "zip", place: place.into(), reason }
+}

@@ -1,0 +1,160 @@
+//! From the axes and unit of a file to a twin's: metres, x east, y north, z up.
+//!
+//! A format never says which axes it means (two PLY files differ), so an import is told.
+
+use std::str::FromStr;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use wildcity_scene::{Gaussians, sh};
+
+use super::IngestError;
+
+/// The way from a file to a twin: a rotation, perhaps with a mirror, and then a scale.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Axes {
+    twin_from_file: DMat3,
+    metres_per_unit: f64,
+}
+
+/// Name, what it is, and the twin's x, y, z in the file's: rows of the matrix.
+const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
+    ("identity", "x, y, z stay; z is up", [[1., 0., 0.], [0., 1., 0.], [0., 0., 1.]]),
+    (
+        "y-down-z-forward",
+        "OpenCV, COLMAP: x right to east, z forward to north, y down",
+        [[1., 0., 0.], [0., 0., 1.], [0., -1., 0.]],
+    ),
+    (
+        "y-up-z-back",
+        "OpenGL, glTF: x right to east, -z forward to north, y up",
+        [[1., 0., 0.], [0., 0., -1.], [0., 1., 0.]],
+    ),
+    (
+        "y-up-z-forward",
+        "Unity: x right to east, z forward to north, y up; left-handed, so mirrored",
+        [[1., 0., 0.], [0., 0., 1.], [0., 1., 0.]],
+    ),
+];
+
+impl Axes {
+    /// Nothing changes.
+    pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
+
+    /// How far `M Mᵀ` may be from the identity: a matrix typed with four digits passes.
+    const MAX_ERROR: f64 = 1e-3;
+
+    /// From a matrix whose rows are the twin's axes in the file's.
+    ///
+    /// # Errors
+    /// [`IngestError::Frame`] if the rows are not of unit length and at right angles.
+    pub fn from_rows(rows: [[f64; 3]; 3]) -> Result<Self, IngestError> {
+        Self::orthonormal(rows).ok_or_else(|| stretched(format!("{rows:?}")))
+    }
+
+    /// `None` if the rows are not of unit length and at right angles.
+    fn orthonormal(rows: [[f64; 3]; 3]) -> Option<Self> {
+        let given = DMat3::from_cols_array_2d(&rows).transpose();
+        let error = given * given.transpose() - DMat3::IDENTITY;
+        let is_orthonormal = error.to_cols_array().iter().all(|e| e.abs() <= Self::MAX_ERROR);
+        if !is_orthonormal {
+            return None;
+        }
+        // Gram-Schmidt, so that what four digits left over does not stretch the scene.
+        let [x, y, z] = rows.map(DVec3::from_array);
+        let x = x.normalize();
+        let y = (y - x * x.dot(y)).normalize();
+        let z_right = x.cross(y);
+        let z = z_right * z_right.dot(z).signum();
+        Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
+    }
+
+    /// The same axes with a unit of so many metres.
+    ///
+    /// # Errors
+    /// [`IngestError::Frame`] if the scale is not from 1e-6 to 1e6.
+    pub fn scaled(self, metres_per_unit: f64) -> Result<Self, IngestError> {
+        if !(1e-6..=1e6).contains(&metres_per_unit) {
+            let reason = "a scale is from 1e-6 to 1e6 metres per unit".to_owned();
+            return Err(frame_error("--scale", format!("{metres_per_unit:?}"), reason));
+        }
+        Ok(Self { metres_per_unit, ..self })
+    }
+
+    /// Takes directions in the twin to the file's axes: orthonormal.
+    pub fn file_from_twin(&self) -> DMat3 {
+        self.twin_from_file.transpose()
+    }
+
+    /// Turns and then scales Gaussians in place. The identity changes no bit.
+    ///
+    /// A mirror turns each ellipsoid as its rotation `-M` does, for an ellipsoid equals its own
+    /// reflection through its centre; the colours follow `M` itself.
+    pub fn apply(&self, gaussians: &mut Gaussians) {
+        if self.twin_from_file != DMat3::IDENTITY {
+            self.turn(gaussians);
+        }
+        if self.metres_per_unit != 1.0 {
+            let ln = self.metres_per_unit.ln();
+            for mean in &mut gaussians.means_m {
+                *mean = mean.map(|m| m * self.metres_per_unit);
+            }
+            for scale in &mut gaussians.ln_scales {
+                *scale = scale.map(|s| (f64::from(s) + ln) as f32);
+            }
+        }
+    }
+
+    fn turn(&self, gaussians: &mut Gaussians) {
+        let matrix = self.twin_from_file;
+        for mean in &mut gaussians.means_m {
+            *mean = (matrix * DVec3::from_array(*mean)).to_array();
+        }
+        let rotation = DQuat::from_mat3(&if matrix.determinant() < 0.0 { -matrix } else { matrix });
+        for quat in &mut gaussians.quats_wxyz {
+            let [w, x, y, z] = quat.map(f64::from);
+            let turned = rotation * DQuat::from_xyzw(x, y, z, w);
+            *quat = [turned.w, turned.x, turned.y, turned.z].map(|q| q as f32);
+        }
+        let turn = sh::Turn::new(matrix, gaussians.sh_degree);
+        for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
+            turn.apply(colour);
+        }
+    }
+}
+
+impl FromStr for Axes {
+    type Err = IngestError;
+
+    /// A preset's name, or nine numbers of the matrix, row by row, with commas or spaces between.
+    fn from_str(text: &str) -> Result<Self, IngestError> {
+        if let Some((_, _, rows)) = PRESETS.iter().find(|(name, ..)| *name == text) {
+            return Self::from_rows(*rows);
+        }
+        let words = text.split([',', ' ']).filter(|word| !word.is_empty());
+        let numbers: Result<Vec<f64>, _> = words.map(str::parse).collect();
+        match numbers.as_deref() {
+            Ok(&[a, b, c, d, e, f, g, h, i]) => {
+                Self::orthonormal([[a, b, c], [d, e, f], [g, h, i]])
+                    .ok_or_else(|| stretched(text.to_owned()))
+            }
+            _ => {
+                let presets: Vec<_> =
+                    PRESETS.iter().map(|(name, what, _)| format!("{name} ({what})")).collect();
+                let presets = presets.join("; ");
+                let reason = format!("expected nine numbers, row by row, or one of {presets}");
+                Err(frame_error("--axes", text.to_owned(), reason))
+            }
+        }
+    }
+}
+
+fn stretched(given: String) -> IngestError {
+    let reason = "the rows of the matrix must be of length 1 and at right angles; lengths belong \
+                  into --scale";
+    frame_error("--axes", given, reason.into())
+}
+
+fn frame_error(option: &'static str, given: String, reason: String) -> IngestError {
+    IngestError::Frame { option, given, reason }
+}

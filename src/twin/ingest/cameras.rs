@@ -1,0 +1,203 @@
+//! Camera lists: JSON files of views in the scene's own axes.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use glam::{DMat3, DQuat};
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+
+use crate::limits;
+use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
+use wildcity_scene::geometry::{Camera, CameraError, Pose, PoseError};
+
+use super::file::{self, FileError};
+use wildcity_scene::rig::MAX_NAME_BYTES;
+
+/// A camera of a list.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ListedCamera {
+    /// Its name, which becomes part of file names.
+    pub name: String,
+    /// Size and intrinsics.
+    pub camera: Camera,
+    /// Where it stands, in the axes and units of the scene.
+    pub world_from_camera: Pose,
+    /// Nearest z that it draws, if the list says so, in units of the scene.
+    pub near: Option<f64>,
+}
+
+/// Why a camera list was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum CamerasError {
+    /// It cannot be read, is no regular file, or is larger than any list should be.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Not the JSON that is asked for.
+    #[error(
+        "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
+         fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
+    )]
+    Json(serde_json::Error),
+    /// There is no camera in it.
+    #[error("the camera list is empty")]
+    Empty,
+    /// A name that cannot be part of a file name, or comes twice.
+    #[error("camera {index}: name {name:?} {must}")]
+    Name {
+        /// Which camera, from 0.
+        index: usize,
+        /// The refused name.
+        name: String,
+        /// What must hold instead.
+        must: &'static str,
+    },
+    /// Neither `position` nor `position_ply`, or both.
+    #[error("camera {name:?}: give either position or position_ply")]
+    Position {
+        /// The camera.
+        name: String,
+    },
+    /// The matrix is a rotation with a mirror.
+    #[error("camera {name:?}: R_world_to_cam is a mirror; flip one of its axes")]
+    Mirror {
+        /// The camera.
+        name: String,
+    },
+    /// The matrix is not a rotation.
+    #[error(
+        "camera {name:?}: R_world_to_cam is no rotation (rows off by {error:.1e} from orthonormal, \
+         determinant {determinant:.3})"
+    )]
+    Rotation {
+        /// The camera.
+        name: String,
+        /// Largest entry of R Rᵀ - I.
+        error: f64,
+        /// Its determinant.
+        determinant: f64,
+    },
+    /// The position cannot be used.
+    #[error("camera {name:?}: {cause}")]
+    Pose {
+        /// The camera.
+        name: String,
+        /// What is wrong.
+        cause: PoseError,
+    },
+    /// What only cameras of a rig have.
+    #[error(
+        "camera {name:?}: a camera list has no {field}: its cameras are at rest, and drawn as they \
+         are; leave {field} out, or mount the camera on a rig"
+    )]
+    OfRigs {
+        /// The camera.
+        name: String,
+        /// `shutter`, `exposure` or `overlay`.
+        field: &'static str,
+    },
+    /// The size or an intrinsic cannot be used.
+    #[error("camera {name:?}: {cause}")]
+    Camera {
+        /// The camera.
+        name: String,
+        /// What is wrong.
+        cause: CameraError,
+    },
+}
+
+const NAME_RULE: &str = "must be 1 to 64 of A-Z a-z 0-9 . _ -, not starting with .";
+
+/// One entry, as written; fields that are not named here are somebody else's notes.
+#[derive(Deserialize)]
+struct Entry {
+    name: String,
+    width: u64,
+    height: u64,
+    fx: Option<f64>,
+    fy: Option<f64>,
+    cx: f64,
+    cy: f64,
+    lens: Option<LensFields>,
+    windshield: Option<WindshieldFields>,
+    shutter: Option<IgnoredAny>,
+    exposure: Option<IgnoredAny>,
+    overlay: Option<IgnoredAny>,
+    near: Option<f64>,
+    position: Option<[f64; 3]>,
+    position_ply: Option<[f64; 3]>,
+    #[serde(rename = "R_world_to_cam")]
+    rotation: [[f64; 3]; 3],
+}
+
+/// Reads a camera list.
+///
+/// A camera's axes are x right, y down, z forward: `p_camera = R_world_to_cam (p - position)`.
+///
+/// # Errors
+/// Names the camera and the field at fault.
+pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
+    let text = file::read_whole(path, limits::CAMERA_LIST_BYTES)?;
+    let one_or_many = match text.trim_ascii_start().first() {
+        Some(b'{') => serde_json::from_slice(&text).map(|entry| vec![entry]),
+        _ => serde_json::from_slice(&text),
+    };
+    let entries: Vec<Entry> = one_or_many.map_err(CamerasError::Json)?;
+    if entries.is_empty() {
+        return Err(CamerasError::Empty);
+    }
+    let mut cameras = Vec::with_capacity(entries.len());
+    let mut names = BTreeSet::new();
+    for (index, entry) in entries.into_iter().enumerate() {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+        let usable = (1..=MAX_NAME_BYTES).contains(&entry.name.len())
+            && entry.name.chars().all(allowed)
+            && !entry.name.starts_with('.');
+        let twice = !names.insert(entry.name.clone());
+        if !usable || twice {
+            let must = if twice { "comes twice" } else { NAME_RULE };
+            return Err(CamerasError::Name { index, name: entry.name, must });
+        }
+        cameras.push(check(entry)?);
+    }
+    Ok(cameras)
+}
+
+fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
+    let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, .. } = entry;
+    let of_rigs = [
+        ("shutter", entry.shutter.is_some()),
+        ("exposure", entry.exposure.is_some()),
+        ("overlay", entry.overlay.is_some()),
+    ];
+    if let Some((field, _)) = of_rigs.into_iter().find(|(_, given)| *given) {
+        return Err(CamerasError::OfRigs { name, field });
+    }
+    let position = match (entry.position, entry.position_ply) {
+        (Some(position), None) | (None, Some(position)) => position,
+        _ => return Err(CamerasError::Position { name }),
+    };
+    // glam's columns are the file's rows, so this is the inverse: world_from_camera.
+    let rotation = DMat3::from_cols_array_2d(&entry.rotation);
+    let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
+    let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
+    let determinant = rotation.determinant();
+    let is_orthonormal = error <= 1e-4;
+    if is_orthonormal && determinant < 0.0 {
+        return Err(CamerasError::Mirror { name });
+    }
+    if !is_orthonormal {
+        return Err(CamerasError::Rotation { name, error, determinant });
+    }
+    let rotation = DQuat::from_mat3(&rotation).normalize();
+    let q = [rotation.w, rotation.x, rotation.y, rotation.z];
+    let pose = Pose::checked(position, q);
+    let world_from_camera =
+        pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
+    let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
+    let (focal_px, center_px) = ([fx, fy], [cx, cy]);
+    let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
+    let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
+    let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
+    Ok(ListedCamera { name, camera, world_from_camera, near })
+}

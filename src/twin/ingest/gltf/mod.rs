@@ -1,0 +1,219 @@
+//! glTF and GLB with KHR_gaussian_splatting.
+//!
+//! Source: the extension's text in KhronosGroup/glTF. Every primitive that has the extension is
+//! read, where its nodes put it: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1) and
+//! SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in earlier
+//! drafts it was its logarithm, which is told by what no standard deviation is: negative. Kernel,
+//! colour space, projection and sorting are not looked at, as the extension allows: the trainer's
+//! are the render profile's.
+//!
+//! A scene without splats is read as what it is: its triangles are covered with flat Gaussians
+//! (`mesh.rs`). The gltf crate keeps only attributes that glTF itself knows, so the document of splats is
+//! our own.
+
+mod accessor;
+mod document;
+mod mesh;
+mod place;
+
+use std::collections::BTreeMap;
+
+use data_encoding::BASE64;
+
+use crate::limits;
+use wildcity_scene::{Gaussians, sh};
+
+use super::parts::Parts;
+use super::validate::{self, Field};
+use super::{IngestError, activated, check_count, joined};
+use accessor::Column;
+use document::{Document, Primitive};
+
+const FORMAT: &str = "glTF";
+const EXTENSION: &str = "KHR_gaussian_splatting";
+
+/// Whether JSON is glTF: all glTF has an asset.
+pub(super) fn is_likely(json: &[u8]) -> bool {
+    #[derive(serde::Deserialize)]
+    struct Kind {
+        asset: Option<Asset>,
+        meshes: Option<serde::de::IgnoredAny>,
+    }
+    #[derive(serde::Deserialize)]
+    struct Asset {
+        version: Option<serde::de::IgnoredAny>,
+    }
+    let kind = serde_json::from_slice::<Kind>(json);
+    // SOG has an asset too, but neither meshes nor a version of that.
+    kind.is_ok_and(|kind| kind.meshes.is_some() || kind.asset.is_some_and(|a| a.version.is_some()))
+}
+
+/// Reads a binary glTF file, held whole.
+pub(super) fn read_glb(file: &[u8], parts: &mut dyn Parts) -> Result<Gaussians, IngestError> {
+    const JSON: u32 = u32::from_le_bytes(*b"JSON");
+    const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
+    let words: Vec<u32> =
+        file.as_chunks().0.iter().take(3).map(|&word| u32::from_le_bytes(word)).collect();
+    let &[_, version, length] = &words[..] else {
+        return Err(bad("the first 12 bytes", "there are fewer".into()));
+    };
+    if version != 2 {
+        return Err(bad("bytes 4 to 7", format!("version {version}; 2 is read")));
+    }
+    if length as usize != file.len() {
+        let (promised, held) = (length.into(), file.len() as u128);
+        return Err(IngestError::Size { format: FORMAT, promised, held, content: "all".into() });
+    }
+    let (mut json, mut buffer, mut rest) = (None, None, &file[12..]);
+    while let Some((head, after)) = rest.split_first_chunk::<8>() {
+        let [length, kind] = [0, 4]
+            .map(|at| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]));
+        let Some((chunk, after)) = after.split_at_checked(length as usize) else {
+            let (promised, held) = (length.into(), after.len() as u128);
+            let content = "a chunk".into();
+            return Err(IngestError::Size { format: FORMAT, promised, held, content });
+        };
+        match kind {
+            JSON => json = json.or(Some(chunk)),
+            BIN => buffer = buffer.or(Some(chunk)),
+            _ => (),
+        }
+        rest = after;
+    }
+    let json = json.ok_or_else(|| bad("chunks", "there is no chunk JSON".into()))?;
+    read(json, buffer, parts)
+}
+
+/// Reads a document, with the buffer that a GLB file brings.
+pub(super) fn read(
+    json: &[u8],
+    own_buffer: Option<&[u8]>,
+    parts: &mut dyn Parts,
+) -> Result<Gaussians, IngestError> {
+    let document: Document =
+        serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
+    let mut fetched = Vec::new();
+    for (index, buffer) in document.buffers.iter().enumerate() {
+        fetched.push(match &buffer.uri {
+            Some(uri) => Some(fetch(uri, &format!("buffer {index}"), parts)?),
+            None => None,
+        });
+    }
+    let mut buffers: Vec<&[u8]> = Vec::new();
+    for (index, (bytes, buffer)) in fetched.iter().zip(&document.buffers).enumerate() {
+        let bytes = bytes.as_deref().or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
+        let Some(bytes) = bytes.get(..buffer.byte_length as usize) else {
+            let (promised, held) = (buffer.byte_length.into(), bytes.len() as u128);
+            let content = format!("buffer {index}");
+            return Err(IngestError::Size { format: FORMAT, promised, held, content });
+        };
+        buffers.push(bytes);
+    }
+    let mut all = Gaussians::default();
+    let mut found = false;
+    let placed = place::meshes(&document)?;
+    for placed in &placed {
+        for (index, primitive) in placed.mesh.primitives.iter().enumerate() {
+            if !primitive.extensions.contains_key(EXTENSION) {
+                continue;
+            }
+            found = true;
+            let place = format!("node {}, primitive {index}", placed.node);
+            let mut part = read_primitive(&document, &buffers, primitive, &place, parts)?;
+            placed.apply(&mut part)?;
+            joined::append(&mut all, &part, 0..part.len());
+            check_count(all.len() as u64)?;
+        }
+    }
+    if !found {
+        all = mesh::read(json, &placed, &buffers, parts)?;
+    }
+    validate::check(&all, &Field::plain_name)?;
+    Ok(all)
+}
+
+/// The bytes of what is not in the GLB file.
+fn fetch(uri: &str, place: &str, parts: &mut dyn Parts) -> Result<Vec<u8>, IngestError> {
+    if !uri.starts_with("data:") {
+        return parts.read(uri, limits::SCENE_PART_BYTES);
+    }
+    let (_, text) = uri
+        .split_once(";base64,")
+        .ok_or_else(|| bad(place, "its data URI has no \";base64,\"".into()))?;
+    BASE64.decode(text.as_bytes()).map_err(|e| bad(place, format!("its base64: {e}")))
+}
+
+/// Reads one primitive in its own axes.
+fn read_primitive(
+    document: &Document,
+    buffers: &[&[u8]],
+    primitive: &Primitive,
+    place: &str,
+    parts: &mut dyn Parts,
+) -> Result<Gaussians, IngestError> {
+    if let Some(packed) = primitive.packed_by() {
+        return Err(bad(place, format!("is packed by {packed}; export it without")));
+    }
+    let column = |name: &str, width: usize| {
+        let index = primitive.attributes.get(name);
+        let index = *index.ok_or_else(|| bad(place, format!("has no attribute {name}")))?;
+        Column::find(document, buffers, index, width)
+            .map_err(|reason| bad(&format!("{place}, {name}"), reason))
+    };
+    let own = |name: &str, width: usize| column(&format!("{EXTENSION}:{name}"), width);
+    let positions = column("POSITION", 3)?;
+    let (rotations, scales, opacities) =
+        (own("ROTATION", 4)?, own("SCALE", 3)?, own("OPACITY", 1)?);
+    let sh_degree = degree(&primitive.attributes);
+    let mut colours = Vec::new();
+    for (degree, n) in (0..=sh_degree.unwrap_or(0)).flat_map(|l| (0..=2 * l).map(move |n| (l, n))) {
+        match sh_degree {
+            Some(_) => colours.push(own(&format!("SH_DEGREE_{degree}_COEF_{n}"), 3)?),
+            None => colours.push(column("COLOR_0", 3).or_else(|_| column("COLOR_0", 4))?),
+        }
+    }
+    let count = positions.count;
+    for column in [&rotations, &scales, &opacities].into_iter().chain(&colours) {
+        if column.count != count {
+            let reason = format!("{} of an attribute for {count} positions", column.count);
+            return Err(bad(place, reason));
+        }
+    }
+    // Nodes may show one mesh many times: that is unpacking, too.
+    let sh_degree_held = sh_degree.unwrap_or(0);
+    let row_bytes = 56 + 12 * sh::coefficients(sh_degree_held) as u128;
+    parts.budget().unpack(FORMAT, place, row_bytes * count as u128)?;
+    let mut g = Gaussians::with_capacity(sh_degree_held, check_count(count as u64)?);
+    g.means_m.extend((0..count).map(|i| positions.row::<3>(i)));
+    g.quats_wxyz.extend((0..count).map(|i| {
+        let [x, y, z, w] = rotations.row::<4>(i).map(|q| q as f32);
+        [w, x, y, z]
+    }));
+    let is_negative = |i: &usize| scales.row::<3>(*i).iter().any(|&s| s < 0.0);
+    // Of logarithms nearly all are negative; of standard deviations none, but for damage.
+    let are_logarithms = (0..count).filter(is_negative).count() * 10 > count;
+    g.ln_scales.extend((0..count).map(|i| {
+        scales.row::<3>(i).map(|s| if are_logarithms { s as f32 } else { activated::ln_scale(s) })
+    }));
+    g.logit_opacities.extend((0..count).map(|i| activated::logit(opacities.row::<1>(i)[0])));
+    for i in 0..count {
+        for colour in &colours {
+            let rgb = colour.row::<3>(i);
+            g.sh.extend(rgb.map(|c| if sh_degree.is_some() { c as f32 } else { activated::dc(c) }));
+        }
+    }
+    Ok(g)
+}
+
+/// The highest SH degree of which there is an attribute.
+fn degree(attributes: &BTreeMap<String, usize>) -> Option<u8> {
+    let has = |l: &u8| {
+        let prefix = format!("{EXTENSION}:SH_DEGREE_{l}_");
+        attributes.keys().any(|name| name.starts_with(&prefix))
+    };
+    (0..=sh::MAX_DEGREE).rev().find(has)
+}
+
+fn bad(place: &str, reason: String) -> IngestError {
+    IngestError::Header { format: FORMAT, place: place.into(), reason }
+}

@@ -1,0 +1,156 @@
+//! MessagePack, as far as NuRec uses it.
+//!
+//! Source: the format's specification, msgpack.org. Values point into the bytes they come from.
+
+use crate::limits;
+
+/// A value; what nobody asks for is `Other`.
+#[derive(Debug)]
+pub(super) enum Value<'a> {
+    Map(Vec<(Value<'a>, Value<'a>)>),
+    Array(Vec<Value<'a>>),
+    Text(&'a str),
+    Bytes(&'a [u8]),
+    Count(u64),
+    Other,
+}
+
+/// Maps and arrays within each other.
+const MAX_DEPTH: usize = 32;
+
+/// Parses one value that is all of the bytes; or why not.
+pub(super) fn parse(bytes: &[u8]) -> Result<Value<'_>, String> {
+    let mut parser = Parser { bytes, at: 0, values: 0 };
+    let value = parser.value(0)?;
+    if parser.at != bytes.len() {
+        return Err(format!("{} bytes, but the value ends at {}", bytes.len(), parser.at));
+    }
+    Ok(value)
+}
+
+impl<'a> Value<'a> {
+    /// What a map has under a name.
+    pub(super) fn get(&self, name: &str) -> Option<&Value<'a>> {
+        let Value::Map(entries) = self else { return None };
+        entries
+            .iter()
+            .find(|(key, _)| matches!(key, Value::Text(key) if *key == name))
+            .map(|e| &e.1)
+    }
+
+    /// The names of a map.
+    pub(super) fn keys(&self) -> impl Iterator<Item = &'a str> {
+        let entries = if let Value::Map(entries) = self { &entries[..] } else { &[] };
+        entries
+            .iter()
+            .filter_map(|(key, _)| if let Value::Text(key) = key { Some(*key) } else { None })
+    }
+
+    pub(super) fn as_usize(&self) -> Option<usize> {
+        if let Value::Count(count) = self { usize::try_from(*count).ok() } else { None }
+    }
+}
+
+struct Parser<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    values: usize,
+}
+
+impl<'a> Parser<'a> {
+    fn value(&mut self, depth: usize) -> Result<Value<'a>, String> {
+        self.values += 1;
+        if depth > MAX_DEPTH {
+            return Err(format!("byte {}: more than {MAX_DEPTH} values in each other", self.at));
+        }
+        if self.values > limits::NUREC_VALUES {
+            return Err(format!("more than {} values", limits::NUREC_VALUES));
+        }
+        let start = self.at;
+        let kind = self.number(1)?;
+        Ok(match kind {
+            0x00..=0x7f => Value::Count(kind),
+            0x80..=0x8f => self.map(kind & 0x0f, depth)?,
+            0x90..=0x9f => self.array(kind & 0x0f, depth)?,
+            0xa0..=0xbf => self.text(kind & 0x1f)?,
+            // nil, false, true; small negative numbers.
+            0xc0 | 0xc2 | 0xc3 | 0xe0..=0xff => Value::Other,
+            0xc4..=0xc6 => {
+                let length = self.number(1 << (kind - 0xc4))?;
+                Value::Bytes(self.take(length)?)
+            }
+            // Extensions have a byte of type more.
+            0xc7..=0xc9 => {
+                let length = self.number(1 << (kind - 0xc7))?;
+                self.skip(length.saturating_add(1))?
+            }
+            0xca => self.skip(4)?,
+            0xcb => self.skip(8)?,
+            0xcc..=0xcf => Value::Count(self.number(1 << (kind - 0xcc))?),
+            0xd0..=0xd3 => {
+                let bytes = 1 << (kind - 0xd0);
+                let number = self.number(bytes)?;
+                if number >> (8 * bytes - 1) == 0 { Value::Count(number) } else { Value::Other }
+            }
+            0xd4..=0xd8 => self.skip((1 << (kind - 0xd4)) + 1)?,
+            0xd9..=0xdb => {
+                let length = self.number(1 << (kind - 0xd9))?;
+                self.text(length)?
+            }
+            0xdc | 0xdd => {
+                let length = self.number(2 << (kind - 0xdc))?;
+                self.array(length, depth)?
+            }
+            0xde | 0xdf => {
+                let length = self.number(2 << (kind - 0xde))?;
+                self.map(length, depth)?
+            }
+            _ => return Err(format!("byte {start}: {kind:#x} begins no value")),
+        })
+    }
+
+    // Lengths are what a file claims: nothing is reserved by them.
+
+    fn map(&mut self, length: u64, depth: usize) -> Result<Value<'a>, String> {
+        let mut entries = Vec::new();
+        for _ in 0..length {
+            let key = self.value(depth + 1)?;
+            entries.push((key, self.value(depth + 1)?));
+        }
+        Ok(Value::Map(entries))
+    }
+
+    fn array(&mut self, length: u64, depth: usize) -> Result<Value<'a>, String> {
+        let mut values = Vec::new();
+        for _ in 0..length {
+            values.push(self.value(depth + 1)?);
+        }
+        Ok(Value::Array(values))
+    }
+
+    fn text(&mut self, length: u64) -> Result<Value<'a>, String> {
+        let start = self.at;
+        let bytes = self.take(length)?;
+        let text = std::str::from_utf8(bytes);
+        text.map(Value::Text).map_err(|e| format!("byte {start}: a text is no UTF-8: {e}"))
+    }
+
+    fn skip(&mut self, length: u64) -> Result<Value<'a>, String> {
+        self.take(length).map(|_| Value::Other)
+    }
+
+    /// An unsigned number, its most significant byte first.
+    fn number(&mut self, bytes: u64) -> Result<u64, String> {
+        Ok(self.take(bytes)?.iter().fold(0, |number, &byte| number << 8 | u64::from(byte)))
+    }
+
+    fn take(&mut self, length: u64) -> Result<&'a [u8], String> {
+        let left = &self.bytes[self.at..];
+        let taken = usize::try_from(length).ok().and_then(|length| left.get(..length));
+        let taken = taken.ok_or_else(|| {
+            format!("byte {}: {length} bytes are wanted, {} are left", self.at, left.len())
+        })?;
+        self.at += taken.len();
+        Ok(taken)
+    }
+}

@@ -1,0 +1,145 @@
+//! PLY as PlayCanvas compresses it: 16 bytes per Gaussian, in chunks of 256 with their extremes.
+//!
+//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has packed_position and
+//! packed_scale (11, 10, 11 bits from the top, between the chunk's extremes), packed_rotation (2
+//! bits for the largest component, 3 x 10 for the others) and packed_color (4 x 8: colour between
+//! the chunk's extremes, opacity). An element sh holds f_rest in 8 bits.
+
+use std::io::BufRead;
+
+use wildcity_scene::{Gaussians, sh};
+
+use super::header::{Element, Header, Property, error};
+use super::{Body, degree, file_name};
+use crate::ingest::activated;
+use crate::ingest::validate::{self, Field};
+use crate::ingest::{IngestError, Progress, check_count};
+
+/// Gaussians that share extremes.
+const CHUNK: usize = 256;
+
+/// Reads the body.
+pub(super) fn read(
+    input: impl BufRead,
+    header: &Header,
+    file_bytes: u64,
+    progress: Progress<'_>,
+) -> Result<Gaussians, IngestError> {
+    let (chunk, vertex, colour) = tables(header)?;
+    let sh_degree = colour.map_or(Ok(0), degree)?;
+    let extremes = Extremes::find(chunk)?;
+    let packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+    let packed = packed.map(|name| vertex.property(name).cloned());
+    let [position, rotation, scale, color] = packed;
+    let [position, rotation, scale, color] = [position?, rotation?, scale?, color?];
+    let rest = colour.map_or(Ok(Vec::new()), |colour| higher_degrees(colour, sh_degree))?;
+    header.check_size(file_bytes)?;
+    let count = check_count(vertex.count)?;
+
+    let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
+    let mut body = Body { input, done: header.bytes, file_bytes, progress };
+    body.rows(chunk, |row| chunks.push(extremes.value(row)))?;
+    let coefficients = sh::coefficients(sh_degree);
+    let mut gaussians = Gaussians::with_capacity(sh_degree, count);
+    body.rows(vertex, |row| {
+        let word = |property: &Property| property.value(row) as u32;
+        let [low, high] = chunks[gaussians.len() / CHUNK];
+        let between = |first: usize, unit: [f64; 3]| -> [f64; 3] {
+            let mix = |i| low[first + i] + (high[first + i] - low[first + i]) * unit[i];
+            std::array::from_fn(mix)
+        };
+        gaussians.means_m.push(between(0, unpack_11_10_11(word(&position))));
+        gaussians.quats_wxyz.push(unpack_rotation(word(&rotation)));
+        let scale = between(3, unpack_11_10_11(word(&scale)));
+        gaussians.ln_scales.push(scale.map(|ln| ln as f32));
+        let [r, g, b, opacity] = word(&color).to_be_bytes().map(|byte| f64::from(byte) / 255.0);
+        gaussians.logit_opacities.push(activated::logit(opacity));
+        gaussians.sh.extend(between(6, [r, g, b]).map(activated::dc));
+        gaussians.sh.extend(std::iter::repeat_n(0.0, 3 * (coefficients - 1)));
+    })?;
+    if let Some(colour) = colour {
+        let mut sh = gaussians.sh.chunks_exact_mut(3 * coefficients);
+        body.rows(colour, |row| {
+            for (value, property) in sh.next().into_iter().flat_map(|s| &mut s[3..]).zip(&rest) {
+                *value = unpack_coefficient(property.value(row)) as f32;
+            }
+        })?;
+    }
+    validate::check(&gaussians, &|field| file_name(field, sh_degree))?;
+    Ok(gaussians)
+}
+
+/// Columns of the coefficients above degree 0, coefficient-major, then red, green, blue.
+fn higher_degrees(colour: &Element, sh_degree: u8) -> Result<Vec<Property>, IngestError> {
+    let rest = 1..sh::coefficients(sh_degree);
+    let rest = rest.flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
+    rest.map(|field| colour.property(&file_name(field, sh_degree)).cloned()).collect()
+}
+
+/// The tables chunk, vertex and, if there is one, sh, in that order and of fitting lengths.
+fn tables(header: &Header) -> Result<(&Element, &Element, Option<&Element>), IngestError> {
+    let bad = |reason: String| error("compressed elements".into(), reason);
+    let (chunk, vertex, colour) = match &header.elements[..] {
+        [chunk, vertex] => (chunk, vertex, None),
+        [chunk, vertex, colour] => (chunk, vertex, Some(colour)),
+        _ => return Err(bad("chunk, vertex and perhaps sh are expected".into())),
+    };
+    let names = [chunk.name.as_str(), &vertex.name, colour.map_or("sh", |sh| &sh.name)];
+    if names != ["chunk", "vertex", "sh"] {
+        return Err(bad(format!("{} must be chunk, vertex, sh", names.join(", "))));
+    }
+    if chunk.count != vertex.count.div_ceil(CHUNK as u64) {
+        let (chunks, count) = (chunk.count, vertex.count);
+        return Err(bad(format!("{chunks} chunks of {CHUNK} do not make {count} vertices")));
+    }
+    match colour {
+        Some(sh) if sh.count != vertex.count => {
+            Err(bad(format!("{} rows of sh for {} vertices", sh.count, vertex.count)))
+        }
+        _ => Ok((chunk, vertex, colour)),
+    }
+}
+
+/// Columns of a chunk's smallest and largest position, ln scale and colour, in that order.
+struct Extremes([Vec<Property>; 2]);
+
+impl Extremes {
+    fn find(chunk: &Element) -> Result<Self, IngestError> {
+        let fields = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
+        let find = |end: &str| {
+            let names = fields.iter().map(|field| format!("{end}_{field}"));
+            names.map(|name| chunk.property(&name).cloned()).collect::<Result<Vec<_>, _>>()
+        };
+        Ok(Self([find("min")?, find("max")?]))
+    }
+
+    fn value(&self, row: &[u8]) -> [[f64; 9]; 2] {
+        [0, 1].map(|end| std::array::from_fn(|i| self.0[end][i].value(row)))
+    }
+}
+
+/// A number of `bits` bits, shifted down to the bottom of `word`, as a fraction of its largest.
+fn unit(word: u32, bits: u32) -> f64 {
+    let largest = (1 << bits) - 1;
+    f64::from(word & largest) / f64::from(largest)
+}
+
+fn unpack_11_10_11(word: u32) -> [f64; 3] {
+    [unit(word >> 21, 11), unit(word >> 11, 10), unit(word, 11)]
+}
+
+/// The largest component is left out, so the others are within ±√½.
+fn unpack_rotation(word: u32) -> [f32; 4] {
+    let others = [20, 10, 0].map(|shift| (unit(word >> shift, 10) - 0.5) * 2f64.sqrt());
+    activated::quat_of_smallest_three((word >> 30) as usize, others)
+}
+
+/// 8 bits over [-4, 4]: the ends exactly, the others at the middle of their step.
+fn unpack_coefficient(byte: f64) -> f64 {
+    let unit = match byte {
+        0.0 => 0.0,
+        255.0 => 1.0,
+        byte => (byte + 0.5) / 256.0,
+    };
+    8.0 * (unit - 0.5)
+}

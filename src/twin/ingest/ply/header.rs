@@ -1,0 +1,200 @@
+//! The header of a binary PLY file.
+//!
+//! Source: Greg Turk, "The PLY Polygon File Format" (1994).
+
+use std::io::{BufRead, Read};
+
+use crate::ingest::IngestError;
+use crate::limits;
+
+/// What a header says.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Header {
+    /// In the order of the body.
+    pub(super) elements: Vec<Element>,
+    /// Where the body starts, in bytes.
+    pub(super) bytes: u64,
+}
+
+/// A table of the body.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Element {
+    pub(super) name: String,
+    pub(super) count: u64,
+    pub(super) properties: Vec<Property>,
+    /// Size of one row, in bytes.
+    pub(super) stride: usize,
+}
+
+/// A column of a table.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Property {
+    pub(super) name: String,
+    pub(super) scalar: Scalar,
+    /// Where in the row it starts, in bytes.
+    pub(super) offset: usize,
+}
+
+/// The type of a column, little-endian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Header {
+    /// Reads up to and with `end_header`, and no byte of the body.
+    pub(super) fn read(input: &mut impl BufRead) -> Result<Self, IngestError> {
+        let mut input = input.take(limits::PLY_HEADER_BYTES as u64);
+        let mut elements: Vec<Element> = Vec::new();
+        let (mut bytes, mut number, mut has_format) = (0, 0, false);
+        let mut line = Vec::new();
+        loop {
+            number += 1;
+            let bad = |reason: String| error(format!("line {number}"), reason);
+            line.clear();
+            bytes += input.read_until(b'\n', &mut line)? as u64;
+            if line.last() != Some(&b'\n') {
+                let limit = limits::PLY_HEADER_BYTES;
+                return Err(bad(format!(
+                    "the file or the limit of {limit} bytes ends before end_header"
+                )));
+            }
+            let text = std::str::from_utf8(&line).map_err(|_| bad("is not text".into()))?.trim();
+            let words: Vec<&str> = text.split_ascii_whitespace().collect();
+            match words[..] {
+                ["ply"] if number == 1 => {}
+                _ if number == 1 => return Err(bad(format!("{text:?} must be ply"))),
+                [] | ["comment" | "obj_info", ..] => {}
+                ["format", "binary_little_endian", "1.0"] => has_format = true,
+                ["format", ..] => {
+                    return Err(bad(format!("{text:?} must be format binary_little_endian 1.0")));
+                }
+                ["element", name, count] => {
+                    let count = count
+                        .parse()
+                        .map_err(|e| bad(format!("the count of {name}, {count:?}: {e}")))?;
+                    if elements.iter().any(|element| element.name == name) {
+                        return Err(bad(format!("element {name} occurs twice")));
+                    }
+                    elements.push(Element { name: name.to_owned(), count, ..Element::default() });
+                }
+                ["property", "list", ..] => {
+                    return Err(bad(format!("{text:?}: lists have no place among Gaussians")));
+                }
+                ["property", kind, name] => {
+                    let scalar = Scalar::parse(kind)
+                        .ok_or_else(|| bad(format!("{kind:?} is not a type of PLY")))?;
+                    let element = elements
+                        .last_mut()
+                        .ok_or_else(|| bad("a property comes after its element".into()))?;
+                    element.push(name, scalar).map_err(bad)?;
+                }
+                ["end_header"] => break,
+                _ => return Err(bad(format!("{text:?} means nothing in a header"))),
+            }
+        }
+        if !has_format {
+            let reason = "there is no line format binary_little_endian 1.0";
+            return Err(error("end".into(), reason.into()));
+        }
+        Ok(Self { elements, bytes })
+    }
+
+    /// An element by its name.
+    pub(super) fn element(&self, name: &str) -> Option<&Element> {
+        self.elements.iter().find(|element| element.name == name)
+    }
+
+    /// Checks the promise of the header against the file before anything is allocated for it.
+    pub(super) fn check_size(&self, file_bytes: u64) -> Result<(), IngestError> {
+        let size = |e: &Element| u128::from(e.count) * e.stride as u128;
+        let promised = self.elements.iter().map(size).sum();
+        let held = u128::from(file_bytes.saturating_sub(self.bytes));
+        if promised == held {
+            return Ok(());
+        }
+        let tables = self.elements.iter();
+        let content: Vec<_> =
+            tables.map(|e| format!("{} {} of {} bytes", e.count, e.name, e.stride)).collect();
+        let content = content.join(", ");
+        Err(IngestError::Size { format: "PLY", promised, held, content })
+    }
+}
+
+impl Element {
+    /// A column by its name.
+    pub(super) fn property(&self, name: &str) -> Result<&Property, IngestError> {
+        self.properties.iter().find(|property| property.name == name).ok_or_else(|| {
+            error(format!("element {}", self.name), format!("there is no property {name}"))
+        })
+    }
+
+    fn push(&mut self, name: &str, scalar: Scalar) -> Result<(), String> {
+        if self.properties.iter().any(|property| property.name == name) {
+            return Err(format!("property {name} occurs twice"));
+        }
+        self.properties.push(Property { name: name.to_owned(), scalar, offset: self.stride });
+        self.stride += scalar.bytes();
+        Ok(())
+    }
+}
+
+impl Property {
+    /// The value in a row, which has the stride of the element.
+    pub(super) fn value(&self, row: &[u8]) -> f64 {
+        /// # Panics
+        /// If the row is shorter than the element's stride.
+        fn at<const N: usize>(row: &[u8], offset: usize) -> [u8; N] {
+            let mut bytes = [0; N];
+            bytes.copy_from_slice(&row[offset..offset + N]);
+            bytes
+        }
+        match self.scalar {
+            Scalar::F32 => f32::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::F64 => f64::from_le_bytes(at(row, self.offset)),
+            Scalar::U8 => u8::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::I8 => i8::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::U16 => u16::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::I16 => i16::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::U32 => u32::from_le_bytes(at(row, self.offset)).into(),
+            Scalar::I32 => i32::from_le_bytes(at(row, self.offset)).into(),
+        }
+    }
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    const fn bytes(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+}
+
+/// An error of the header.
+pub(super) fn error(place: String, reason: String) -> IngestError {
+    IngestError::Header { format: "PLY", place, reason }
+}

@@ -1,0 +1,220 @@
+//! safetensors with the names of a gsplat checkpoint.
+//!
+//! means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3] and
+//! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. Tensors of
+//! other names are skipped.
+
+use std::io::{self, Read};
+
+use ::safetensors::Dtype;
+use ::safetensors::tensor::{Metadata, TensorInfo};
+
+use crate::limits;
+use wildcity_scene::{Gaussians, sh};
+
+use super::validate::{self, Field};
+use super::{IngestError, Progress, check_count};
+
+/// Reads a safetensors file of a known size, from front to back.
+pub(super) fn read(
+    mut input: impl Read,
+    file_bytes: u64,
+    progress: Progress<'_>,
+) -> Result<Gaussians, IngestError> {
+    let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
+    let mut plan = Plan::of(&metadata)?;
+    let coefficients = sh::coefficients(plan.sh_degree);
+    let mut gaussians = Gaussians::with_capacity(plan.sh_degree, plan.count);
+    gaussians.sh.resize(3 * coefficients * plan.count, 0.0);
+    let mut body = Body { input, body_start, done: body_start, file_bytes, progress };
+
+    plan.tensors.sort_by_key(|(_, tensor)| tensor.data_offsets);
+    for (column, tensor) in plan.tensors {
+        let g = &mut gaussians;
+        match column {
+            Column::Means => body.rows(tensor, |row| g.means_m.push(row))?,
+            Column::Quats => body.rows(tensor, |row| g.quats_wxyz.push(row.map(|q| q as f32)))?,
+            Column::Scales => body.rows(tensor, |row| g.ln_scales.push(row.map(|s| s as f32)))?,
+            Column::Opacities => body.rows(tensor, |[o]| g.logit_opacities.push(o as f32))?,
+            // Coefficient `first` to `first + of_tensor - 1` of each Gaussian, as in memory.
+            Column::Colours { first } => {
+                let of_tensor = tensor.shape[1];
+                let mut row = 0;
+                body.rows(tensor, |rgb: [f64; 3]| {
+                    let at = 3 * (row / of_tensor * coefficients + first + row % of_tensor);
+                    g.sh[at..at + 3].copy_from_slice(&rgb.map(|c| c as f32));
+                    row += 1;
+                })?;
+            }
+        }
+    }
+    (body.progress)(file_bytes, file_bytes);
+    let one_tensor = plan.one_tensor;
+    validate::check(&gaussians, &|field| file_name(field, one_tensor))?;
+    Ok(gaussians)
+}
+
+/// Reads the header and checks it against the size of the file. Offsets and shapes were checked
+/// against each other by the crate.
+fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u64), IngestError> {
+    let mut length = [0; 8];
+    input.read_exact(&mut length)?;
+    let length = u64::from_le_bytes(length);
+    let limit = limits::SAFETENSORS_HEADER_BYTES as u64;
+    if length > limit {
+        return Err(bad("length", format!("{length} bytes; at most {limit} are read")));
+    }
+    let mut header = vec![0; length as usize];
+    if input.read_exact(&mut header).is_err() {
+        return Err(bad("length", format!("{length} bytes do not fit a file of {file_bytes}")));
+    }
+    let metadata: Metadata =
+        serde_json::from_slice(&header).map_err(|e| bad("JSON", e.to_string()))?;
+    let promised = metadata.data_len() as u128;
+    let held = u128::from(file_bytes.saturating_sub(8 + length));
+    if promised != held {
+        let content = format!("{} tensors", metadata.offset_keys().len());
+        return Err(IngestError::Size { format: "safetensors", promised, held, content });
+    }
+    Ok((metadata, 8 + length))
+}
+
+/// The tensors to read, of shapes that fit each other.
+struct Plan<'a> {
+    count: usize,
+    sh_degree: u8,
+    tensors: Vec<(Column, &'a TensorInfo)>,
+    /// Whether all colours are in coeffs.
+    one_tensor: bool,
+}
+
+/// Where a tensor goes.
+enum Column {
+    Means,
+    Quats,
+    Scales,
+    Opacities,
+    /// From this coefficient on.
+    Colours {
+        first: usize,
+    },
+}
+
+impl<'a> Plan<'a> {
+    fn of(metadata: &'a Metadata) -> Result<Self, IngestError> {
+        let find = |name: &str| {
+            let missing = || bad(&format!("tensor {name}"), "is missing".into());
+            metadata.info(name).ok_or_else(missing)
+        };
+        let shaped = |name: &str, wanted: &[Option<usize>]| {
+            let info = find(name)?;
+            let is_float = info.dtype == Dtype::F32 || (info.dtype, name) == (Dtype::F64, "means");
+            if !is_float {
+                let wanted = if name == "means" { "F32 or F64" } else { "F32" };
+                let reason = format!("is {:?}; {wanted} is read", info.dtype);
+                return Err(bad(&format!("tensor {name}"), reason));
+            }
+            let fits = info.shape.len() == wanted.len()
+                && info.shape.iter().zip(wanted).all(|(&d, w)| w.is_none_or(|w| w == d));
+            if !fits {
+                let any = |w: &Option<usize>| w.map_or("any".into(), |w| w.to_string());
+                let wanted: Vec<_> = wanted.iter().map(any).collect();
+                let reason = format!("has shape {:?}, not [{}]", info.shape, wanted.join(", "));
+                return Err(bad(&format!("tensor {name}"), reason));
+            }
+            Ok(info)
+        };
+        let means = shaped("means", &[None, Some(3)])?;
+        let n = Some(means.shape[0]);
+        let one_tensor = metadata.info("sh0").is_none() && metadata.info("coeffs").is_some();
+        let colours = if one_tensor {
+            vec![shaped("coeffs", &[n, None, Some(3)])?]
+        } else {
+            let mut colours = vec![shaped("sh0", &[n, Some(1), Some(3)])?];
+            if metadata.info("shN").is_some() {
+                colours.push(shaped("shN", &[n, None, Some(3)])?);
+            }
+            colours
+        };
+        // Saturating: a shape with a zero may have any other length.
+        let coefficients = colours.iter().fold(0, |sum: usize, c| sum.saturating_add(c.shape[1]));
+        let sh_degree = (0..=sh::MAX_DEGREE).find(|&d| sh::coefficients(d) == coefficients);
+        let sh_degree = sh_degree.ok_or_else(|| {
+            let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };
+            let allowed = [1, 4, 9, 16].map(|k: usize| (k - before).to_string()).join(", ");
+            let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
+            bad(&format!("tensor {name}"), reason)
+        })?;
+        let mut tensors = vec![
+            (Column::Means, means),
+            (Column::Quats, shaped("quats", &[n, Some(4)])?),
+            (Column::Scales, shaped("scales", &[n, Some(3)])?),
+            (Column::Opacities, shaped("opacities", &[n])?),
+        ];
+        // coeffs and sh0 start at coefficient 0, shN at 1.
+        let colours = colours.into_iter().enumerate();
+        tensors.extend(colours.map(|(first, tensor)| (Column::Colours { first }, tensor)));
+        Ok(Self { count: check_count(means.shape[0] as u64)?, sh_degree, tensors, one_tensor })
+    }
+}
+
+/// The bytes after the header.
+struct Body<'a, R> {
+    input: R,
+    body_start: u64,
+    /// Bytes of the file that were read.
+    done: u64,
+    file_bytes: u64,
+    progress: Progress<'a>,
+}
+
+impl<R: Read> Body<'_, R> {
+    /// Hands a tensor to `take` in rows of `N`. It starts no earlier than the last one ended, since
+    /// tensors do not overlap; what lies between is skipped.
+    fn rows<const N: usize>(
+        &mut self,
+        tensor: &TensorInfo,
+        mut take: impl FnMut([f64; N]),
+    ) -> Result<(), IngestError> {
+        let (start, end) = tensor.data_offsets;
+        let between = (self.body_start + start as u64).saturating_sub(self.done);
+        self.done += io::copy(&mut (&mut self.input).take(between), &mut io::sink())?;
+        let is_f64 = tensor.dtype == Dtype::F64;
+        let mut row = vec![0; N * if is_f64 { 8 } else { 4 }];
+        for index in 0..(end - start) / row.len() {
+            self.input.read_exact(&mut row)?;
+            let (doubles, singles) = (row.as_chunks::<8>().0, row.as_chunks::<4>().0);
+            take(std::array::from_fn(|i| match is_f64 {
+                true => f64::from_le_bytes(doubles[i]),
+                false => f32::from_le_bytes(singles[i]).into(),
+            }));
+            self.done += row.len() as u64;
+            if index.is_multiple_of(REPORT_EVERY) {
+                (self.progress)(self.done, self.file_bytes);
+            }
+        }
+        (self.progress)(self.done, self.file_bytes);
+        Ok(())
+    }
+}
+
+/// Rows between two reports of progress.
+const REPORT_EVERY: usize = 65_536;
+
+/// What a safetensors file calls a field.
+fn file_name(field: Field, one_tensor: bool) -> String {
+    match field {
+        Field::Mean(axis) => format!("means[{axis}]"),
+        Field::Quat(i) => format!("quats[{i}]"),
+        Field::QuatLength => "length of quats".into(),
+        Field::Scale(axis) => format!("scales[{axis}]"),
+        Field::Opacity => "opacities".into(),
+        Field::Sh(k, channel) if one_tensor => format!("coeffs[{k}][{channel}]"),
+        Field::Sh(0, channel) => format!("sh0[0][{channel}]"),
+        Field::Sh(k, channel) => format!("shN[{}][{channel}]", k - 1),
+    }
+}
+
+fn bad(place: &str, reason: String) -> IngestError {
+    IngestError::Header { format: "safetensors", place: place.into(), reason }
+}

@@ -1,0 +1,123 @@
+//! WebP images whose pixels are numbers.
+
+use std::io::Cursor;
+
+use image_webp::WebPDecoder;
+
+use crate::ingest::IngestError;
+use crate::ingest::unpacked::Budget;
+use wildcity_scene::sh;
+
+use super::{FORMAT, body};
+
+/// A decoded image.
+pub(super) struct Image {
+    bytes: Vec<u8>,
+    /// Bytes of a pixel: 3, or 4 with alpha.
+    channels: usize,
+    size_px: [usize; 2],
+}
+
+impl Image {
+    /// Decodes a named image of at least so many pixels.
+    pub(super) fn decode(
+        (name, file): (String, Vec<u8>),
+        count: usize,
+        budget: &mut Budget,
+    ) -> Result<Self, IngestError> {
+        // The decoder would not miss what pads the end.
+        let promised = match file.as_slice() {
+            [b'R', b'I', b'F', b'F', a, b, c, d, ..] => {
+                8 + u64::from(u32::from_le_bytes([*a, *b, *c, *d]))
+            }
+            _ => 0,
+        };
+        let held = file.len() as u64;
+        if promised > held {
+            let reason = format!("{held} of {promised} bytes are there: it is truncated");
+            return Err(body(&name, reason));
+        }
+        let damaged = |e| body(&name, format!("is no sound WebP image: {e}; copy it again"));
+        let mut decoder = WebPDecoder::new(Cursor::new(file)).map_err(damaged)?;
+        if decoder.is_lossy() {
+            return Err(body(
+                &name,
+                "is lossy, which no number survives; encode it lossless".into(),
+            ));
+        }
+        let (width_px, height_px) = decoder.dimensions();
+        let size_px = [width_px as usize, height_px as usize];
+        let pixels = u128::from(width_px) * u128::from(height_px);
+        if pixels < count as u128 {
+            let reason = format!("{width_px}x{height_px} pixels for {count} Gaussians");
+            return Err(body(&name, reason));
+        }
+        // The decoder works on four bytes per pixel, whether there is alpha or not.
+        budget.unpack(FORMAT, &name, 4 * pixels)?;
+        let channels = if decoder.has_alpha() { 4 } else { 3 };
+        let mut bytes = vec![0; channels * size_px[0] * size_px[1]];
+        decoder.read_image(&mut bytes).map_err(damaged)?;
+        Ok(Self { bytes, channels, size_px })
+    }
+
+    /// The first so many pixels.
+    pub(super) fn pixels(&self, count: usize) -> impl Iterator<Item = [u8; 4]> {
+        self.bytes.chunks_exact(self.channels).take(count).map(|pixel| {
+            let alpha = pixel.get(3).copied().unwrap_or(255);
+            [pixel[0], pixel[1], pixel[2], alpha]
+        })
+    }
+}
+
+/// The colours of higher degrees that labels choose from.
+pub(super) struct Palette {
+    image: Image,
+    pub(super) sh_degree: u8,
+    /// Pixels of an entry: coefficients without the first.
+    coefficients: usize,
+    entries: usize,
+}
+
+/// Entries in a row of the image.
+const ENTRIES_PER_ROW: usize = 64;
+
+impl Palette {
+    /// Decodes an image of so many entries and such a degree, where that is known; the width says
+    /// the degree, too.
+    pub(super) fn decode(
+        part: (String, Vec<u8>),
+        entries: Option<u64>,
+        bands: Option<u8>,
+        budget: &mut Budget,
+    ) -> Result<Self, IngestError> {
+        let name = part.0.clone();
+        let image = Image::decode(part, 0, budget)?;
+        let [width_px, height_px] = image.size_px;
+        let wide = |d: &u8| ENTRIES_PER_ROW * (sh::coefficients(*d) - 1) == width_px;
+        let degree = (1..=sh::MAX_DEGREE).find(wide).filter(|d| bands.is_none_or(|b| b == *d));
+        let Some(sh_degree) = degree else {
+            let bands = bands.map_or(String::new(), |bands| format!(" for {bands} bands"));
+            let reason =
+                format!("is {width_px} pixels wide{bands}; 1, 2, 3 bands have 192, 512, 960");
+            return Err(body(&name, reason));
+        };
+        let held = ENTRIES_PER_ROW * height_px;
+        let entries = entries.unwrap_or(held as u64);
+        if entries > held as u64 {
+            return Err(body(&name, format!("has room for {held} entries, not for {entries}")));
+        }
+        let coefficients = sh::coefficients(sh_degree) - 1;
+        Ok(Self { image, sh_degree, coefficients, entries: entries as usize })
+    }
+
+    /// The bytes of an entry: coefficient-major, then red, green, blue.
+    pub(super) fn entry(&self, label: u16) -> Option<impl Iterator<Item = u8>> {
+        let (label, stride) = (usize::from(label), self.image.channels);
+        if label >= self.entries {
+            return None;
+        }
+        let start = label * self.coefficients * stride;
+        let pixels = &self.image.bytes[start..start + self.coefficients * stride];
+        Some(pixels.chunks_exact(stride).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]))
+    }
+}

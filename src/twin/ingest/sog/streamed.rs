@@ -1,0 +1,115 @@
+//! Streamed SOG: lod-meta.json and a SOG folder per block of every level of detail.
+//!
+//! Its tree has, at every leaf, one range of Gaussians per level, 0 being the finest. A twin makes
+//! levels of its own from the full detail, so the finest one of every leaf is read.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Deserialize;
+
+use crate::ingest::parts::Parts;
+use crate::ingest::{IngestError, check_count, joined};
+use crate::limits;
+use wildcity_scene::Gaussians;
+
+use super::{bad, read_one};
+
+const NAME: &str = "lod-meta.json";
+
+/// What lod-meta.json says; unknown keys are skipped.
+#[derive(Deserialize)]
+struct LodMeta {
+    version: Option<u32>,
+    /// Paths of a meta.json each.
+    filenames: Vec<String>,
+    /// One more, of what surrounds the scene.
+    environment: Option<String>,
+    tree: Node,
+}
+
+#[derive(Deserialize)]
+struct Node {
+    #[serde(default)]
+    children: Vec<Node>,
+    #[serde(default)]
+    lods: BTreeMap<u32, Place>,
+}
+
+/// Gaussians `offset` to `offset + count - 1` of a file.
+#[derive(Clone, Copy, Deserialize)]
+struct Place {
+    file: usize,
+    offset: u64,
+    count: u64,
+}
+
+/// Reads the finest level, and the environment behind it.
+pub(super) fn read(
+    json: &[u8],
+    folder: &str,
+    parts: &mut dyn Parts,
+) -> Result<Gaussians, IngestError> {
+    let meta: LodMeta = serde_json::from_slice(json).map_err(|e| bad(NAME, e.to_string()))?;
+    if let Some(version) = meta.version.filter(|&version| version != 1) {
+        return Err(bad(NAME, format!("version {version}; 1, with or without a number, is read")));
+    }
+    let mut names = BTreeSet::new();
+    if let Some(twice) = meta.filenames.iter().find(|name| !names.insert(name.as_str())) {
+        return Err(bad(NAME, format!("file {twice:?} is named twice")));
+    }
+    let places = places_by_file(&meta)?;
+    let total = places.values().flatten().map(|place| u128::from(place.count)).sum::<u128>();
+    check_count(u64::try_from(total).unwrap_or(u64::MAX))?;
+    let mut all = Gaussians::default();
+    for (file, places) in places {
+        let block = read_block(&meta.filenames[file], folder, parts)?;
+        for Place { offset, count, .. } in places {
+            let (held, end) = (block.len() as u64, offset.saturating_add(count));
+            if end > held {
+                let reason =
+                    format!("Gaussians to {end} of {:?}, which has {held}", meta.filenames[file]);
+                return Err(bad(NAME, reason));
+            }
+            joined::append(&mut all, &block, offset as usize..end as usize);
+        }
+    }
+    if let Some(environment) = &meta.environment {
+        let block = read_block(environment, folder, parts)?;
+        joined::append(&mut all, &block, 0..block.len());
+    }
+    Ok(all)
+}
+
+/// The finest ranges of every file, in order and apart from each other.
+fn places_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<Place>>, IngestError> {
+    let mut places: BTreeMap<usize, Vec<Place>> = BTreeMap::new();
+    let mut nodes = vec![&meta.tree];
+    while let Some(node) = nodes.pop() {
+        nodes.extend(&node.children);
+        if let Some(place) = node.lods.values().next() {
+            if place.file >= meta.filenames.len() {
+                let reason = format!("file {}; there are {}", place.file, meta.filenames.len());
+                return Err(bad(NAME, reason));
+            }
+            places.entry(place.file).or_default().push(*place);
+        }
+    }
+    for (file, places) in &mut places {
+        places.sort_by_key(|place| place.offset);
+        let apart =
+            places.windows(2).all(|w| w[0].offset.saturating_add(w[0].count) <= w[1].offset);
+        if !apart {
+            let reason =
+                format!("two leaves have the same Gaussians of {:?}", meta.filenames[*file]);
+            return Err(bad(NAME, reason));
+        }
+    }
+    Ok(places)
+}
+
+fn read_block(name: &str, folder: &str, parts: &mut dyn Parts) -> Result<Gaussians, IngestError> {
+    let path = format!("{folder}{name}");
+    let json = parts.read(&path, limits::SCENE_JSON_BYTES)?;
+    let folder = path.rfind('/').map_or("", |slash| &path[..=slash]);
+    read_one(&json, name, folder, parts)
+}

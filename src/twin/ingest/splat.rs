@@ -1,0 +1,62 @@
+//! `.splat`, the format of antimatter15's web viewer: records of 32 bytes, and nothing else.
+//!
+//! A record is position (3 f32), standard deviations (3 f32), colour and opacity (4 u8, of 255), and
+//! the rotation (w, x, y, z) as u8 around 128. No colour depends on the direction.
+
+use std::io::Read;
+
+use wildcity_scene::Gaussians;
+
+use super::validate::{self, Field};
+use super::{IngestError, activated, check_count};
+
+/// Bytes of a Gaussian.
+const RECORD_BYTES: usize = 32;
+
+/// Whether a file that starts so can be one: there is no magic number, but its first rotation is
+/// a unit quaternion, its position near and its scales positive. Text is none of these.
+pub(super) fn is_likely(start: &[u8]) -> bool {
+    start.first_chunk().is_some_and(|record| {
+        let [means_m, scales, ..] = numbers(record);
+        let length = quat_wxyz(record).iter().map(|q| q * q).sum::<f32>().sqrt();
+        means_m.iter().all(|m| m.abs() <= 1e8)
+            && scales.iter().all(|s| (0.0..=1e5).contains(s))
+            // Components are off by 1/256 at most, and 1 is stored as 127/128.
+            && (0.95..=1.05).contains(&length)
+    })
+}
+
+/// Reads a file of a known size.
+pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, IngestError> {
+    let count = file_bytes.div_ceil(RECORD_BYTES as u64);
+    let promised = u128::from(count) * RECORD_BYTES as u128;
+    if promised != u128::from(file_bytes) {
+        let content = format!("{count} records of {RECORD_BYTES} bytes");
+        let held = file_bytes.into();
+        return Err(IngestError::Size { format: ".splat", promised, held, content });
+    }
+    let mut gaussians = Gaussians::with_capacity(0, check_count(count)?);
+    let mut record = [0; RECORD_BYTES];
+    for _ in 0..count {
+        input.read_exact(&mut record)?;
+        let [means_m, scales] = numbers(&record);
+        gaussians.means_m.push(means_m.map(f64::from));
+        gaussians.ln_scales.push(scales.map(|s| activated::ln_scale(s.into())));
+        let [r, g, b, opacity] = [24, 25, 26, 27].map(|at| f64::from(record[at]) / 255.0);
+        gaussians.sh.extend([r, g, b].map(activated::dc));
+        gaussians.logit_opacities.push(activated::logit(opacity));
+        gaussians.quats_wxyz.push(quat_wxyz(&record));
+    }
+    validate::check(&gaussians, &Field::plain_name)?;
+    Ok(gaussians)
+}
+
+/// Position and scales.
+fn numbers(record: &[u8; RECORD_BYTES]) -> [[f32; 3]; 2] {
+    let words = record.as_chunks::<4>().0;
+    [0, 3].map(|first| std::array::from_fn(|i| f32::from_le_bytes(words[first + i])))
+}
+
+fn quat_wxyz(record: &[u8; RECORD_BYTES]) -> [f32; 4] {
+    [28, 29, 30, 31].map(|at| (f32::from(record[at]) - 128.0) / 128.0)
+}

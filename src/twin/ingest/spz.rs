@@ -1,0 +1,304 @@
+//! SPZ, Niantic's format: versions 2 and 3 in one gzip stream (or none), version 4 in zstd streams.
+//!
+//! Source: the format's description and headers in nianticlabs/spz. All versions hold the same
+//! attributes, each for all Gaussians, in the order of [`Payload`]: positions (3 x 24-bit fixed
+//! point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations and the
+//! higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green, blue).
+//! Version 4 has a header of 32 bytes that no compression hides, a table of the streams' sizes
+//! behind it, and between the two whatever extensions somebody added; those are skipped.
+
+use std::io::{self, BufRead, Read};
+
+use flate2::bufread::GzDecoder;
+
+use wildcity_scene::{Gaussians, sh};
+
+use super::validate::{self, Field};
+use super::{IngestError, activated, check_count, unpacked};
+
+const FORMAT: &str = "SPZ";
+/// "NGSP": Niantic's Gaussian splats.
+const MAGIC: [u8; 4] = *b"NGSP";
+/// Bytes of the header of versions 2 and 3.
+const HEADER_BYTES: u64 = 16;
+/// Bytes of version 4's, of which the last 16 begin with the place of the table of streams.
+const HEADER_4_BYTES: u64 = 32;
+/// Two u64 per stream: compressed and uncompressed bytes.
+const STREAM_ENTRY_BYTES: u64 = 16;
+/// Set if extensions lie before the table of version 4, or behind the payload of the others.
+const FLAG_EXTENSIONS: u8 = 2;
+/// What a colour of 0 to 1 was multiplied with, that brighter and darker ones fit a byte.
+const COLOUR_SCALE: f64 = 0.15;
+
+/// Reads a file that starts with the header, of a known size.
+pub(super) fn read(mut input: impl BufRead, file_bytes: u64) -> Result<Gaussians, IngestError> {
+    let header = Header::read(&mut input)?;
+    let count = header.count;
+    let attributes = header.attributes();
+    if header.version < 4 {
+        let promised = u128::from(HEADER_BYTES) + header.body_bytes();
+        let held = u128::from(file_bytes);
+        if header.flags & FLAG_EXTENSIONS == 0 && promised != held || promised > held {
+            let content = format!("{count} Gaussians of SH degree {}", header.sh_degree);
+            return Err(IngestError::Size { format: FORMAT, promised, held, content });
+        }
+        return decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take));
+    }
+    let streams = read_table(&mut input, &header, file_bytes)?;
+    decode(&header, |attribute, take| {
+        let attribute = &attributes[attribute];
+        let broken = |error: io::Error| attribute.broken(&error);
+        let mut packed = (&mut input).take(streams[attribute.index]);
+        let mut stream = zstd::Decoder::with_buffer(&mut packed).map_err(broken)?.single_frame();
+        attribute.rows(&mut stream, take)?;
+        let more = stream.read(&mut [0]).map_err(broken)? + packed.read(&mut [0])?;
+        if more > 0 {
+            return Err(body(attribute.name, "the stream is longer than its table says".into()));
+        }
+        Ok(())
+    })
+}
+
+/// Reads a gzip stream that holds versions 2 or 3, of a known compressed size.
+pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussians, IngestError> {
+    let mut input = GzDecoder::new(input);
+    let header = Header::read(&mut input)?;
+    if header.version > 3 {
+        let reason = format!("version {} within gzip; 2 and 3 are read so", header.version);
+        return Err(bad("bytes 4 to 7", reason));
+    }
+    let unpacked_bytes = u128::from(HEADER_BYTES) + header.body_bytes();
+    unpacked::check(FORMAT, "the gzip stream", file_bytes, unpacked_bytes)?;
+    let attributes = header.attributes();
+    let gaussians =
+        decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take))?;
+    // To the end, where the checksum is.
+    let limit = unpacked::limit_bytes(file_bytes);
+    let more = io::copy(&mut (&mut input).take(limit), &mut io::sink());
+    let more = more.map_err(|e| body("the end", format!("the gzip stream is damaged: {e}")))?;
+    if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
+        let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
+        return Err(body("the end", reason));
+    }
+    Ok(gaussians)
+}
+
+/// What all versions say first.
+struct Header {
+    version: u32,
+    count: u32,
+    sh_degree: u8,
+    fraction_bits: u8,
+    flags: u8,
+    /// Streams of version 4.
+    streams: u8,
+}
+
+impl Header {
+    fn read(input: &mut impl Read) -> Result<Self, IngestError> {
+        let mut bytes = [0; HEADER_BYTES as usize];
+        input.read_exact(&mut bytes).map_err(|e| bad("the first 16 bytes", e.to_string()))?;
+        let [magic, version, count, rest] = *bytes.as_chunks::<4>().0 else {
+            return Err(bad("the first 16 bytes", "there are fewer".into()));
+        };
+        if magic != MAGIC {
+            let reason = format!("{:?}, not \"NGSP\"", String::from_utf8_lossy(&magic));
+            return Err(bad("the first 4 bytes", reason));
+        }
+        let [sh_degree, fraction_bits, flags, streams] = rest;
+        let version = u32::from_le_bytes(version);
+        if !(2..=4).contains(&version) {
+            return Err(bad("bytes 4 to 7", format!("version {version}; 2, 3 and 4 are read")));
+        }
+        if sh_degree > sh::MAX_DEGREE {
+            return Err(bad("byte 12", format!("SH degree {sh_degree}; 0 to 3 are read")));
+        }
+        // A sign and 23 bits are all that a coordinate has.
+        if fraction_bits > 23 {
+            return Err(bad("byte 13", format!("{fraction_bits} fractional bits; 0 to 23 fit")));
+        }
+        let count = u32::from_le_bytes(count);
+        Ok(Self { version, count, sh_degree, fraction_bits, flags, streams })
+    }
+
+    /// The attributes in the order of the file.
+    fn attributes(&self) -> Vec<Attribute> {
+        let rotation_bytes = if self.version == 2 { 3 } else { 4 };
+        let sh_bytes = 3 * (sh::coefficients(self.sh_degree) - 1);
+        let attributes = [
+            ("positions", 9),
+            ("opacities", 1),
+            ("colours", 3),
+            ("scales", 3),
+            ("rotations", rotation_bytes),
+            ("colour coefficients", sh_bytes),
+        ];
+        let attributes = attributes.into_iter().enumerate().filter(|(_, (_, stride))| *stride > 0);
+        attributes
+            .map(|(index, (name, stride))| Attribute { index, name, stride, count: self.count })
+            .collect()
+    }
+
+    /// Bytes of all attributes.
+    fn body_bytes(&self) -> u128 {
+        self.attributes().iter().map(Attribute::bytes).sum()
+    }
+}
+
+/// One property of all Gaussians.
+struct Attribute {
+    index: usize,
+    name: &'static str,
+    stride: usize,
+    count: u32,
+}
+
+impl Attribute {
+    fn bytes(&self) -> u128 {
+        self.stride as u128 * u128::from(self.count)
+    }
+
+    /// Hands the rows to `take`, one after another.
+    fn rows(&self, input: &mut dyn Read, take: &mut dyn FnMut(&[u8])) -> Result<(), IngestError> {
+        let mut rows = vec![0; self.stride * ROWS_AT_ONCE];
+        let mut left = self.count as usize;
+        while left > 0 {
+            let rows = &mut rows[..self.stride * left.min(ROWS_AT_ONCE)];
+            input.read_exact(rows).map_err(|error| self.broken(&error))?;
+            rows.chunks_exact(self.stride).for_each(&mut *take);
+            left -= left.min(ROWS_AT_ONCE);
+        }
+        Ok(())
+    }
+
+    fn broken(&self, error: &io::Error) -> IngestError {
+        let reason = match error.kind() {
+            io::ErrorKind::UnexpectedEof => {
+                format!("the file ends before {} of them: it is truncated", self.count)
+            }
+            _ => format!("the compressed stream is damaged: {error}"),
+        };
+        body(self.name, reason)
+    }
+}
+
+/// Rows that are read at once.
+const ROWS_AT_ONCE: usize = 4096;
+
+/// Skips to version 4's table of streams and reads it: the compressed bytes of every attribute.
+fn read_table(
+    input: &mut impl Read,
+    header: &Header,
+    file_bytes: u64,
+) -> Result<Vec<u64>, IngestError> {
+    let attributes = header.attributes();
+    if usize::from(header.streams) != attributes.len() {
+        let (found, wanted) = (header.streams, attributes.len());
+        let degree = header.sh_degree;
+        return Err(bad("byte 15", format!("{found} streams; SH degree {degree} has {wanted}")));
+    }
+    let short = |e: io::Error| bad("the table of streams", e.to_string());
+    let mut rest = [0; (HEADER_4_BYTES - HEADER_BYTES) as usize];
+    input.read_exact(&mut rest).map_err(short)?;
+    let table_at = u64::from(u32::from_le_bytes([rest[0], rest[1], rest[2], rest[3]]));
+    let streams_at = table_at + STREAM_ENTRY_BYTES * attributes.len() as u64;
+    if table_at < HEADER_4_BYTES || streams_at > file_bytes {
+        let reason = format!("{table_at} is no place for the table within {file_bytes} bytes");
+        return Err(bad("bytes 16 to 19", reason));
+    }
+    io::copy(&mut input.take(table_at - HEADER_4_BYTES), &mut io::sink())?;
+    let mut packed = Vec::with_capacity(attributes.len());
+    for attribute in &attributes {
+        let mut entry = [0; STREAM_ENTRY_BYTES as usize];
+        input.read_exact(&mut entry).map_err(short)?;
+        let sizes = entry.as_chunks::<8>().0;
+        let (packed_bytes, bytes) = (u64::from_le_bytes(sizes[0]), u64::from_le_bytes(sizes[1]));
+        if u128::from(bytes) != attribute.bytes() {
+            let (wanted, count) = (attribute.bytes(), attribute.count);
+            let reason = format!("{bytes} bytes; {count} Gaussians have {wanted}");
+            return Err(bad(&format!("stream of {}", attribute.name), reason));
+        }
+        packed.push(packed_bytes);
+    }
+    let promised = packed.iter().map(|&bytes| u128::from(bytes)).sum();
+    let held = u128::from(file_bytes - streams_at);
+    if promised != held {
+        let content = format!("{} streams", packed.len());
+        return Err(IngestError::Size { format: FORMAT, promised, held, content });
+    }
+    unpacked::check(FORMAT, "the zstd streams", file_bytes, header.body_bytes())?;
+    Ok(packed)
+}
+
+/// Makes Gaussians of the attributes; `rows` hands all rows of one of them to its argument.
+fn decode(
+    header: &Header,
+    mut rows: impl FnMut(usize, &mut dyn FnMut(&[u8])) -> Result<(), IngestError>,
+) -> Result<Gaussians, IngestError> {
+    let count = check_count(header.count.into())?;
+    let mut gaussians = Gaussians::with_capacity(header.sh_degree, count);
+    let g = &mut gaussians;
+    let unit = |byte: u8| f64::from(byte) / 255.0;
+    let metres = f64::from(header.fraction_bits).exp2().recip();
+    rows(0, &mut |row| {
+        let fixed = |i: usize| {
+            // Into the upper three bytes, and back with the sign.
+            i32::from_le_bytes([0, row[3 * i], row[3 * i + 1], row[3 * i + 2]]) >> 8
+        };
+        g.means_m.push(std::array::from_fn(|i| f64::from(fixed(i)) * metres));
+    })?;
+    rows(1, &mut |row| g.logit_opacities.push(activated::logit(unit(row[0]))))?;
+    let stride = 3 * sh::coefficients(header.sh_degree);
+    g.sh.resize(stride * count, 0.0);
+    let mut colours = g.sh.chunks_exact_mut(stride);
+    rows(2, &mut |row| {
+        for (value, &byte) in colours.next().into_iter().flatten().zip(row) {
+            *value = ((unit(byte) - 0.5) / COLOUR_SCALE) as f32;
+        }
+    })?;
+    rows(3, &mut |row| {
+        g.ln_scales.push(std::array::from_fn(|i| f32::from(row[i]) / 16.0 - 10.0));
+    })?;
+    rows(4, &mut |row| {
+        g.quats_wxyz.push(match *row {
+            [x, y, z] => quat_of_xyz([x, y, z]),
+            _ => quat_of_word(row.first_chunk().map_or(0, |&word| u32::from_le_bytes(word))),
+        });
+    })?;
+    if header.sh_degree > 0 {
+        let mut colours = g.sh.chunks_exact_mut(stride);
+        rows(5, &mut |row| {
+            for (value, &byte) in colours.next().into_iter().flat_map(|c| &mut c[3..]).zip(row) {
+                *value = (f32::from(byte) - 128.0) / 128.0;
+            }
+        })?;
+    }
+    validate::check(&gaussians, &Field::plain_name)?;
+    Ok(gaussians)
+}
+
+/// Version 2: x, y, z around 127.5; w is what is left to length 1, and positive.
+fn quat_of_xyz(bytes: [u8; 3]) -> [f32; 4] {
+    let xyz = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
+    activated::quat_of_smallest_three(0, xyz)
+}
+
+/// Version 3: the place of the largest of (x, y, z, w) in the upper 2 bits, then sign and magnitude
+/// of the others, 1 + 9 bits each, of √½.
+fn quat_of_word(word: u32) -> [f32; 4] {
+    let others = [20, 10, 0].map(|shift| {
+        let bits = word >> shift;
+        let magnitude = f64::from(bits & 0x1ff) / f64::from(0x1ff) * 0.5f64.sqrt();
+        if bits & 0x200 == 0 { magnitude } else { -magnitude }
+    });
+    let [x, y, z, w] = activated::quat_of_smallest_three((word >> 30) as usize, others);
+    [w, x, y, z]
+}
+
+fn bad(place: &str, reason: String) -> IngestError {
+    IngestError::Header { format: FORMAT, place: place.into(), reason }
+}
+
+fn body(place: &str, reason: String) -> IngestError {
+    IngestError::Body { format: FORMAT, place: place.into(), reason }
+}

@@ -1,0 +1,465 @@
+//! The chunk object: one cell, all its blocks and levels of detail.
+//!
+//! ```text
+//! 0      magic "WILDCHNK", format u32, length of the table of contents u32, its BLAKE3, zeros
+//! 4096   table of contents (bincode), zeros up to a multiple of 4096
+//! ...    sections, coarse levels first: one level of one block each, so that the start of the
+//!        object holds whole levels. One that fits into the rest of a page lies there, any other
+//!        begins a page: no section touches more pages than it must.
+//! ```
+//!
+//! A section is one part after the other of up to 65,536 Gaussians: length u32, and that many bytes
+//! of zstd, of what `scene::record` says. Any section can be read, checked and decoded by itself.
+//!
+//! The tables of all chunks together are the table that a manifest names.
+
+use std::io::{self, Write};
+
+use bincode::config::Config;
+use bincode::{Decode, Encode};
+use glam::DVec3;
+
+use crate::limits;
+use wildcity_scene::chunk::{Chunk, LANES, Lanes, columns};
+use wildcity_scene::geometry::Bounds;
+use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_scene::record::{Clamped, PART, Record};
+
+const MAGIC: [u8; 8] = *b"WILDCHNK";
+/// The layout that this build reads and writes.
+pub(super) const FORMAT: u32 = 1;
+/// Sections that start on pages can be mapped and read past the cache.
+pub(super) const PAGE_BYTES: usize = 4096;
+/// Higher levels of zstd gain nothing on columns of noise and trends.
+const ZSTD_LEVEL: i32 = 1;
+
+/// A section before it has a place.
+#[derive(Debug)]
+pub(super) struct Packed {
+    section: Section,
+    bytes: Vec<u8>,
+    bounds: Bounds,
+}
+
+/// What a table says of one cell.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+struct Contents {
+    cell: [i32; 2],
+    origin_m: [f64; 3],
+    sh_degree: u8,
+    record: u8,
+    sections: Vec<Row>,
+}
+
+/// A [`Section`], on disk.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+struct Row {
+    block: u8,
+    level: u8,
+    count: u32,
+    error_m: f32,
+    min_m: [f32; 3],
+    max_m: [f32; 3],
+    offset_bytes: u64,
+    bytes: u32,
+    hash: [u8; 32],
+}
+
+/// Codes and compresses one level of one block.
+///
+/// # Errors
+/// More than 4 GiB: the block is denser than anything.
+pub(super) fn pack(
+    chunk: &Chunk,
+    [block, level]: [u8; 2],
+    error_m: f32,
+    record: Record,
+    clamped: &mut Clamped,
+) -> io::Result<Packed> {
+    let mut bytes = Vec::new();
+    for start in (0..chunk.len()).step_by(PART) {
+        let part = record.encode(chunk, start..chunk.len().min(start + PART), clamped);
+        let part = zstd::bulk::compress(&part, ZSTD_LEVEL)?;
+        bytes.extend((part.len() as u32).to_le_bytes());
+        bytes.extend(part);
+    }
+    let mut bounds = Bounds::EMPTY;
+    for index in 0..chunk.len() {
+        let mean_m = [0, 1, 2].map(|axis| f64::from(chunk.value(index, axis)));
+        bounds.add(DVec3::from_array(mean_m), chunk.reach_m(index));
+    }
+    let section = Section {
+        block,
+        level,
+        count: chunk.len() as u32,
+        error_m,
+        // Rounded outwards: nothing reaches beyond its box.
+        min_m: bounds.min_m.to_array().map(|m| (m as f32).next_down()),
+        max_m: bounds.max_m.to_array().map(|m| (m as f32).next_up()),
+        offset_bytes: 0,
+        bytes: u32::try_from(bytes.len()).map_err(io::Error::other)?,
+        hash: *blake3::hash(&bytes).as_bytes(),
+    };
+    Ok(Packed { section, bytes, bounds })
+}
+
+/// Writes the object of one cell. Returns what is in it, in order of (block, level), and the box of
+/// its Gaussians in the world.
+pub(super) fn write(
+    out: &mut dyn Write,
+    (cell, origin_m): ([i32; 2], DVec3),
+    sh_degree: u8,
+    record: Record,
+    mut packed: Vec<Packed>,
+) -> io::Result<(Vec<Section>, Bounds)> {
+    packed.sort_by_key(|packed| (std::cmp::Reverse(packed.section.level), packed.section.block));
+    let mut contents = Contents {
+        cell,
+        origin_m: origin_m.to_array(),
+        sh_degree,
+        record: record as u8,
+        sections: packed.iter().map(|packed| Row::of(&packed.section)).collect(),
+    };
+    // Integers have a fixed size, so that the places do not change the table's own size.
+    let table_bytes = encode(&contents)?.len();
+    let mut end = (PAGE_BYTES + table_bytes).next_multiple_of(PAGE_BYTES) as u64;
+    for row in &mut contents.sections {
+        row.offset_bytes = place(end, row.bytes);
+        end = row.offset_bytes + u64::from(row.bytes);
+    }
+    let table = encode(&contents)?;
+    let mut page = [0; PAGE_BYTES];
+    page[..8].copy_from_slice(&MAGIC);
+    page[8..12].copy_from_slice(&FORMAT.to_le_bytes());
+    page[12..16].copy_from_slice(&(table.len() as u32).to_le_bytes());
+    page[16..48].copy_from_slice(blake3::hash(&table).as_bytes());
+    out.write_all(&page)?;
+    out.write_all(&table)?;
+    let mut written = (PAGE_BYTES + table.len()) as u64;
+    let mut bounds = Bounds::EMPTY;
+    for (packed, row) in packed.iter().zip(&contents.sections) {
+        // Less than a page.
+        out.write_all(&[0; PAGE_BYTES][..(row.offset_bytes - written) as usize])?;
+        out.write_all(&packed.bytes)?;
+        written = row.offset_bytes + u64::from(row.bytes);
+        if packed.section.level == 0 {
+            bounds = bounds.union(&packed.bounds);
+        }
+    }
+    let bounds = Bounds { min_m: origin_m + bounds.min_m, max_m: origin_m + bounds.max_m };
+    Ok((contents.in_order(), bounds))
+}
+
+/// Where a section goes that follows one that ends at `end`.
+fn place(end: u64, bytes: u32) -> u64 {
+    let page = PAGE_BYTES as u64;
+    let rest = end.next_multiple_of(page) - end;
+    if u64::from(bytes) <= rest { end } else { end + rest }
+}
+
+/// Decodes a section, whose bytes have the hash that they should.
+///
+/// # Errors
+/// Says what is wrong with it. Memory is taken part by part, as the bytes for it turn up.
+pub(super) fn unpack(
+    bytes: &[u8],
+    chunk: &ChunkEntry,
+    section: &Section,
+    sh_degree: u8,
+    record: Record,
+) -> Result<Chunk, String> {
+    let count = section.count as usize;
+    let width = columns(sh_degree);
+    let mut lanes = Vec::new();
+    let mut rest = bytes;
+    for start in (0..count).step_by(PART) {
+        let here = (count - start).min(PART);
+        let (length, after) = rest.split_first_chunk().ok_or("it ends before its last part")?;
+        let length = u32::from_le_bytes(*length) as usize;
+        let part = after.get(..length).ok_or("it ends within a part")?;
+        rest = &after[length..];
+        let raw = zstd::bulk::decompress(part, record.part_bytes(sh_degree, here));
+        let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
+        let first = lanes.len();
+        // Exactly: growing by half again would take memory that no budget knows of.
+        lanes.reserve_exact(here.div_ceil(LANES) * width);
+        lanes.resize(first + here.div_ceil(LANES) * width, Lanes([0.0; LANES]));
+        record.decode(&raw, sh_degree, here, &mut lanes[first..])?;
+    }
+    if !rest.is_empty() {
+        return Err(format!("{} bytes are left over", rest.len()));
+    }
+    Ok(Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes))
+}
+
+/// The table of all chunks.
+pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io::Result<Vec<u8>> {
+    let mut table = Vec::new();
+    for chunk in chunks {
+        let sections = chunk.sections.iter().map(Row::of).collect();
+        let (cell, origin_m) = (chunk.cell, chunk.origin_m.to_array());
+        let contents = Contents { cell, origin_m, sh_degree, record: record as u8, sections };
+        table.extend(encode(&contents)?);
+    }
+    Ok(table)
+}
+
+/// Fills in the sections of chunks from the table of all.
+///
+/// # Errors
+/// Says what is wrong with the table.
+pub(super) fn fill(
+    chunks: &mut [ChunkEntry],
+    sh_degree: u8,
+    record: Record,
+    mut table: &[u8],
+) -> Result<(), String> {
+    for chunk in chunks {
+        let (contents, consumed) = decode(table)?;
+        table = &table[consumed..];
+        let found = (contents.cell, contents.origin_m, contents.sh_degree, contents.record);
+        if found != (chunk.cell, chunk.origin_m.to_array(), sh_degree, record as u8) {
+            return Err(format!("it says something else of cell {:?}", chunk.cell));
+        }
+        chunk.sections = contents.in_order();
+        let full = chunk.sections.iter().filter(|section| section.level == 0);
+        let count: u64 = full.map(|section| u64::from(section.count)).sum();
+        if count != chunk.count {
+            return Err(format!("it has {count} Gaussians of {} in {:?}", chunk.count, chunk.cell));
+        }
+        check_levels(chunk)?;
+    }
+    if table.is_empty() { Ok(()) } else { Err("it has more cells than the manifest".into()) }
+}
+
+/// Whether an object's own table says what the manifest's does. `start` is the object's start, as
+/// long as it is, up to [`limits::CHUNK_TABLE_BYTES`] and a page.
+///
+/// # Errors
+/// Says what is wrong.
+pub(super) fn check_start(start: &[u8], chunk: &ChunkEntry) -> Result<(), String> {
+    let (page, rest) =
+        start.split_first_chunk::<PAGE_BYTES>().ok_or("it is shorter than a page")?;
+    if page[..8] != MAGIC {
+        return Err("it does not start as a chunk".into());
+    }
+    let word = |at: usize| u32::from_le_bytes([page[at], page[at + 1], page[at + 2], page[at + 3]]);
+    if word(8) != FORMAT {
+        return Err(format!("it has format {}; this build reads format {FORMAT}", word(8)));
+    }
+    let table = rest.get(..word(12) as usize).ok_or("its table is longer than it may be")?;
+    if page[16..48] != *blake3::hash(table).as_bytes() {
+        return Err("its table of contents has another hash".into());
+    }
+    let (contents, consumed) = decode(table)?;
+    let same = consumed == table.len()
+        && (contents.cell, contents.origin_m) == (chunk.cell, chunk.origin_m.to_array())
+        && contents.in_order() == chunk.sections;
+    if same { Ok(()) } else { Err("its table of contents is not the manifest's".into()) }
+}
+
+/// Every block has level 0 without error, and then levels in a row with rising errors.
+fn check_levels(chunk: &ChunkEntry) -> Result<(), String> {
+    for block in chunk.sections.chunk_by(|a, b| a.block == b.block) {
+        let numbered = block.iter().enumerate().all(|(k, section)| usize::from(section.level) == k);
+        // Phrased as what must hold, so that NaN fails it.
+        let rising = block.is_sorted_by(|a, b| a.error_m <= b.error_m) && block[0].error_m == 0.0;
+        let finite = block.iter().all(|section| {
+            section.min_m.iter().chain(&section.max_m).all(|m| m.is_finite())
+                && section.error_m.is_finite()
+        });
+        if !(numbered && rising && finite) {
+            return Err(format!(
+                "block {} of cell {:?} has wrong levels",
+                block[0].block, chunk.cell
+            ));
+        }
+    }
+    Ok(())
+}
+
+impl Contents {
+    fn in_order(&self) -> Vec<Section> {
+        let mut sections: Vec<Section> = self.sections.iter().map(Row::section).collect();
+        sections.sort_by_key(|section| (section.block, section.level));
+        sections
+    }
+}
+
+impl Row {
+    fn of(section: &Section) -> Self {
+        let Section { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash } =
+            *section;
+        Self { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash }
+    }
+
+    fn section(&self) -> Section {
+        let Self { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash } = *self;
+        Section { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash }
+    }
+}
+
+fn encode(contents: &Contents) -> io::Result<Vec<u8>> {
+    bincode::encode_to_vec(contents, encoding()).map_err(io::Error::other)
+}
+
+fn decode(bytes: &[u8]) -> Result<(Contents, usize), String> {
+    bincode::decode_from_slice(bytes, encoding())
+        .map_err(|error| format!("a table of contents does not decode: {error}"))
+}
+
+/// Fixed-size integers, and a limit, without which a short message may ask for any allocation.
+fn encoding() -> impl Config {
+    const LIMIT: usize = limits::CHUNK_TABLE_BYTES;
+    bincode::config::standard().with_fixed_int_encoding().with_limit::<LIMIT>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use wildcity_scene::Gaussians;
+    use wildcity_scene::chunk::{CellRun, Partition};
+
+    /// 300 Gaussians of one block, a coarse level of 100, and the object that holds them.
+    fn object() -> (Vec<u8>, ChunkEntry) {
+        let n = 300;
+        let gaussians = Gaussians {
+            sh_degree: 0,
+            means_m: (0..n).map(|i| [0.04 * f64::from(i), 1.0, 2.0]).collect(),
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n as usize],
+            ln_scales: vec![[-2.0; 3]; n as usize],
+            logit_opacities: vec![1.0; n as usize],
+            sh: vec![0.25; 3 * n as usize],
+        };
+        let Partition { cells, order } = Partition::new(&gaussians.means_m);
+        let cell: &CellRun = &cells[0];
+        let chunk = |count: usize| {
+            let mut chunk = Chunk::new(cell.cell, cell.origin_m, 0, count);
+            for &index in &order[..count] {
+                chunk.push(&cell.record(&gaussians, index as usize));
+            }
+            chunk
+        };
+        let lost = &mut Clamped::default();
+        let packed = [(0, 0.0, 300), (1, 0.5, 100)].map(|(level, error_m, count)| {
+            pack(&chunk(count), [10, level], error_m, Record::Q32, lost).unwrap()
+        });
+        let mut bytes = Vec::new();
+        let place = (cell.cell, cell.origin_m);
+        let (sections, bounds) = write(&mut bytes, place, 0, Record::Q32, packed.into()).unwrap();
+        let entry = ChunkEntry {
+            cell: cell.cell,
+            object: blake3::hash(&bytes).to_hex().to_string(),
+            count: 300,
+            bytes: bytes.len() as u64,
+            bounds,
+            origin_m: cell.origin_m,
+            sections,
+        };
+        (bytes, entry)
+    }
+
+    fn filled(entry: &ChunkEntry, table: &[u8]) -> Result<Vec<Section>, String> {
+        let mut chunks = [ChunkEntry { sections: Vec::new(), ..entry.clone() }];
+        fill(&mut chunks, 0, Record::Q32, table).map(|()| chunks[0].sections.clone())
+    }
+
+    #[test]
+    fn sections_share_a_page_where_they_fit_and_begin_one_where_not() {
+        assert_eq!(place(8192, 100), 8192);
+        assert_eq!(place(8292, 3996), 8292);
+        assert_eq!(place(8292, 3997), 12288);
+        assert_eq!(place(8292, 50_000), 12288);
+        let (bytes, entry) = object();
+        let [full, coarse] = &entry.sections[..] else { panic!("{:?}", entry.sections) };
+        assert_eq!((coarse.offset_bytes, coarse.level), (8192, 1), "coarse levels come first");
+        for section in [full, coarse] {
+            let start = section.offset_bytes as usize;
+            let own = &bytes[start..start + section.bytes as usize];
+            let chunk = unpack(own, &entry, section, 0, Record::Q32).unwrap();
+            assert_eq!((chunk.cell(), chunk.len()), (entry.cell, section.count as usize));
+        }
+    }
+
+    #[test]
+    fn a_table_comes_back_and_one_that_lies_is_refused() {
+        let (_, entry) = object();
+        let table = table(std::slice::from_ref(&entry), 0, Record::Q32).unwrap();
+        assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
+        // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
+        assert_eq!(table.len(), 42 + 2 * 78);
+        const { assert!(42 + 16 * 29 * 78 < limits::CHUNK_TABLE_BYTES) };
+        for cut in 0..table.len() {
+            filled(&entry, &table[..cut]).unwrap_err();
+        }
+        assert!(filled(&entry, &[&table[..], &table].concat()).unwrap_err().contains("more cells"));
+        let refused = |change: &dyn Fn(&mut ChunkEntry)| {
+            let mut other = entry.clone();
+            change(&mut other);
+            let table = super::table(&[other], 0, Record::Q32).unwrap();
+            filled(&entry, &table).unwrap_err()
+        };
+        assert!(refused(&|e| e.cell[0] += 1).contains("something else of cell"));
+        assert!(refused(&|e| e.sections[0].count = 7).contains("it has 7 Gaussians of 300"));
+        for change in [
+            (|e| e.sections[1].level = 2) as fn(&mut ChunkEntry),
+            |e| e.sections[1].error_m = f32::NAN,
+            |e| e.sections[1].error_m = -1.0,
+            |e| e.sections[0].error_m = 0.1,
+            |e| e.sections[1].max_m[2] = f32::INFINITY,
+        ] {
+            assert!(refused(&change).contains("has wrong levels"));
+        }
+        // 2^64 sections: nothing is allocated for them.
+        let mut many = table.clone();
+        many[34..42].fill(255);
+        assert!(filled(&entry, &many).unwrap_err().contains("does not decode"));
+    }
+
+    #[test]
+    fn an_object_says_itself_what_is_in_it() {
+        let (bytes, entry) = object();
+        check_start(&bytes, &entry).unwrap();
+        let refused = |at: usize| {
+            let mut bytes = bytes.clone();
+            bytes[at] ^= 1;
+            check_start(&bytes, &entry).unwrap_err()
+        };
+        assert_eq!(refused(0), "it does not start as a chunk");
+        assert_eq!(refused(8), "it has format 0; this build reads format 1");
+        assert_eq!(refused(15), "its table is longer than it may be");
+        assert_eq!(refused(20), "its table of contents has another hash");
+        assert_eq!(refused(4100), "its table of contents has another hash");
+        assert_eq!(check_start(&bytes[..4000], &entry).unwrap_err(), "it is shorter than a page");
+        let mut other = entry.clone();
+        other.sections[0].hash[0] ^= 1;
+        let said = check_start(&bytes, &other).unwrap_err();
+        assert_eq!(said, "its table of contents is not the manifest's");
+    }
+
+    #[test]
+    fn a_section_that_is_not_what_it_says_is_refused_in_bounded_memory() {
+        let (bytes, entry) = object();
+        let section = entry.sections[0];
+        let start = section.offset_bytes as usize;
+        let own = &bytes[start..start + section.bytes as usize];
+        let refused = |own: &[u8], count: u32| {
+            let section = Section { count, ..section };
+            unpack(own, &entry, &section, 0, Record::Q32).unwrap_err()
+        };
+        for cut in 0..own.len() {
+            refused(&own[..cut], 300);
+        }
+        assert_eq!(refused(&[own, &[0]].concat(), 300), "1 bytes are left over");
+        assert!(refused(own, 299).starts_with("a part does not decompress"));
+        assert!(refused(own, 301).starts_with("301 Gaussians take "));
+        // 4 G Gaussians, 240 GB: the first part is missing.
+        assert!(refused(own, u32::MAX).starts_with("65536 Gaussians take "));
+        for at in 0..own.len() {
+            let mut own = own.to_vec();
+            own[at] ^= 0x40;
+            // The hash is looked at before: here it only must not panic.
+            let _ = unpack(&own, &entry, &section, 0, Record::Q32);
+        }
+    }
+}

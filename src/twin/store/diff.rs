@@ -1,0 +1,83 @@
+//! What differs between two versions of a twin.
+
+use std::collections::BTreeMap;
+
+use wildcity_scene::Manifest;
+use wildcity_scene::manifest::ChunkEntry;
+
+use super::{Catalog, StoreError};
+
+/// What differs between two versions.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Diff {
+    /// Cells that differ, in order of (cell y, cell x).
+    pub cells: Vec<CellDiff>,
+    /// Cells that both have alike.
+    pub kept: u64,
+    /// Fields of the manifest that differ: of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`.
+    pub settings: Vec<&'static str>,
+}
+
+/// A cell that is not the same in both.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CellDiff {
+    /// Grid cell (x, y).
+    pub cell: [i32; 2],
+    /// What it was; none if it was added.
+    pub before: Option<CellSize>,
+    /// What it is; none if it was removed.
+    pub after: Option<CellSize>,
+}
+
+/// How much a cell holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CellSize {
+    /// Gaussians at full detail.
+    pub gaussians: u64,
+    /// Size of its object, in bytes.
+    pub bytes: u64,
+}
+
+impl Catalog {
+    /// What differs from version `before` to version `after` of a twin, from their manifests alone.
+    ///
+    /// # Errors
+    /// As [`Catalog::version`].
+    pub fn diff(&self, name: &str, before: u64, after: u64) -> Result<Diff, StoreError> {
+        let before = self.version(name, Some(before))?;
+        let after = self.version(name, Some(after))?;
+        Ok(Diff::between(&before.manifest, &after.manifest))
+    }
+}
+
+impl Diff {
+    /// What differs from one manifest to another.
+    pub fn between(before: &Manifest, after: &Manifest) -> Self {
+        let mut cells: BTreeMap<_, [Option<&ChunkEntry>; 2]> = BTreeMap::new();
+        for (which, manifest) in [before, after].into_iter().enumerate() {
+            for chunk in &manifest.chunks {
+                let [x, y] = chunk.cell;
+                cells.entry([y, x]).or_default()[which] = Some(chunk);
+            }
+        }
+        let all = cells.len() as u64;
+        cells.retain(|_, [old, new]| old.map(|c| &c.object) != new.map(|c| &c.object));
+        let size = |c: &ChunkEntry| CellSize { gaussians: c.count, bytes: c.bytes };
+        let cells = cells.into_iter().map(|([y, x], [old, new])| CellDiff {
+            cell: [x, y],
+            before: old.map(size),
+            after: new.map(size),
+        });
+        let cells: Vec<_> = cells.collect();
+        let differs = [
+            ("profile", before.profile != after.profile),
+            ("sh_degree", before.sh_degree != after.sh_degree),
+            ("record", before.record != after.record),
+            ("rig", before.rig != after.rig),
+            ("trajectories", before.trajectories != after.trajectories),
+            ("sky", before.sky != after.sky),
+        ];
+        let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
+        Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }
+    }
+}

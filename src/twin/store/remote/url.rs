@@ -1,0 +1,60 @@
+//! Which object store a URL names, and who we are there.
+
+use std::sync::{Arc, Once};
+
+use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
+use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
+use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+use object_store::path::Path as Key;
+use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
+
+use crate::limits;
+use crate::store::StoreError;
+
+/// Opens the store of a URL, as `s3://bucket/twins`, with credentials and endpoints from the
+/// environment: `AWS_*`, `GOOGLE_*`, `AZURE_*`. Returns what keys begin with, too.
+pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError> {
+    let refused = |reason: String| StoreError::Url { url: url.to_owned(), reason };
+    let unknown = || refused("one of s3://, gs://, az:// and file:// is read".to_owned());
+    let (scheme, place) = url.split_once("://").ok_or_else(unknown)?;
+    let (bucket, prefix) = place.split_once('/').unwrap_or((place, ""));
+    if bucket.is_empty() {
+        return Err(refused(format!("it names no bucket: give {scheme}://BUCKET/FOLDER")));
+    }
+    let prefix = Key::parse(prefix).map_err(|error| refused(error.to_string()))?;
+    provide_tls();
+    // Requests are made again here, and not there.
+    let retry = RetryConfig { max_retries: 0, ..RetryConfig::default() };
+    let timeout = format!("{} s", limits::REMOTE_TIMEOUT.as_secs());
+    let store: object_store::Result<Arc<dyn ObjectStore>> = match scheme {
+        "s3" | "s3a" => AmazonS3Builder::from_env()
+            .with_url(url)
+            .with_retry(retry)
+            .with_config(AmazonS3ConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .build()
+            .map(|store| Arc::new(store) as _),
+        "gs" => GoogleCloudStorageBuilder::from_env()
+            .with_url(url)
+            .with_retry(retry)
+            .with_config(GoogleConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .build()
+            .map(|store| Arc::new(store) as _),
+        "az" | "azure" | "abfs" | "abfss" => MicrosoftAzureBuilder::from_env()
+            .with_url(url)
+            .with_retry(retry)
+            .with_config(AzureConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .build()
+            .map(|store| Arc::new(store) as _),
+        _ => return Err(unknown()),
+    };
+    Ok((store.map_err(|error| refused(error.to_string()))?, prefix))
+}
+
+/// Says once who does the cryptography of TLS.
+fn provide_tls() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        // It fails if the program that uses this library said so before, which is as good.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+    });
+}
