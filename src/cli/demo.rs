@@ -14,7 +14,7 @@ use serde_json::json;
 use wildcity_client::{Client, Observation, Open, Pose};
 use wildcity_generate::StreetSettings;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
+use wildcity_scene::{ProfileOverrides, RecordFormat, Rig, Trajectory};
 use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
@@ -76,7 +76,7 @@ impl Demo {
             uploads: self.out.join("uploads"),
             tokens: None,
             backend: Arc::from(self.engine.backend()?),
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
@@ -188,7 +188,7 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
 
 /// The demo street in the record that leaves nothing out, under a name of its own.
 pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
-    demo_twin(twins, EXACT_TWIN, Storage { record: Record::F32, ..Storage::default() })
+    demo_twin(twins, EXACT_TWIN, Storage { record: RecordFormat::F32, ..Storage::default() })
 }
 
 /// The demo twin in the user's store: built on first use, and again after the generator changed or

@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
 use crate::cli::limits;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_server::{Limits, Tokens};
 use wildcity_twin::ingest;
 
@@ -134,10 +134,10 @@ fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
 }
 
 /// A profile file, which must fit a profile: it need not fit every twin's.
-fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
+fn read_profile(path: &Path) -> anyhow::Result<ProfileOverrides> {
     let cannot = || format!("--profile {}", path.display());
     let text = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
-    let changes: ProfileChanges = serde_json::from_slice(&text).with_context(cannot)?;
+    let changes: ProfileOverrides = serde_json::from_slice(&text).with_context(cannot)?;
     changes.apply(RenderProfile::default()).with_context(cannot)?;
     Ok(changes)
 }

@@ -10,7 +10,7 @@ use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{Rolling, View};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::geometry::camera::{Cone, WIDEST_RAD};
+use wildcity_scene::geometry::camera::{FieldCone, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole
@@ -67,7 +67,7 @@ pub struct Beside {
 impl<'a> Bent<'a> {
     /// `None` for a pinhole at rest.
     pub fn of(view: &'a View, profile: &RenderProfile) -> Option<Self> {
-        if view.is_ideal() {
+        if view.is_pinhole() {
             return None;
         }
         let [moved_m, rolled_rad] =
@@ -80,7 +80,8 @@ impl<'a> Bent<'a> {
             });
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
-        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = Cone::of(&view.camera);
+        let FieldCone { image_rad, least_px_per_rad, most_px_per_rad } =
+            FieldCone::of(&view.camera);
         let beside = Beside {
             widest_rad: widest_rad(&view.camera),
             image_rad,

@@ -18,7 +18,7 @@ pub struct Appearance {
     pub overlay: Option<Arc<Overlay>>,
 }
 
-/// Colours as they are recorded: `matrix * rgb + offset`, linear red, green, blue. It follows the sky and
+/// MatrixOrGain as they are recorded: `matrix * rgb + offset`, linear red, green, blue. It follows the sky and
 /// precedes the overlay, and is what street reconstructions train per camera.
 ///
 /// In JSON `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` if its
@@ -55,7 +55,7 @@ pub enum AppearanceError {
     },
     /// Two things that say the same, or nothing.
     #[error("an exposure has either a matrix or a gain")]
-    Colours,
+    MatrixOrGain,
     /// The overlay is of another size than the image.
     #[error(
         "the overlay is {} x {} pixels, and the camera's image {} x {}",
@@ -88,7 +88,7 @@ impl Exposure {
         let matrix = match (matrix, gain) {
             (Some(matrix), None) => matrix,
             (None, Some([r, g, b])) => [[r, 0.0, 0.0], [0.0, g, 0.0], [0.0, 0.0, b]],
-            _ => return Err(AppearanceError::Colours),
+            _ => return Err(AppearanceError::MatrixOrGain),
         };
         Ok(Self { matrix, offset })
     }
@@ -98,7 +98,7 @@ impl AppearanceError {
     /// What of a camera it is about: `exposure` or `overlay`.
     pub fn field(&self) -> &'static str {
         match self {
-            Self::Exposure { .. } | Self::Colours => "exposure",
+            Self::Exposure { .. } | Self::MatrixOrGain => "exposure",
             Self::Size { .. } | Self::Overlay { .. } => "overlay",
         }
     }
@@ -119,7 +119,7 @@ impl Appearance {
     }
 
     /// Whether it changes nothing.
-    pub fn is_plain(&self) -> bool {
+    pub fn is_identity(&self) -> bool {
         self.exposure.is_none() && self.overlay.is_none()
     }
 

@@ -56,7 +56,7 @@ pub const fn columns(sh_degree: u8) -> usize {
 
 /// One raw Gaussian relative to its chunk's origin: what an F32 record holds.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RawRecord<'a> {
+pub struct RawGaussian<'a> {
     /// Centre relative to the chunk's origin, in metres.
     pub mean_m: [f32; 3],
     /// Rotation (w, x, y, z), of any length but zero.
@@ -71,7 +71,7 @@ pub struct RawRecord<'a> {
 
 /// One Gaussian as the renderer reads it, relative to its chunk's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ActiveRecord<'a> {
+pub struct ActivatedGaussian<'a> {
     /// Centre relative to the chunk's origin, in metres.
     pub mean_m: [f32; 3],
     /// Standard deviation along each own axis, in metres.
@@ -128,7 +128,7 @@ impl Chunk {
 
     /// A chunk whose columns are already laid out, as `lanes[block * columns(sh_degree) + column]`.
     ///
-    /// Lanes past `count` are made empty, and so is what cannot be drawn, as by [`Chunk::push_active`].
+    /// Lanes past `count` are made empty, and so is what cannot be drawn, as by [`Chunk::push_activated`].
     ///
     /// # Panics
     /// If there are not as many lanes as `count` Gaussians of the degree take.
@@ -167,9 +167,9 @@ impl Chunk {
     ///
     /// # Panics
     /// If the record's colour is not of the chunk's degree.
-    pub fn push(&mut self, record: &RawRecord<'_>) {
+    pub fn push(&mut self, record: &RawGaussian<'_>) {
         let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
-        self.push_active(&ActiveRecord {
+        self.push_activated(&ActivatedGaussian {
             mean_m: record.mean_m,
             scale_m: record.ln_scale.map(|ln| f64::from(ln).exp() as f32),
             quat_wxyz: record.quat_wxyz.map(|q| (f64::from(q) / length) as f32),
@@ -183,7 +183,7 @@ impl Chunk {
     ///
     /// # Panics
     /// If the record's colour is not of the chunk's degree.
-    pub fn push_active(&mut self, record: &ActiveRecord<'_>) {
+    pub fn push_activated(&mut self, record: &ActivatedGaussian<'_>) {
         let width = columns(self.sh_degree);
         assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
         let (slot, lane) = (self.count / LANES * width, self.count % LANES);
@@ -196,7 +196,7 @@ impl Chunk {
         }
         self.count += 1;
 
-        let ActiveRecord { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
+        let ActivatedGaussian { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
         let geometry = mean_m.iter().chain(scale_m).chain(quat_wxyz);
         if !is_drawable(geometry.chain([log2_opacity]).chain(*sh).copied()) {
             return;
@@ -248,7 +248,7 @@ impl Chunk {
     }
 
     /// The columns of block `k`, which holds Gaussians `16 k` to `16 k + 15`.
-    pub fn block(&self, block: usize) -> &[Lanes] {
+    pub fn lane_group(&self, group: usize) -> &[Lanes] {
         let width = columns(self.sh_degree);
         &self.lanes[block * width..(block + 1) * width]
     }
@@ -256,7 +256,7 @@ impl Chunk {
     /// Half-size of the box around 3 standard deviations of one Gaussian, in metres: per axis
     /// `3 sqrt(cov_ii)`, where `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of row i of
     /// `R S`.
-    pub fn reach_m(&self, index: usize) -> DVec3 {
+    pub fn half_extent_m(&self, index: usize) -> DVec3 {
         let value = |column| f64::from(self.value(index, column));
         let [w, x, y, z] = [0, 1, 2, 3].map(|i| value(column::QUAT + i));
         let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
@@ -267,7 +267,7 @@ impl Chunk {
 
     /// One parameter of one Gaussian, by its column.
     pub fn value(&self, index: usize, column: usize) -> f32 {
-        self.block(index / LANES)[column].0[index % LANES]
+        self.lane_group(index / LANES)[column].0[index % LANES]
     }
 
     /// Memory that a chunk of so many Gaussians will hold, in bytes.
@@ -362,9 +362,9 @@ impl Partition {
 
 impl CellRun {
     /// Reads one Gaussian relative to this cell's origin.
-    pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawRecord<'a> {
+    pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawGaussian<'a> {
         let mean = DVec3::from_array(gaussians.means_m[index]) - self.origin_m;
-        RawRecord {
+        RawGaussian {
             mean_m: mean.as_vec3().to_array(),
             quat_wxyz: gaussians.quats_wxyz[index],
             ln_scale: gaussians.ln_scales[index],
@@ -487,7 +487,7 @@ mod tests {
         assert!((-1e-40..=0.0).contains(&full), "sigmoid(100) is 1 - exp(-100), not {full:e}");
         // sigmoid(-100) = exp(-100) to 43 digits.
         assert!((value(2, column::LOG2_OPACITY) + 100.0 * std::f32::consts::LOG2_E).abs() < 1e-5);
-        let unused = &scene.chunks[0].block(0)[column::LOG2_OPACITY].0[1..];
+        let unused = &scene.chunks[0].lane_group(0)[column::LOG2_OPACITY].0[1..];
         assert_eq!(unused, [f32::NEG_INFINITY; LANES - 1]);
     }
 
@@ -496,7 +496,7 @@ mod tests {
     fn both_ways_into_a_chunk_keep_the_same_out() {
         let mut cell = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
         for _ in 0..2 {
-            cell.push(&RawRecord {
+            cell.push(&RawGaussian {
                 mean_m: [1.0; 3],
                 quat_wxyz: [1.0, 0.0, 0.0, 0.0],
                 ln_scale: [0.0; 3],
@@ -513,13 +513,13 @@ mod tests {
             (column::SH, 1e6),
             (column::SH + 2, f32::NEG_INFINITY),
         ] {
-            let mut lanes = cell.block(0).to_vec();
+            let mut lanes = cell.lane_group(0).to_vec();
             lanes[column].0[0] = value;
             let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, 2, lanes.clone());
             let one = |i: usize, column: usize| lanes[column].0[i];
             let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
             for i in 0..2 {
-                pushed.push_active(&ActiveRecord {
+                pushed.push_activated(&ActivatedGaussian {
                     mean_m: [0, 1, 2].map(|k| one(i, column::MEAN + k)),
                     scale_m: [0, 1, 2].map(|k| one(i, column::SCALE + k)),
                     quat_wxyz: [0, 1, 2, 3].map(|k| one(i, column::QUAT + k)),

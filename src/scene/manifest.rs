@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::Bounds;
 
-use super::{Record, RenderProfile, Rig, Trajectory};
+use super::{RecordFormat, RenderProfile, Rig, Trajectory};
 
 /// One immutable version of a twin. Its canonical JSON bytes are its identity (BLAKE3).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -20,7 +20,7 @@ pub struct Manifest {
     /// Spherical-harmonic degree of every chunk.
     pub sh_degree: u8,
     /// How Gaussians are stored.
-    pub record: Record,
+    pub record: RecordFormat,
     /// The object that holds [`ChunkEntry::sections`] of all chunks.
     pub table: ObjectRef,
     /// The chunks in order of (cell y, cell x): the order of global ids.
@@ -28,7 +28,7 @@ pub struct Manifest {
     /// The vehicle that recorded it, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<Rig>,
-    /// Recorded drives.
+    /// RoundTrip drives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trajectories: Vec<Trajectory>,
     /// What is behind everything, if it has a sky.

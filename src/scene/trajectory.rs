@@ -1,4 +1,4 @@
-//! Recorded trajectories: the log's poses at their times.
+//! RoundTrip trajectories: the log's poses at their times.
 
 use serde::{Deserialize, Serialize};
 

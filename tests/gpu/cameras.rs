@@ -2,7 +2,7 @@
 //! pinhole.
 
 use glam::DVec3;
-use wildcity::geometry::camera::{Rolls, Windshield, WindshieldReference};
+use wildcity::geometry::camera::{ShutterDirection, Windshield, WindshieldReference};
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::gpu::shaders::Shaders;
 use wildcity::render::gpu::{AdapterChoice, Gpu};
@@ -34,10 +34,10 @@ pub(crate) fn bent_views() -> Vec<View> {
     let pose = straight().world_from_camera;
     let still = lenses.iter().map(|(_, camera)| View::new(*camera, pose));
     let rolling = [
-        driven(straight().camera, pose, Rolls::TopToBottom),
-        driven(camera("opencv"), pose, Rolls::BottomToTop),
-        driven(behind, pose, Rolls::LeftToRight),
-        driven(camera("f-theta by pixels"), pose, Rolls::RightToLeft),
+        driven(straight().camera, pose, ShutterDirection::TopToBottom),
+        driven(camera("opencv"), pose, ShutterDirection::BottomToTop),
+        driven(behind, pose, ShutterDirection::LeftToRight),
+        driven(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
     ];
     still.chain(rolling).collect()
 }
@@ -78,8 +78,8 @@ fn the_demo_street_through_lenses_and_shutters() {
         lens(0),
         lens(1),
         lens(2),
-        roll(views[0], Rolls::TopToBottom),
-        roll(lens(2), Rolls::LeftToRight),
+        roll(views[0], ShutterDirection::TopToBottom),
+        roll(lens(2), ShutterDirection::LeftToRight),
     ];
     let profile = RenderProfile::default();
     let truths = render(&cpu(), &scene, &profile, &views);

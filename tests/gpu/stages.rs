@@ -253,7 +253,7 @@ fn close(found: &Splat, truth: &Splat, view: &View) -> Result<(), String> {
     let step = slope_bound(truth);
     let mean = |k: usize| 2e-3 + step * (truth.mean_px[k].abs() + 200.0);
     // Mist around the camera is six points all over the image of a lens.
-    let wide = if view.is_ideal() { 1e-5 } else { 1e-4 };
+    let wide = if view.is_pinhole() { 1e-5 } else { 1e-4 };
     let reach = |k: usize| 1e-3 + (wide + 2.0 * step) * truth.reach_px[k];
     let factor = |of: f64| (1e-4 + 2.0 * step) * of;
     let numbers = [

@@ -21,7 +21,7 @@ use std::sync::Arc;
 use wildcity::render::View;
 use wildcity::residency::{Cache, Eye, Pinned, Resident};
 use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, Record, RenderProfile, Scene};
+use wildcity::scene::{Gaussians, RecordFormat, RenderProfile, Scene};
 use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 use images::{cpu, psnr, render};
@@ -39,7 +39,7 @@ struct Stored {
     _dir: tempfile::TempDir,
 }
 
-fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Stored {
+fn stored(gaussians: &Gaussians, record: RecordFormat, levels: bool) -> Stored {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), gaussians, Storage { record, levels }).unwrap();
     let resident = Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap();

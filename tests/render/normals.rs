@@ -2,7 +2,7 @@
 
 use glam::{DQuat, DVec3};
 use wildcity::geometry::Pose;
-use wildcity::geometry::camera::Rolls;
+use wildcity::geometry::camera::ShutterDirection;
 use wildcity::render::reference::Reference;
 use wildcity::render::{Backend, Frame, RenderError, Rolling, Target, View};
 use wildcity::report::stress::blobs::{Blob, ahead, scene};
@@ -66,7 +66,8 @@ fn a_wall_faces_where_it_does() {
     let facing = DVec3::new(0.4, -0.3, -1.0).normalize();
     let scene = scene(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
-    let rolling = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: way };
+    let rolling =
+        Rolling { direction: ShutterDirection::TopToBottom, world_from_camera_first: way };
     let mut views: Vec<(&str, View)> = lenses()
         .into_iter()
         .map(|(name, camera)| (name, View::new(camera, Pose::IDENTITY)))

@@ -28,7 +28,7 @@ use wildcity::residency::{Cache, Resident};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::RigCamera;
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
+use wildcity::scene::{ProfileOverrides, Rays, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
 };
@@ -54,7 +54,7 @@ fn commit_reaching(
         profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
-        storage: Storage { record: Record::F32, levels: true },
+        storage: Storage { record: RecordFormat::F32, levels: true },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -407,12 +407,12 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
 }
 
 /// A setting as a session asks for it, whatever it loses.
-fn changes(setting: &Setting) -> ProfileChanges {
+fn changes(setting: &Setting) -> ProfileOverrides {
     let field = |change: &String| {
         let (key, value) = change.split_once('=').unwrap();
         (key.to_owned(), serde_json::from_str(value).unwrap())
     };
-    ProfileChanges::new(setting.profile.iter().map(field).collect())
+    ProfileOverrides::new(setting.profile.iter().map(field).collect())
 }
 
 /// What the rig's cameras see from poses by definition, of all Gaussians as they were generated: colours
@@ -433,7 +433,7 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
 /// Least PSNR of an image that an agent gets from any of the poses, in dB.
 async fn least_db_of_session(
     engine: &Arc<Engine>,
-    profile: ProfileChanges,
+    profile: ProfileOverrides,
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
@@ -462,7 +462,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: Storage { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -504,7 +504,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q32, levels: false },
+        storage: Storage { record: RecordFormat::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -767,7 +767,7 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
     assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
-    let profile: ProfileChanges = serde_json::from_str(&read("profile.json")).unwrap();
+    let profile: ProfileOverrides = serde_json::from_str(&read("profile.json")).unwrap();
     profile.apply(RenderProfile::default()).unwrap();
 
     let bad = dir.path().join("bad.json");

@@ -10,7 +10,7 @@ use wildcity::geometry::{Camera, Pose};
 use wildcity::render::View;
 use wildcity::render::cpu::Cpu;
 use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, Record, RenderProfile, Rig, Scene};
+use wildcity::scene::{Gaussians, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity::session::{Trained, Trust};
 use wildcity::store::{Catalog, NewVersion, Storage};
 
@@ -120,7 +120,7 @@ fn pair() -> Pair {
     let dir = tempfile::tempdir().unwrap();
     let new = NewVersion {
         trajectories: vec![street.trajectory.clone()],
-        storage: Storage { record: Record::F32, levels: false },
+        storage: Storage { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();

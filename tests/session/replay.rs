@@ -8,7 +8,7 @@ use serde_json::json;
 use wildcity::render::Backend;
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
-use wildcity::scene::ProfileChanges;
+use wildcity::scene::ProfileOverrides;
 use wildcity::server::{self, Config, Limits};
 use wildcity::session::{Extent, FrameRequest, Recording, ReplayError, Report};
 use wildcity::store::Catalog;
@@ -142,7 +142,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         uploads: twins.path().join(".uploads"),
         tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
-        profile: ProfileChanges::default(),
+        profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };
     let running = server::start(config).await.unwrap();

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use wildcity::scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity::scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
 use wildcity::store::{
     Catalog, CellDiff, CellSize, Change, Commit, Kind, NewVersion, Settings, Storage, StoreError,
     Version,
@@ -11,7 +11,7 @@ use wildcity::store::{
 use crate::scene_files::gaussians;
 use crate::{commit, files, street, turn};
 
-const EXACT: Storage = Storage { record: Record::F32, levels: false };
+const EXACT: Storage = Storage { record: RecordFormat::F32, levels: false };
 
 /// Settings as `street` has them.
 fn settings() -> Settings {

@@ -22,12 +22,12 @@ mod skies;
 use std::path::{Path, PathBuf};
 
 use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, Record};
+use wildcity::scene::{Gaussians, RecordFormat};
 use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 fn street(gaussians: &Gaussians) -> NewVersion<'_> {
-    let storage = Storage { record: Record::F32, levels: false };
+    let storage = Storage { record: RecordFormat::F32, levels: false };
     let provenance = Provenance::of("test".into());
     NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use wildcity::ingest;
 use wildcity::residency::Cache;
 use wildcity::scene::RenderProfile;
-use wildcity::scene::sky::Model;
+use wildcity::scene::sky::SkyModel;
 use wildcity::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
 
 use crate::places::{cells_alone, everywhere};
@@ -34,7 +34,7 @@ fn tensors(seed: usize) -> Vec<Tensor> {
 
 fn sky_bytes(seed: usize) -> SkyBytes {
     let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
-    assert!(matches!(read.model, Model::Network(..)));
+    assert!(matches!(read.model, SkyModel::Network(..)));
     SkyBytes { bytes: read.bytes.into(), image: None, sky_from_world: DMat3::IDENTITY }
 }
 

@@ -20,7 +20,7 @@ use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
 use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 use wildcity::scene::Gaussians;
-use wildcity::scene::ProfileChanges;
+use wildcity::scene::ProfileOverrides;
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
@@ -146,7 +146,7 @@ pub(crate) fn rig() -> Rig {
             position_m: DVec3::new(0.5, 0.0, 1.5),
             rotation: DQuat::from_rotation_z(yaw_rad) * forward,
         };
-        RigCamera::new(name, Camera::ideal(width_px, height_px, pinhole), rig_from_camera)
+        RigCamera::new(name, Camera::from_pinhole(width_px, height_px, pinhole), rig_from_camera)
     };
     let cameras = vec![camera("front", 8, 6, 0.0), camera("rear", 5, 4, std::f64::consts::PI)];
     Rig { name: "pair".to_owned(), cameras }
@@ -180,7 +180,7 @@ impl TestServer {
             uploads: twins.path().join(".uploads"),
             tokens: None,
             backend: painter.clone(),
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };
         change(&mut config);

@@ -62,7 +62,7 @@ impl Work {
                 false => from,
                 true => from.by_distance(world_from_camera.position_m - chunk.origin_m()),
             });
-            let bent = usize::from(!frame.views[view].is_ideal());
+            let bent = usize::from(!frame.views[view].is_pinhole());
             for (page, line) in clusters {
                 pages[page][bent].push(work.items.len() as u32);
                 work.items.push(Item { line, chunk_view });

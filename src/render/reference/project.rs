@@ -52,7 +52,7 @@ pub(super) fn sort(splats: &mut [Splat]) {
 
 fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View) -> Option<Splat> {
     let (mean_world, axes_m) = placed(chunk, index);
-    let seen = if view.is_ideal() {
+    let seen = if view.is_pinhole() {
         straight(mean_world, axes_m, profile, view)
     } else {
         bent(mean_world, axes_m, profile, view)

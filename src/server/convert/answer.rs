@@ -19,7 +19,7 @@ use wildcity_session::{
     self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Maps, Outcome, PastImage, Session, Summary,
     TensorKind, TrajectorySummary, TwinSummary,
 };
-use wildcity_sim::{Dynamics, Model};
+use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::SUBPROTOCOL;
@@ -350,9 +350,9 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::Model::Teleport,
-        Model::Kinematic => message::Model::Kinematic,
-        Model::Dynamic => message::Model::Dynamic,
+        EgoModel::Teleport => message::Model::Teleport,
+        EgoModel::Kinematic => message::Model::Kinematic,
+        EgoModel::Dynamic => message::Model::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

@@ -4,7 +4,7 @@ use wildcity_protocol::camera as wire;
 use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::camera::{
-    Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
+    Camera, CameraError, FThetaReference, Shutter, ShutterDirection, WindshieldReference,
 };
 
 /// Wire to lens.
@@ -14,8 +14,8 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
         wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                wire::Reference::AngleToPixel => Reference::AngleToPixel,
-                wire::Reference::PixelToAngle => Reference::PixelToAngle,
+                wire::Reference::AngleToPixel => FThetaReference::AngleToPixel,
+                wire::Reference::PixelToAngle => FThetaReference::PixelToAngle,
             };
             LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
@@ -52,10 +52,10 @@ pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposu
 pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        wire::Rolls::TopToBottom => Rolls::TopToBottom,
-        wire::Rolls::BottomToTop => Rolls::BottomToTop,
-        wire::Rolls::LeftToRight => Rolls::LeftToRight,
-        wire::Rolls::RightToLeft => Rolls::RightToLeft,
+        wire::Rolls::TopToBottom => ShutterDirection::TopToBottom,
+        wire::Rolls::BottomToTop => ShutterDirection::BottomToTop,
+        wire::Rolls::LeftToRight => ShutterDirection::LeftToRight,
+        wire::Rolls::RightToLeft => ShutterDirection::RightToLeft,
     };
     let shutter = Shutter { direction, duration_us };
     shutter.check().map(|()| shutter)
@@ -71,10 +71,10 @@ pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Winds
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        Rolls::TopToBottom => wire::Rolls::TopToBottom,
-        Rolls::BottomToTop => wire::Rolls::BottomToTop,
-        Rolls::LeftToRight => wire::Rolls::LeftToRight,
-        Rolls::RightToLeft => wire::Rolls::RightToLeft,
+        ShutterDirection::TopToBottom => wire::Rolls::TopToBottom,
+        ShutterDirection::BottomToTop => wire::Rolls::BottomToTop,
+        ShutterDirection::LeftToRight => wire::Rolls::LeftToRight,
+        ShutterDirection::RightToLeft => wire::Rolls::RightToLeft,
     };
     wire::Shutter { direction, duration_us }
 }
@@ -85,8 +85,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
         LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
         LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                Reference::AngleToPixel => wire::Reference::AngleToPixel,
-                Reference::PixelToAngle => wire::Reference::PixelToAngle,
+                FThetaReference::AngleToPixel => wire::Reference::AngleToPixel,
+                FThetaReference::PixelToAngle => wire::Reference::PixelToAngle,
             };
             wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
