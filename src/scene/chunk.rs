@@ -250,7 +250,7 @@ impl Chunk {
     /// The columns of block `k`, which holds Gaussians `16 k` to `16 k + 15`.
     pub fn lane_group(&self, group: usize) -> &[Lanes] {
         let width = columns(self.sh_degree);
-        &self.lanes[block * width..(block + 1) * width]
+        &self.lanes[group * width..(group + 1) * width]
     }
 
     /// Half-size of the box around 3 standard deviations of one Gaussian, in metres: per axis
