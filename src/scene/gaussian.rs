@@ -4,17 +4,34 @@ use super::sh;
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
-/// Activation (Kerbl et al. 2023): `scale = exp(ln_scale)`, `opacity = sigmoid(logit)`, the
-/// quaternion normalised; the covariance is `R S Sᵀ Rᵀ`.
+/// Activation (Kerbl et al. 2023, section 5.1): `scale = exp(ln_scale)`, `opacity = sigmoid(logit)`, and the
+/// quaternion is normalised. The covariance is `R S Sᵀ Rᵀ`, where `R` is the rotation and `S` the diagonal
+/// matrix of the scales.
+///
+/// ```
+/// use wildcity_scene::Gaussians;
+///
+/// let mut gaussians = Gaussians::with_capacity(0, 1);
+/// gaussians.means_m.push([1.0, 2.0, 0.5]);
+/// gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+/// gaussians.ln_scales.push([-3.0; 3]);
+/// gaussians.logit_opacities.push(2.0);
+/// gaussians.sh.extend([0.5, 0.4, 0.3]); // one coefficient: red, green, blue
+/// assert_eq!(gaussians.sh_of(0), [0.5, 0.4, 0.3]);
+///
+/// gaussians.raise_sh_degree(1);
+/// assert_eq!(gaussians.sh_of(0).len(), 3 * 4); // (1 + 1)² coefficients
+/// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     /// Spherical-harmonic degree of the colour, 0 to 3.
     pub sh_degree: u8,
-    /// Centres, in metres along the axes of the file or twin. f64: a twin may lie at 4.5e6 m.
+    /// Means, in metres along the axes of the file or twin. They are f64 because the coordinates of a twin
+    /// may be as large as 4.5e6 m.
     pub means_m: Vec<[f64; 3]>,
-    /// Rotations (w, x, y, z), of any length but zero.
+    /// Rotations (w, x, y, z) that take principal axes to world axes; of any length except zero.
     pub quats_wxyz: Vec<[f32; 4]>,
-    /// Natural logarithm of the standard deviation along each own axis, of metres.
+    /// Natural logarithm of the standard deviation in metres along each principal axis.
     pub ln_scales: Vec<[f32; 3]>,
     /// Opacity before the sigmoid.
     pub logit_opacities: Vec<f32>,
@@ -23,7 +40,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// No Gaussians yet, with room for `n`.
+    /// No Gaussians yet, with capacity for `n`.
     pub fn with_capacity(sh_degree: u8, n: usize) -> Self {
         Self {
             sh_degree,
@@ -35,7 +52,7 @@ impl Gaussians {
         }
     }
 
-    /// Makes room for `n` more, and no further.
+    /// Reserves capacity for exactly `n` more Gaussians.
     pub fn reserve_exact(&mut self, n: usize) {
         self.means_m.reserve_exact(n);
         self.quats_wxyz.reserve_exact(n);
@@ -44,7 +61,7 @@ impl Gaussians {
         self.sh.reserve_exact(n * 3 * sh::coefficients(self.sh_degree));
     }
 
-    /// Adds one of others, which have the same SH degree.
+    /// Appends the Gaussian `others[index]`. `others` must have the same SH degree.
     pub fn push_from(&mut self, others: &Self, index: usize) {
         self.means_m.push(others.means_m[index]);
         self.quats_wxyz.push(others.quats_wxyz[index]);
@@ -53,29 +70,32 @@ impl Gaussians {
         self.sh.extend_from_slice(others.sh_of(index));
     }
 
-    /// How many.
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means_m.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means_m.is_empty()
     }
 
-    /// Adds coefficients of zero, which change no colour, up to a degree that is not lower.
+    /// Raises the SH degree to `degree` by appending zero coefficients, which change no colour. A lower
+    /// degree changes nothing.
     pub fn raise_sh_degree(&mut self, degree: u8) {
-        let (from, to) = (3 * sh::coefficients(self.sh_degree), 3 * sh::coefficients(degree));
+        let from = 3 * sh::coefficients(self.sh_degree);
+        let to = 3 * sh::coefficients(degree);
         if from < to {
             let mut raised = vec![0.0; self.len() * to];
             for (new, old) in raised.chunks_exact_mut(to).zip(self.sh.chunks_exact(from)) {
                 new[..from].copy_from_slice(old);
             }
-            (self.sh, self.sh_degree) = (raised, degree);
+            self.sh = raised;
+            self.sh_degree = degree;
         }
     }
 
-    /// Colour coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
+    /// SH coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]

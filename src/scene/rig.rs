@@ -62,7 +62,7 @@ impl RigCamera {
         let mut appearance = self.appearance.clone();
         if let Some(overlay) = &mut appearance.overlay {
             let size_px = [camera.width_px, camera.height_px];
-            let part = overlay.part(at_px, part_px, size_px);
+            let part = overlay.cropped_and_resized(at_px, part_px, size_px);
             *overlay = Arc::new(part.map_err(|cause| self.looks_wrong(cause))?);
         }
         Ok(Self { camera, appearance, ..self.clone() })
