@@ -177,7 +177,8 @@ impl Overlay {
     /// As [`Overlay::from_png`].
     pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
         let bytes = text.strip_prefix(DATA_URI);
-        let bytes = bytes.ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
+        let bytes =
+            bytes.ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
         let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
         Self::from_png(png, camera_px)
     }
@@ -371,6 +372,9 @@ mod tests {
         for (at, part) in [([3, 0], [2, 1]), ([0, 0], [0, 1]), ([u32::MAX, 0], [1, 1])] {
             assert!(overlay.cropped_and_resized(at, part, [1, 1]).is_err(), "{at:?} {part:?}");
         }
-        assert!(overlay.cropped_and_resized([0, 0], [1, 1], [1 << 13, 1 << 12]).is_err(), "too large");
+        assert!(
+            overlay.cropped_and_resized([0, 0], [1, 1], [1 << 13, 1 << 12]).is_err(),
+            "too large"
+        );
     }
 }

@@ -133,7 +133,7 @@ impl Merging {
         }
     }
 
-    /// Chooses disjoint pairs of a group, the min_cost first.
+    /// Chooses disjoint pairs of a group, the cheapest first.
     fn pair(&self, group: std::ops::Range<usize>, limit_m: f64, partner: &mut [Option<u32>]) {
         let mut pairs = Vec::new();
         // Most pairs are too far apart, whatever their errors: a root less for each of those. The
