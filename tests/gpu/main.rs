@@ -32,7 +32,7 @@ mod overlap;
 mod parity;
 mod parts;
 mod sky;
-mod slips;
+mod mutations;
 mod stages;
 mod twins;
 
