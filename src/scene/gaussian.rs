@@ -135,9 +135,9 @@ mod tests {
             gaussians.quats_wxyz.push([f32::from(number); 4]);
             gaussians.ln_scales.push([-f32::from(number); 3]);
             gaussians.logit_opacities.push(f32::from(number));
-            gaussians.sh.extend((0..3 * sh::coefficients(sh_degree)).map(|k| {
-                100.0 * f32::from(number) + k as f32
-            }));
+            gaussians.sh.extend(
+                (0..3 * sh::coefficients(sh_degree)).map(|k| 100.0 * f32::from(number) + k as f32),
+            );
         }
         gaussians
     }
