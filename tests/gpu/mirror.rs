@@ -129,7 +129,8 @@ fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
     let (small, large) = (&cells[0], &Scene { chunks: all.collect(), sky: None });
-    let limited = gpu_with_limits(MemoryLimits { mirror_bytes: 1_000_000, ..MemoryLimits::default() });
+    let limited =
+        gpu_with_limits(MemoryLimits { mirror_bytes: 1_000_000, ..MemoryLimits::default() });
     let expected = render(&gpu(), small, &profile, &turning_views());
     for _ in 0..2 {
         assert!(render(&limited, small, &profile, &turning_views()) == expected);

@@ -295,7 +295,8 @@ fn a_slip_in_a_lens_fails_its_projection() {
         let found = broken.run_through(&BENT.frame(), None, Stage::Project).unwrap();
         BENT.object_to_project(&found).iter().all(Option::is_some)
     };
-    let unnoticed: Vec<&(&str, &str)> = LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
+    let unnoticed: Vec<&(&str, &str)> =
+        LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
     assert!(unnoticed.is_empty(), "{unnoticed:#?}");
 }
 

@@ -33,7 +33,7 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
-pub use device::{AdapterChoice, DeviceInfo, GpuError, DeviceTotals, devices};
+pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
 pub use traffic::FrameCounts;
 
@@ -145,8 +145,10 @@ impl Gpu {
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
-        let limits =
-            MemoryLimits { binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN), ..limits };
+        let limits = MemoryLimits {
+            binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
+            ..limits
+        };
         let device = Device::open(choice, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
