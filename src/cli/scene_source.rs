@@ -281,9 +281,9 @@ impl Source {
     fn scene(&self, shots: &[Shot]) -> anyhow::Result<Drawn<'_>> {
         let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
         Ok(match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => {
-                Drawn::Needed(resident.scene(&wildcity_session::eyes(&views), &first.profile)?)
-            }
+            (Self::Twin(resident), [first, ..]) => Drawn::Needed(
+                resident.scene(&wildcity_session::viewpoints(&views), &first.profile)?,
+            ),
             (Self::Twin(_), []) => Drawn::Whole(Cow::default()),
             (Self::File(scene), _) => Drawn::Whole(Cow::Borrowed(scene)),
         })

@@ -215,7 +215,7 @@ impl Bench<'_> {
     }
 
     fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
-        Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
+        Ok(self.resident.scene(&wildcity_session::viewpoints(views), profile)?)
     }
 
     /// The scene in the setting's record, if it is another one, and bytes of a Gaussian in it.

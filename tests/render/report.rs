@@ -30,7 +30,7 @@ use wildcity::scene::rig::RigCamera;
 use wildcity::scene::trajectory::{Keyframe, Trajectory};
 use wildcity::scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
 use wildcity::session::{
-    Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
+    Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
 };
 use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
 
@@ -437,7 +437,10 @@ async fn least_db_of_session(
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
-    let opening = Opening { profile, ..Opening::twin("street", Outputs::colour(Encoding::Raw)) };
+    let opening = SessionOptions {
+        profile,
+        ..SessionOptions::twin("street", Outputs::colour(Encoding::Raw))
+    };
     let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
     session.reset(0, None).await.unwrap();
     let mut frame = session.observe(poses.to_vec()).await.unwrap();

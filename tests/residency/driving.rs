@@ -9,7 +9,8 @@ use wildcity::geometry::Pose;
 use wildcity::residency::{Cache, Needed, ResidencyError, Resident};
 use wildcity::scene::rig::{Rig, RigCamera};
 use wildcity::session::{
-    Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
+    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Session, SessionError,
+    SessionOptions,
 };
 
 use crate::source::{Fault, Faulty, Place};
@@ -47,18 +48,18 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let opening = Opening {
+        let opening = SessionOptions {
             start: Some(wildcity::session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
             deadline,
-            ..Opening::twin("demo", Outputs::colour(Encoding::Raw))
+            ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
         };
         Session::open(self.engine.clone(), name.to_owned(), opening).await
     }
 }
 
 /// Hashes of a frame's images.
-fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
+fn hashes(frame: &Observation) -> Vec<blake3::Hash> {
     frame.images.iter().map(|image| image.hash).collect()
 }
 

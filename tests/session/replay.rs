@@ -10,7 +10,7 @@ use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::residency::Cache;
 use wildcity::scene::ProfileChanges;
 use wildcity::server::{self, Config, Limits};
-use wildcity::session::{Extent, FrameRequest, Recording, ReplayError, Report};
+use wildcity::session::{FrameRequest, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil};
 use wildcity::store::Catalog;
 
 use crate::support::{self, Agent, Painter, TestServer, pose};
@@ -36,11 +36,11 @@ pub(crate) fn replay(
     server: &TestServer,
     path: &Path,
     backend: &dyn Backend,
-) -> Result<Report, ReplayError> {
-    let recording = Recording::read(path)?;
+) -> Result<ReplayReport, ReplayError> {
+    let recording = RecordedEpisode::read(path)?;
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let mut open = |version| cache.open(&recording.header.twin, Some(version));
-    recording.replay(&mut open, backend, Extent::FirstDifference, &mut |_| Ok(()))
+    recording.replay(&mut open, backend, ReplayUntil::FirstDifference, &mut |_| Ok(()))
 }
 
 /// Changes one hex digit of the hash of an image, in a line counted from 0.
@@ -60,7 +60,10 @@ fn tamper(path: &Path, line: usize, image: usize) {
 async fn what_was_recorded_is_rendered_again() {
     let (server, path) = recorded().await;
     let report = replay(&server, &path, &Painter::default()).unwrap();
-    assert_eq!(report, Report { images: 24, changes: vec![], strayed: None, difference: None });
+    assert_eq!(
+        report,
+        ReplayReport { images: 24, changes: vec![], diverged: None, difference: None }
+    );
 }
 
 #[tokio::test]
@@ -103,7 +106,7 @@ async fn damaged_files_are_named_by_line() {
     let lines: Vec<&str> = whole.lines().collect();
     let damaged = |text: &str| {
         std::fs::write(&path, text).unwrap();
-        match Recording::read(&path) {
+        match RecordedEpisode::read(&path) {
             Err(ReplayError::Line { line, reason, .. }) => (line, reason),
             other => panic!("{other:?}"),
         }
@@ -119,7 +122,10 @@ async fn damaged_files_are_named_by_line() {
     assert!(line == 1 && reason.contains('7'), "{reason}");
     let (line, reason) = damaged(&format!("{}\n\"{}\"\n", lines[0], "x".repeat(2 << 20)));
     assert!(line == 2 && reason.contains("longer"), "{reason}");
-    assert!(matches!(Recording::read(Path::new("/nowhere.jsonl")), Err(ReplayError::Read { .. })));
+    assert!(matches!(
+        RecordedEpisode::read(Path::new("/nowhere.jsonl")),
+        Err(ReplayError::Read { .. })
+    ));
     // Without its last line, the episode of a killed server can still be replayed.
     std::fs::write(&path, lines[..lines.len() - 1].join("\n") + "\n").unwrap();
     assert_eq!(replay(&server, &path, &Painter::default()).unwrap().difference, None);
