@@ -1,6 +1,6 @@
 //! Only what is needed: what one step of a street holds, moves and runs, with each feature and without.
 //!
-//! Counts, not times: they are the same on every machine, and a base scene that pays for a feature of
+//! ResourceCounts, not times: they are the same on every machine, and a base scene that pays for a feature of
 //! others is seen at once.
 
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use super::ReportError;
 use super::measure::sky_bytes;
 use wildcity_render::compare::drawing::look;
 use wildcity_render::cpu::Cpu;
-use wildcity_render::gpu::{Gpu, GpuUse};
+use wildcity_render::gpu::{Gpu, GpuUsage};
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::camera::{
@@ -23,16 +23,16 @@ use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Row {
+pub struct FeatureCounts {
     /// The feature, as `SH degree 1`.
     pub with: &'static str,
     /// What was counted.
-    pub counts: Counts,
+    pub counts: ResourceCounts,
 }
 
 /// What one step takes. Those of a device are absent where there is none.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Counts {
+pub struct ResourceCounts {
     /// Gaussians in the frame.
     pub gaussians: u64,
     /// Bytes of one in the host's memory.
@@ -64,7 +64,7 @@ pub struct DeviceCounts {
     pub pixel_bytes: u64,
 }
 
-/// Names of the columns, in order of [`Counts::texts`].
+/// Names of the columns, in order of [`ResourceCounts::texts`].
 pub const COLUMNS: [&str; 11] = [
     "Gaussians",
     "B each, host",
@@ -131,11 +131,14 @@ const FEATURES: [Feature; 18] = [
 ///
 /// # Errors
 /// A frame cannot be drawn.
-pub fn rows(cpu: &Cpu, device: &dyn Fn() -> Option<Gpu>) -> Result<Vec<Row>, ReportError> {
+pub fn count_features(
+    cpu: &Cpu,
+    device: &dyn Fn() -> Option<Gpu>,
+) -> Result<Vec<FeatureCounts>, ReportError> {
     let counted = |(with, change): Feature| {
         let mut step = Step::base();
         change(&mut step);
-        Ok(Row { with, counts: step.counts(cpu, device())? })
+        Ok(FeatureCounts { with, counts: step.counts(cpu, device())? })
     };
     FEATURES.into_iter().map(counted).collect()
 }
@@ -205,14 +208,14 @@ impl Step {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
 
-    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<Counts, ReportError> {
+    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<ResourceCounts, ReportError> {
         let FrameStats { evaluations, .. } = self.draw(cpu)?;
         let device = device.map(|gpu| self.of_device(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
-        Ok(Counts {
+        Ok(ResourceCounts {
             gaussians,
             host_bytes: self.scene.bytes() as f64 / gaussians as f64,
             beside_bytes: sky_bytes + hood_bytes as u64,
@@ -226,16 +229,16 @@ impl Step {
     fn of_device(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
         // The first frame makes room, perhaps in several tries.
         self.draw(gpu)?;
-        let dispatches = |usage: &GpuUse| usage.made.dispatches;
+        let dispatches = |usage: &GpuUsage| usage.totals.dispatches;
         let before = gpu.usage().as_ref().map_or(0, dispatches);
         self.draw(gpu)?;
         Ok(gpu.usage().map(|usage| DeviceCounts {
             gaussian_bytes: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
-            pipelines: usage.made.pipelines,
-            buffers: usage.made.buffers,
+            pipelines: usage.totals.pipelines,
+            buffers: usage.totals.buffers,
             dispatches: dispatches(&usage) - before,
-            moved_bytes: usage.last.bytes().iter().map(|(_, bytes)| bytes).sum(),
-            pixel_bytes: 4 * usage.last.planes,
+            moved_bytes: usage.last_frame.stage_bytes().iter().map(|(_, bytes)| bytes).sum(),
+            pixel_bytes: 4 * usage.last_frame.planes,
         }))
     }
 
@@ -259,7 +262,7 @@ impl Step {
     }
 }
 
-impl Counts {
+impl ResourceCounts {
     /// In words, by [`COLUMNS`].
     pub fn texts(&self) -> [String; 11] {
         let device = |text: &dyn Fn(&DeviceCounts) -> String| {
