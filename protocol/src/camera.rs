@@ -29,7 +29,7 @@ pub enum Lens {
     /// NVIDIA's f-theta, which has its focal lengths from its polynomial.
     Ftheta {
         /// Which way the polynomial goes.
-        reference: Reference,
+        reference: FthetaReference,
         /// Coefficients of powers 0 to 5, in radians and pixels.
         polynomial: [f64; 6],
         /// `[c, d, e]` of `[[c, d], [e, 1]]`, from round to real pixels.
@@ -42,7 +42,8 @@ pub enum Lens {
 /// Which way an f-theta polynomial goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Reference {
+#[schemars(rename = "Reference")]
+pub enum FthetaReference {
     /// From radians off the axis to pixels from the principal point.
     AngleToPixel,
     /// From pixels to radians.
@@ -89,7 +90,7 @@ pub enum WindshieldReference {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Shutter {
     /// Which row or column comes first.
-    pub direction: Rolls,
+    pub direction: ShutterDirection,
     /// From the first row's exposure to the last's, in microseconds.
     pub duration_us: i64,
 }
@@ -97,7 +98,8 @@ pub struct Shutter {
 /// The way a shutter rolls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Rolls {
+#[schemars(rename = "Rolls")]
+pub enum ShutterDirection {
     /// The top row first.
     TopToBottom,
     /// The bottom row first.

@@ -49,7 +49,7 @@ pub struct NewPush {
     pub base: Option<u64>,
     /// The 64 m cells that it replaces; those that its Gaussians touch, if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub cells: Option<Cells>,
+    pub cells: Option<CellSelection>,
     /// In how many bits Gaussians are stored: `f32`, `h52`, `q32` or `q24`; the base's if absent,
     /// and `q32` in a new twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -64,8 +64,8 @@ pub struct NewPush {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
     /// Where to compare before and after.
-    #[serde(default)]
-    pub golden: Golden,
+    #[serde(default, rename = "golden")]
+    pub preview: PreviewRequest,
 }
 
 /// One scene of a push.
@@ -85,17 +85,19 @@ pub struct PushFile {
 /// Which cells a push replaces.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
-pub enum Cells {
+#[schemars(rename = "Cells")]
+pub enum CellSelection {
     /// `"all"`: the whole twin.
-    All(All),
+    All(AllCells),
     /// These, as (x, y); cell (i, j) is centred on (64 i, 64 j) m. Gaussians elsewhere are left out.
-    These(Vec<[i32; 2]>),
+    Listed(Vec<[i32; 2]>),
 }
 
 /// The word `all`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum All {
+#[schemars(rename = "All")]
+pub enum AllCells {
     /// The whole twin.
     All,
 }
@@ -103,7 +105,8 @@ pub enum All {
 /// Where a push is compared with what was there.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Golden {
+#[schemars(rename = "Golden")]
+pub struct PreviewRequest {
     /// `world_from_rig` each; if absent, a few along the twin's first trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poses: Option<Vec<Pose>>,
@@ -197,7 +200,8 @@ pub struct PushReport {
     /// The cells that are replaced.
     pub cells: Vec<CellReport>,
     /// How single poses look before and after.
-    pub golden: Vec<GoldenReport>,
+    #[serde(rename = "golden")]
+    pub previews: Vec<PsnrPreview>,
 }
 
 /// One file of a push.
@@ -252,7 +256,8 @@ pub struct CellReport {
 
 /// One pose, before and after.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct GoldenReport {
+#[schemars(rename = "GoldenReport")]
+pub struct PsnrPreview {
     /// `world_from_rig`.
     pub pose: Pose,
     /// How alike all images of the pose are, in dB; absent where they are equal.

@@ -136,7 +136,7 @@ pub struct Action {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Dynamics {
     /// The model.
-    pub model: Model,
+    pub model: DynamicsModel,
     /// Speed at the start of an episode, in m/s.
     #[serde(default)]
     pub speed: f64,
@@ -148,7 +148,8 @@ pub struct Dynamics {
 /// A model of the ego.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Model {
+#[schemars(rename = "Model")]
+pub enum DynamicsModel {
     /// Goes to the pose that it is told.
     Teleport,
     /// Rolls without slipping, and has acceleration and curvature at once.
@@ -272,7 +273,7 @@ pub enum RigChoice {
 #[serde(untagged)]
 pub enum DynamicsChoice {
     /// A model, from standstill.
-    Model(Model),
+    Model(DynamicsModel),
     /// All of it, written out.
     Full(Dynamics),
 }

@@ -1,7 +1,7 @@
 //! The observation: one binary frame in safetensors layout.
 //!
 //! 8 bytes little-endian header length, a JSON header (space-padded), raw tensor bytes. The
-//! header's `__metadata__` is `{"observation": "<JSON of Observation>"}`: safetensors allows only
+//! header's `__metadata__` is `{"observation": "<JSON of ObservationMetadata>"}`: safetensors allows only
 //! strings there.
 //!
 //! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
@@ -19,7 +19,8 @@ use super::message::{Encoding, Pose};
 
 /// What an observation says beside its tensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct Observation {
+#[schemars(rename = "Observation")]
+pub struct ObservationMetadata {
     /// Number of the request.
     pub seq: u64,
     /// Steps done in the episode; 0 after `reset`.

@@ -57,7 +57,7 @@ async fn push(client: HttpClient, path: std::path::PathBuf, id: String) -> u64 {
     let mut asked = push_of(&[&upload.id]);
     asked.id = Some(id);
     let begun = client.push("test", &asked).await.unwrap();
-    let ended = client.wait(begun, &mut |_| {}).await.unwrap();
+    let ended = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
     assert_eq!(ended.state, PushState::Ready, "{ended:?}");
     ended.version.unwrap()
 }

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use wildcity::client::{Golden, HttpClient, NewPush, Push, PushFile};
+use wildcity::client::{HttpClient, NewPush, PreviewRequest, Push, PushFile};
 use wildcity::scene::Gaussians;
 
 use scene_files::{inria_columns, ply};
@@ -101,7 +101,7 @@ fn push_of(uploads: &[&str]) -> NewPush {
         levels: true,
         profile: Vec::new(),
         note: None,
-        golden: Golden::default(),
+        preview: PreviewRequest::default(),
     }
 }
 
@@ -118,7 +118,7 @@ async fn push(
     let mut asked = push_of(&[&upload.id]);
     change(&mut asked);
     let begun = client.push("test", &asked).await.unwrap();
-    client.wait(begun, &mut |_| {}).await.unwrap()
+    client.wait_for_push(begun, &mut |_| {}).await.unwrap()
 }
 
 /// Gaussians in one cell, about its centre.

@@ -138,7 +138,7 @@ async fn the_client_sends_its_token() {
     assert!(!format!("{pusher:?}").contains(PUSHER));
     let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap();
     let begun = pusher.push("test", &push_of(&[&upload.id])).await.unwrap();
-    assert_eq!(pusher.wait(begun, &mut |_| {}).await.unwrap().version, Some(2));
+    assert_eq!(pusher.wait_for_push(begun, &mut |_| {}).await.unwrap().version, Some(2));
     assert!(pusher.rollback("test", 1).await.unwrap_err().to_string().contains("403"));
     let admin = HttpClient::new(&url, Some(ADMIN.to_owned())).unwrap();
     assert_eq!(admin.rollback("test", 1).await.unwrap(), 3);

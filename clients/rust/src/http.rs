@@ -101,7 +101,7 @@ impl HttpClient {
         }
     }
 
-    /// Asks for a new version of uploaded files; [`HttpClient::wait`] tells how it goes on.
+    /// Asks for a new version of uploaded files; [`HttpClient::wait_for_push`] tells how it goes on.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
@@ -113,7 +113,7 @@ impl HttpClient {
     ///
     /// # Errors
     /// The server refuses, or does not answer.
-    pub async fn look(&self, twin: &str, id: &str) -> Result<Push, HttpError> {
+    pub async fn push_status(&self, twin: &str, id: &str) -> Result<Push, HttpError> {
         self.json(Method::GET, &format!("/v1/twins/{twin}/pushes/{id}"), None::<&()>).await
     }
 
@@ -121,7 +121,7 @@ impl HttpClient {
     ///
     /// # Errors
     /// The server refuses, or does not answer any more.
-    pub async fn wait(
+    pub async fn wait_for_push(
         &self,
         push: Push,
         seen: &mut (dyn FnMut(&Push) + Send),
@@ -133,7 +133,7 @@ impl HttpClient {
                 return Ok(push);
             }
             tokio::time::sleep(limits::PUSH_POLL).await;
-            push = match self.look(&push.twin, &push.id).await {
+            push = match self.push_status(&push.twin, &push.id).await {
                 Ok(push) => {
                     lost = 0;
                     push

@@ -25,10 +25,11 @@ pub use error::{ClientError, FrameError};
 pub use http::{HttpClient, HttpError};
 pub use observation::{ImageView, Observation};
 pub use wildcity_protocol::http::{
-    All, CellReport, Cells, Golden, NewPush, Push, PushFile, PushReport, PushState, Upload,
+    AllCells, CellReport, CellSelection, NewPush, PreviewRequest, Push, PushFile, PushReport,
+    PushState, Upload,
 };
 pub use wildcity_protocol::message::{
-    Action, Dynamics, DynamicsChoice, Model, Open, Pose, TimedPose,
+    Action, Dynamics, DynamicsChoice, DynamicsModel, Open, Pose, TimedPose,
 };
 
 /// A connection to a server, and the session on it.

@@ -18,7 +18,7 @@ use super::error::FrameError;
 /// asked for, and hashes, which are compared by [`Observation::verify`].
 #[derive(Clone, Debug)]
 pub struct Observation {
-    metadata: wire::Observation,
+    metadata: wire::ObservationMetadata,
     tensors: Metadata,
     /// Where tensor bytes start in `frame`.
     data_start: usize,
@@ -52,7 +52,7 @@ impl Observation {
     }
 
     /// What the observation says beside its tensors.
-    pub fn metadata(&self) -> &wire::Observation {
+    pub fn metadata(&self) -> &wire::ObservationMetadata {
         &self.metadata
     }
 
