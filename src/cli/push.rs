@@ -7,8 +7,8 @@ use anyhow::Context as _;
 
 use crate::cli::limits;
 use wildcity_client::{
-    AllCells, CellSelection, HttpClient, NewPush, PreviewRequest, Push as Pushed, PushFile,
-    PushReport, PushState,
+    AllCells, CellSelection, ConnectOptions, HttpClient, NewPush, PreviewRequest, Push as Pushed,
+    PushFile, PushReport, PushState,
 };
 use wildcity_twin::ingest;
 
@@ -165,7 +165,7 @@ impl Server {
             Some(path) => Some(read_token(path)?),
             None => std::env::var("WILDCITY_TOKEN").ok().filter(|token| !token.is_empty()),
         };
-        Ok(HttpClient::new(&self.server, token)?)
+        Ok(HttpClient::new(&self.server, &ConnectOptions::with_token(token))?)
     }
 }
 

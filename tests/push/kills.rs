@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use wildcity::client::{HttpClient, PushState};
+use wildcity::client::{ConnectOptions, HttpClient, PushState};
 use wildcity::store::Catalog;
 
 use crate::scene_files::{Random, gaussians};
@@ -39,7 +39,7 @@ impl Serving {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let url = line.trim().strip_prefix("listening on ws://").expect(&line);
         let url = format!("http://{}", url.strip_suffix("/v1/session").unwrap());
-        Self { child, client: HttpClient::new(&url, None).unwrap() }
+        Self { child, client: HttpClient::new(&url, &ConnectOptions::default()).unwrap() }
     }
 }
 

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use wildcity::client::{HttpClient, NewPush, PreviewRequest, Push, PushFile};
+use wildcity::client::{ConnectOptions, HttpClient, NewPush, PreviewRequest, Push, PushFile};
 use wildcity::scene::Gaussians;
 
 use scene_files::{inria_columns, ply};
@@ -77,7 +77,7 @@ async fn get(server: &TestServer, path: &str) -> Reply {
 }
 
 fn client(server: &TestServer) -> HttpClient {
-    HttpClient::new(&format!("http://{}", server.address()), None).unwrap()
+    HttpClient::new(&format!("http://{}", server.address()), &ConnectOptions::default()).unwrap()
 }
 
 /// Writes Gaussians as a PLY file of INRIA's.
