@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use serde_json::json;
-use wildcity::client::{AllCells, CellSelection, NewPush, Push, PushState};
-use wildcity::protocol::error::Code;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::store::Catalog;
+use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushState};
+use wildcity_protocol::error::Code;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_twin::store::Catalog;
 
+use crate::http::{client, get, in_cell, post, push, push_of, write};
 use crate::scene_files::gaussians;
 use crate::support::TestServer;
-use crate::{client, get, in_cell, post, push, push_of, write};
 
 #[tokio::test]
 async fn a_push_replaces_the_cells_that_it_touches() {
