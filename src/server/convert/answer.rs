@@ -11,7 +11,9 @@ use wildcity_protocol::http::Refusal;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
+use wildcity_protocol::observation::{
+    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+};
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -262,7 +264,7 @@ fn metadata(
     session: &Session,
     frame: &wildcity_session::Observation,
     image_names: &[String],
-) -> Observation {
+) -> ObservationMetadata {
     let (episode, version) = (session.episode(), &session.resident().version);
     let time_us = episode.time_us();
     let (encoding, _) = encoding(session.encoding());
@@ -313,7 +315,7 @@ fn metadata(
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    Observation {
+    ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
@@ -359,9 +361,9 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::Model::Teleport,
-        Model::Kinematic => message::Model::Kinematic,
-        Model::Dynamic => message::Model::Dynamic,
+        Model::Teleport => message::DynamicsModel::Teleport,
+        Model::Kinematic => message::DynamicsModel::Kinematic,
+        Model::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }
