@@ -19,7 +19,7 @@ use wildcity_render::{Backend, View};
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
 use wildcity_twin::ingest::{self};
-use wildcity_twin::residency::{Cache, Pinned, Resident};
+use wildcity_twin::residency::{Cache, PinnedScene, Resident};
 
 use super::places::{TwinVersion, Twins};
 use super::progress;
@@ -263,7 +263,7 @@ enum Source {
 /// What is drawn of a source, in memory for as long as this lives.
 pub(super) enum Drawn<'a> {
     Whole(Cow<'a, Scene>),
-    Needed(Pinned),
+    Needed(PinnedScene),
 }
 
 impl Deref for Drawn<'_> {

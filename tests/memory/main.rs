@@ -10,7 +10,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use glam::DVec3;
-use wildcity::residency::{Cache, Eye};
+use wildcity::residency::{Cache, Viewpoint};
 use wildcity::scene::RenderProfile;
 use wildcity::store::Catalog;
 
@@ -48,7 +48,7 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     let before = status_bytes("self", "VmRSS").unwrap();
     let resident = cache.open("degree1", None).unwrap();
     // What a frame of all of it in full detail draws, and no other level.
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     let everything = RenderProfile { tau_px: 0.0, reach_m: None, ..RenderProfile::default() };
     let scene = resident.scene(&[eye], &everything).unwrap();
     assert!(scene.gaussians() == n && scene.bytes() >= 92 * n);

@@ -32,7 +32,7 @@ use wildcity::scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
 use wildcity::session::{
     Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
 };
-use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
 
 use crate::skies::demo_sky;
 
@@ -54,7 +54,7 @@ fn commit_reaching(
         profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
-        storage: Storage { record: Record::F32, levels: true },
+        storage: StorageOptions { record: Record::F32, levels: true },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -462,7 +462,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -504,7 +504,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: Record::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

@@ -11,7 +11,7 @@ use wildcity::residency::Cache;
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::route::Route;
 use wildcity::scene::{Rig, Trajectory};
-use wildcity::store::{Catalog, Kind, Settings, Storage};
+use wildcity::store::{Catalog, CommitKind, StorageOptions, VersionSettings};
 
 use crate::{PROFILE, bytes, eyes, pixels, views};
 
@@ -28,12 +28,13 @@ fn city() -> &'static City {
             CitySettings { seed: 3, length_m: 2_000.0, millions_per_km: 1.0, speed_m_s: 30.0 };
         let dir = tempfile::tempdir().unwrap();
         let catalog = Catalog::open(dir.path()).unwrap();
-        let mut commit = catalog.begin("city", Kind::Import, Storage::default()).unwrap();
+        let mut commit =
+            catalog.begin("city", CommitKind::Import, StorageOptions::default()).unwrap();
         for cell in generate::city(&settings).unwrap() {
             commit.put(&cell.gaussians, None, &mut |_, _| {}).unwrap();
         }
         let drive = generate::city_drive(&settings).unwrap();
-        let settings = Settings {
+        let settings = VersionSettings {
             profile: PROFILE,
             rig: Rig::preset("vehicle6"),
             trajectories: vec![drive.clone()],
@@ -59,7 +60,7 @@ fn two_kilometres_in_the_memory_of_their_worst_frame_look_as_with_all_of_it() {
         (0..=50).map(|i| route.at(f64::from(i) * route.length_m() / 50.0).world_from_rig).collect();
     let need = |pose| bytes(&whole, &whole.demand(&eyes(&views(pose)), &PROFILE));
     let limit_bytes = poses.iter().map(|&pose| need(pose)).max().unwrap();
-    assert!(8 * limit_bytes < whole.whole_bytes(), "{limit_bytes} of {}", whole.whole_bytes());
+    assert!(8 * limit_bytes < whole.total_bytes(), "{limit_bytes} of {}", whole.total_bytes());
 
     let (cache, resident) = open(Some(limit_bytes));
     for pose in poses {

@@ -22,7 +22,7 @@ use glam::DVec3;
 use wildcity::generate::{self, StreetSettings};
 use wildcity::geometry::Pose;
 use wildcity::render::View;
-use wildcity::residency::{Cache, Eye, Needed, Resident};
+use wildcity::residency::{Cache, Resident, SectionRef, Viewpoint};
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
 use wildcity::store::{Catalog, NewVersion, Version};
@@ -78,8 +78,8 @@ fn views(world_from_rig: Pose) -> [View; 2] {
     [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
 }
 
-fn eyes(views: &[View]) -> Vec<Eye> {
-    let eye = |view: &View| Eye {
+fn eyes(views: &[View]) -> Vec<Viewpoint> {
+    let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };
@@ -93,9 +93,9 @@ fn pixels(scene: &Scene, world_from_rig: Pose) -> Vec<Vec<u8>> {
 }
 
 /// Bytes of memory that sections take.
-fn bytes(resident: &Resident, needed: &[Needed]) -> u64 {
+fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     let manifest = &resident.version.manifest;
-    let of = |n: &Needed| {
+    let of = |n: &SectionRef| {
         let count = manifest.chunks[n.chunk].sections[n.section].count;
         Chunk::bytes_of(manifest.sh_degree, count.into())
     };

@@ -5,7 +5,7 @@ use std::io;
 use std::sync::{Condvar, Mutex};
 use std::time::Instant;
 
-use wildcity::residency::Source;
+use wildcity::residency::SectionSource;
 use wildcity::scene::Chunk;
 use wildcity::scene::manifest::{ChunkEntry, Section};
 use wildcity::store::{Catalog, StoreError, Version};
@@ -80,7 +80,7 @@ impl Faulty {
     }
 }
 
-impl Source for Faulty {
+impl SectionSource for Faulty {
     fn section(
         &self,
         version: &Version,

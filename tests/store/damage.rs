@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
-use wildcity::residency::{Cache, Eye, Pinned, ResidencyError};
+use wildcity::residency::{Cache, PinnedScene, ResidencyError, Viewpoint};
 use wildcity::scene::Gaussians;
 use wildcity::scene::RenderProfile;
 use wildcity::store::{Catalog, StoreError, Version};
@@ -66,9 +66,9 @@ impl Twin {
 }
 
 /// Reads all of the twin but its coarse levels.
-fn everything(catalog: Catalog) -> Result<Pinned, ResidencyError> {
+fn everything(catalog: Catalog) -> Result<PinnedScene, ResidencyError> {
     let resident = Cache::new(catalog).open("street", None)?;
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     resident.scene(&[eye], &RenderProfile { tau_px: 0.0, ..RenderProfile::default() })
 }
 

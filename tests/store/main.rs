@@ -23,11 +23,11 @@ use std::path::{Path, PathBuf};
 
 use wildcity::scene::manifest::Provenance;
 use wildcity::scene::{Gaussians, Record};
-use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use wildcity::store::{Catalog, NewVersion, StorageOptions, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 fn street(gaussians: &Gaussians) -> NewVersion<'_> {
-    let storage = Storage { record: Record::F32, levels: false };
+    let storage = StorageOptions { record: Record::F32, levels: false };
     let provenance = Provenance::of("test".into());
     NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use wildcity::scene::Gaussians;
 use wildcity::store::{
-    Catalog, Change, Commit, Kind, NewVersion, Settings, Storage, StoreError, Version,
+    Catalog, Commit, CommitKind, NewVersion, StorageOptions, StoreError, Version, VersionChange,
+    VersionSettings,
 };
 
 use crate::s3::{S3, keys};
@@ -43,7 +44,7 @@ pub(crate) fn everywhere(test: impl Fn(&Place)) {
 }
 
 fn whole(scene: &Gaussians) -> NewVersion<'_> {
-    NewVersion { storage: Storage::default(), ..street(scene) }
+    NewVersion { storage: StorageOptions::default(), ..street(scene) }
 }
 
 pub(crate) fn commit(catalog: &Catalog, scene: &Gaussians) -> Version {
@@ -57,14 +58,14 @@ pub(crate) fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
         mean_m[0] += 64.0 * f64::from(cell[0]);
         mean_m[1] += 64.0 * f64::from(cell[1]);
     }
-    let mut commit = catalog.begin("street", Kind::Push, Storage::default()).unwrap();
+    let mut commit = catalog.begin("street", CommitKind::Push, StorageOptions::default()).unwrap();
     commit.put(&scene, None, &mut |_, _| {}).unwrap();
     commit
 }
 
-pub(crate) fn cells_alone() -> Change {
+pub(crate) fn cells_alone() -> VersionChange {
     let provenance = street(&gaussians(0, 0, 1.0, 0)).provenance;
-    Change { profile: None, rig: None, trajectories: None, sky: None, provenance }
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }
 
 fn read_all(catalog: &Catalog, version: &Version) -> u64 {
@@ -149,7 +150,7 @@ fn the_same_cell_is_refused_and_an_old_version_comes_back() {
         assert_eq!((back.number, &back.hash), (3, &first.hash));
         let kinds: Vec<_> =
             catalog.versions("street").unwrap().iter().map(|entry| entry.kind).collect();
-        assert_eq!(kinds, [Kind::Import, Kind::Push, Kind::Rollback]);
+        assert_eq!(kinds, [CommitKind::Import, CommitKind::Push, CommitKind::Rollback]);
         let diff = catalog.diff("street", 2, 3).unwrap();
         assert_eq!((diff.cells.len(), diff.cells[0].cell, diff.cells[0].after), (1, [3, 3], None));
     });
@@ -208,8 +209,9 @@ fn settings_are_replaced_whole() {
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
-        let version =
-            commit.replace(None, Settings { profile, rig, trajectories, sky, provenance }).unwrap();
+        let version = commit
+            .replace(None, VersionSettings { profile, rig, trajectories, sky, provenance })
+            .unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));
     });

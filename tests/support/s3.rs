@@ -16,7 +16,7 @@ use object_store::aws::AmazonS3Builder;
 use object_store::{ObjectStore, RetryConfig};
 use s3s::auth::SimpleAuth;
 use s3s::service::{S3Service, S3ServiceBuilder};
-use wildcity::store::{CacheSettings, Catalog, Patience, StoreError};
+use wildcity::store::{Catalog, DiskCacheSettings, RetryPolicy, StoreError};
 
 const KEYS: [&str; 2] = ["test", "secret"];
 const BUCKET: &str = "bucket";
@@ -112,7 +112,7 @@ impl S3 {
         self.cached(None).unwrap()
     }
 
-    pub(crate) fn cached(&self, cache: Option<&CacheSettings>) -> Result<Catalog, StoreError> {
+    pub(crate) fn cached(&self, cache: Option<&DiskCacheSettings>) -> Result<Catalog, StoreError> {
         Catalog::over(self.store(), &Self::url(), "twins", cache, quick())
     }
 
@@ -128,9 +128,9 @@ impl S3 {
 }
 
 /// The patience of tests.
-pub(crate) fn quick() -> Patience {
+pub(crate) fn quick() -> RetryPolicy {
     let (timeout, backoff) = (Duration::from_secs(3), Duration::from_millis(10));
-    Patience { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
+    RetryPolicy { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
 }
 
 /// All files below a folder that are objects of the server: it keeps notes of its own beside them.

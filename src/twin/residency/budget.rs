@@ -15,14 +15,14 @@ use super::ResidencyError;
 #[derive(Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
-    versions: BTreeMap<String, Claims>,
+    versions: BTreeMap<String, VersionClaims>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Claims {
+struct VersionClaims {
     sessions: u64,
     sum_bytes: u64,
-    whole_bytes: u64,
+    total_bytes: u64,
 }
 
 /// The worst frame of a session.
@@ -35,7 +35,7 @@ pub(super) struct Claim {
     /// What it needs at once.
     pub(super) bytes: u64,
     /// What all of its version takes, in all levels of detail.
-    pub(super) whole_bytes: u64,
+    pub(super) total_bytes: u64,
 }
 
 impl Budget {
@@ -47,13 +47,13 @@ impl Budget {
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
-    pub(super) fn take(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
-        let Claim { twin, version, bytes, whole_bytes } = claim;
-        let held_bytes = self.held_bytes();
-        let nobody = Claims { sessions: 0, sum_bytes: 0, whole_bytes: *whole_bytes };
+    pub(super) fn reserve(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
+        let Claim { twin, version, bytes, total_bytes } = claim;
+        let held_bytes = self.reserved_bytes();
+        let nobody = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: *total_bytes };
         let before = self.versions.get(version).copied().unwrap_or(nobody);
         let (sessions, sum_bytes) = (before.sessions + 1, before.sum_bytes.saturating_add(*bytes));
-        let after = Claims { sessions, sum_bytes, ..before };
+        let after = VersionClaims { sessions, sum_bytes, ..before };
         let needed_bytes = after.bytes() - before.bytes();
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
             let (twin, limit_bytes) = (twin.clone(), self.limit_bytes);
@@ -66,15 +66,15 @@ impl Budget {
     /// Sets memory aside in place of what was taken before; if that is refused, nothing changes.
     ///
     /// # Errors
-    /// As [`Budget::take`].
+    /// As [`Budget::reserve`].
     pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
         let before = self.versions.clone();
-        self.give_back(old);
-        self.take(new).inspect_err(|_| self.versions = before)
+        self.release(old);
+        self.reserve(new).inspect_err(|_| self.versions = before)
     }
 
-    /// Gives back what [`Budget::take`] took.
-    pub(super) fn give_back(&mut self, claim: &Claim) {
+    /// Gives back what [`Budget::reserve`] took.
+    pub(super) fn release(&mut self, claim: &Claim) {
         if let Some(claims) = self.versions.get_mut(&claim.version) {
             claims.sessions -= 1;
             claims.sum_bytes -= claim.bytes;
@@ -85,14 +85,14 @@ impl Budget {
     }
 
     /// Bytes that are set aside.
-    pub(super) fn held_bytes(&self) -> u64 {
-        self.versions.values().map(Claims::bytes).sum()
+    pub(super) fn reserved_bytes(&self) -> u64 {
+        self.versions.values().map(VersionClaims::bytes).sum()
     }
 }
 
-impl Claims {
+impl VersionClaims {
     fn bytes(&self) -> u64 {
-        self.sum_bytes.min(self.whole_bytes)
+        self.sum_bytes.min(self.total_bytes)
     }
 }
 

@@ -5,17 +5,17 @@ use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use crate::store::{Catalog, Listing, StoreError, Version};
+use crate::store::{Catalog, StoreError, TwinListing, Version};
 use wildcity_scene::manifest::{ChunkEntry, Section, SkyRef};
 use wildcity_scene::{Chunk, Manifest, RenderProfile, Sky};
 
 use super::budget::{Budget, default_bytes};
-use super::pager::{Pager, Waiting};
-use super::requests::{Done, Wanted};
+use super::pager::{Pager, WaitingFrame};
+use super::requests::{RequestedSections, SceneCallback};
 use super::reservation::Reservation;
-use super::table::{Id, Key};
-use super::worst::{Lens, worst_bytes};
-use super::{Eye, Index, Needed, Pinned, ResidencyError, Source, Stats};
+use super::table::{Key, SlotId};
+use super::worst_case::{RigExtent, worst_case_bytes};
+use super::{BlockIndex, PinnedScene, ResidencyError, SectionRef, SectionSource, Stats, Viewpoint};
 
 /// Opens versions of twins, and shares the memory for what their frames need.
 #[derive(Debug)]
@@ -51,29 +51,29 @@ pub struct Resident {
     /// What is behind its Gaussians, baked as its profile asks.
     sky: Option<Arc<Sky>>,
     pub(super) shared: Arc<Shared>,
-    index: Index,
+    index: BlockIndex,
     /// Names in the pager's table, chunk after chunk, section after section.
-    ids: Vec<Id>,
+    ids: Vec<SlotId>,
     /// Where each chunk begins in `ids`.
     first: Vec<usize>,
     /// All levels of all of it, in bytes.
-    whole_bytes: u64,
+    total_bytes: u64,
     /// The most that a frame needs, by lens: looking for it takes a while.
-    worst: Mutex<Vec<(Looks, u64)>>,
+    worst: Mutex<Vec<(WorstCaseKey, u64)>>,
 }
 
 /// A frame that waits for what it needs. Dropped, it waits no more.
 #[derive(Debug)]
-pub struct Ticket {
+pub struct SceneRequest {
     /// Dropped first: as long as it waits, the queue names sections by ids that `resident` keeps.
-    waiting: Waiting,
+    waiting: WaitingFrame,
     resident: Arc<Resident>,
     needed: usize,
     asked: Instant,
 }
 
 /// A lens, and the tau_px and reach_m that it is drawn with.
-type Looks = (Lens, f64, Option<f64>);
+type WorstCaseKey = (RigExtent, f64, Option<f64>);
 
 impl Cache {
     /// Nothing in memory yet, and room for three quarters of the machine's memory.
@@ -90,7 +90,7 @@ impl Cache {
     /// The same with sections that come from somewhere else.
     pub fn with_source(
         catalog: Catalog,
-        source: Arc<dyn Source>,
+        source: Arc<dyn SectionSource>,
         limit_bytes: Option<u64>,
     ) -> Self {
         let limit_bytes = limit_bytes.unwrap_or_else(default_bytes);
@@ -104,7 +104,7 @@ impl Cache {
     ///
     /// # Errors
     /// As [`Catalog::twins`].
-    pub fn twins(&self) -> Result<Vec<Listing>, StoreError> {
+    pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
         self.catalog.twins()
     }
 
@@ -170,7 +170,7 @@ impl Cache {
 
 impl Shared {
     fn stats(&self) -> Stats {
-        let reserved_bytes = lock(&self.budget).held_bytes();
+        let reserved_bytes = lock(&self.budget).reserved_bytes();
         Stats { reserved_bytes, ..self.pager.stats() }
     }
 }
@@ -187,17 +187,17 @@ impl Resident {
             }));
         }
         let sky_bytes = sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
-        let whole_bytes = sky_bytes + keys.iter().map(|(_, bytes)| bytes).sum::<u64>();
+        let total_bytes = sky_bytes + keys.iter().map(|(_, bytes)| bytes).sum::<u64>();
         let ids = shared.pager.with_table(|table| {
             keys.into_iter().map(|(key, bytes)| table.register(key, bytes)).collect()
         });
-        let index = Index::new(manifest);
+        let index = BlockIndex::new(manifest);
         let (version, worst) = (Arc::new(version), Mutex::default());
-        Self { version, sky, shared, index, ids, first, whole_bytes, worst }
+        Self { version, sky, shared, index, ids, first, total_bytes, worst }
     }
 
     /// What a frame of these cameras draws; `profile` is the version's unless somebody knows better.
-    pub fn demand(&self, eyes: &[Eye], profile: &RenderProfile) -> Vec<Needed> {
+    pub fn demand(&self, eyes: &[Viewpoint], profile: &RenderProfile) -> Vec<SectionRef> {
         self.index.demand(&self.version.manifest, eyes, profile)
     }
 
@@ -206,16 +206,16 @@ impl Resident {
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`] if it can never be.
-    pub fn ask(
+    pub fn request(
         self: &Arc<Self>,
-        eyes: &[Eye],
+        eyes: &[Viewpoint],
         profile: &RenderProfile,
-        done: Done,
-    ) -> Result<Ticket, ResidencyError> {
+        done: SceneCallback,
+    ) -> Result<SceneRequest, ResidencyError> {
         let wanted = self.wanted(self.demand(eyes, profile));
         let (needed, asked) = (wanted.needed.len(), Instant::now());
-        let waiting = self.shared.pager.ask(wanted, done)?;
-        Ok(Ticket { waiting, resident: self.clone(), needed, asked })
+        let waiting = self.shared.pager.request_frame(wanted, done)?;
+        Ok(SceneRequest { waiting, resident: self.clone(), needed, asked })
     }
 
     /// What a frame of these cameras draws, all of it in memory. Blocks until it is.
@@ -224,23 +224,23 @@ impl Resident {
     /// [`ResidencyError::TooLarge`], or [`ResidencyError::Load`] if something cannot be read.
     pub fn scene(
         self: &Arc<Self>,
-        eyes: &[Eye],
+        eyes: &[Viewpoint],
         profile: &RenderProfile,
-    ) -> Result<Pinned, ResidencyError> {
+    ) -> Result<PinnedScene, ResidencyError> {
         let (tell, told) = sync_channel(1);
-        let done: Done = Box::new(move |pinned| {
+        let done: SceneCallback = Box::new(move |pinned| {
             // Nobody listens any more only if this very call has ended.
             let _ = tell.send(pinned);
         });
-        let ticket = self.ask(eyes, profile, done)?;
-        told.recv().unwrap_or_else(|_| Err(ticket.late()))
+        let request = self.request(eyes, profile, done)?;
+        told.recv().unwrap_or_else(|_| Err(request.timeout_error()))
     }
 
     /// Sets aside the most that a frame of a rig anywhere in the twin needs.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
-    pub fn reserve(self: &Arc<Self>, lens: Lens) -> Result<Reservation, ResidencyError> {
+    pub fn reserve(self: &Arc<Self>, lens: RigExtent) -> Result<Reservation, ResidencyError> {
         self.reserve_with(lens, &self.version.manifest.profile)
     }
 
@@ -250,25 +250,25 @@ impl Resident {
     /// As [`Resident::reserve`].
     pub fn reserve_with(
         self: &Arc<Self>,
-        lens: Lens,
+        lens: RigExtent,
         profile: &RenderProfile,
     ) -> Result<Reservation, ResidencyError> {
-        Reservation::new(self.clone(), self.worst_bytes_with(lens, profile))
+        Reservation::new(self.clone(), self.worst_case_bytes_with(lens, profile))
     }
 
     /// The most that a frame of a rig anywhere in the twin needs, in bytes.
-    pub fn worst_bytes(&self, lens: Lens) -> u64 {
-        self.worst_bytes_with(lens, &self.version.manifest.profile)
+    pub fn worst_case_bytes(&self, lens: RigExtent) -> u64 {
+        self.worst_case_bytes_with(lens, &self.version.manifest.profile)
     }
 
     /// The same of frames that are drawn with another profile than the version's.
-    pub fn worst_bytes_with(&self, lens: Lens, profile: &RenderProfile) -> u64 {
+    pub fn worst_case_bytes_with(&self, lens: RigExtent, profile: &RenderProfile) -> u64 {
         // What of a profile decides how much is drawn.
         let looks = (lens, profile.tau_px, profile.reach_m);
         let known =
             lock(&self.worst).iter().find(|(known, _)| *known == looks).map(|known| known.1);
         let bytes = known.unwrap_or_else(|| {
-            let bytes = worst_bytes(&self.index, &self.version.manifest, lens, profile);
+            let bytes = worst_case_bytes(&self.index, &self.version.manifest, lens, profile);
             let mut worst = lock(&self.worst);
             worst.truncate(crate::limits::REMEMBERED_LENSES - 1);
             worst.insert(0, (looks, bytes));
@@ -284,8 +284,8 @@ impl Resident {
     }
 
     /// Memory that all levels of all of it would take, in bytes.
-    pub fn whole_bytes(&self) -> u64 {
-        self.whole_bytes
+    pub fn total_bytes(&self) -> u64 {
+        self.total_bytes
     }
 
     /// What was done for all twins so far, and what is held now.
@@ -303,9 +303,9 @@ impl Resident {
         self.shared.pager.load_times().quantile(0.99)
     }
 
-    pub(super) fn wanted(&self, needed: Vec<Needed>) -> Wanted {
+    pub(super) fn wanted(&self, needed: Vec<SectionRef>) -> RequestedSections {
         let ids = needed.iter().map(|n| self.ids[self.first[n.chunk] + n.section]).collect();
-        Wanted { version: self.version.clone(), sky: self.sky.clone(), needed, ids }
+        RequestedSections { version: self.version.clone(), sky: self.sky.clone(), needed, ids }
     }
 }
 
@@ -315,10 +315,10 @@ impl Drop for Resident {
     }
 }
 
-impl Ticket {
+impl SceneRequest {
     /// Why there is no frame, now that its time is up.
-    pub fn late(&self) -> ResidencyError {
-        ResidencyError::Late {
+    pub fn timeout_error(&self) -> ResidencyError {
+        ResidencyError::TimedOut {
             twin: self.resident.version.manifest.twin.clone(),
             missing: self.waiting.missing(),
             needed: self.needed,

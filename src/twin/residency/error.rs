@@ -46,7 +46,7 @@ pub enum ResidencyError {
         "{missing} of the {needed} sections of twin {twin:?} that the frame needs were not in memory \
          after {waited:.1?}; they go on loading: try again, or allow more time"
     )]
-    Late {
+    TimedOut {
         /// The twin.
         twin: String,
         /// Sections that are still not there.

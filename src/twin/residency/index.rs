@@ -8,8 +8,8 @@ use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::Section;
 use wildcity_scene::{Manifest, RenderProfile};
 
-use super::demand::{level, longest_px};
-use super::{Eye, Needed};
+use super::demand::{coarsest_level, longest_px};
+use super::{SectionRef, Viewpoint};
 
 /// Cells along the edge of a group: 1 km, so that 20 km of road are some twenty groups, and the 200
 /// cells within 300 m of an eye lie in at most four.
@@ -17,7 +17,7 @@ const GROUP_CELLS: i32 = 16;
 
 /// The blocks of a version in order, beneath the boxes of their cells and of groups of cells.
 #[derive(Debug)]
-pub struct Index {
+pub struct BlockIndex {
     groups: Vec<Group>,
     cells: Vec<Cell>,
     blocks: Vec<Block>,
@@ -44,7 +44,7 @@ pub(super) struct Block {
     sections: Range<usize>,
 }
 
-impl Index {
+impl BlockIndex {
     /// Of a version's table.
     pub fn new(manifest: &Manifest) -> Self {
         let mut groups: BTreeMap<[i32; 2], Group> = BTreeMap::new();
@@ -73,17 +73,18 @@ impl Index {
     pub fn demand(
         &self,
         manifest: &Manifest,
-        eyes: &[Eye],
+        eyes: &[Viewpoint],
         profile: &RenderProfile,
-    ) -> Vec<Needed> {
+    ) -> Vec<SectionRef> {
         let focal_px = longest_px(eyes);
         let distance_m = |bounds: &Bounds| {
-            let from = |eye: &Eye| bounds.distance_m(eye.position_m);
+            let from = |eye: &Viewpoint| bounds.distance_m(eye.position_m);
             eyes.iter().map(from).fold(f64::INFINITY, f64::min)
         };
         let mut needed = Vec::new();
         self.visit(profile.reach_m, &distance_m, &mut |block, distance_m| {
-            let level = level(block.levels(manifest), focal_px, distance_m, profile.tau_px);
+            let level =
+                coarsest_level(block.levels(manifest), focal_px, distance_m, profile.tau_px);
             needed.push(block.at(level));
         });
         needed
@@ -124,7 +125,7 @@ impl Block {
         &manifest.chunks[self.chunk].sections[self.sections.clone()]
     }
 
-    fn at(&self, level: usize) -> Needed {
-        Needed { chunk: self.chunk, section: self.sections.start + level }
+    fn at(&self, level: usize) -> SectionRef {
+        SectionRef { chunk: self.chunk, section: self.sections.start + level }
     }
 }

@@ -1,7 +1,7 @@
 //! The pager: loads what is wanted, in order of urgency, and gives a frame all it needs at once.
 //!
 //! A frame that waits holds nothing, so frames cannot block each other; its sections are spared by
-//! everybody but older frames ([`super::table::Asker`]). Threads of its own load, because reading blocks; nobody
+//! everybody but older frames ([`super::table::Requester`]). Threads of its own load, because reading blocks; nobody
 //! else ever waits in here for more than a lock.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,16 +13,19 @@ use crate::store::Version;
 use wildcity_scene::Scene;
 
 use super::load_times::LoadTimes;
-use super::requests::{Done, Failed, Next, Ready, Requests, Tellings, Urgency, Wanted};
-use super::table::{Id, Table};
-use super::{Needed, ResidencyError, Source, Stats};
+use super::requests::{
+    CompleteFrame, LoadFailure, NextLoad, Notifications, RequestedSections, Requests,
+    SceneCallback, Urgency,
+};
+use super::table::{SectionTable, SlotId};
+use super::{ResidencyError, SectionRef, SectionSource, Stats};
 
 /// The table of sections and the threads that fill it, which end with it.
 pub(super) struct Pager(Arc<Shared>);
 
 /// What a frame draws, all of it in memory for as long as this lives.
 #[derive(Debug)]
-pub struct Pinned {
+pub struct PinnedScene {
     scene: Scene,
     shared: Arc<Shared>,
     /// Sections that were not in memory when the frame asked.
@@ -32,13 +35,13 @@ pub struct Pinned {
 }
 
 /// A frame's place among those that wait; dropping it gives the place up.
-pub(super) struct Waiting {
+pub(super) struct WaitingFrame {
     shared: Arc<Shared>,
     number: u64,
 }
 
 struct Shared {
-    source: Arc<dyn Source>,
+    source: Arc<dyn SectionSource>,
     state: Mutex<State>,
     /// Rings when there may be something to load, or room for it.
     work: Condvar,
@@ -51,8 +54,8 @@ struct State {
 }
 
 impl Pager {
-    pub(super) fn new(source: Arc<dyn Source>, limit_bytes: u64) -> Self {
-        let requests = Requests::new(Table::new(limit_bytes));
+    pub(super) fn new(source: Arc<dyn SectionSource>, limit_bytes: u64) -> Self {
+        let requests = Requests::new(SectionTable::new(limit_bytes));
         let state = State { requests, started: false, closed: false };
         Self(Arc::new(Shared { source, state: Mutex::new(state), work: Condvar::new() }))
     }
@@ -78,7 +81,7 @@ impl Pager {
     }
 
     /// Changes what the table knows of versions.
-    pub(super) fn with_table<T>(&self, change: impl FnOnce(&mut Table) -> T) -> T {
+    pub(super) fn with_table<T>(&self, change: impl FnOnce(&mut SectionTable) -> T) -> T {
         change(&mut self.0.lock().requests.table)
     }
 
@@ -86,14 +89,18 @@ impl Pager {
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`]; `done` is dropped then.
-    pub(super) fn ask(&self, wanted: Wanted, done: Done) -> Result<Waiting, ResidencyError> {
-        let mut tellings = Tellings::new();
-        let number = self.0.lock().requests.ask(wanted, done, &mut tellings)?;
-        if tellings.is_empty() {
+    pub(super) fn request_frame(
+        &self,
+        wanted: RequestedSections,
+        done: SceneCallback,
+    ) -> Result<WaitingFrame, ResidencyError> {
+        let mut notifications = Notifications::new();
+        let number = self.0.lock().requests.add_frame(wanted, done, &mut notifications)?;
+        if notifications.is_empty() {
             self.0.work.notify_all();
         }
-        self.0.tell(tellings);
-        Ok(Waiting { shared: self.0.clone(), number })
+        self.0.notify(notifications);
+        Ok(WaitingFrame { shared: self.0.clone(), number })
     }
 
     /// Loads what somebody may need, in order, as far as there is room, in place of what the same
@@ -101,15 +108,15 @@ impl Pager {
     pub(super) fn prefetch(
         &self,
         before: Option<u64>,
-        wanted: Wanted,
+        wanted: RequestedSections,
         urgencies: &[Urgency],
     ) -> u64 {
         let number = {
             let requests = &mut self.0.lock().requests;
             if let Some(before) = before {
-                requests.withdraw_prefetch(before);
+                requests.cancel_prefetch(before);
             }
-            let number = requests.prefetch(before, wanted, urgencies);
+            let number = requests.add_prefetch(before, wanted, urgencies);
             requests.forget_failures();
             number
         };
@@ -118,16 +125,16 @@ impl Pager {
     }
 
     /// Loads nothing more of what was wanted under a number.
-    pub(super) fn withdraw_prefetch(&self, number: u64) {
+    pub(super) fn cancel_prefetch(&self, number: u64) {
         let requests = &mut self.0.lock().requests;
-        requests.withdraw_prefetch(number);
+        requests.cancel_prefetch(number);
         requests.forget_failures();
     }
 
     /// Sections that were wanted under a number and may still come: not those that are there, that
     /// failed or for which there was no room.
-    pub(super) fn coming(&self, number: u64) -> usize {
-        self.0.lock().requests.coming(number)
+    pub(super) fn pending(&self, number: u64) -> usize {
+        self.0.lock().requests.pending(number)
     }
 
     /// Bytes of memory in use, and bytes there are.
@@ -157,19 +164,19 @@ impl Drop for Pager {
     }
 }
 
-impl Waiting {
+impl WaitingFrame {
     /// How many of its sections are not there.
     pub(super) fn missing(&self) -> usize {
         self.shared.lock().requests.missing(self.number)
     }
 }
 
-impl Drop for Waiting {
+impl Drop for WaitingFrame {
     fn drop(&mut self) {
         // What it was to be told is dropped once the lock is open: it may hold anything.
         let _done = {
             let requests = &mut self.shared.lock().requests;
-            let done = requests.give_up(self.number);
+            let done = requests.cancel_frame(self.number);
             requests.forget_failures();
             done
         };
@@ -177,7 +184,7 @@ impl Drop for Waiting {
     }
 }
 
-impl std::ops::Deref for Pinned {
+impl std::ops::Deref for PinnedScene {
     type Target = Scene;
 
     fn deref(&self) -> &Scene {
@@ -185,11 +192,11 @@ impl std::ops::Deref for Pinned {
     }
 }
 
-impl Drop for Pinned {
+impl Drop for PinnedScene {
     fn drop(&mut self) {
         self.scene.chunks.clear();
         // Under the lock: a loader that has just found everything in use is asleep by then.
-        if self.shared.lock().requests.starving {
+        if self.shared.lock().requests.waiting_for_room {
             self.shared.work.notify_all();
         }
     }
@@ -206,17 +213,17 @@ impl Shared {
         let mut state = self.lock();
         while !state.closed {
             match state.requests.next(Instant::now()) {
-                Next::Load { id, needed, version } => {
+                NextLoad::Load { id, needed, version } => {
                     drop(state);
-                    let tellings = self.load(id, needed, &version);
+                    let notifications = self.load(id, needed, &version);
                     self.work.notify_all();
-                    self.tell(tellings);
+                    self.notify(notifications);
                     state = self.lock();
                 }
-                Next::Wait(until) => {
+                NextLoad::Wait(until) => {
                     // A frame's end rings. What else may hold a chunk for a moment does not, so that
                     // whoever waits for room looks again now and then.
-                    let until = if state.requests.starving {
+                    let until = if state.requests.waiting_for_room {
                         Some(Instant::now() + limits::ROOM_POLL)
                     } else {
                         until
@@ -234,7 +241,7 @@ impl Shared {
         }
     }
 
-    fn load(&self, id: Id, needed: Needed, version: &Version) -> Tellings {
+    fn load(&self, id: SlotId, needed: SectionRef, version: &Version) -> Notifications {
         let chunk = &version.manifest.chunks[needed.chunk];
         let section = &chunk.sections[needed.section];
         let began = Instant::now();
@@ -244,16 +251,16 @@ impl Shared {
         let took = began.elapsed();
         let requests = &mut self.lock().requests;
         match loaded {
-            Ok(Ok(loaded)) => requests.arrived(id, Arc::new(loaded), took),
-            Ok(Err(error)) => requests.failed(id, &Failed::Store(error)),
-            Err(_) => requests.failed(id, &Failed::Crashed),
+            Ok(Ok(loaded)) => requests.loaded(id, Arc::new(loaded), took),
+            Ok(Err(error)) => requests.load_failed(id, &LoadFailure::Store(error)),
+            Err(_) => requests.load_failed(id, &LoadFailure::Crashed),
         }
     }
 
     /// Hands over what frames waited for.
-    fn tell(self: &Arc<Self>, tellings: Tellings) {
-        for (done, told) in tellings {
-            done(told.map(|Ready { scene, waited_for, waited }| Pinned {
+    fn notify(self: &Arc<Self>, notifications: Notifications) {
+        for (done, told) in notifications {
+            done(told.map(|CompleteFrame { scene, waited_for, waited }| PinnedScene {
                 scene,
                 shared: self.clone(),
                 waited_for,
@@ -269,9 +276,9 @@ impl std::fmt::Debug for Pager {
     }
 }
 
-impl std::fmt::Debug for Waiting {
+impl std::fmt::Debug for WaitingFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Waiting").field("number", &self.number).finish_non_exhaustive()
+        f.debug_struct("WaitingFrame").field("number", &self.number).finish_non_exhaustive()
     }
 }
 

@@ -13,46 +13,46 @@ use crate::store::{StoreError, Version};
 use wildcity_scene::{Chunk, Scene, Sky};
 
 use super::load_times::LoadTimes;
-use super::pager::Pinned;
-use super::table::{Asker, Id, Table};
-use super::{Needed, ResidencyError, Stats};
+use super::pager::PinnedScene;
+use super::table::{Requester, SectionTable, SlotId};
+use super::{ResidencyError, SectionRef, Stats};
 
 /// All requests, and the table of sections that answers them.
 pub(super) struct Requests {
-    pub(super) table: Table,
+    pub(super) table: SectionTable,
     /// What is to be loaded, the most urgent first. A section may stand here for several, and stays
     /// until it is there.
-    queue: BTreeMap<Place, Needed>,
+    queue: BTreeMap<QueueKey, SectionRef>,
     requests: BTreeMap<u64, Request>,
     /// Sections whose last load failed.
-    failures: BTreeMap<Id, Failure>,
+    failures: BTreeMap<SlotId, RetryState>,
     /// Requests so far: numbers them, and stamps what they want.
     number: u64,
     /// A load waits for room.
-    pub(super) starving: bool,
+    pub(super) waiting_for_room: bool,
     stats: Stats,
     pub(super) load_times: LoadTimes,
 }
 
 /// Sections of a version.
-pub(super) struct Wanted {
+pub(super) struct RequestedSections {
     pub(super) version: Arc<Version>,
     pub(super) sky: Option<Arc<Sky>>,
-    pub(super) needed: Vec<Needed>,
+    pub(super) needed: Vec<SectionRef>,
     /// Their names in the table, in the same order.
-    pub(super) ids: Vec<Id>,
+    pub(super) ids: Vec<SlotId>,
 }
 
 /// What a frame is told once: what it draws, or why it cannot.
-pub type Done = Box<dyn FnOnce(Result<Pinned, ResidencyError>) + Send>;
+pub type SceneCallback = Box<dyn FnOnce(Result<PinnedScene, ResidencyError>) + Send>;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Place {
+struct QueueKey {
     urgency: Urgency,
     request: u64,
     /// Sooner is smaller.
     order: u32,
-    id: Id,
+    id: SlotId,
 }
 
 /// How soon something is needed.
@@ -67,56 +67,56 @@ pub enum Urgency {
 }
 
 pub(super) struct Request {
-    wanted: Wanted,
+    wanted: RequestedSections,
     /// What it may push out.
-    asker: Asker,
+    requester: Requester,
     /// Only of frames.
     frame: Option<Frame>,
 }
 
 struct Frame {
-    done: Done,
+    done: SceneCallback,
     asked: Instant,
     waited_for: usize,
     missing: usize,
 }
 
-struct Failure {
+struct RetryState {
     attempts: u32,
     not_before: Instant,
 }
 
 /// What a loader does next.
-pub(super) enum Next {
-    Load { id: Id, needed: Needed, version: Arc<Version> },
+pub(super) enum NextLoad {
+    Load { id: SlotId, needed: SectionRef, version: Arc<Version> },
     Wait(Option<Instant>),
 }
 
 /// All that a frame draws.
-pub(super) struct Ready {
+pub(super) struct CompleteFrame {
     pub(super) scene: Scene,
     pub(super) waited_for: usize,
     pub(super) waited: Duration,
 }
 
 /// Why a load failed.
-pub(super) enum Failed {
+pub(super) enum LoadFailure {
     Store(StoreError),
     Crashed,
 }
 
 /// Frames to be told, once the lock is open: whoever is told may drop what it gets, which locks.
-pub(super) type Tellings = Vec<(Done, Result<Ready, ResidencyError>)>;
+pub(super) type Notifications = Vec<(SceneCallback, Result<CompleteFrame, ResidencyError>)>;
 
 impl Requests {
-    pub(super) fn new(table: Table) -> Self {
+    pub(super) fn new(table: SectionTable) -> Self {
         Self {
             table,
             queue: BTreeMap::new(),
             requests: BTreeMap::new(),
             failures: BTreeMap::new(),
             number: 0,
-            starving: false,
+            waiting_for_room: false,
             stats: Stats::default(),
             load_times: LoadTimes::default(),
         }
@@ -126,11 +126,11 @@ impl Requests {
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`].
-    pub(super) fn ask(
+    pub(super) fn add_frame(
         &mut self,
-        wanted: Wanted,
-        done: Done,
-        tellings: &mut Tellings,
+        wanted: RequestedSections,
+        done: SceneCallback,
+        notifications: &mut Notifications,
     ) -> Result<u64, ResidencyError> {
         let needed_bytes: u64 = wanted.ids.iter().map(|&id| self.table.bytes(id)).sum();
         let limit_bytes = self.table.limit_bytes();
@@ -142,62 +142,62 @@ impl Requests {
         let number = self.number;
         let mut missing = 0;
         for (&id, &needed) in wanted.ids.iter().zip(&wanted.needed) {
-            self.table.want(id, number);
+            self.table.touch(id, number);
             if self.table.get(id).is_none() {
                 missing += 1;
                 let urgency = Urgency::Required;
-                self.queue.insert(Place { urgency, request: number, order: 0, id }, needed);
+                self.queue.insert(QueueKey { urgency, request: number, order: 0, id }, needed);
             }
         }
         self.stats.hits += (wanted.ids.len() - missing) as u64;
         self.stats.misses += missing as u64;
         let frame = Frame { done, asked: Instant::now(), waited_for: missing, missing };
-        let asker = Asker::Frame(number);
+        let requester = Requester::Frame(number);
         if missing == 0 {
-            tellings.push(self.complete(&wanted, frame));
+            notifications.push(self.complete(&wanted, frame));
         } else {
             self.stats.waits += 1;
-            wanted.ids.iter().for_each(|&id| self.table.wait(id, number));
-            self.requests.insert(number, Request { wanted, asker, frame: Some(frame) });
+            wanted.ids.iter().for_each(|&id| self.table.add_waiter(id, number));
+            self.requests.insert(number, Request { wanted, requester, frame: Some(frame) });
         }
         Ok(number)
     }
 
-    pub(super) fn prefetch(
+    pub(super) fn add_prefetch(
         &mut self,
         before: Option<u64>,
-        wanted: Wanted,
+        wanted: RequestedSections,
         urgencies: &[Urgency],
     ) -> u64 {
         self.number += 1;
         let request = self.number;
         let all = wanted.ids.iter().zip(&wanted.needed).zip(urgencies);
         for (order, ((&id, &needed), &urgency)) in (0..).zip(all) {
-            self.table.want(id, request);
+            self.table.touch(id, request);
             if self.table.get(id).is_none() && self.queue.len() < limits::QUEUED_SECTIONS {
-                self.queue.insert(Place { urgency, request, order, id }, needed);
+                self.queue.insert(QueueKey { urgency, request, order, id }, needed);
             }
         }
         // What its owner has wanted since its last time stays; for an owner that is new, what any
         // other has.
-        let since = |request: &Request| match request.asker {
-            Asker::Prefetch(since) => Some(since),
-            Asker::Frame(_) => None,
+        let since = |request: &Request| match request.requester {
+            Requester::Prefetch(since) => Some(since),
+            Requester::Frame(_) => None,
         };
         let others = || self.requests.values().filter_map(since).min();
-        let asker = Asker::Prefetch(before.or_else(others).unwrap_or(request));
-        self.requests.insert(request, Request { wanted, asker, frame: None });
+        let requester = Requester::Prefetch(before.or_else(others).unwrap_or(request));
+        self.requests.insert(request, Request { wanted, requester, frame: None });
         request
     }
 
-    pub(super) fn withdraw_prefetch(&mut self, number: u64) {
+    pub(super) fn cancel_prefetch(&mut self, number: u64) {
         self.requests.remove(&number);
         self.unqueue(Urgency::Imminent, number);
         self.unqueue(Urgency::Speculative, number);
     }
 
     /// Sections that were wanted under a number and may still come.
-    pub(super) fn coming(&self, number: u64) -> usize {
+    pub(super) fn pending(&self, number: u64) -> usize {
         let of = |urgency| self.queue.range(places_of(urgency, number));
         let places = of(Urgency::Imminent).chain(of(Urgency::Speculative));
         places.filter(|(place, _)| self.table.get(place.id).is_none()).count()
@@ -221,7 +221,7 @@ impl Requests {
 
     fn unqueue(&mut self, urgency: Urgency, request: u64) {
         let places = self.queue.range(places_of(urgency, request));
-        let places: Vec<Place> = places.map(|(place, _)| *place).collect();
+        let places: Vec<QueueKey> = places.map(|(place, _)| *place).collect();
         places.iter().for_each(|place| {
             self.queue.remove(place);
         });
@@ -231,15 +231,15 @@ impl Requests {
     /// its name may become another section's. What is wanted and not there stands in the queue.
     pub(super) fn forget_failures(&mut self) {
         if !self.failures.is_empty() {
-            let wanted: BTreeSet<Id> = self.queue.keys().map(|place| place.id).collect();
+            let wanted: BTreeSet<SlotId> = self.queue.keys().map(|place| place.id).collect();
             self.failures.retain(|id, _| wanted.contains(id));
         }
     }
 
     /// Takes a frame from those that wait.
-    pub(super) fn give_up(&mut self, number: u64) -> Option<Request> {
+    pub(super) fn cancel_frame(&mut self, number: u64) -> Option<Request> {
         let request = self.requests.remove(&number)?;
-        request.wanted.ids.iter().for_each(|&id| self.table.unwait(id, number));
+        request.wanted.ids.iter().for_each(|&id| self.table.remove_waiter(id, number));
         self.unqueue(Urgency::Required, number);
         let frame = request.frame.as_ref()?;
         self.stats.waits_given_up += 1;
@@ -248,12 +248,12 @@ impl Requests {
     }
 
     /// The most urgent section that can be loaded now. Room is taken for it.
-    pub(super) fn next(&mut self, now: Instant) -> Next {
-        self.starving = false;
+    pub(super) fn next(&mut self, now: Instant) -> NextLoad {
+        self.waiting_for_room = false;
         let (mut over, mut soonest, mut found) = (Vec::new(), None, None);
         let mut full = None;
         for (place, needed) in &self.queue {
-            let Place { urgency, request, id, .. } = *place;
+            let QueueKey { urgency, request, id, .. } = *place;
             if self.table.get(id).is_some() || full == Some(request) {
                 over.push(*place);
                 continue;
@@ -267,11 +267,11 @@ impl Requests {
                 soonest = Some(soonest.map_or(failure.not_before, |s| failure.not_before.min(s)));
                 continue;
             }
-            let Some(Request { asker, wanted, .. }) = self.requests.get(&request) else {
+            let Some(Request { requester, wanted, .. }) = self.requests.get(&request) else {
                 over.push(*place);
                 continue;
             };
-            match self.table.reserve(id, *asker) {
+            match self.table.reserve(id, *requester) {
                 Some(dropped) => {
                     let version = wanted.version.clone();
                     found = Some((id, *needed, version, dropped));
@@ -279,7 +279,7 @@ impl Requests {
                 }
                 // Nobody younger may take the room that it waits for.
                 None if urgency == Urgency::Required => {
-                    self.starving = true;
+                    self.waiting_for_room = true;
                     break;
                 }
                 None => {
@@ -293,37 +293,42 @@ impl Requests {
             self.queue.remove(place);
         });
         self.forget_failures();
-        let Some((id, needed, version, dropped)) = found else { return Next::Wait(soonest) };
+        let Some((id, needed, version, dropped)) = found else { return NextLoad::Wait(soonest) };
         self.stats.evictions += dropped.len() as u64;
-        dropped.into_iter().for_each(|dropped| self.is_missing_again(dropped));
+        dropped.into_iter().for_each(|dropped| self.requeue_evicted(dropped));
         if self.failures.contains_key(&id) {
             self.stats.retries += 1;
         }
-        Next::Load { id, needed, version }
+        NextLoad::Load { id, needed, version }
     }
 
     /// Something was dropped that younger frames wait for: they wait for it to be loaded again.
-    fn is_missing_again(&mut self, id: Id) {
-        for &number in self.table.waiting(id) {
+    fn requeue_evicted(&mut self, id: SlotId) {
+        for &number in self.table.waiters(id) {
             let Some(Request { wanted, frame: Some(frame), .. }) = self.requests.get_mut(&number)
             else {
                 continue;
             };
             let Some(index) = wanted.ids.iter().position(|&other| other == id) else { continue };
             frame.missing += 1;
-            let place = Place { urgency: Urgency::Required, request: number, order: 0, id };
+            let place = QueueKey { urgency: Urgency::Required, request: number, order: 0, id };
             self.queue.insert(place, wanted.needed[index]);
         }
     }
 
     /// A section is in memory: frames that have all of theirs are told.
-    pub(super) fn arrived(&mut self, id: Id, chunk: Arc<Chunk>, took: Duration) -> Tellings {
+    pub(super) fn loaded(
+        &mut self,
+        id: SlotId,
+        chunk: Arc<Chunk>,
+        took: Duration,
+    ) -> Notifications {
         self.stats.loads += 1;
         self.load_times.add(took);
         self.failures.remove(&id);
-        self.table.fill(id, chunk, self.number);
+        self.table.loaded(id, chunk, self.number);
         let mut complete = Vec::new();
-        for number in self.table.waiting(id) {
+        for number in self.table.waiters(id) {
             let request = self.requests.get_mut(number);
             if let Some(frame) = request.and_then(|request| request.frame.as_mut()) {
                 frame.missing -= 1;
@@ -332,24 +337,28 @@ impl Requests {
                 }
             }
         }
-        let mut tellings = Tellings::new();
+        let mut notifications = Notifications::new();
         for number in complete {
             let Some(Request { wanted, frame, .. }) = self.requests.remove(&number) else {
                 continue;
             };
             let Some(frame) = frame else { continue };
-            wanted.ids.iter().for_each(|&id| self.table.unwait(id, number));
+            wanted.ids.iter().for_each(|&id| self.table.remove_waiter(id, number));
             self.unqueue(Urgency::Required, number);
             self.stats.wait_time += frame.asked.elapsed();
-            tellings.push(self.complete(&wanted, frame));
+            notifications.push(self.complete(&wanted, frame));
         }
-        tellings
+        notifications
     }
 
     /// Everything is there: the frame takes hold of it.
-    fn complete(&self, wanted: &Wanted, frame: Frame) -> (Done, Result<Ready, ResidencyError>) {
+    fn complete(
+        &self,
+        wanted: &RequestedSections,
+        frame: Frame,
+    ) -> (SceneCallback, Result<CompleteFrame, ResidencyError>) {
         let chunks = wanted.ids.iter().filter_map(|&id| self.table.get(id).cloned());
-        let ready = Ready {
+        let ready = CompleteFrame {
             scene: Scene { chunks: chunks.collect(), sky: wanted.sky.clone() },
             waited_for: frame.waited_for,
             waited: if frame.waited_for == 0 { Duration::ZERO } else { frame.asked.elapsed() },
@@ -358,14 +367,14 @@ impl Requests {
     }
 
     /// A load failed: it is tried again after a while, or the frames that wait for it are told.
-    pub(super) fn failed(&mut self, id: Id, failed: &Failed) -> Tellings {
-        let mut tellings = Tellings::new();
+    pub(super) fn load_failed(&mut self, id: SlotId, failed: &LoadFailure) -> Notifications {
+        let mut notifications = Notifications::new();
         let (count, cause) = match failed {
-            Failed::Store(error @ StoreError::Damaged { .. }) => {
+            LoadFailure::Store(error @ StoreError::Damaged { .. }) => {
                 (&mut self.stats.failed_damaged, error.to_string())
             }
-            Failed::Store(error) => (&mut self.stats.failed_unreadable, error.to_string()),
-            Failed::Crashed => {
+            LoadFailure::Store(error) => (&mut self.stats.failed_unreadable, error.to_string()),
+            LoadFailure::Crashed => {
                 let cause = "the program crashed; its log says where".to_owned();
                 (&mut self.stats.failed_crashed, cause)
             }
@@ -374,33 +383,33 @@ impl Requests {
         let attempts = self.failures.get(&id).map_or(0, |failure| failure.attempts) + 1;
         if attempts < limits::LOAD_ATTEMPTS {
             let not_before = Instant::now() + limits::LOAD_BACKOFF * 4_u32.pow(attempts - 1);
-            self.failures.insert(id, Failure { attempts, not_before });
+            self.failures.insert(id, RetryState { attempts, not_before });
             self.forget_failures();
-            self.table.fail(id);
-            return tellings;
+            self.table.load_failed(id);
+            return notifications;
         }
         self.failures.remove(&id);
-        for number in self.table.waiting(id).to_vec() {
-            let Some(request) = self.give_up(number) else { continue };
+        for number in self.table.waiters(id).to_vec() {
+            let Some(request) = self.cancel_frame(number) else { continue };
             let Request { wanted, frame: Some(frame), .. } = request else { continue };
             let index = wanted.ids.iter().position(|&other| other == id).unwrap_or(0);
-            let Needed { chunk, section } = wanted.needed[index];
+            let SectionRef { chunk, section } = wanted.needed[index];
             let manifest = &wanted.version.manifest;
             let (chunk, twin) = (&manifest.chunks[chunk], manifest.twin.clone());
             let (section, cell) = (&chunk.sections[section], chunk.cell);
             let (block, level, cause) = (section.block, section.level, cause.clone());
             let error = ResidencyError::Load { twin, cell, block, level, attempts, cause };
-            tellings.push((frame.done, Err(error)));
+            notifications.push((frame.done, Err(error)));
         }
         // Whoever would only have liked to have it, does without.
         self.queue.retain(|place, _| place.id != id);
-        self.table.fail(id);
-        tellings
+        self.table.load_failed(id);
+        notifications
     }
 }
 
 /// Where a request's sections stand in the queue.
-fn places_of(urgency: Urgency, request: u64) -> RangeInclusive<Place> {
-    let first = Place { urgency, request, order: 0, id: 0 };
-    first..=Place { order: u32::MAX, id: Id::MAX, ..first }
+fn places_of(urgency: Urgency, request: u64) -> RangeInclusive<QueueKey> {
+    let first = QueueKey { urgency, request, order: 0, id: 0 };
+    first..=QueueKey { order: u32::MAX, id: SlotId::MAX, ..first }
 }

@@ -7,26 +7,26 @@ use wildcity_scene::RenderProfile;
 use super::budget::Claim;
 use super::cache::lock;
 use super::requests::Urgency;
-use super::{Eye, Needed, ResidencyError, Resident};
+use super::{ResidencyError, Resident, SectionRef, Viewpoint};
 
 /// Memory that is set aside for the frames of one session, and what it expects to need next. Given
 /// back when dropped.
 #[derive(Debug)]
 pub struct Reservation {
     claim: Claim,
-    expectation: Arc<Expectation>,
+    prefetcher: Arc<Prefetcher>,
 }
 
 /// What somebody expects to need of a version. Shared by whoever finds that out, which takes a
 /// while; it ends with its [`Reservation`] nevertheless.
 #[derive(Debug)]
-pub struct Expectation {
+pub struct Prefetcher {
     resident: Arc<Resident>,
-    wish: Mutex<Wish>,
+    prefetch: Mutex<PrefetchState>,
 }
 
 #[derive(Debug)]
-enum Wish {
+enum PrefetchState {
     /// Number of the last prefetch.
     Open(Option<u64>),
     /// Nothing is expected any more.
@@ -36,8 +36,8 @@ enum Wish {
 impl Reservation {
     pub(super) fn new(resident: Arc<Resident>, bytes: u64) -> Result<Self, ResidencyError> {
         let claim = claim(&resident, bytes);
-        lock(&resident.shared.budget).take(&claim)?;
-        Ok(Self { claim, expectation: Arc::new(Expectation::new(resident)) })
+        lock(&resident.shared.budget).reserve(&claim)?;
+        Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
     }
 
     /// Sets `bytes` aside for another version in place of this one, at once: there need not be room
@@ -48,14 +48,14 @@ impl Reservation {
     pub fn exchange(&mut self, resident: Arc<Resident>, bytes: u64) -> Result<(), ResidencyError> {
         let claim = claim(&resident, bytes);
         lock(&resident.shared.budget).exchange(&self.claim, &claim)?;
-        self.expectation.end();
-        (self.claim, self.expectation) = (claim, Arc::new(Expectation::new(resident)));
+        self.prefetcher.end();
+        (self.claim, self.prefetcher) = (claim, Arc::new(Prefetcher::new(resident)));
         Ok(())
     }
 
     /// The version.
     pub fn resident(&self) -> &Arc<Resident> {
-        self.expectation.resident()
+        self.prefetcher.resident()
     }
 
     /// What is set aside, in bytes.
@@ -64,22 +64,22 @@ impl Reservation {
     }
 
     /// What its session expects to need next.
-    pub fn expectation(&self) -> &Arc<Expectation> {
-        &self.expectation
+    pub fn prefetcher(&self) -> &Arc<Prefetcher> {
+        &self.prefetcher
     }
 }
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        self.expectation.end();
-        lock(&self.resident().shared.budget).give_back(&self.claim);
+        self.prefetcher.end();
+        lock(&self.resident().shared.budget).release(&self.claim);
     }
 }
 
-impl Expectation {
+impl Prefetcher {
     /// Nothing yet, of a version.
     pub fn new(resident: Arc<Resident>) -> Self {
-        Self { resident, wish: Mutex::new(Wish::Open(None)) }
+        Self { resident, prefetch: Mutex::new(PrefetchState::Open(None)) }
     }
 
     /// The version.
@@ -89,8 +89,8 @@ impl Expectation {
 
     /// Loads what frames from other places will need, in the order of the places, as far as there is
     /// room; in place of what was expected before. Never waits for it.
-    pub fn prefetch(&self, places: &[(Urgency, Vec<Eye>)], profile: &RenderProfile) {
-        let (mut needed, mut urgencies): (Vec<Needed>, Vec<Urgency>) = Default::default();
+    pub fn prefetch(&self, places: &[(Urgency, Vec<Viewpoint>)], profile: &RenderProfile) {
+        let (mut needed, mut urgencies): (Vec<SectionRef>, Vec<Urgency>) = Default::default();
         let mut seen = std::collections::BTreeSet::new();
         for (urgency, eyes) in places {
             for one in self.resident.demand(eyes, profile) {
@@ -101,7 +101,7 @@ impl Expectation {
             }
         }
         let wanted = self.resident.wanted(needed);
-        if let Wish::Open(number) = &mut *lock(&self.wish) {
+        if let PrefetchState::Open(number) = &mut *lock(&self.prefetch) {
             let pager = &self.resident.shared.pager;
             *number = Some(pager.prefetch(*number, wanted, &urgencies));
         }
@@ -109,21 +109,23 @@ impl Expectation {
 
     /// Sections that are expected and may still come: not those for which there was no room, or which
     /// cannot be read.
-    pub fn coming(&self) -> usize {
-        match *lock(&self.wish) {
-            Wish::Open(Some(number)) => self.resident.shared.pager.coming(number),
-            Wish::Open(None) | Wish::Ended => 0,
+    pub fn pending(&self) -> usize {
+        match *lock(&self.prefetch) {
+            PrefetchState::Open(Some(number)) => self.resident.shared.pager.pending(number),
+            PrefetchState::Open(None) | PrefetchState::Ended => 0,
         }
     }
 
     fn end(&self) {
-        if let Wish::Open(Some(number)) = std::mem::replace(&mut *lock(&self.wish), Wish::Ended) {
-            self.resident.shared.pager.withdraw_prefetch(number);
+        if let PrefetchState::Open(Some(number)) =
+            std::mem::replace(&mut *lock(&self.prefetch), PrefetchState::Ended)
+        {
+            self.resident.shared.pager.cancel_prefetch(number);
         }
     }
 }
 
-impl Drop for Expectation {
+impl Drop for Prefetcher {
     fn drop(&mut self) {
         self.end();
     }
@@ -134,6 +136,6 @@ fn claim(resident: &Resident, bytes: u64) -> Claim {
         twin: resident.version.manifest.twin.clone(),
         version: resident.version.hash.clone(),
         bytes,
-        whole_bytes: resident.whole_bytes(),
+        total_bytes: resident.total_bytes(),
     }
 }

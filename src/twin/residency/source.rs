@@ -5,7 +5,7 @@ use wildcity_scene::Chunk;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 
 /// Something that reads sections: a catalog, or a test's idea of one that is slow or broken.
-pub trait Source: Send + Sync {
+pub trait SectionSource: Send + Sync {
     /// Reads one section, activated. Blocks.
     ///
     /// # Errors
@@ -18,7 +18,7 @@ pub trait Source: Send + Sync {
     ) -> Result<Chunk, StoreError>;
 }
 
-impl Source for Catalog {
+impl SectionSource for Catalog {
     fn section(
         &self,
         version: &Version,

@@ -27,7 +27,7 @@ pub struct Stats {
     pub waits: u64,
     /// How long those waited, together.
     pub wait_time: Duration,
-    /// Frames that were not complete by their deadline, or whose asker went away.
+    /// Frames that were not complete by their deadline, or whose requester went away.
     pub waits_given_up: u64,
     /// Bytes of memory in use, what is being loaded included.
     pub held_bytes: u64,

@@ -10,27 +10,27 @@ use wildcity_scene::Chunk;
 pub(super) struct Key(pub(super) [u8; 16]);
 
 /// Name of a section in the table, for as long as a version that has it is open.
-pub(super) type Id = u32;
+pub(super) type SlotId = u32;
 
 /// No section: the end of the list.
-const NONE: Id = Id::MAX;
+const NONE: SlotId = SlotId::MAX;
 
 /// Sections by what they are, those in memory in the order in which they were last wanted.
 ///
 /// A section may be dropped if the table alone holds it (a frame's scene holds what it draws), and
 /// nobody with an older right waits for it.
 #[derive(Debug)]
-pub(super) struct Table {
+pub(super) struct SectionTable {
     limit_bytes: u64,
     held_bytes: u64,
     held_sections: u64,
-    ids: HashMap<Key, Id>,
+    ids: HashMap<Key, SlotId>,
     slots: Vec<Slot>,
-    vacant: Vec<Id>,
-    oldest: Id,
-    newest: Id,
+    vacant: Vec<SlotId>,
+    oldest: SlotId,
+    newest: SlotId,
     /// Frames that wait for others beside a section, by their numbers, rising.
-    waiting: BTreeMap<Id, Vec<u64>>,
+    waiting: BTreeMap<SlotId, Vec<u64>>,
 }
 
 #[derive(Debug)]
@@ -42,20 +42,20 @@ struct Slot {
     versions: u32,
     /// When it was last wanted, in requests since the start.
     stamp: u64,
-    older: Id,
-    newer: Id,
+    older: SlotId,
+    newer: SlotId,
 }
 
 #[derive(Debug)]
 enum State {
     Absent,
     Loading,
-    Here(Arc<Chunk>),
+    Loaded(Arc<Chunk>),
 }
 
 /// Whose load it is, and so what it may push out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Asker {
+pub(super) enum Requester {
     /// A frame that waits: everything but what older frames wait for. So the oldest frame always gets
     /// on, and no two can block each other.
     Frame(u64),
@@ -63,7 +63,7 @@ pub(super) enum Asker {
     Prefetch(u64),
 }
 
-impl Table {
+impl SectionTable {
     pub(super) fn new(limit_bytes: u64) -> Self {
         Self {
             limit_bytes,
@@ -79,7 +79,7 @@ impl Table {
     }
 
     /// The name of a section that a version has, once per version.
-    pub(super) fn register(&mut self, key: Key, bytes: u64) -> Id {
+    pub(super) fn register(&mut self, key: Key, bytes: u64) -> SlotId {
         if let Some(&id) = self.ids.get(&key) {
             self.slots[id as usize].versions += 1;
             return id;
@@ -93,7 +93,7 @@ impl Table {
             }
             None => {
                 self.slots.push(slot);
-                (self.slots.len() - 1) as Id
+                (self.slots.len() - 1) as SlotId
             }
         };
         self.ids.insert(key, id);
@@ -102,31 +102,31 @@ impl Table {
 
     /// A version that has it was closed. What is in memory stays until its room is needed: the next
     /// version may have it, too.
-    pub(super) fn unregister(&mut self, id: Id) {
+    pub(super) fn unregister(&mut self, id: SlotId) {
         self.slots[id as usize].versions -= 1;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
     /// The section, if it is in memory.
-    pub(super) fn get(&self, id: Id) -> Option<&Arc<Chunk>> {
+    pub(super) fn get(&self, id: SlotId) -> Option<&Arc<Chunk>> {
         match &self.slots[id as usize].state {
-            State::Here(chunk) => Some(chunk),
+            State::Loaded(chunk) => Some(chunk),
             State::Absent | State::Loading => None,
         }
     }
 
     /// Whether it is neither in memory nor on its way.
-    pub(super) fn is_absent(&self, id: Id) -> bool {
+    pub(super) fn is_absent(&self, id: SlotId) -> bool {
         matches!(self.slots[id as usize].state, State::Absent)
     }
 
     /// What it takes, in bytes.
-    pub(super) fn bytes(&self, id: Id) -> u64 {
+    pub(super) fn bytes(&self, id: SlotId) -> u64 {
         self.slots[id as usize].bytes
     }
 
     /// Notes that it is wanted now: the last to be dropped.
-    pub(super) fn want(&mut self, id: Id, stamp: u64) {
+    pub(super) fn touch(&mut self, id: SlotId, stamp: u64) {
         self.slots[id as usize].stamp = stamp;
         if self.get(id).is_some() {
             self.unlink(id);
@@ -135,12 +135,12 @@ impl Table {
     }
 
     /// A frame waits until this section and others are there together.
-    pub(super) fn wait(&mut self, id: Id, frame: u64) {
+    pub(super) fn add_waiter(&mut self, id: SlotId, frame: u64) {
         self.waiting.entry(id).or_default().push(frame);
     }
 
     /// It waits no more.
-    pub(super) fn unwait(&mut self, id: Id, frame: u64) {
+    pub(super) fn remove_waiter(&mut self, id: SlotId, frame: u64) {
         if let Some(frames) = self.waiting.get_mut(&id) {
             frames.retain(|&other| other != frame);
             if frames.is_empty() {
@@ -150,13 +150,13 @@ impl Table {
     }
 
     /// The frames that wait for it, the oldest first.
-    pub(super) fn waiting(&self, id: Id) -> &[u64] {
+    pub(super) fn waiters(&self, id: SlotId) -> &[u64] {
         self.waiting.get(&id).map_or(&[], Vec::as_slice)
     }
 
     /// Takes the room of a section that is to be loaded, and returns what was dropped for it. If there
     /// is not enough that may be dropped, nothing is, and nothing is taken.
-    pub(super) fn reserve(&mut self, id: Id, asker: Asker) -> Option<Vec<Id>> {
+    pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
         let free_bytes = self.limit_bytes - self.held_bytes;
         let mut victims = Vec::new();
@@ -166,37 +166,37 @@ impl Table {
                 return None;
             }
             let slot = &self.slots[next as usize];
-            if let Asker::Prefetch(since) = asker
+            if let Requester::Prefetch(since) = requester
                 && slot.stamp >= since
             {
                 return None;
             }
-            if self.may_drop(next, asker) {
+            if self.may_evict(next, requester) {
                 gained_bytes += slot.bytes;
                 victims.push(next);
             }
             next = slot.newer;
         }
-        victims.iter().for_each(|&victim| self.drop_section(victim));
+        victims.iter().for_each(|&victim| self.evict(victim));
         self.slots[id as usize].state = State::Loading;
         self.held_bytes += bytes;
         Some(victims)
     }
 
     /// A section has arrived. That counts as being wanted: the list stays in order of stamps.
-    pub(super) fn fill(&mut self, id: Id, chunk: Arc<Chunk>, stamp: u64) {
+    pub(super) fn loaded(&mut self, id: SlotId, chunk: Arc<Chunk>, stamp: u64) {
         let slot = &mut self.slots[id as usize];
-        (slot.state, slot.stamp) = (State::Here(chunk), stamp);
+        (slot.state, slot.stamp) = (State::Loaded(chunk), stamp);
         self.held_sections += 1;
         self.link_newest(id);
     }
 
     /// A section has not arrived.
-    pub(super) fn fail(&mut self, id: Id) {
+    pub(super) fn load_failed(&mut self, id: SlotId) {
         let slot = &mut self.slots[id as usize];
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
     /// Bytes of memory in use, what is being loaded included.
@@ -214,27 +214,27 @@ impl Table {
         self.held_sections
     }
 
-    fn may_drop(&self, id: Id, asker: Asker) -> bool {
-        let State::Here(chunk) = &self.slots[id as usize].state else { return false };
-        let oldest_waiting = self.waiting(id).first();
-        let spared = match asker {
-            Asker::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
-            Asker::Prefetch(_) => oldest_waiting.is_some(),
+    fn may_evict(&self, id: SlotId, requester: Requester) -> bool {
+        let State::Loaded(chunk) = &self.slots[id as usize].state else { return false };
+        let oldest_waiting = self.waiters(id).first();
+        let spared = match requester {
+            Requester::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
+            Requester::Prefetch(_) => oldest_waiting.is_some(),
         };
         Arc::strong_count(chunk) == 1 && !spared
     }
 
-    fn drop_section(&mut self, id: Id) {
+    fn evict(&mut self, id: SlotId) {
         self.unlink(id);
         let slot = &mut self.slots[id as usize];
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
         self.held_sections -= 1;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
     /// Absent sections of versions that nobody has open are not worth a name.
-    fn forget_if_unused(&mut self, id: Id) {
+    fn release_if_unused(&mut self, id: SlotId) {
         let Slot { key, state, versions, .. } = &self.slots[id as usize];
         if *versions == 0 && matches!(state, State::Absent) {
             self.ids.remove(key);
@@ -242,7 +242,7 @@ impl Table {
         }
     }
 
-    fn unlink(&mut self, id: Id) {
+    fn unlink(&mut self, id: SlotId) {
         let Slot { older, newer, .. } = self.slots[id as usize];
         match older {
             NONE => self.oldest = newer,
@@ -254,7 +254,7 @@ impl Table {
         }
     }
 
-    fn link_newest(&mut self, id: Id) {
+    fn link_newest(&mut self, id: SlotId) {
         let before = std::mem::replace(&mut self.newest, id);
         match before {
             NONE => self.oldest = id,
@@ -270,9 +270,9 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
-    impl Table {
+    impl SectionTable {
         /// What must hold at any time; `pinned` is what frames hold.
-        fn check(&self, pinned: &[(Id, Arc<Chunk>)]) {
+        fn check(&self, pinned: &[(SlotId, Arc<Chunk>)]) {
             let taken = |slot: &&Slot| !matches!(slot.state, State::Absent);
             let bytes: u64 = self.slots.iter().filter(taken).map(|slot| slot.bytes).sum();
             assert_eq!(bytes, self.held_bytes);
@@ -281,15 +281,15 @@ mod tests {
             while next != NONE {
                 let slot = &self.slots[next as usize];
                 assert_eq!(slot.older, before);
-                let stamp = |id: Id| self.slots[id as usize].stamp;
+                let stamp = |id: SlotId| self.slots[id as usize].stamp;
                 assert!(before == NONE || stamp(before) <= slot.stamp, "in order of stamps");
                 listed.push(next);
                 (before, next) = (next, slot.newer);
             }
             assert_eq!(before, self.newest);
             listed.sort_unstable();
-            let here = |id: &Id| matches!(self.slots[*id as usize].state, State::Here(_));
-            let held: Vec<Id> = (0..self.slots.len() as Id).filter(here).collect();
+            let here = |id: &SlotId| matches!(self.slots[*id as usize].state, State::Loaded(_));
+            let held: Vec<SlotId> = (0..self.slots.len() as SlotId).filter(here).collect();
             assert_eq!(listed, held, "the list is of what is here");
             assert_eq!(held.len() as u64, self.held_sections);
             for (id, chunk) in pinned {
@@ -331,27 +331,27 @@ mod tests {
         for seed in 1..=50 {
             let mut random = Random(seed);
             let sizes: Vec<u64> = (0..40).map(|_| 1 + random.below(50) as u64).collect();
-            let mut table = Table::new(200 + random.below(300) as u64);
-            let names = |table: &mut Table| -> Vec<Id> {
+            let mut table = SectionTable::new(200 + random.below(300) as u64);
+            let names = |table: &mut SectionTable| -> Vec<SlotId> {
                 let all = sizes.iter().enumerate();
                 all.map(|(number, &bytes)| table.register(key(number), bytes)).collect()
             };
             let mut versions = vec![names(&mut table)];
-            let mut pinned: Vec<(Id, Arc<Chunk>)> = Vec::new();
-            let mut loading: Vec<Id> = Vec::new();
+            let mut pinned: Vec<(SlotId, Arc<Chunk>)> = Vec::new();
+            let mut loading: Vec<SlotId> = Vec::new();
             let mut evicted = 0;
             for now in 1..=2_000_u64 {
                 let id = versions[0][random.below(sizes.len())];
                 match random.below(8) {
-                    0 => table.want(id, now),
+                    0 => table.touch(id, now),
                     1..=3 if table.is_absent(id) => {
-                        let asker = match random.below(2) {
-                            0 => Asker::Frame(now),
-                            _ => Asker::Prefetch(now.saturating_sub(random.below(500) as u64)),
+                        let requester = match random.below(2) {
+                            0 => Requester::Frame(now),
+                            _ => Requester::Prefetch(now.saturating_sub(random.below(500) as u64)),
                         };
-                        table.want(id, now);
+                        table.touch(id, now);
                         let before = table.held_bytes();
-                        match table.reserve(id, asker) {
+                        match table.reserve(id, requester) {
                             Some(dropped) => {
                                 evicted += dropped.len();
                                 loading.push(id);
@@ -362,9 +362,9 @@ mod tests {
                     4 | 5 if !loading.is_empty() => {
                         let id = loading.swap_remove(random.below(loading.len()));
                         if random.below(4) > 0 {
-                            table.fill(id, chunk(), now);
+                            table.loaded(id, chunk(), now);
                         } else {
-                            table.fail(id);
+                            table.load_failed(id);
                         }
                     }
                     6 => {
@@ -390,13 +390,13 @@ mod tests {
     }
 
     /// A table with room for three sections of 10 bytes, all here, and a fourth.
-    fn full() -> (Table, [Id; 4]) {
-        let mut table = Table::new(30);
+    fn full() -> (SectionTable, [SlotId; 4]) {
+        let mut table = SectionTable::new(30);
         let ids = [0, 1, 2, 3].map(|number| table.register(key(number), 10));
         for (stamp, &id) in (1..).zip(&ids[..3]) {
-            table.want(id, stamp);
-            assert_eq!(table.reserve(id, Asker::Frame(stamp)), Some(vec![]));
-            table.fill(id, chunk(), stamp);
+            table.touch(id, stamp);
+            assert_eq!(table.reserve(id, Requester::Frame(stamp)), Some(vec![]));
+            table.loaded(id, chunk(), stamp);
         }
         (table, ids)
     }
@@ -404,29 +404,29 @@ mod tests {
     #[test]
     fn what_was_wanted_longest_ago_goes_first() {
         let (mut table, ids) = full();
-        table.want(ids[0], 4);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(5)), Some(vec![ids[1]]));
+        table.touch(ids[0], 4);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(5)), Some(vec![ids[1]]));
     }
 
     #[test]
     fn a_prefetch_pushes_out_nothing_that_was_wanted_lately() {
         let (mut table, ids) = full();
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(1)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(2)), Some(vec![ids[0]]));
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(1)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(2)), Some(vec![ids[0]]));
     }
 
     #[test]
     fn what_a_frame_waits_for_is_spared_by_all_but_older_frames() {
         let (mut table, ids) = full();
-        ids[..3].iter().for_each(|&id| table.wait(id, 7));
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(100)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(7)), None, "not even by itself");
-        table.unwait(ids[2], 7);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), Some(vec![ids[2]]));
-        table.fail(ids[3]);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(6)), Some(vec![]), "there is room now");
-        assert_eq!(table.reserve(ids[2], Asker::Frame(6)), Some(vec![ids[0]]));
+        ids[..3].iter().for_each(|&id| table.add_waiter(id, 7));
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(100)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(8)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(7)), None, "not even by itself");
+        table.remove_waiter(ids[2], 7);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(8)), Some(vec![ids[2]]));
+        table.load_failed(ids[3]);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(6)), Some(vec![]), "there is room now");
+        assert_eq!(table.reserve(ids[2], Requester::Frame(6)), Some(vec![ids[0]]));
     }
 
     #[test]
@@ -437,7 +437,7 @@ mod tests {
         let again = table.register(key(1), 10);
         assert_eq!(again, ids[1]);
         let new = table.register(key(9), 30);
-        assert_eq!(table.reserve(new, Asker::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
+        assert_eq!(table.reserve(new, Requester::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
         table.unregister(again);
         assert_eq!(table.ids.len(), 1);
         table.check(&[]);

@@ -7,12 +7,12 @@ use crate::limits;
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::{Chunk, Manifest, RenderProfile};
 
-use super::Index;
-use super::demand::level;
+use super::BlockIndex;
+use super::demand::coarsest_level;
 
 /// As far as it decides how much detail a frame needs: the cameras of a rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lens {
+pub struct RigExtent {
     /// The longest focal length, in pixels.
     pub focal_px: f64,
     /// How far the farthest camera is from the rig's origin, in metres.
@@ -26,10 +26,10 @@ pub struct Lens {
 /// bound is divided again and again until it is as small as a cell: then no place anywhere needs more
 /// than that. Outside of the box of everything, each place needs no more than the nearest one of the
 /// box does, which is nearer to everything.
-pub(super) fn worst_bytes(
-    index: &Index,
+pub(super) fn worst_case_bytes(
+    index: &BlockIndex,
     manifest: &Manifest,
-    lens: Lens,
+    lens: RigExtent,
     profile: &RenderProfile,
 ) -> u64 {
     let whole = index.bounds();
@@ -41,7 +41,8 @@ pub(super) fn worst_bytes(
         let distance_m = |bounds: &Bounds| (gap_m(&place, bounds) - lens.radius_m).max(0.0);
         index.visit(profile.reach_m, &distance_m, &mut |block, distance_m| {
             let levels = block.levels(manifest);
-            let section = &levels[level(levels, lens.focal_px, distance_m, profile.tau_px)];
+            let section =
+                &levels[coarsest_level(levels, lens.focal_px, distance_m, profile.tau_px)];
             bytes += Chunk::bytes_of(manifest.sh_degree, section.count.into());
         });
         Square { bytes, place }
