@@ -127,10 +127,10 @@ pub const QUEUED_SECTIONS: usize = 1 << 18;
 
 /// Squares that the search for a twin's worst place looks at. A square cell of 64 m of 20 km of road is
 /// one of 320 in a row, and twice as many lie above them.
-pub const WORST_PLACES: usize = 4096;
+pub const WORST_CASE_SQUARES: usize = 4096;
 
 /// Rigs whose worst place in a twin is remembered, so that sessions open at once.
-pub const REMEMBERED_LENSES: usize = 16;
+pub const REMEMBERED_WORST_CASES: usize = 16;
 
 /// Bad Gaussians that are named of one file; the others are counted.
 pub const BAD_GAUSSIANS: usize = 16;

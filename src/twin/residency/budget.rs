@@ -1,4 +1,4 @@
-//! How much memory twins may take together, and who has how much of it set aside.
+//! How much memory twins may take together, and which sessions reserved how much of it.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -8,16 +8,17 @@ use crate::limits;
 
 use super::ResidencyError;
 
-/// Bytes that are set aside for the worst frames of sessions, by version.
+/// Bytes that are reserved for the worst frames of sessions, by version.
 ///
-/// Sessions on one version share what they draw, so that together they never need more than all of
-/// it.
+/// Sessions on one version share what they draw, so together they never need more than the whole
+/// version takes.
 #[derive(Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
     versions: BTreeMap<String, VersionClaims>,
 }
 
+/// The claims of all sessions on one version.
 #[derive(Clone, Copy, Debug)]
 struct VersionClaims {
     sessions: u64,
@@ -25,16 +26,16 @@ struct VersionClaims {
     total_bytes: u64,
 }
 
-/// The worst frame of a session.
+/// The memory for the worst frame of one session.
 #[derive(Clone, Debug)]
 pub(super) struct Claim {
-    /// The twin, for the error.
+    /// The twin's name, for the error.
     pub(super) twin: String,
     /// The version's hash.
     pub(super) version: String,
-    /// What it needs at once.
+    /// Bytes that the frame needs at once.
     pub(super) bytes: u64,
-    /// What all of its version takes, in all levels of detail.
+    /// Bytes that all levels of detail of the whole version take.
     pub(super) total_bytes: u64,
 }
 
@@ -43,27 +44,30 @@ impl Budget {
         Self { limit_bytes, versions: BTreeMap::new() }
     }
 
-    /// Sets memory aside.
+    /// Reserves memory.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
     pub(super) fn reserve(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
-        let Claim { twin, version, bytes, total_bytes } = claim;
         let held_bytes = self.reserved_bytes();
-        let nobody = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: *total_bytes };
-        let before = self.versions.get(version).copied().unwrap_or(nobody);
-        let (sessions, sum_bytes) = (before.sessions + 1, before.sum_bytes.saturating_add(*bytes));
-        let after = VersionClaims { sessions, sum_bytes, ..before };
+        let unused = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: claim.total_bytes };
+        let before = self.versions.get(&claim.version).copied().unwrap_or(unused);
+        let after = VersionClaims {
+            sessions: before.sessions + 1,
+            sum_bytes: before.sum_bytes.saturating_add(claim.bytes),
+            ..before
+        };
         let needed_bytes = after.bytes() - before.bytes();
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
-            let (twin, limit_bytes) = (twin.clone(), self.limit_bytes);
+            let twin = claim.twin.clone();
+            let limit_bytes = self.limit_bytes;
             return Err(ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes });
         }
-        self.versions.insert(version.clone(), after);
+        self.versions.insert(claim.version.clone(), after);
         Ok(())
     }
 
-    /// Sets memory aside in place of what was taken before; if that is refused, nothing changes.
+    /// Reserves memory in place of an earlier claim. If the new claim is refused, the old one stays.
     ///
     /// # Errors
     /// As [`Budget::reserve`].
@@ -73,7 +77,7 @@ impl Budget {
         self.reserve(new).inspect_err(|_| self.versions = before)
     }
 
-    /// Gives back what [`Budget::reserve`] took.
+    /// Returns what [`Budget::reserve`] reserved.
     pub(super) fn release(&mut self, claim: &Claim) {
         if let Some(claims) = self.versions.get_mut(&claim.version) {
             claims.sessions -= 1;
@@ -84,7 +88,7 @@ impl Budget {
         }
     }
 
-    /// Bytes that are set aside.
+    /// Bytes that are reserved.
     pub(super) fn reserved_bytes(&self) -> u64 {
         self.versions.values().map(VersionClaims::bytes).sum()
     }
@@ -96,12 +100,13 @@ impl VersionClaims {
     }
 }
 
-/// Three quarters of the machine's memory.
+/// The default limit: three quarters of the machine's memory.
 pub(super) fn default_bytes() -> u64 {
     physical_bytes().map_or(limits::RESIDENT_BYTES, |physical| physical / 4 * 3)
 }
 
-/// Memory of the machine; none where /proc does not say.
+/// Memory of the machine in bytes; `None` where /proc/meminfo does not say. By hand, because it is shorter than the
+/// dependency on a crate for system information.
 fn physical_bytes() -> Option<u64> {
     let mut text = String::new();
     File::open("/proc/meminfo").ok()?.take(4096).read_to_string(&mut text).ok()?;
