@@ -1,7 +1,7 @@
 use glam::DVec3;
-use wildcity::residency::{SectionRef, Viewpoint, demand};
-use wildcity::scene::{Manifest, RenderProfile};
-use wildcity::store::StorageOptions;
+use wildcity_scene::{Manifest, RenderProfile};
+use wildcity_twin::residency::{SectionRef, Viewpoint, demand};
+use wildcity_twin::store::StorageOptions;
 
 use crate::{commit, streets, tau};
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use wildcity::store::{Catalog, Retention};
+use wildcity_twin::store::{Catalog, Retention};
 
 use crate::support::{PATIENCE, TestServer, commit_twin_of};
 

@@ -2,18 +2,18 @@
 
 use std::collections::BTreeSet;
 
-use wildcity::scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
-use wildcity::store::{
+use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
     Version, VersionChange, VersionSettings,
 };
 
 use crate::scene_files::gaussians;
-use crate::{commit, files, street, turn};
+use crate::support::{commit, files, street, turn};
 
 const EXACT: StorageOptions = StorageOptions { record: Record::F32, levels: false };
 
-/// Settings as `street` has them.
+/// VersionSettings as `street` has them.
 fn settings() -> VersionSettings {
     let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
     VersionSettings { profile, rig, trajectories, sky, provenance }

@@ -6,7 +6,6 @@
 //! Gaussian becomes columns of 68, as if the scene came uncompressed.
 
 mod activation;
-mod append;
 mod archive;
 pub mod axes;
 pub mod cameras;
@@ -24,7 +23,6 @@ mod sog;
 mod splat;
 mod spz;
 mod unpack_budget;
-pub mod validate;
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
@@ -36,13 +34,13 @@ use wildcity_scene::sky::SkyError;
 
 pub use axes::Axes;
 pub use file::{FileError, read_whole};
-pub use validate::{BadGaussian, BadGaussians};
+pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use hash_reader::HashReader;
 use progress::ProgressReader;
 use scene_files::Folder;
 
-/// ProgressReader about bytes done and bytes in all.
+/// Called with bytes done and bytes in all.
 pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
 
 /// Why a file was refused.
@@ -132,7 +130,7 @@ pub enum IngestError {
     },
     /// Gaussians that no renderer can draw.
     #[error("{0}")]
-    Values(BadGaussians),
+    Values(#[from] BadGaussians),
     /// A sky that cannot be drawn.
     #[error("sky: {0}")]
     Sky(#[from] SkyError),

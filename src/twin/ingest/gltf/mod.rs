@@ -25,7 +25,7 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
-use super::{IngestError, activation, append, check_count};
+use super::{IngestError, activation, check_count};
 use accessor::Column;
 use document::{Document, Primitive};
 
@@ -121,7 +121,7 @@ pub(super) fn read(
             let place = format!("node {}, primitive {index}", placed.node);
             let mut part = read_primitive(&document, &buffers, primitive, &place, parts)?;
             placed.apply(&mut part)?;
-            append::append(&mut all, &part, 0..part.len());
+            all.append(&part);
             check_count(all.len() as u64)?;
         }
     }
