@@ -43,7 +43,8 @@ fn edges(files: &BTreeMap<String, String>) -> Edges {
     for (file, text) in files {
         let own = module(file);
         for named in paths(file, text) {
-            let Some(("crate", path)) = named.path.split_first().map(|(a, b)| (a.as_str(), b)) else {
+            let Some(("crate", path)) = named.path.split_first().map(|(a, b)| (a.as_str(), b))
+            else {
                 continue;
             };
             // The longest start of the path that is a file.

@@ -93,10 +93,16 @@ fn no_crate_is_there_twice_unless_it_is_listed() {
     for Dependency { name, version, .. } in dependencies() {
         versions.entry(name).or_default().insert(version);
     }
-    let twice: BTreeSet<String> =
-        versions.iter().filter(|(_, versions)| versions.len() > 1).map(|(name, _)| name.clone()).collect();
+    let twice: BTreeSet<String> = versions
+        .iter()
+        .filter(|(_, versions)| versions.len() > 1)
+        .map(|(name, _)| name.clone())
+        .collect();
     let listed: BTreeSet<String> = deny().bans.skip.into_iter().map(|skip| skip.name).collect();
-    assert_eq!(twice, listed, "left: crates with several versions; right: `bans.skip` of deny.toml");
+    assert_eq!(
+        twice, listed,
+        "left: crates with several versions; right: `bans.skip` of deny.toml"
+    );
 }
 
 /// Whether an SPDX expression can be fulfilled with allowed licences. `AND` binds closer than `OR`, as SPDX

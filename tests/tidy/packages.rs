@@ -63,10 +63,20 @@ fn crates_are_named_where_they_belong() {
 fn a_planted_violation_is_found() {
     for (folder, file, planted, reason) in [
         ("src/session", "episode.rs", "use axum::Router;", "only src/server may name axum"),
-        ("src/render", "cpu/bin.rs", "fn f() { wgpu::init(); }", "only src/render/gpu may name wgpu"),
+        (
+            "src/render",
+            "cpu/bin.rs",
+            "fn f() { wgpu::init(); }",
+            "only src/render/gpu may name wgpu",
+        ),
         ("src/twin", "store/log.rs", "use bincode::Encode;", "chunk_file.rs may name bincode"),
         ("src/twin", "store/log.rs", "use std::{fs, io};", "may name std::fs"),
-        ("src/server", "router.rs", "use wildcity_protocol::message;", "may name wildcity_protocol"),
+        (
+            "src/server",
+            "router.rs",
+            "use wildcity_protocol::message;",
+            "may name wildcity_protocol",
+        ),
     ] {
         let package = Package {
             name: "planted".to_owned(),

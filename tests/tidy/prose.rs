@@ -16,8 +16,19 @@ const PERSONS: &[&str] =
 
 /// Folders and files that people read.
 const READ: &[&str] = &[
-    "src", "clients", "protocol", "shaders", "scenes", "tests", "docs", ".ci", "README.md",
-    "ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md", "CONTRIBUTING.md",
+    "src",
+    "clients",
+    "protocol",
+    "shaders",
+    "scenes",
+    "tests",
+    "docs",
+    ".ci",
+    "README.md",
+    "ARCHITECTURE.md",
+    "BENCHMARKS.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
 ];
 
 const EXTENSIONS: &[&str] = &["rs", "md", "py", "wgsl", "toml", "yml"];
@@ -104,7 +115,10 @@ fn one_binding_stands_on_a_line() {
 
 #[test]
 fn a_planted_tuple_is_found() {
-    assert_eq!(tuple_lets("fn f() { let (a, b) = (1, 2); let (c, d) = pair(); let e = (1, 2); }"), 1);
+    assert_eq!(
+        tuple_lets("fn f() { let (a, b) = (1, 2); let (c, d) = pair(); let e = (1, 2); }"),
+        1
+    );
 }
 
 fn tuple_lets(text: &str) -> usize {
