@@ -12,7 +12,7 @@ use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Chunk, Gaussians, Manifest, RenderProfile, Rig, Scene};
-use wildcity_twin::residency::{Needed, demand};
+use wildcity_twin::residency::{SectionRef, demand};
 use wildcity_twin::store::{Catalog, Version};
 
 use crate::engine::Engine;
@@ -137,7 +137,7 @@ fn scene(
 ) -> Result<Scene, SessionError> {
     let chunks = &version.manifest.chunks;
     let mut scene = Scene::default();
-    for Needed { chunk, section } in demand(&version.manifest, &viewpoints(views), profile) {
+    for SectionRef { chunk, section } in demand(&version.manifest, &viewpoints(views), profile) {
         let entry = &chunks[chunk];
         if without.contains(&entry.cell) {
             continue;
