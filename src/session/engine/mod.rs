@@ -17,7 +17,7 @@ use crate::limits;
 use wildcity_render::Backend;
 use wildcity_scene::RenderProfile;
 use wildcity_twin::residency::{
-    Cache, Prefetcher, Viewpoint, RigExtent, Reservation, ResidencyError, Resident, Stats, Urgency,
+    Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
 };
 use wildcity_twin::store::Catalog;
 
@@ -256,7 +256,8 @@ impl Engine {
         lens: RigExtent,
         profile: RenderProfile,
     ) -> Result<u64, SessionError> {
-        let sought = tokio::task::spawn_blocking(move || resident.worst_case_bytes_with(lens, &profile));
+        let sought =
+            tokio::task::spawn_blocking(move || resident.worst_case_bytes_with(lens, &profile));
         sought.await.map_err(|_| SessionError::Crashed)
     }
 

@@ -13,7 +13,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{RigCamera, overlay_bytes};
 use wildcity_scene::{ProfileChanges, RenderProfile};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
-use wildcity_twin::residency::{Viewpoint, RigExtent, PinnedScene, Reservation, Resident, Urgency};
+use wildcity_twin::residency::{PinnedScene, Reservation, Resident, RigExtent, Urgency, Viewpoint};
 
 use crate::engine::{BudgetShare, Engine};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -452,7 +452,11 @@ impl Session {
     }
 
     /// Waits until everything that a frame needs is in memory, all at once.
-    async fn pin(&self, deadline: Instant, eyes: Vec<Viewpoint>) -> Result<PinnedScene, SessionError> {
+    async fn pin(
+        &self,
+        deadline: Instant,
+        eyes: Vec<Viewpoint>,
+    ) -> Result<PinnedScene, SessionError> {
         let (reply, answer) = oneshot::channel();
         let (resident, profile) = (self.resident().clone(), self.profile);
         let ask = move || {
