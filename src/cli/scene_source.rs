@@ -9,11 +9,11 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::ValueEnum;
 
-use wildcity_render::automatic::{Automatic, automatic};
+use wildcity_render::automatic::{self, Selection};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gpu::{AdapterChoice, Gpu, Limits};
+use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
-use wildcity_render::relay::Relay;
 use wildcity_render::stage::Stage;
 use wildcity_render::{Backend, View};
 use wildcity_scene::{RenderProfile, Scene};
@@ -159,7 +159,8 @@ impl Engine {
         match (self.backend, device) {
             (BackendName::Auto, None) => {
                 let limits = self.machine.limits();
-                let Automatic { backend, reason } = automatic(*threads, (*simd).into(), limits)?;
+                let Selection { backend, reason } =
+                    automatic::select(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
@@ -209,7 +210,7 @@ impl Renderer {
         match (self.cpu_through, backend) {
             (None, _) => self.engine.backend(),
             (Some(stage), BackendName::Auto | BackendName::Gpu) => {
-                Ok(Box::new(Relay::new(machine.cpu()?, machine.gpu()?, stage.into())))
+                Ok(Box::new(HybridBackend::new(machine.cpu()?, machine.gpu()?, stage.into())))
             }
             (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
                 "--cpu-through leaves the stages after it to the GPU: leave --backend away, or give \

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::ReportError;
 use super::ladder::{Family, Sent};
 use super::measure::{AtPlace, Measured, least};
-use wildcity_render::compare::numbers::number;
+use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileChanges, RenderProfile};
 
@@ -52,7 +52,7 @@ pub struct Encoded {
     /// Whether sessions get their images so unless they ask for another encoding.
     pub by_default: bool,
     /// Least PSNR of a window at any place, in dB, of what arrives.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub least_db: f64,
     /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
     /// chance can make it less than 0.
@@ -90,7 +90,7 @@ pub fn front(all: &[Measured]) -> Vec<bool> {
 /// worst of eight values of a normal distribution lies 1.4 deviations from its mean on average, so
 /// what is wanted then lies 2.4 away, where one of 120 others falls. It is verified all the same.
 ///
-/// # Errors
+/// # ImageErrors
 /// None is good enough where settings are chosen; or the best one is not where it is verified.
 pub fn recommend(
     wanted: Wanted,
@@ -153,7 +153,7 @@ impl Encoded {
 impl Recommendation {
     /// The fields of the profile that it changes, as a profile file has them.
     ///
-    /// # Errors
+    /// # ImageErrors
     /// Names the change that cannot be made.
     pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
         let mut profile = RenderProfile::default();

@@ -289,7 +289,7 @@ impl Traits {
                 Some(Model::Network(..)) => Behind::Network,
                 Some(Model::Cube(_)) => Behind::Images,
             },
-            bent: views.iter().any(|view| !view.is_ideal()),
+            bent: views.iter().any(|view| !view.is_static_pinhole()),
         }
     }
 }

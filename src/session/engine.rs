@@ -85,7 +85,7 @@ impl Engine {
         let EngineSettings { cache, episodes, backend, step_timeout } = settings;
         let (jobs, queue) = mpsc::channel::<Job>(limits::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
-        for number in 0..backend.frames_at_once().max(1) {
+        for number in 0..backend.frames_in_flight().max(1) {
             let queue = queue.clone();
             std::thread::Builder::new()
                 .name(format!("render-{number}"))
@@ -385,7 +385,7 @@ mod tests {
             "takes"
         }
 
-        fn frames_at_once(&self) -> usize {
+        fn frames_in_flight(&self) -> usize {
             self.0
         }
 
@@ -393,7 +393,7 @@ mod tests {
             &self,
             _: &render::Frame<'_>,
             _: &mut [render::Target<'_>],
-            _: render::Finished<'_>,
+            _: render::OnViewDone<'_>,
         ) -> Result<render::FrameStats, render::RenderError> {
             Ok(render::FrameStats::default())
         }

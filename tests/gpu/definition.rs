@@ -5,7 +5,7 @@ use glam::DVec2;
 use wildcity::geometry::Camera;
 use wildcity::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
 use wildcity::render::reference;
-use wildcity::render::stage::Between;
+use wildcity::render::stage::StageOutputs;
 use wildcity::render::{Frame, layout};
 
 use crate::images::Image;
@@ -72,7 +72,7 @@ impl Splat {
 }
 
 /// What a backend's stage project left.
-pub(crate) fn splats(between: &Between) -> Vec<Splat> {
+pub(crate) fn splats(between: &StageOutputs) -> Vec<Splat> {
     let pairs = between.keys.iter().zip(&between.splats);
     pairs.map(|(&key, splat)| Splat::of_backend(key, splat)).collect()
 }

@@ -36,4 +36,4 @@ mod slips;
 mod stages;
 mod twins;
 
-use wildcity::report::stress::blobs;
+use wildcity::render::compare::gaussians;

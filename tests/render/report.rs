@@ -11,14 +11,14 @@ use serde_json::Value;
 use wildcity::generate;
 use wildcity::geometry::Pose;
 use wildcity::geometry::camera::{Fisheye, Lens};
+use wildcity::render::compare::errors::ImageErrors;
+use wildcity::render::compare::images::{RenderedImage, render_images};
 use wildcity::render::cpu::{Cpu, Simd};
 use wildcity::render::psnr::psnr_db;
 use wildcity::render::reference::Reference;
 use wildcity::render::{Backend, View};
 use wildcity::report::believed::believed;
 use wildcity::report::choose::{Wanted, front, recommend};
-use wildcity::report::drawing::{Drawing, draw};
-use wildcity::report::errors::Errors;
 use wildcity::report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
 use wildcity::report::measure::{AtPlace, Bench, Measured};
 use wildcity::report::places::{OFFSETS_M, Place, Sampling, places};
@@ -421,9 +421,9 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     let scene = Scene::from_gaussians(&generate::canyon(30_000, &mut |_, _| {}));
     let at = |pose: &Pose| {
         let views = View::of_rig(&rig().cameras, *pose);
-        draw(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
+        render_images(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
     };
-    let colours = |drawing: Drawing| {
+    let colours = |drawing: RenderedImage| {
         let rgba = drawing.rgba.chunks_exact(4);
         rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect()
     };
@@ -533,7 +533,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
 
 #[test]
 fn json_says_what_it_has_no_number_for() {
-    let errors = Errors {
+    let errors = ImageErrors {
         psnr_db: f64::INFINITY,
         ssim: f64::NAN,
         max: 0.0,

@@ -27,7 +27,7 @@ use wildcity::scene::manifest::Provenance;
 use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
 use wildcity::store::{Catalog, NewVersion, Version};
 
-use images::{cpu, look, render};
+use images::{cpu, render, view_along};
 
 /// How long a test waits for anything before it fails.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -75,7 +75,10 @@ fn views(world_from_rig: Pose) -> [View; 2] {
     let at = world_from_rig.position_m + DVec3::Z * 1.6;
     let forward = world_from_rig.rotation * DVec3::X;
     let left = world_from_rig.rotation * DVec3::Y;
-    [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
+    [
+        view_along([96, 64], 70.0, at, forward, -DVec3::Z),
+        view_along([64, 64], 40.0, at, left, -DVec3::Z),
+    ]
 }
 
 fn eyes(views: &[View]) -> Vec<Eye> {

@@ -18,7 +18,7 @@ use tokio_tungstenite::tungstenite::{Bytes, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use wildcity::geometry::camera::Pinhole;
 use wildcity::geometry::{Camera, Pose};
-use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity::render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity::scene::Gaussians;
 use wildcity::scene::ProfileChanges;
 use wildcity::scene::manifest::Provenance;
@@ -68,7 +68,7 @@ impl Backend for Painter {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         self.begun.fetch_add(1, Ordering::SeqCst);

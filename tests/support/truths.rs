@@ -11,7 +11,7 @@ use wildcity::render::View;
 use wildcity::scene::{RenderProfile, Scene};
 
 use crate::data::real;
-use crate::images::look;
+use crate::images::view_along;
 
 /// Somebody else's image, and what it was made of.
 pub(crate) struct Truth {
