@@ -2,14 +2,14 @@
 //! pinhole.
 
 use glam::DVec3;
-use wildcity::geometry::camera::{Rolls, Windshield, WindshieldReference};
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::compare::gaussians::{GaussianSpec, scene_of};
-use wildcity::render::compare::reprojection::ReprojectionErrors;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::{RenderError, RollingShutter, View};
-use wildcity::scene::{RenderProfile, Rig, Scene};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::ReprojectionErrors;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::{RenderError, RollingShutter, View};
+use wildcity_scene::geometry::camera::{Rolls, Windshield, WindshieldReference};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, psnr, render, render_one, try_render, view_along};

@@ -17,17 +17,12 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
-mod bench;
 mod cameras;
-mod command_line;
 mod definition;
 mod determinism;
-mod devices;
 mod encoding;
-mod extremes;
 mod flat;
 mod mirror;
-mod needed;
 mod overlap;
 mod parity;
 mod parts;
@@ -36,4 +31,4 @@ mod slips;
 mod stages;
 mod twins;
 
-use wildcity::render::compare::gaussians;
+use wildcity_render::compare::gaussians;

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::render::gpu::Limits;
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::chunk::{CellRun, Partition};
-use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
+use wildcity_generate::StreetSettings;
+use wildcity_render::gpu::Limits;
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::chunk::{CellRun, Partition};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{render, view_along};
@@ -19,7 +19,7 @@ const BYTES: f64 = 64.0;
 /// The demo street as a twin has it, in blocks of 16 m, each at the coarsest level whose error is at most
 /// a pixel in a camera of so many pixels of focal length that stands at the street's start.
 fn demo(focal_px: f32) -> Scene {
-    let street = generate::street(&StreetSettings::default()).unwrap();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let (gaussians, eye_m) = (street.gaussians, street.trajectory.at_station(0.0).position_m);
     let Partition { cells, order } = Partition::new(&gaussians.means_m);
     let block = |cell: &CellRun, indices: &[u32]| {

@@ -3,15 +3,15 @@
 
 use std::sync::LazyLock;
 
-use wildcity::render::cpu::Cpu;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::hybrid::{HybridBackend, bisect};
-use wildcity::render::layout::Cutoffs;
-use wildcity::render::psnr::MIN_PSNR_DB;
-use wildcity::render::stage::{Stage, StageOutputs};
-use wildcity::render::{Backend, Frame, RenderError, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::compare::psnr::MIN_PSNR_DB;
+use wildcity_render::cpu::Cpu;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::hybrid::{HybridBackend, bisect};
+use wildcity_render::layout::Cutoffs;
+use wildcity_render::stage::{Stage, StageOutputs};
+use wildcity_render::{Backend, Frame, RenderError, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::cameras::bent_views;
 use crate::definition::{self, Splat};
@@ -219,9 +219,9 @@ impl Backend for GoOn<'_> {
     fn render(
         &self,
         frame: &Frame<'_>,
-        targets: &mut [wildcity::render::Target<'_>],
-        finished: wildcity::render::OnViewDone<'_>,
-    ) -> Result<wildcity::render::FrameStats, wildcity::render::RenderError> {
+        targets: &mut [wildcity_render::Target<'_>],
+        finished: wildcity_render::OnViewDone<'_>,
+    ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
         self.gpu.resume(self.between, frame, targets, finished)
     }
 }

@@ -224,7 +224,7 @@ fn seen_rad(camera: &Camera) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Rolling;
+    use crate::RollingShutter;
     use fearless_simd::{Level, dispatch};
     use glam::{DMat3, DQuat, DVec2, DVec3};
     use wildcity_scene::Rig;
