@@ -292,7 +292,7 @@ impl TwinFeatures {
                 Some(SkyModel::Network(..)) => BackgroundKind::Network,
                 Some(SkyModel::Cube(_)) => BackgroundKind::Images,
             },
-            bent: views.iter().any(|view| !view.is_pinhole()),
+            bent: views.iter().any(|view| !view.is_static_pinhole()),
         }
     }
 }

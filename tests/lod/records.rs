@@ -160,7 +160,8 @@ fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
         wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number,
         1
     );
-    commit(dir.path(), &scene, StorageOptions { record: RecordFormat::H52, levels: false }).unwrap();
+    commit(dir.path(), &scene, StorageOptions { record: RecordFormat::H52, levels: false })
+        .unwrap();
 }
 
 #[test]
