@@ -231,7 +231,7 @@ impl Frame<'_> {
     ///
     /// # Errors
     /// [`RenderError::Sky`].
-    pub fn background(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
+    pub fn background(&self) -> Result<Option<(DrawableSky, DMat3)>, RenderError> {
         match &self.scene.sky {
             Some(sky) => Ok(Some((sky.drawable(self.profile.sky_error)?, sky.sky_from_world()))),
             None if self.profile.background == [0.0; 3] => Ok(None),
