@@ -208,7 +208,7 @@ fn damaged_tables() -> Vec<Damaged> {
     unnamed.metadata.images[1].tensor = "camera/left/rgb".into();
     cases.push(Damaged {
         name: "missing_tensor",
-        what: "an image whose tensor is not there",
+        what: "an image that names a missing tensor",
         bytes: unnamed.bytes(),
         image_only: false,
         refused: |e| matches!(e, FrameError::Missing { name } if name == "camera/left/rgb"),
