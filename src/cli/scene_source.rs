@@ -11,7 +11,7 @@ use clap::ValueEnum;
 
 use wildcity_render::automatic::{Automatic, automatic};
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gpu::{AdapterChoice, Gpu, Limits};
+use wildcity_render::gpu::{AdapterChoice, Gpu, MemoryLimits};
 use wildcity_render::reference::Reference;
 use wildcity_render::relay::Relay;
 use wildcity_render::stage::Stage;
@@ -194,10 +194,10 @@ impl Machine {
         Ok(Gpu::with_limits(&choice, self.threads, self.limits())?)
     }
 
-    fn limits(&self) -> Limits {
-        Limits {
+    fn limits(&self) -> MemoryLimits {
+        MemoryLimits {
             mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
-            ..Limits::default()
+            ..MemoryLimits::default()
         }
     }
 }

@@ -9,7 +9,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
 use super::compare::psnr::{RIGHT_DB, psnr_db};
 use super::cpu::{Cpu, CpuError, Simd};
-use super::gpu::{AdapterChoice, Gpu, GpuError, Limits};
+use super::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
 use super::{Backend, Frame, RenderError, Target, View};
 
 /// A backend, and why it and no other.
@@ -25,7 +25,7 @@ pub struct Automatic {
 ///
 /// # Errors
 /// As [`Cpu::new`].
-pub fn automatic(threads: usize, simd: Simd, limits: Limits) -> Result<Automatic, CpuError> {
+pub fn automatic(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Automatic, CpuError> {
     let cpu = Cpu::new(threads, simd)?;
     let reason = match Gpu::with_limits(&AdapterChoice::Hardware, threads, limits) {
         Ok(gpu) => match trial(&gpu, &cpu) {
@@ -140,7 +140,7 @@ mod tests {
     use crate::{Finished, FrameStats};
 
     fn broken(stage: &str, part: &str, slip: &str) -> Gpu {
-        let shaders = Shaders::default().with_slip(stage, part, slip).unwrap();
+        let shaders = Shaders::default().with_mutation(stage, part, slip).unwrap();
         Gpu::with_shaders(&AdapterChoice::Best, 1, shaders)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers")
     }

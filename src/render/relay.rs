@@ -55,7 +55,7 @@ fn render_through(
 ) -> Result<FrameStats, RenderError> {
     frame.check(targets)?;
     let (between, before) = cpu.through(frame, through)?;
-    let mut stats = gpu.go_on(&between, frame, targets, finished)?;
+    let mut stats = gpu.resume(&between, frame, targets, finished)?;
     stats.stages_ms.splice(0..0, before.stages_ms);
     Ok(stats)
 }

@@ -12,7 +12,7 @@ use super::ReportError;
 use super::measure::sky_bytes;
 use wildcity_render::compare::drawing::look;
 use wildcity_render::cpu::Cpu;
-use wildcity_render::gpu::{Gpu, GpuUse};
+use wildcity_render::gpu::{Gpu, GpuUsage};
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::camera::{
@@ -226,16 +226,16 @@ impl Step {
     fn of_device(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
         // The first frame makes room, perhaps in several tries.
         self.draw(gpu)?;
-        let dispatches = |usage: &GpuUse| usage.made.dispatches;
+        let dispatches = |usage: &GpuUsage| usage.totals.dispatches;
         let before = gpu.usage().as_ref().map_or(0, dispatches);
         self.draw(gpu)?;
         Ok(gpu.usage().map(|usage| DeviceCounts {
             gaussian_bytes: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
-            pipelines: usage.made.pipelines,
-            buffers: usage.made.buffers,
+            pipelines: usage.totals.pipelines,
+            buffers: usage.totals.buffers,
             dispatches: dispatches(&usage) - before,
-            moved_bytes: usage.last.bytes().iter().map(|(_, bytes)| bytes).sum(),
-            pixel_bytes: 4 * usage.last.planes,
+            moved_bytes: usage.last_frame.stage_bytes().iter().map(|(_, bytes)| bytes).sum(),
+            pixel_bytes: 4 * usage.last_frame.planes,
         }))
     }
 

@@ -56,7 +56,7 @@ fn a_device_is_for_the_gpu_backend() {
 fn a_shader_that_does_not_compile_is_an_error() {
     let broken = wildcity_render::gpu::shaders::Shaders::default();
     let broken =
-        broken.with_slip("ranges", "let own = macros[i];", "let own = nothing[i];").unwrap();
+        broken.with_mutation("ranges", "let own = macros[i];", "let own = nothing[i];").unwrap();
     let error = Gpu::with_shaders(&AdapterChoice::Best, 1, broken).unwrap_err();
     assert!(error.to_string().contains("nothing"), "{error}");
 }

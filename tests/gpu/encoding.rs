@@ -36,7 +36,7 @@ fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
 fn projected(gpu: &Gpu, scene: &Scene, view: View) -> (Vec<Splat>, Vec<Splat>) {
     let (profile, views) = (RenderProfile::default(), [view]);
     let frame = Frame { scene, profile: &profile, views: &views };
-    let found = definition::splats(&gpu.through(&frame, None, Stage::Project).unwrap());
+    let found = definition::splats(&gpu.run_through(&frame, None, Stage::Project).unwrap());
     let truths = definition::project(&frame);
     assert_eq!((found.len(), truths.len()), (scene.gaussians(), scene.gaussians()));
     (found, truths)
@@ -100,7 +100,7 @@ fn t10_a_colour_is_off_by_half_a_step_of_its_clusters_largest() {
         // 50 C0 / 65,534 are 2.2e-4: the bound is one that is reached.
         assert!(second > 1.5e-4, "degree {degree}: off by {second:e} only, was the outlier seen?");
     }
-    let slip = Shaders::default().with_slip("project", "0.28209479177387814 *", "0.2815 *");
+    let slip = Shaders::default().with_mutation("project", "0.28209479177387814 *", "0.2815 *");
     let (beyond, _) = beyond_the_bound(&gpu_with(slip.unwrap()), &Scene::from_gaussians(&wall(0)));
     assert_eq!(beyond.len(), 3, "two thousandths were not noticed: {beyond:?}");
 }

@@ -23,11 +23,11 @@ mod determinism;
 mod encoding;
 mod flat;
 mod mirror;
+mod mutations;
 mod overlap;
 mod parity;
 mod parts;
 mod sky;
-mod slips;
 mod stages;
 mod twins;
 

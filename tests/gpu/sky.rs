@@ -191,7 +191,7 @@ fn what_cameras_make_of_colours() {
 fn without_a_sky_nothing_of_it_is_compiled() {
     let broken = || {
         let shaders = Shaders::default();
-        shaders.with_slip("rasterize_map", "fn sky(view: u32", "fn sky(view: Nothing").unwrap()
+        shaders.with_mutation("rasterize_map", "fn sky(view: u32", "fn sky(view: Nothing").unwrap()
     };
     let view = all_around()[0];
     render_one(&gpu_with(broken()), &Scene::default(), &RenderProfile::DEFAULT, view);
@@ -207,7 +207,7 @@ fn slips_are_caught() {
     let caught = |variant, profile: &RenderProfile, views: &[View], slips: &[(&str, &str)]| {
         let truths = render(&cpu(), &empty(sky()), profile, views);
         for (part, slip) in slips {
-            let shaders = Shaders::default().with_slip(variant, part, slip).expect(part);
+            let shaders = Shaders::default().with_mutation(variant, part, slip).expect(part);
             let images = render(&gpu_with(shaders), &empty(sky()), profile, views);
             let off = images.iter().zip(&truths).map(|(a, b)| max_difference(&a.rgba, &b.rgba));
             assert!(off.fold(0.0, f32::max) > 1e-3, "{part} went unnoticed");

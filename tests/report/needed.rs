@@ -137,9 +137,9 @@ fn after_all_features_the_base_is_as_before() {
     let mut bent = view;
     bent.camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
     let made = |scene: &Scene, view: View| {
-        let before = gpu.usage().map(|usage| usage.made).unwrap_or_default();
+        let before = gpu.usage().map(|usage| usage.totals).unwrap_or_default();
         render_one(&*gpu, scene, &RenderProfile::DEFAULT, view);
-        let after = gpu.usage().unwrap().made;
+        let after = gpu.usage().unwrap().totals;
         [
             after.pipelines - before.pipelines,
             after.buffers - before.buffers,

@@ -7,7 +7,7 @@ use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity_render::gpu::shaders::Shaders;
-use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, Limits};
+use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
 use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The best device of this machine.
@@ -26,12 +26,12 @@ pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
 }
 
 /// Bindings of so many bytes.
-pub(crate) fn bindings(binding_bytes: u64) -> Limits {
-    Limits { binding_bytes, ..Limits::default() }
+pub(crate) fn bindings(binding_bytes: u64) -> MemoryLimits {
+    MemoryLimits { binding_bytes, ..MemoryLimits::default() }
 }
 
 /// The same with less of the device than it has.
-pub(crate) fn gpu_with_limits(limits: Limits) -> Watched {
+pub(crate) fn gpu_with_limits(limits: MemoryLimits) -> Watched {
     watched(|| Gpu::with_limits(&AdapterChoice::Best, 0, limits))
 }
 

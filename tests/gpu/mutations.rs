@@ -11,7 +11,7 @@ use crate::streets::{street, street_views};
 
 /// A fault to plant in a shader.
 #[derive(Debug)]
-pub(crate) struct Slip {
+pub(crate) struct Mutation {
     /// Which shader.
     pub(crate) shader: &'static str,
     /// What of it is replaced.
@@ -27,8 +27,8 @@ const fn slip(
     part: &'static str,
     text: &'static str,
     stages: &'static [&'static str],
-) -> Slip {
-    Slip { shader, part, text, stages }
+) -> Mutation {
+    Mutation { shader, part, text, stages }
 }
 
 const PROJECT: &[&str] = &["project"];
@@ -37,7 +37,7 @@ const BIN: &[&str] = &["bin"];
 const RASTERIZE: &[&str] = &["rasterize"];
 const SORTS: &[&str] = &["sort", "bin"];
 
-pub(crate) const SLIPS: &[Slip] = &[
+pub(crate) const MUTATIONS: &[Mutation] = &[
     slip(
         "project",
         "let clamped = clamp(slope, view.slope_min, view.slope_max);",
@@ -104,7 +104,7 @@ pub(crate) const SLIPS: &[Slip] = &[
 ];
 
 /// Faults of lenses and shutters: what of `project_bent` is replaced, by what.
-pub(crate) const LENS_SLIPS: &[(&str, &str)] = &[
+pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("0.07902598 * square", "0.0 * square"),
     ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),
     ("off_axis < end * inside.z", "off_axis < 0.5 * end * inside.z"),
@@ -171,8 +171,8 @@ fn a_slip_in_any_stage_is_caught() {
         }
     };
     assert!(!caught(&gpu()), "nothing is broken, and something was found");
-    for slip in SLIPS {
-        let broken = Shaders::default().with_slip(slip.shader, slip.part, slip.text);
+    for slip in MUTATIONS {
+        let broken = Shaders::default().with_mutation(slip.shader, slip.part, slip.text);
         let broken = broken.unwrap_or_else(|| panic!("{slip:?}: the part is no longer there"));
         assert!(caught(&gpu_with(broken)), "{slip:?} went unnoticed");
     }
