@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
-use wildcity_report::places::OFFSETS_M;
+use wildcity_report::sample_points::OFFSETS_M;
 use wildcity_scene::{ProfileChanges, RenderProfile};
 
 use crate::reported::{commit, drive};

@@ -46,9 +46,9 @@ fn import_inspect_and_verify_tell_what_is_there() {
         &path("rig.json"),
         "--trajectory",
         &path("log.json"),
-        "--profile",
+        "--set",
         "near=0.2",
-        "--profile",
+        "--set",
         "alpha_cap=0.999",
     ];
     let output = import(dir.path(), &scene, &options);
@@ -121,7 +121,7 @@ fn bad_options_are_named_before_the_file_is_read() {
         (["--axes", "2 0 0 0 1 0 0 0 1"], "--axes \"2 0 0 0 1 0 0 0 1\": the rows of the matrix"),
         (["--axes", "sideways"], "--axes \"sideways\": expected nine numbers"),
         (["--scale", "-2"], "--scale \"-2.0\": a scale is from 1e-6 to 1e6"),
-        (["--profile", "fog=1"], "there is no field \"fog\""),
+        (["--set", "fog=1"], "there is no field \"fog\""),
         (["--rig", &broken], "broken.json"),
         (["--trajectory", "/nonexistent.json"], "/nonexistent.json: cannot read: No such file"),
     ] {

@@ -5,10 +5,10 @@ use std::cell::Cell;
 use glam::DVec3;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
 use wildcity_render::{Backend, Frame, Target, View};
-use wildcity_report::ladder::{Ladder, Traits, ladder};
-use wildcity_report::measure::Bench;
-use wildcity_report::needed::{self, DeviceCounts};
-use wildcity_report::places::{Sampling, places};
+use wildcity_report::feature_costs::{self, DeviceCounts};
+use wildcity_report::measure::Benchmark;
+use wildcity_report::sample_points::{Sampling, sample_points};
+use wildcity_report::settings::{SettingList, TwinFeatures, settings_to_compare};
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Rays, Record, RenderProfile, Scene};
@@ -35,14 +35,14 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let resident = Cache::new(catalog).open("street", None).unwrap();
     let manifest = &resident.version.manifest;
-    let places = places(manifest, &[], Sampling { stations: 2, window_px: [32, 32] });
+    let places = sample_points(manifest, &[], Sampling { stations: 2, window_px: [32, 32] });
     let open = || Gpu::new(&AdapterChoice::Best, 0).ok();
     let backends: [Box<dyn Backend>; 2] = [Box::new(cpu()), Box::new(open().unwrap())];
-    let twin = Traits::of(manifest, None, &places[0].views);
-    let Ladder { settings, .. } = ladder(&twin, &["cpu", "gpu"]);
+    let twin = TwinFeatures::of(manifest, None, &places[0].views);
+    let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu", "gpu"]);
     let held_bytes = |name: &str, device: &dyn Fn() -> Option<Gpu>| {
         let (backends, places) = (&backends[..], &places[..]);
-        let bench = Bench { resident: &resident, backends, places, repeat: 1, device };
+        let bench = Benchmark { resident: &resident, backends, places, repeat: 1, device };
         let truth = bench.truth(Rays::Splats, &mut |_| {}).unwrap();
         let setting = settings.iter().find(|setting| setting.name == name).unwrap();
         bench.measure(setting, &truth).unwrap().cost.device_bytes
@@ -72,7 +72,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         opened.set(opened.get() + 1);
         Gpu::new(&AdapterChoice::Best, 0).ok()
     };
-    let rows = needed::rows(&cpu(), &open).unwrap();
+    let rows = feature_costs::count_features(&cpu(), &open).unwrap();
     rows.iter().for_each(|row| eprintln!("| {} | {} |", row.with, row.counts.texts().join(" | ")));
     // Each on a device that drew nothing else.
     assert_eq!(opened.get(), rows.len());

@@ -9,13 +9,15 @@ use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, View};
-use wildcity_report::believed::believed;
-use wildcity_report::choose::{Wanted, front, recommend};
-use wildcity_report::ladder::{Family, Ladder, LeftOut, Setting, Traits, ladder};
-use wildcity_report::measure::{AtPlace, Bench, Measured};
-use wildcity_report::places::{OFFSETS_M, Place, Sampling, places};
-use wildcity_report::timing::at_one_speed;
-use wildcity_report::{ReportError, needed};
+use wildcity_report::confidence::confidence_by_offset;
+use wildcity_report::measure::normalize_machine_speed;
+use wildcity_report::measure::{Benchmark, Measurement, SampleResult};
+use wildcity_report::recommend::{Goal, pareto_front, recommend};
+use wildcity_report::sample_points::{OFFSETS_M, SamplePoint, Sampling, sample_points};
+use wildcity_report::settings::{
+    Family, Setting, SettingList, Skipped, TwinFeatures, settings_to_compare,
+};
+use wildcity_report::{ReportError, feature_costs};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
@@ -35,15 +37,15 @@ fn measured(
     resident: &Arc<Resident>,
     rig: &Rig,
     keep: &dyn Fn(&Setting) -> bool,
-) -> (Vec<Measured>, Vec<LeftOut>) {
+) -> (Vec<Measurement>, Vec<Skipped>) {
     let sampling = Sampling { stations: 3, window_px: [64, 48] };
     let manifest = &resident.version.manifest;
-    let places = places(manifest, &rig.cameras, sampling);
+    let places = sample_points(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
     let bench =
-        Bench { resident, backends: &backends, places: &places, repeat: 1, device: &|| None };
-    let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
-    let Ladder { settings, left_out } = ladder(&twin, &["cpu"]);
+        Benchmark { resident, backends: &backends, places: &places, repeat: 1, device: &|| None };
+    let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let SettingList { settings, skipped: left_out } = settings_to_compare(&twin, &["cpu"]);
     let truths = [Rays::Splats, Rays::Exact].map(|rays| {
         let wanted = settings.iter().any(|s| keep(s) && s.against == rays);
         wanted.then(|| bench.truth(rays, &mut |_| {}).unwrap())
@@ -57,12 +59,12 @@ fn measured(
 }
 
 /// One setting of the ladder on the cpu backend at some places.
-fn one(resident: &Arc<Resident>, places: &[Place], name: &str) -> Measured {
+fn one(resident: &Arc<Resident>, places: &[SamplePoint], name: &str) -> Measurement {
     let manifest = &resident.version.manifest;
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Bench { resident, backends: &backends, places, repeat: 1, device: &|| None };
-    let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
-    let Ladder { settings, .. } = ladder(&twin, &["cpu"]);
+    let bench = Benchmark { resident, backends: &backends, places, repeat: 1, device: &|| None };
+    let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu"]);
     let setting = settings.iter().find(|setting| setting.name == name).unwrap();
     bench.measure(setting, &bench.truth(Rays::Splats, &mut |_| {}).unwrap()).unwrap()
 }
@@ -113,10 +115,10 @@ fn errors_and_costs_go_the_way_they_must() {
         assert!(files.iter().all(|file| file.starts_with(b"\x89PNG")), "{}", m.setting.name);
         assert!(m.cost.step_ms > 0.0);
     }
-    assert!(front(&all).iter().any(|on| *on) && !front(&all).iter().all(|on| *on));
+    assert!(pareto_front(&all).iter().any(|on| *on) && !pareto_front(&all).iter().all(|on| *on));
 
     let names = ["cpu".to_owned()];
-    let best = recommend(Wanted::AtLeastDb(35.0), &all, &names).unwrap();
+    let best = recommend(Goal::AtLeastDb(35.0), &all, &names).unwrap();
     // Beside it, what the encodings that it is not of lose and take.
     let encoded: Vec<(&str, bool)> =
         best.encoded.iter().map(|e| (e.sent.as_str(), e.by_default)).collect();
@@ -132,30 +134,30 @@ fn errors_and_costs_go_the_way_they_must() {
     assert!(best.verified >= 35.0 && best.chosen_by >= 35.0 + best.margin, "{best:?}");
     assert_eq!((least_db(chosen, true), least_db(chosen, false)), (best.chosen_by, best.verified));
     assert!(chosen.setting.can_be_served() && chosen.setting.scale == 1.0);
-    let too_much = recommend(Wanted::AtLeastDb(500.0), &all, &names).unwrap_err();
-    assert!(matches!(too_much, ReportError::OutOfReach { .. }), "{too_much}");
-    let too_fast = recommend(Wanted::AtMostMs(1e-6), &all, &names).unwrap_err();
-    assert!(matches!(too_fast, ReportError::OutOfReach { .. }), "{too_fast}");
+    let too_much = recommend(Goal::AtLeastDb(500.0), &all, &names).unwrap_err();
+    assert!(matches!(too_much, ReportError::GoalNotReached { .. }), "{too_much}");
+    let too_fast = recommend(Goal::AtMostMs(1e-6), &all, &names).unwrap_err();
+    assert!(matches!(too_fast, ReportError::GoalNotReached { .. }), "{too_fast}");
     let slowest = all.iter().flat_map(|m| &m.by_place).filter_map(|place| place.p95_ms);
     let slowest = slowest.fold(0.0, f64::max);
-    let exact = recommend(Wanted::AtMostMs(10.0 * slowest), &all, &names).unwrap();
+    let exact = recommend(Goal::AtMostMs(10.0 * slowest), &all, &names).unwrap();
     let servable = all.iter().filter(|m| m.setting.can_be_served());
     let best_db = servable.map(|m| least_db(m, true)).fold(0.0, f64::max);
     assert_eq!(least_db(of(&exact.setting), true), best_db, "{exact:?}");
 }
 
 /// Least PSNR of the places that choose, or of those that verify.
-fn least_db(m: &Measured, chooses: bool) -> f64 {
+fn least_db(m: &Measurement, chooses: bool) -> f64 {
     let places = m.by_place.iter().filter(|place| place.chooses == chooses);
     places.map(|place| place.least_db).fold(f64::INFINITY, f64::min)
 }
 
 /// A slow and good setting and a fast one, at places that give so many dB: of each two the first chooses.
-fn two(like: &[Measured], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measured> {
+fn two(like: &[Measurement], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measurement> {
     let mut all = like.to_vec();
     for (m, (db, ms)) in all.iter_mut().zip([(slow_db, 20.0), (fast_db, 10.0)]) {
         m.cost.step_ms = ms;
-        let place = |(index, psnr_db): (usize, f64)| AtPlace {
+        let place = |(index, psnr_db): (usize, f64)| SampleResult {
             chooses: index % 2 == 0,
             psnr_db,
             least_db: psnr_db,
@@ -174,7 +176,7 @@ fn the_margin_is_what_places_differ_by() {
     let (like, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
     let chosen = |fast_db: [f64; 6]| {
         let all = two(&like, [60.0, 59.0, 62.0, 60.0, f64::INFINITY, 61.0], fast_db);
-        recommend(Wanted::AtLeastDb(35.0), &all, &names).map(|best| (best.setting, best.margin))
+        recommend(Goal::AtLeastDb(35.0), &all, &names).map(|best| (best.setting, best.margin))
     };
     // Alike everywhere: a decibel is enough.
     assert_eq!(
@@ -192,17 +194,17 @@ fn the_margin_is_what_places_differ_by() {
     // The first was measured while the machine was twice as fast as with the second.
     let mut uneven = two(&like, [60.0; 6], [40.0; 6]);
     (uneven[0].served_ms, uneven[1].served_ms) = (15.0, 30.0);
-    at_one_speed(&mut uneven);
+    normalize_machine_speed(&mut uneven);
     let times = [0, 1].map(|i| (uneven[i].cost.step_ms, uneven[i].by_place[0].p95_ms));
     assert_eq!(times, [(40.0, Some(40.0)), (10.0, Some(10.0))]);
     // Times have a margin, too: 10 ms and a tenth.
     let all = two(&like, [60.0; 6], [40.0; 6]);
-    let by_time = |ms: f64| recommend(Wanted::AtMostMs(ms), &all, &names).unwrap().setting;
+    let by_time = |ms: f64| recommend(Goal::AtMostMs(ms), &all, &names).unwrap().setting;
     assert_eq!(
         [by_time(22.1), by_time(21.9), by_time(11.1)],
         ["as served", "stop=0.016", "stop=0.016"]
     );
-    assert!(recommend(Wanted::AtMostMs(10.9), &all, &names).is_err());
+    assert!(recommend(Goal::AtMostMs(10.9), &all, &names).is_err());
 }
 
 #[test]
@@ -219,19 +221,19 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
             (place.least_db, place.p95_ms) = (f64::INFINITY, Some(ms));
         }
     }
-    let within = |all: &[Measured], ms| recommend(Wanted::AtMostMs(ms), all, &names).unwrap();
+    let within = |all: &[Measurement], ms| recommend(Goal::AtMostMs(ms), all, &names).unwrap();
     assert_eq!([100.0, 25.0].map(|ms| within(&all, ms).setting), ["as served", "stop=0.004"]);
     // One that draws what the twin as served draws seems to be the fastest of all.
     let mut idle = all[0].clone();
     (idle.setting.name, idle.setting.family) = ("tau_px=4".to_owned(), Family::Detail);
     idle.cost.step_ms = 1.0;
     idle.by_place.iter_mut().for_each(|place| place.p95_ms = Some(1.0));
-    let at_least = |all: &[Measured]| recommend(Wanted::AtLeastDb(60.0), all, &names).unwrap();
+    let at_least = |all: &[Measurement]| recommend(Goal::AtLeastDb(60.0), all, &names).unwrap();
     for first in [true, false] {
         let mut all = all.clone();
         all.insert(if first { 0 } else { 3 }, idle.clone());
         assert_eq!(within(&all, 100.0).setting, "as served");
-        assert!(recommend(Wanted::AtMostMs(5.0), &all, &names).is_err());
+        assert!(recommend(Goal::AtMostMs(5.0), &all, &names).is_err());
         assert_eq!(at_least(&all).setting, "stop=0.016");
     }
     // With fewer Gaussians it is no chance.
@@ -259,17 +261,17 @@ fn a_place_is_as_good_as_its_worst_camera() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), vec![drive()]);
     let sampling = Sampling { stations: 2, window_px: [64, 48] };
-    let both = places(&resident.version.manifest, &rig().cameras, sampling);
+    let both = sample_points(&resident.version.manifest, &rig().cameras, sampling);
     let at_least_db = |cameras: Option<usize>| {
-        let only = |place: &Place| match cameras {
+        let only = |place: &SamplePoint| match cameras {
             None => place.clone(),
-            Some(i) => Place {
+            Some(i) => SamplePoint {
                 views: vec![place.views[i]],
                 windows: vec![place.windows[i]],
                 ..place.clone()
             },
         };
-        let places: Vec<Place> = both.iter().map(only).collect();
+        let places: Vec<SamplePoint> = both.iter().map(only).collect();
         let m = one(&resident, &places, "alpha_cut=0.032");
         m.by_place.iter().map(|place| (place.least_db, place.psnr_db)).collect::<Vec<_>>()
     };
@@ -287,7 +289,7 @@ fn a_place_is_as_good_as_its_worst_camera() {
     let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
     let (like, _) = measured(&resident, &rig(), &keep);
     let mut all = two(&like, [60.0; 6], [40.0; 6]);
-    let chosen = |all: &[Measured]| recommend(Wanted::AtLeastDb(35.0), all, &names);
+    let chosen = |all: &[Measurement]| recommend(Goal::AtLeastDb(35.0), all, &names);
     assert_eq!(chosen(&all).unwrap().setting, "stop=0.016");
     for least_db in [32.2, f64::NAN] {
         all[1].by_place[2].least_db = least_db;
@@ -331,7 +333,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
                 let is_fastest = m.setting.name == fastest.setting.name;
                 m.cost.step_ms = if is_fastest { 1.0 } else { 2.0 };
             }
-            let best = recommend(Wanted::AtLeastDb(wanted_db), &timed, &names);
+            let best = recommend(Goal::AtLeastDb(wanted_db), &timed, &names);
             let own = best.ok().filter(|best| best.setting == fastest.setting.name);
             let profile = match &own {
                 Some(best) => best.changes().unwrap(),
@@ -424,7 +426,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
         for m in &mut all {
             m.cost.step_ms = if m.setting.name == fastest { 1.0 } else { 2.0 };
         }
-        match recommend(Wanted::AtLeastDb(35.0), &all, &names) {
+        match recommend(Goal::AtLeastDb(35.0), &all, &names) {
             Ok(best) if best.setting == fastest => met.push(fastest),
             Ok(best) => assert!(best.verified >= 35.0, "{best:?}"),
             Err(refused) => panic!("{fastest}: {refused}"),
@@ -432,8 +434,8 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     }
     assert!(met.contains(&"as served") && met.contains(&"stop=0.004"), "{met:?}");
     assert!(!met.contains(&"alpha_cut=0.032"), "{met:?}");
-    let refused = recommend(Wanted::AtLeastDb(150.0), &all, &names).unwrap_err();
-    assert!(matches!(refused, ReportError::OutOfReach { .. }), "{refused}");
+    let refused = recommend(Goal::AtLeastDb(150.0), &all, &names).unwrap_err();
+    assert!(matches!(refused, ReportError::GoalNotReached { .. }), "{refused}");
 }
 
 #[test]
@@ -474,7 +476,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     assert!((35.0..60.0).contains(&rays.errors.psnr_db), "{:?}", rays.errors);
     assert!(!rays.setting.can_be_served());
     assert!(rays.errors.psnr_db < db("as served"), "{:?}", rays.errors);
-    assert!(!front(std::slice::from_ref(rays))[0]);
+    assert!(!pareto_front(std::slice::from_ref(rays))[0]);
 }
 
 #[test]
@@ -502,10 +504,10 @@ fn a_setting_is_beaten_by_what_is_faster_and_closer() {
     for (m, (ms, db)) in all.iter_mut().zip([(1.0, 30.0), (2.0, 40.0), (2.5, 40.0), (3.0, 35.0)]) {
         (m.cost.step_ms, m.errors.psnr_db) = (ms, db);
     }
-    assert_eq!(front(&all), [true, true, false, false]);
+    assert_eq!(pareto_front(&all), [true, true, false, false]);
     // Equals do not beat each other.
     all[2].cost.step_ms = 2.0;
-    assert_eq!(front(&all), [true, true, true, false]);
+    assert_eq!(pareto_front(&all), [true, true, true, false]);
 }
 
 #[test]
@@ -514,7 +516,7 @@ fn without_a_drive_a_twin_is_looked_at_from_around() {
     let resident = commit(dir.path(), Vec::new());
     let sampling = Sampling { stations: 4, window_px: [64, 48] };
     let manifest = &resident.version.manifest;
-    let places = places(manifest, &rig().cameras, sampling);
+    let places = sample_points(manifest, &rig().cameras, sampling);
     assert_eq!(places.len(), 16);
     let bounds = manifest.bounds();
     for place in &places {
@@ -532,9 +534,9 @@ fn images_are_believed_less_beside_the_drive() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), vec![drive()]);
     let sampling = Sampling { stations: 2, window_px: [16, 16] };
-    let places = places(&resident.version.manifest, &rig().cameras, sampling);
+    let places = sample_points(&resident.version.manifest, &rig().cameras, sampling);
     let cpu = Cpu::new(2, Simd::Best).unwrap();
-    let all = believed(&resident, &cpu, &places).unwrap();
+    let all = confidence_by_offset(&resident, &cpu, &places).unwrap();
     assert_eq!(all.iter().map(|b| b.offset_m).collect::<Vec<_>>(), OFFSETS_M);
     assert!(all[0].mean > 0.9 && all[3].mean < 0.45, "{all:?}");
     for (pair, [near_m, far_m]) in all.windows(2).zip([[0.0, 1.0], [1.0, 3.0], [3.0, 5.0]]) {
@@ -547,13 +549,13 @@ fn images_are_believed_less_beside_the_drive() {
         assert!(b.offset_m == 0.0 || b.picture.place.contains(&format!("{} m", b.offset_m)));
     }
     let nowhere = commit(tempfile::tempdir().unwrap().path(), Vec::new());
-    assert!(believed(&nowhere, &cpu, &places).unwrap().is_empty());
+    assert!(confidence_by_offset(&nowhere, &cpu, &places).unwrap().is_empty());
 }
 
 #[test]
 fn the_base_pays_for_no_feature_of_others() {
     let cpu = Cpu::new(2, Simd::Best).unwrap();
-    let rows = needed::rows(&cpu, &|| None).unwrap();
+    let rows = feature_costs::count_features(&cpu, &|| None).unwrap();
     let of = |with: &str| rows.iter().find(|row| row.with == with).unwrap().counts;
     let base = of("nothing else");
     // 14 columns of 4 B, and no more than 1 % of ends of blocks and clusters.

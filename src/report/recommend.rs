@@ -3,8 +3,8 @@
 use serde::Serialize;
 
 use super::ReportError;
-use super::ladder::{Family, Sent};
-use super::measure::{AtPlace, Measured, least};
+use super::measure::{Measurement, SampleResult, least};
+use super::settings::{Family, Sent};
 use wildcity_render::compare::numbers::number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileChanges, RenderProfile};
@@ -12,7 +12,7 @@ use wildcity_scene::{ProfileChanges, RenderProfile};
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Wanted {
+pub enum Goal {
     /// In every camera's window at every place at least this PSNR, in dB, in as little time as possible.
     AtLeastDb(f64),
     /// All but one of twenty steps within this time, in milliseconds, with as little error as possible.
@@ -25,7 +25,7 @@ pub enum Wanted {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
     /// What was wanted.
-    pub wanted: Wanted,
+    pub wanted: Goal,
     /// The setting's name.
     pub setting: String,
     /// Its changes of the profile.
@@ -41,12 +41,12 @@ pub struct Recommendation {
     /// Where in the way of an image to an agent all of that was measured: [`RENDERED`].
     pub measured: &'static str,
     /// What encodings lose and take on top.
-    pub encoded: Vec<Encoded>,
+    pub encoded: Vec<EncodingCost>,
 }
 
 /// What the twin as served loses and takes when its images are encoded.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Encoded {
+pub struct EncodingCost {
     /// The rung, as `jpeg 90`.
     pub sent: String,
     /// Whether sessions get their images so unless they ask for another encoding.
@@ -71,9 +71,9 @@ const MOST_DB: f64 = 144.5;
 
 /// Which of them no other one beats, in time and in error at once. What is compared with rays is another
 /// question, and neither beats nor is beaten.
-pub fn front(all: &[Measured]) -> Vec<bool> {
-    let is_asked = |m: &&Measured| m.setting.family != Family::Rays;
-    let point = |m: &Measured| (m.cost.step_ms, m.errors.psnr_db);
+pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
+    let is_asked = |m: &&Measurement| m.setting.family != Family::Rays;
+    let point = |m: &Measurement| (m.cost.step_ms, m.errors.psnr_db);
     let beaten = |(ms, db): (f64, f64)| {
         let better = |(other_ms, other_db)| {
             (other_ms < ms && other_db >= db) || (other_ms <= ms && other_db > db)
@@ -93,39 +93,39 @@ pub fn front(all: &[Measured]) -> Vec<bool> {
 /// # Errors
 /// None is good enough where settings are chosen; or the best one is not where it is verified.
 pub fn recommend(
-    wanted: Wanted,
-    all: &[Measured],
+    wanted: Goal,
+    all: &[Measurement],
     backends: &[String],
 ) -> Result<Recommendation, ReportError> {
     let served = all.iter().find(|m| m.setting.family == Family::AsServed);
-    let changes = |m: &&Measured| !served.is_some_and(|served| m.changes_nothing(served));
+    let changes = |m: &&Measurement| !served.is_some_and(|served| m.changes_nothing(served));
     let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(changes);
     let judged = servable.map(|m| (m, wanted.judge(m)));
-    let judged: Vec<(&Measured, Judged)> = judged.collect();
+    let judged: Vec<(&Measurement, Assessment)> = judged.collect();
     let meets = judged.iter().filter(|(_, judged)| wanted.holds(judged.assured));
     let best = match wanted {
-        Wanted::AtLeastDb(_) => {
+        Goal::AtLeastDb(_) => {
             meets.min_by(|(a, _), (b, _)| a.cost.step_ms.total_cmp(&b.cost.step_ms))
         }
-        Wanted::AtMostMs(_) => {
-            let db = |m: &Measured| Wanted::AtLeastDb(0.0).judge(m).worst;
+        Goal::AtMostMs(_) => {
+            let db = |m: &Measurement| Goal::AtLeastDb(0.0).judge(m).worst;
             let numbers = meets.filter(|(m, _)| !db(m).is_nan());
             numbers.reduce(|best, next| if db(next.0) > db(best.0) { next } else { best })
         }
     };
-    let Some((best, Judged { worst, margin, verified, .. })) = best.copied() else {
+    let Some((best, Assessment { worst, margin, verified, .. })) = best.copied() else {
         let assured = judged.iter().map(|(_, judged)| judged.assured);
         let reached = match wanted {
-            Wanted::AtLeastDb(_) => assured.fold(f64::NEG_INFINITY, f64::max),
-            Wanted::AtMostMs(_) => assured.fold(f64::INFINITY, f64::min),
+            Goal::AtLeastDb(_) => assured.fold(f64::NEG_INFINITY, f64::max),
+            Goal::AtMostMs(_) => assured.fold(f64::INFINITY, f64::min),
         };
-        return Err(ReportError::OutOfReach { wanted: wanted.to_string(), reached });
+        return Err(ReportError::GoalNotReached { wanted: wanted.to_string(), reached });
     };
     if !wanted.holds(verified) {
         let (setting, wanted) = (best.setting.name.clone(), wanted.to_string());
         return Err(ReportError::NotVerified { setting, wanted, verified });
     }
-    let is_sent = |m: &&Measured| m.setting.family == Family::Sent;
+    let is_sent = |m: &&Measurement| m.setting.family == Family::Sent;
     Ok(Recommendation {
         wanted,
         setting: best.setting.name.clone(),
@@ -135,12 +135,12 @@ pub fn recommend(
         margin,
         verified,
         measured: RENDERED,
-        encoded: all.iter().filter(is_sent).map(Encoded::of).collect(),
+        encoded: all.iter().filter(is_sent).map(EncodingCost::of).collect(),
     })
 }
 
-impl Encoded {
-    fn of(m: &Measured) -> Self {
+impl EncodingCost {
+    fn of(m: &Measurement) -> Self {
         Self {
             sent: m.setting.name.clone(),
             by_default: m.setting.sent == Some(Sent::Jpeg(wildcity_session::limits::JPEG_QUALITY)),
@@ -177,8 +177,8 @@ impl Recommendation {
 
     /// What its decibels and milliseconds are of, and what encodings add to them.
     pub fn of_what(&self) -> String {
-        let one = |encoded: &Encoded| {
-            let Encoded { sent, by_default, least_db, more_ms } = encoded;
+        let one = |encoded: &EncodingCost| {
+            let EncodingCost { sent, by_default, least_db, more_ms } = encoded;
             let default = if *by_default { " (the default)" } else { "" };
             format!("{sent}{default} {least_db:.1} dB at worst and {more_ms:+.1} ms a step")
         };
@@ -193,7 +193,7 @@ impl Recommendation {
 
 /// What the places say of a setting, in dB or milliseconds.
 #[derive(Clone, Copy)]
-struct Judged {
+struct Assessment {
     /// The worst of those that choose.
     worst: f64,
     /// What they differ by.
@@ -204,7 +204,7 @@ struct Judged {
     verified: f64,
 }
 
-impl Wanted {
+impl Goal {
     fn holds(self, value: f64) -> bool {
         match self {
             Self::AtLeastDb(db) => value >= db,
@@ -212,8 +212,8 @@ impl Wanted {
         }
     }
 
-    fn judge(self, m: &Measured) -> Judged {
-        let value = |place: &AtPlace| match self {
+    fn judge(self, m: &Measurement) -> Assessment {
+        let value = |place: &SampleResult| match self {
             // NaN stays NaN, and holds nothing.
             Self::AtLeastDb(_) => Some(place.least_db.clamp(f64::NEG_INFINITY, MOST_DB)),
             Self::AtMostMs(_) => place.p95_ms,
@@ -229,12 +229,12 @@ impl Wanted {
         match self {
             Self::AtLeastDb(_) => {
                 let (worst, margin) = (least(&choosing), spread(&choosing, f64::lt).max(MARGIN_DB));
-                Judged { worst, margin, assured: worst - margin, verified: least(&verifying) }
+                Assessment { worst, margin, assured: worst - margin, verified: least(&verifying) }
             }
             Self::AtMostMs(_) => {
                 let worst = most(&choosing);
                 let margin = spread(&choosing, f64::gt).max(MARGIN_MS * worst);
-                Judged { worst, margin, assured: worst + margin, verified: most(&verifying) }
+                Assessment { worst, margin, assured: worst + margin, verified: most(&verifying) }
             }
         }
     }
@@ -253,7 +253,7 @@ fn spread(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
     (squares / worse.len().max(1) as f64).sqrt()
 }
 
-impl std::fmt::Display for Wanted {
+impl std::fmt::Display for Goal {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::AtLeastDb(db) => write!(f, "at least {db} dB"),

@@ -32,7 +32,7 @@ pub struct Setting {
 
 /// What a ladder is of: what decides which settings can be felt.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Traits {
+pub struct TwinFeatures {
     /// How the twin is drawn.
     pub profile: RenderProfile,
     /// How it is stored.
@@ -40,14 +40,14 @@ pub struct Traits {
     /// Whether it has levels of detail.
     pub levels: bool,
     /// What is behind it.
-    pub behind: Behind,
+    pub behind: BackgroundKind,
     /// Whether some camera has a lens, a windshield or a rolling shutter while it moves.
     pub bent: bool,
 }
 
 /// What is behind a twin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Behind {
+pub enum BackgroundKind {
     /// Nothing, or a background of one colour.
     Nothing,
     /// A network, which is evaluated or baked.
@@ -58,23 +58,23 @@ pub enum Behind {
 
 /// Settings to compare, and what is not among them.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Ladder {
+pub struct SettingList {
     /// The twin as it is served first; names are unique.
     pub settings: Vec<Setting>,
     /// What this twin, or this build, cannot feel.
-    pub left_out: Vec<LeftOut>,
+    pub skipped: Vec<Skipped>,
 }
 
 /// What is not compared.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct LeftOut {
+pub struct Skipped {
     /// The setting or family.
     pub what: String,
     /// Why.
     pub why: String,
 }
 
-impl LeftOut {
+impl Skipped {
     /// Something that is not compared, and why.
     pub fn new(what: impl Into<String>, why: impl Into<String>) -> Self {
         Self { what: what.into(), why: why.into() }
@@ -180,7 +180,7 @@ const TILE: &str = "16 x 16 px by construction: sixteen vectors of 4 x 4 on the 
 
 /// Every setting that the twin can feel: `backends` many backends, of which the first draws all; only
 /// coarser records than the twin's own are compared with it.
-pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
+pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingList {
     let profile = &twin.profile;
     let served = Setting {
         name: "as served".to_owned(),
@@ -199,7 +199,7 @@ pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
         ..served.clone()
     };
     let mut all = vec![served.clone()];
-    let mut left_out = vec![LeftOut::new("tile size", TILE)];
+    let mut skipped = vec![Skipped::new("tile size", TILE)];
     for (backend, name) in backends.iter().enumerate().skip(1) {
         let (name, family) = ((*name).to_owned(), Family::Backend);
         all.push(Setting { name, family, backend, ..served.clone() });
@@ -209,16 +209,16 @@ pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
         let taus = TAUS_PX.into_iter().filter(|tau_px| *tau_px != profile.tau_px);
         all.extend(taus.map(|tau_px| changed(Family::Detail, &[tau(tau_px)])));
     } else {
-        left_out.push(LeftOut::new("tau_px", "the twin has no levels of detail"));
+        skipped.push(Skipped::new("tau_px", "the twin has no levels of detail"));
     }
     match profile.reach_m {
-        None => left_out.push(LeftOut::new("reach_m", "the twin is drawn however far it goes")),
+        None => skipped.push(Skipped::new("reach_m", "the twin is drawn however far it goes")),
         Some(_) => all.push(changed(Family::Reach, &["reach_m=none".to_owned()])),
     }
     let mut coarser =
         Record::ALL.into_iter().skip_while(|record| *record != twin.stored).skip(1).peekable();
     if coarser.peek().is_none() {
-        left_out.push(LeftOut::new("record", "the twin's own is the coarsest"));
+        skipped.push(Skipped::new("record", "the twin's own is the coarsest"));
     }
     all.extend(coarser.map(|record| Setting {
         name: format!("record {record}"),
@@ -235,17 +235,17 @@ pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
     let stops = STOPS.into_iter().filter(|stop| *stop > profile.stop);
     all.extend(stops.map(|left| changed(Family::Stop, &[stop(left)])));
     match twin.behind {
-        Behind::Nothing => left_out.push(LeftOut::new("sky_error", "the twin has no sky")),
-        Behind::Images => {
-            left_out.push(LeftOut::new("sky_error", "the sky is images: they are their own map"));
+        BackgroundKind::Nothing => skipped.push(Skipped::new("sky_error", "the twin has no sky")),
+        BackgroundKind::Images => {
+            skipped.push(Skipped::new("sky_error", "the sky is images: they are their own map"));
         }
-        Behind::Network => {
+        BackgroundKind::Network => {
             let others = SKY_ERRORS.into_iter().filter(|error| *error != profile.sky_error);
             all.extend(others.map(|e| changed(Family::Sky, &[format!("sky_error={e}")])));
         }
     }
     match twin.bent {
-        false => left_out.push(LeftOut::new("rays", "every camera is a pinhole at rest")),
+        false => skipped.push(Skipped::new("rays", "every camera is a pinhole at rest")),
         true => all.push(Setting {
             name: "against every pixel's own ray".to_owned(),
             family: Family::Rays,
@@ -273,10 +273,10 @@ pub fn ladder(twin: &Traits, backends: &[&str]) -> Ladder {
             all.push(combined);
         }
     }
-    Ladder { settings: all, left_out }
+    SettingList { settings: all, skipped }
 }
 
-impl Traits {
+impl TwinFeatures {
     /// Of a version of a twin, with the sky that it has, and what looks at it.
     pub fn of(manifest: &Manifest, sky: Option<&Sky>, views: &[View]) -> Self {
         let sections = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
@@ -285,9 +285,9 @@ impl Traits {
             stored: manifest.record,
             levels: sections.into_iter().any(|section| section.level > 0),
             behind: match sky.map(Sky::model) {
-                None => Behind::Nothing,
-                Some(Model::Network(..)) => Behind::Network,
-                Some(Model::Cube(_)) => Behind::Images,
+                None => BackgroundKind::Nothing,
+                Some(Model::Network(..)) => BackgroundKind::Network,
+                Some(Model::Cube(_)) => BackgroundKind::Images,
             },
             bent: views.iter().any(|view| !view.is_ideal()),
         }

@@ -5,7 +5,7 @@ use wildcity_render::compare::errors::Image;
 
 /// Where a setting is worst.
 #[derive(Clone, Debug, Default)]
-pub struct Pictures {
+pub struct ErrorImages {
     /// The place.
     pub place: String,
     /// Width and height of each picture, in pixels.
@@ -24,7 +24,7 @@ pub(super) const HEAT_RGB: [[u8; 3]; 6] =
 
 /// # Errors
 /// A picture cannot be encoded.
-pub(super) fn of(place: String, image: &Image, truth: &Image) -> Result<Pictures, ReportError> {
+pub(super) fn of(place: String, image: &Image, truth: &Image) -> Result<ErrorImages, ReportError> {
     let [width, height] = image.size_px;
     let png = |rgb8: Vec<u8>| {
         wildcity_session::png(&rgb8, width, height).map_err(|reason| ReportError::Encode { reason })
@@ -35,7 +35,7 @@ pub(super) fn of(place: String, image: &Image, truth: &Image) -> Result<Pictures
         heat(off.fold(0.0, f32::max))
     });
     let files = [png(bytes(image))?, png(bytes(truth))?, png(off.collect())?];
-    Ok(Pictures { place, size_px: image.size_px, files })
+    Ok(ErrorImages { place, size_px: image.size_px, files })
 }
 
 /// The colour of an error.

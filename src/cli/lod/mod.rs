@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use wildcity_scene::Manifest;
 use wildcity_twin::store::Version;
 
-use super::places::{TwinVersion, Twins};
-use super::scene_source::Engine;
+use super::backend_options::BackendOptions;
+use super::directories::{TwinVersion, Twins};
 
 /// Show a twin's levels of detail: how many Gaussians and bytes each takes, and how far off it is.
 ///
@@ -39,7 +39,7 @@ pub(super) struct Lod {
     tau: Vec<f64>,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 }
 
 const EXAMPLES: &str = "\

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::ReportError;
-use super::ladder::scaled;
-use super::places::{OFFSETS_M, Place};
+use super::sample_points::{OFFSETS_M, SamplePoint};
+use super::settings::scaled;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::CameraError;
 use wildcity_session::{Trained, Trust};
@@ -14,7 +14,7 @@ use wildcity_twin::residency::Resident;
 
 /// Trust at one distance from the recorded drive: of all cameras at all stations.
 #[derive(Clone, Debug, Serialize)]
-pub struct Believed {
+pub struct Confidence {
     /// Distance from the drive, in metres.
     pub offset_m: f64,
     /// Mean trust of an image, from 0 to 1.
@@ -33,12 +33,12 @@ pub struct Believed {
     pub outside: f64,
     /// What the rig's first camera sees in the middle of the drive.
     #[serde(skip)]
-    pub picture: Picture,
+    pub picture: ViewImage,
 }
 
 /// An image of a place.
 #[derive(Clone, Debug, Default)]
-pub struct Picture {
+pub struct ViewImage {
     /// The place.
     pub place: String,
     /// A JPEG file.
@@ -54,16 +54,17 @@ const QUALITY: u8 = 85;
 ///
 /// # Errors
 /// The twin cannot be read, a frame cannot be drawn, or a picture not be encoded.
-pub fn believed(
+pub fn confidence_by_offset(
     resident: &Arc<Resident>,
     backend: &dyn Backend,
-    places: &[Place],
-) -> Result<Vec<Believed>, ReportError> {
+    places: &[SamplePoint],
+) -> Result<Vec<Confidence>, ReportError> {
     let Some(trained) = Trained::new(&resident.version.manifest) else { return Ok(Vec::new()) };
     let mut all = Vec::new();
     for offset_m in OFFSETS_M {
-        let here: Vec<&Place> = places.iter().filter(|place| place.offset_m == offset_m).collect();
-        let (mut trusts, mut picture) = (Vec::new(), Picture::default());
+        let here: Vec<&SamplePoint> =
+            places.iter().filter(|place| place.offset_m == offset_m).collect();
+        let (mut trusts, mut picture) = (Vec::new(), ViewImage::default());
         for (station, place) in here.iter().enumerate() {
             let seen = Seen::of(resident, backend, place, &trained)?;
             if station == here.len() / 2 {
@@ -87,10 +88,10 @@ impl Seen {
     fn of(
         resident: &Arc<Resident>,
         backend: &dyn Backend,
-        place: &Place,
+        place: &SamplePoint,
         trained: &Trained,
     ) -> Result<Self, ReportError> {
-        let world_from_rig = place.world_from_rig.ok_or(ReportError::NoPlaces)?;
+        let world_from_rig = place.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
         let widest_px = place.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
         let share = (WIDTH_PX / f64::from(widest_px)).min(1.0);
         let views = place.views.iter().map(|view| scaled(*view, share));
@@ -116,19 +117,19 @@ impl Seen {
         Ok(Self { trusts, first: views[0], rgb8: rgb8.swap_remove(0) })
     }
 
-    fn picture(&self, place: &Place) -> Result<Picture, ReportError> {
+    fn picture(&self, place: &SamplePoint) -> Result<ViewImage, ReportError> {
         let (width_px, height_px) = (self.first.camera.width_px, self.first.camera.height_px);
         let file = wildcity_session::jpeg(&self.rgb8, width_px, height_px, QUALITY);
         let file = file.map_err(|reason| ReportError::Encode { reason })?;
-        Ok(Picture { place: place.name.clone(), file })
+        Ok(ViewImage { place: place.name.clone(), file })
     }
 }
 
-fn summed(offset_m: f64, trusts: &[Trust], picture: Picture) -> Believed {
+fn summed(offset_m: f64, trusts: &[Trust], picture: ViewImage) -> Confidence {
     let count = trusts.len().max(1) as f64;
     let mean = |of: &dyn Fn(&Trust) -> f64| trusts.iter().map(of).sum::<f64>() / count;
     let values = || trusts.iter().map(|trust| trust.value);
-    Believed {
+    Confidence {
         offset_m,
         mean: mean(&|trust| trust.value),
         least: values().fold(1.0, f64::min),

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use crate::cli::places::{TwinVersion, Twins};
-use crate::cli::scene_source::{self, Engine};
+use crate::cli::backend_options::{self, BackendOptions};
+use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::{output, progress};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
@@ -36,10 +36,10 @@ pub(super) struct Drive {
     twins: Twins,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 
     /// Memory for the twin, in GiB [default: three quarters of the machine's]
-    #[arg(long, value_name = "N", value_parser = scene_source::gib)]
+    #[arg(long, value_name = "N", value_parser = backend_options::gib)]
     memory_gib: Option<f64>,
 
     /// How fast, in m/s.
@@ -99,12 +99,12 @@ impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
-        let limit_bytes = self.memory_gib.map(scene_source::bytes_of_gib);
+        let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
         let scratch = Scratch::new()?;
         let engine = wildcity_session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
             episodes: scratch.0.clone(),
-            backend: Arc::from(self.engine.backend()?),
+            backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
         })?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

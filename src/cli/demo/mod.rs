@@ -19,8 +19,8 @@ use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
 
-use super::places::Twins;
-use super::scene_source::Engine;
+use super::backend_options::BackendOptions;
+use super::directories::Twins;
 use super::{output, progress};
 
 /// Drive through the demo twin and look at the pictures.
@@ -43,7 +43,7 @@ pub(super) struct Demo {
     twins: Twins,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 }
 
 const EXAMPLES: &str = "\
@@ -75,7 +75,7 @@ impl Demo {
             episodes: self.out.join("episodes"),
             uploads: self.out.join("uploads"),
             tokens: None,
-            backend: Arc::from(self.engine.backend()?),
+            backend: Arc::from(self.backend.backend()?),
             profile: ProfileChanges::default(),
             limits: Limits::default(),
         };

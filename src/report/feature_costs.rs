@@ -1,6 +1,6 @@
 //! Only what is needed: what one step of a street holds, moves and runs, with each feature and without.
 //!
-//! Counts, not times: they are the same on every machine, and a base scene that pays for a feature of
+//! ResourceCounts, not times: they are the same on every machine, and a base scene that pays for a feature of
 //! others is seen at once.
 
 use std::sync::Arc;
@@ -23,16 +23,16 @@ use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Row {
+pub struct FeatureCounts {
     /// The feature, as `SH degree 1`.
     pub with: &'static str,
     /// What was counted.
-    pub counts: Counts,
+    pub counts: ResourceCounts,
 }
 
 /// What one step takes. Those of a device are absent where there is none.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Counts {
+pub struct ResourceCounts {
     /// Gaussians in the frame.
     pub gaussians: u64,
     /// Bytes of one in the host's memory.
@@ -64,7 +64,7 @@ pub struct DeviceCounts {
     pub pixel_bytes: u64,
 }
 
-/// Names of the columns, in order of [`Counts::texts`].
+/// Names of the columns, in order of [`ResourceCounts::texts`].
 pub const COLUMNS: [&str; 11] = [
     "Gaussians",
     "B each, host",
@@ -131,11 +131,14 @@ const FEATURES: [Feature; 18] = [
 ///
 /// # Errors
 /// A frame cannot be drawn.
-pub fn rows(cpu: &Cpu, device: &dyn Fn() -> Option<Gpu>) -> Result<Vec<Row>, ReportError> {
+pub fn count_features(
+    cpu: &Cpu,
+    device: &dyn Fn() -> Option<Gpu>,
+) -> Result<Vec<FeatureCounts>, ReportError> {
     let counted = |(with, change): Feature| {
         let mut step = Step::base();
         change(&mut step);
-        Ok(Row { with, counts: step.counts(cpu, device())? })
+        Ok(FeatureCounts { with, counts: step.counts(cpu, device())? })
     };
     FEATURES.into_iter().map(counted).collect()
 }
@@ -205,14 +208,14 @@ impl Step {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
 
-    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<Counts, ReportError> {
+    fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<ResourceCounts, ReportError> {
         let FrameStats { evaluations, .. } = self.draw(cpu)?;
         let device = device.map(|gpu| self.of_device(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
-        Ok(Counts {
+        Ok(ResourceCounts {
             gaussians,
             host_bytes: self.scene.bytes() as f64 / gaussians as f64,
             beside_bytes: sky_bytes + hood_bytes as u64,
@@ -259,7 +262,7 @@ impl Step {
     }
 }
 
-impl Counts {
+impl ResourceCounts {
     /// In words, by [`COLUMNS`].
     pub fn texts(&self) -> [String; 11] {
         let device = |text: &dyn Fn(&DeviceCounts) -> String| {

@@ -2,7 +2,7 @@
 
 use glam::{DQuat, DVec3};
 
-use super::ladder::scaled;
+use super::settings::scaled;
 use wildcity_render::View;
 use wildcity_render::compare::drawing::{crop, look};
 use wildcity_scene::geometry::{Bounds, CameraError, Pose};
@@ -11,7 +11,7 @@ use wildcity_scene::{Manifest, Trajectory};
 
 /// Somewhere that all settings are measured.
 #[derive(Clone, Debug)]
-pub struct Place {
+pub struct SamplePoint {
     /// As `60 m, 3 m left`.
     pub name: String,
     /// Metres beside the recorded drive, whichever side; 0 on it, and where there is none.
@@ -40,7 +40,11 @@ pub struct Sampling {
 pub const OFFSETS_M: [f64; 4] = [0.0, 1.0, 3.0, 5.0];
 
 /// Places along the twin's first recorded drive with these cameras, or around it if there is none.
-pub fn places(manifest: &Manifest, cameras: &[RigCamera], sampling: Sampling) -> Vec<Place> {
+pub fn sample_points(
+    manifest: &Manifest,
+    cameras: &[RigCamera],
+    sampling: Sampling,
+) -> Vec<SamplePoint> {
     match manifest.trajectories.first() {
         Some(drive) => along(drive, cameras, sampling),
         None => around(manifest.bounds(), sampling),
@@ -49,7 +53,7 @@ pub fn places(manifest: &Manifest, cameras: &[RigCamera], sampling: Sampling) ->
 
 /// Every other station chooses; offsets are to the left and to the right in turn. The rig moves as fast as
 /// it did on the whole drive, which rolling shutters see.
-fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<Place> {
+fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<SamplePoint> {
     let mut places = Vec::new();
     let length_m = drive.length_m();
     let (first, last) = (drive.keyframes.first(), drive.keyframes.last());
@@ -74,7 +78,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<P
                 0.0 => format!("{station_m:.0} m"),
                 _ => format!("{station_m:.0} m, {offset_m} m {side}"),
             };
-            let place = Place {
+            let place = SamplePoint {
                 name,
                 offset_m,
                 chooses: station.is_multiple_of(2),
@@ -96,7 +100,7 @@ const MIDDLE: f64 = 0.5;
 
 /// Cameras of 640 x 480 px on a circle around the middle, 20° above it, that see all of it: a capture of
 /// one thing. z is up.
-fn around(bounds: Bounds, sampling: Sampling) -> Vec<Place> {
+fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
     let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
     // A lens of 600 px sees ±0.53 across and ±0.4 down of what is 1 m away: the box' longest side fits at
     // 1.2 times its length from its middle.
@@ -106,7 +110,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<Place> {
         let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
         let toward = DVec3::new(cos, sin, 20.0_f64.to_radians().tan()).normalize();
         let view = look([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
-        let place = Place {
+        let place = SamplePoint {
             name: format!("{:.1}° around", 360.0 * share),
             offset_m: 0.0,
             chooses: station.is_multiple_of(2),
@@ -119,7 +123,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<Place> {
     (0..AROUND * sampling.stations).map(place_at).collect()
 }
 
-impl Place {
+impl SamplePoint {
     /// The same with a window in each image, spread evenly over a share of its sides around the middle
     /// (Roberts 2018: powers of the plastic number's inverse); `index` counts the places.
     fn with_windows(mut self, index: usize, window_px: [u32; 2], within: f64) -> Self {
