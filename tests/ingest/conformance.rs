@@ -236,7 +236,7 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
         matches(few, many, steps).unwrap_or_else(|strange| panic!("{file}: {strange}"))
     };
     let (read, fitted, original) = if read.len() > original.len() {
-        (pick(&read, &find(&fitted, &read)), fitted, original)
+        (read.select(find(&fitted, &read)), fitted, original)
     } else {
         let found = find(&read, &fitted);
         (read, fitted.select(found.iter().copied()), original.select(found.iter().copied()))

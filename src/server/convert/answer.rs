@@ -158,9 +158,9 @@ pub(crate) fn twin(twin: &TwinSummary) -> serde_json::Value {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::Model::Teleport,
-        Model::Kinematic => message::Model::Kinematic,
-        Model::Dynamic => message::Model::Dynamic,
+        Model::Teleport => message::DynamicsModel::Teleport,
+        Model::Kinematic => message::DynamicsModel::Kinematic,
+        Model::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

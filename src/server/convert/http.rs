@@ -55,9 +55,9 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     let body: http::NewPush = parse(body)?;
     // The hash is of what was understood: white space makes no other push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
-    let http::NewPush { id, files, base, cells, record, levels, profile, note, golden } = body;
+    let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
     let files = files.into_iter().enumerate();
-    let preview_poses = golden.poses.map(|poses| {
+    let preview_poses = preview.poses.map(|poses| {
         poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_POSES)
     });
     let request = PushRequest {
@@ -68,15 +68,15 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         base,
         cells: match cells {
             None => CellSelection::Touched,
-            Some(http::Cells::All(http::All::All)) => CellSelection::All,
-            Some(http::Cells::These(cells)) => CellSelection::These(cells.into_iter().collect()),
+            Some(http::CellSelection::All(http::AllCells::All)) => CellSelection::All,
+            Some(http::CellSelection::Listed(cells)) => CellSelection::These(cells.into_iter().collect()),
         },
         record: record.map(|text| parse_field("record", &text)).transpose()?,
         levels,
         profile,
         note,
         preview_poses: preview_poses.transpose()?,
-        min_psnr_db: golden.min_psnr_db,
+        min_psnr_db: preview.min_psnr_db,
     };
     request.check()?;
     Ok(request)
@@ -147,10 +147,10 @@ fn report(report: &PushReport) -> http::PushReport {
             .iter()
             .map(|&CellChange { cell, before, after }| http::CellReport { cell, before, after })
             .collect(),
-        golden: report
+        previews: report
             .preview
             .iter()
-            .map(|preview| http::GoldenReport {
+            .map(|preview| http::PsnrPreview {
                 pose: pose(&preview.world_from_rig),
                 // JSON has no infinity: equal images have no PSNR.
                 psnr_db: Some(preview.psnr_db).filter(|db| db.is_finite()),

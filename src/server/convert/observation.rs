@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
-use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
+use wildcity_protocol::observation::{Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust};
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_session::{
     DType, Frame, HEADER_PREFIX_BYTES, PastImage, Session, TensorKind,
@@ -87,7 +87,7 @@ fn past_tensor(session: &Session, past: &PastImage) -> String {
     format!("camera/{}/history/{}/rgb", session.cameras()[past.camera].name, past.back)
 }
 
-fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> Observation {
+fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> ObservationMetadata {
     let episode = session.episode();
     let version = &session.resident().version;
     let time_us = episode.time_us();
@@ -139,7 +139,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    Observation {
+    ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
