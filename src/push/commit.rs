@@ -2,7 +2,8 @@
 
 use wildcity_scene::Gaussians;
 use wildcity_twin::store::{
-    Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version,
+    Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
+    VersionSettings,
 };
 
 use crate::error::PushError;
@@ -30,8 +31,8 @@ pub(crate) fn commit(
 ) -> Result<Version, PushError> {
     let old = base.map(|base| &base.manifest);
     let record = request.record.or(old.map(|old| old.record)).unwrap_or_default();
-    let storage = Storage { record, levels: request.levels };
-    let mut commit = catalog.begin(&request.twin, Kind::Push, storage)?;
+    let storage = StorageOptions { record, levels: request.levels };
+    let mut commit = catalog.begin(&request.twin, CommitKind::Push, storage)?;
     let only = match &request.cells {
         CellSelection::These(cells) => Some(cells),
         CellSelection::Touched | CellSelection::All => None,
@@ -39,19 +40,19 @@ pub(crate) fn commit(
     let progress = &mut |done: u64, total: u64| push.set_progress(done, total);
     commit.put(content.gaussians, only, progress)?;
 
-    let mut provenance =
-        provenance(content.hashes, content.options.to_vec(), request.levels);
+    let mut provenance = provenance(content.hashes, content.options.to_vec(), request.levels);
     provenance.options.extend(request.note.as_ref().map(|note| format!("note={note}")));
     let old_profile = old.map(|old| old.profile).unwrap_or_default();
     let profile = profile_with(old_profile, &request.profile).map_err(StoreError::from)?;
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);
-            let change = Change { profile, rig: None, trajectories: None, sky: None, provenance };
+            let change =
+                VersionChange { profile, rig: None, trajectories: None, sky: None, provenance };
             commit.change(base.number, change)?
         }
         _ => {
-            let settings = Settings {
+            let settings = VersionSettings {
                 profile,
                 rig: old.and_then(|old| old.rig.clone()),
                 trajectories: old.map(|old| old.trajectories.clone()).unwrap_or_default(),

@@ -104,26 +104,26 @@ fn is_refused_content(error: &StoreError) -> bool {
         StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),
         StoreError::Clamped { .. }
         | StoreError::Profile(_)
-        | StoreError::Field { .. }
+        | StoreError::FieldMismatch { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::Overlap { .. } => true,
         StoreError::Io { .. }
         | StoreError::Name { .. }
         | StoreError::NoTwin { .. }
         | StoreError::NoVersion { .. }
-        | StoreError::Collected { .. }
+        | StoreError::GarbageCollected { .. }
         | StoreError::Leased { .. }
         | StoreError::Damaged { .. }
         | StoreError::Format { .. }
         | StoreError::Conflict { .. }
-        | StoreError::CellTwice { .. }
-        | StoreError::NoteSize { .. }
+        | StoreError::DuplicateCell { .. }
+        | StoreError::SideFileSize { .. }
         | StoreError::NotSynced { .. }
-        | StoreError::Unsettled { .. }
+        | StoreError::OutcomeUnknown { .. }
         | StoreError::Url { .. }
         | StoreError::Rig(_)
         | StoreError::Trajectory(_)
-        | StoreError::TrajectoryName { .. } => false,
+        | StoreError::DuplicateTrajectory { .. } => false,
     }
 }
 
@@ -159,7 +159,7 @@ mod tests {
         for error in [overlap, clamped] {
             assert!(PushError::from(error).is_refusal());
         }
-        let unsettled = StoreError::Unsettled {
+        let unsettled = StoreError::OutcomeUnknown {
             name: name(),
             number: 2,
             cause: io::ErrorKind::TimedOut.into(),
@@ -176,7 +176,7 @@ mod tests {
             unsettled,
             not_synced,
             StoreError::Url { url: "s3://x".to_owned(), reason: "no credentials".to_owned() },
-            StoreError::Collected { name: name(), number: 2 },
+            StoreError::GarbageCollected { name: name(), number: 2 },
             StoreError::Format { path: "city/log/2".into(), found: 9, supported: 1 },
             StoreError::Conflict { name: name(), number: 2 },
         ] {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::chunk::cell_at;
-use wildcity_session::{Changed, Golden};
+use wildcity_session::{ProposedChange, PsnrPreview};
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::error::PushError;
@@ -24,7 +24,7 @@ pub(crate) fn comparison(
     gaussians: &Arc<Gaussians>,
     report: &PushReport,
     base: Option<&Arc<Version>>,
-) -> Result<Option<Changed>, PushError> {
+) -> Result<Option<ProposedChange>, PushError> {
     let fits = gaussians.len() <= limits::PREVIEW_GAUSSIANS;
     let is_wanted = request.preview_poses.is_some() || request.min_psnr_db.is_some();
     if is_wanted && !fits {
@@ -38,7 +38,7 @@ pub(crate) fn comparison(
     }
     let cells: BTreeSet<[i32; 2]> = report.cells.iter().map(|change| change.cell).collect();
     let profile = profile_with(base.manifest.profile, &request.profile);
-    Ok(Some(Changed {
+    Ok(Some(ProposedChange {
         before: base.clone(),
         gaussians: within(gaussians, &cells, report.left_out),
         cells,
@@ -47,11 +47,7 @@ pub(crate) fn comparison(
 }
 
 /// The Gaussians within some cells; no copy is made if none is left out.
-fn within(
-    gaussians: &Arc<Gaussians>,
-    cells: &BTreeSet<[i32; 2]>,
-    left_out: u64,
-) -> Arc<Gaussians> {
+fn within(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64) -> Arc<Gaussians> {
     if left_out == 0 {
         return gaussians.clone();
     }
@@ -74,7 +70,7 @@ pub(crate) fn check_psnr(
         return Err(PushError::OutOfRange { field: "golden.min_psnr_db".to_owned(), must });
     }
     let worst = report.preview.iter().enumerate().find(|(_, pose)| pose.psnr_db < min_db);
-    if let Some((index, Golden { world_from_rig, psnr_db })) = worst {
+    if let Some((index, PsnrPreview { world_from_rig, psnr_db })) = worst {
         let [x, y, z] = world_from_rig.position_m.to_array();
         let reason = format!(
             "pose {index} at ({x:.1}, {y:.1}, {z:.1}) differs from the version before: {psnr_db:.1} dB, \

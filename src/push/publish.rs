@@ -7,8 +7,8 @@ use tokio::time::timeout;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::chunk::cell_at;
-use wildcity_session::{Engine, HeldLatest};
-use wildcity_twin::residency::Eye;
+use wildcity_session::{Engine, LatestPin};
+use wildcity_twin::residency::Viewpoint;
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::base::find_base;
@@ -23,7 +23,7 @@ use crate::source::SourceFile;
 use crate::status::{Push, PushedVersion, State};
 
 /// For a twin, the viewpoints of the next frame of each session that drives on it now.
-pub type Viewpoints<'a> = &'a (dyn Fn(&str) -> Vec<Vec<Eye>> + Send + Sync);
+pub type Viewpoints<'a> = &'a (dyn Fn(&str) -> Vec<Vec<Viewpoint>> + Send + Sync);
 
 /// A scene that was checked against the base.
 struct CheckedScene {
@@ -95,8 +95,7 @@ async fn check(
         let base = base.clone();
         blocking(move || {
             let scene = compare_cells(&push, &request, scene, base.as_deref())?;
-            let changed =
-                comparison(&request, &scene.gaussians, &scene.report, base.as_ref())?;
+            let changed = comparison(&request, &scene.gaussians, &scene.report, base.as_ref())?;
             Ok((scene, changed))
         })
         .await?
@@ -104,7 +103,7 @@ async fn check(
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
         let poses = request.preview_poses.clone();
-        scene.report.preview = engine.compare(changed, poses, &progress).await?;
+        scene.report.preview = engine.preview_psnr(changed, poses, &progress).await?;
         push.set_report(scene.report.clone());
     }
     check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;
@@ -141,7 +140,7 @@ fn compare_cells(
 struct Committed {
     version: Version,
     /// Keeps the version before as the latest until it is dropped.
-    held: Option<HeldLatest>,
+    held: Option<LatestPin>,
 }
 
 fn commit_held(
@@ -153,29 +152,26 @@ fn commit_held(
 ) -> Result<Committed, PushError> {
     // Until the new version is ready, sessions that open the latest get the version that is the latest
     // now; the preview took its time, so that it may be later than the base.
-    let held = hold_latest(engine, &request.twin)?;
-    let content = NewContent {
-        gaussians: &scene.gaussians,
-        hashes: &scene.hashes,
-        options: &scene.options,
-    };
+    let held = pin_latest(engine, &request.twin)?;
+    let content =
+        NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
     let version = commit(engine.catalog(), push, request, content, base)?;
     Ok(Committed { version, held })
 }
 
 /// Keeps the version that is the latest now; none if the twin is new.
-fn hold_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<HeldLatest>, PushError> {
+fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
         Err(StoreError::NoTwin { .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
-    Ok(versions.last().map(|latest| engine.hold_latest(twin, latest.number)))
+    Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
 /// Loads the version where sessions drive on the twin now, so that those that switch need not wait.
 /// The version is committed and sound: what cannot be loaded now is loaded when it is opened.
-async fn load_ahead(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Eye>>) {
+async fn load_ahead(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
     let prepared = engine.prepare(twin, version, frames);
     match timeout(wildcity_session::limits::PREFETCH_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}

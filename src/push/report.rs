@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::{Gaussians, Manifest};
-use wildcity_session::Golden;
+use wildcity_session::PsnrPreview;
 use wildcity_twin::ingest::BadGaussian;
 
 use crate::error::PushError;
@@ -26,7 +26,7 @@ pub struct PushReport {
     /// Cells that are replaced, in order of (y, x).
     pub cells: Vec<CellChange>,
     /// How alike the twin looks before and after, at each pose of the preview.
-    pub preview: Vec<Golden>,
+    pub preview: Vec<PsnrPreview>,
 }
 
 /// A cell that is replaced, and its number of Gaussians before and after.
@@ -159,9 +159,8 @@ fn refuse_empty(cells: &[CellChange]) -> Result<(), PushError> {
 
 /// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`].
 fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
-    let shrinks = |change: &&CellChange| {
-        (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64
-    };
+    let shrinks =
+        |change: &&CellChange| (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64;
     let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
     let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() else { return Ok(()) };
     let reason = format!(

@@ -66,15 +66,19 @@ impl PushRequest {
     /// # Errors
     /// Names the first field that is outside its limits or cannot be understood.
     pub fn check(&self) -> Result<(), PushError> {
-        let out_of_range =
-            |field: &str, must: String| Err(PushError::OutOfRange { field: field.to_owned(), must });
+        let out_of_range = |field: &str, must: String| {
+            Err(PushError::OutOfRange { field: field.to_owned(), must })
+        };
         if !(1..=limits::PUSH_FILES).contains(&self.files.len()) {
             let must =
                 format!("{} entries; 1 to {} are accepted", self.files.len(), limits::PUSH_FILES);
             return out_of_range("files", must);
         }
         if matches!(&self.cells, CellSelection::These(cells) if cells.is_empty()) {
-            return out_of_range("cells", "empty; leave it out, or name at least one cell".to_owned());
+            return out_of_range(
+                "cells",
+                "empty; leave it out, or name at least one cell".to_owned(),
+            );
         }
         for (index, setting) in self.profile.iter().enumerate() {
             RenderProfile::default().set(setting).map_err(|error| PushError::InvalidField {

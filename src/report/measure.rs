@@ -20,7 +20,7 @@ use wildcity_render::{Backend, RenderError, View};
 use wildcity_scene::record::recorded;
 use wildcity_scene::sky::Drawn;
 use wildcity_scene::{Rays, RenderProfile, Scene};
-use wildcity_twin::residency::{Pinned, Resident};
+use wildcity_twin::residency::{PinnedScene, Resident};
 
 /// What is measured, and on what.
 pub struct Benchmark<'a> {
@@ -222,8 +222,8 @@ impl Benchmark<'_> {
         self.resident.version.manifest.profile
     }
 
-    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
-        Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
+    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<PinnedScene, ReportError> {
+        Ok(self.resident.scene(&wildcity_session::viewpoints(views), profile)?)
     }
 
     /// The scene in the setting's record, if it is another one, and bytes of a Gaussian in it.

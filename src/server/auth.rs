@@ -89,7 +89,8 @@ impl Tokens {
     /// # Errors
     /// Names the first entry that cannot be used.
     pub fn parse(text: &[u8]) -> Result<Self, TokensError> {
-        let wrong = |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
+        let wrong =
+            |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
         let file: File = serde_json::from_slice(text).map_err(|error| {
             // serde's message could quote a token that is in the wrong place.
             let location = format!("line {}, column {}", error.line(), error.column());

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_scene::ProfileChanges;
-use wildcity_twin::store::CacheSettings;
+use wildcity_twin::store::DiskCacheSettings;
 
 use crate::auth::Tokens;
 use crate::limits;
@@ -21,7 +21,7 @@ pub struct Config {
     /// Directory of twins, or their URL.
     pub twins: PathBuf,
     /// Where parts of twins at a URL are kept on disk.
-    pub cache: Option<CacheSettings>,
+    pub cache: Option<DiskCacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use tokio::time::{Instant, sleep_until, timeout};
 
-use wildcity_session::{Frame, Opening, Outcome, Session, SessionError};
+use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
 
 use crate::auth::Grant;
 use crate::convert::{self, Command, Parsed};
@@ -233,7 +233,7 @@ impl Connection {
         &mut self,
         seq: u64,
         name: Option<String>,
-        mut opening: Opening,
+        mut opening: SessionOptions,
     ) -> Result<Answer, Fault> {
         opening.profile = opening.profile.or(&self.state.profile);
         self.grant.require_twin(&opening.twin)?;
@@ -268,7 +268,7 @@ impl Connection {
         self.slot.as_mut().and_then(|slot| slot.session.as_mut()).ok_or(NO_SESSION)
     }
 
-    fn observation(&mut self, seq: u64, frame: Frame) -> Result<Answer, Fault> {
+    fn observation(&mut self, seq: u64, frame: Observation) -> Result<Answer, Fault> {
         let frame = convert::observation(seq, self.session()?, frame)?;
         Ok(Answer::Observation(Arc::new(frame)))
     }

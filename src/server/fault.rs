@@ -142,7 +142,9 @@ pub(crate) enum Fault {
         reason: String,
     },
     /// There is no upload of this id.
-    #[error("there is no upload {id:?}: it was never begun, did not match its digest, or is too old")]
+    #[error(
+        "there is no upload {id:?}: it was never begun, did not match its digest, or is too old"
+    )]
     UnknownUpload {
         /// The id asked for.
         id: String,

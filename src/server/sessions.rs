@@ -9,8 +9,8 @@ use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Frame, Outcome, Session};
-use wildcity_twin::residency::Eye;
+use wildcity_session::{Observation, Outcome, Session};
+use wildcity_twin::residency::Viewpoint;
 
 use crate::fault::Fault;
 
@@ -52,7 +52,7 @@ pub(crate) struct SessionView {
     pub(crate) step: u64,
     pub(crate) world_from_rig: Pose,
     /// Viewpoints of the next frame, if the ego stays where it is.
-    pub(crate) viewpoints: Vec<Eye>,
+    pub(crate) viewpoints: Vec<Viewpoint>,
 }
 
 /// An entry of the list of sessions.
@@ -88,7 +88,7 @@ pub(crate) enum Answer {
     /// A control message.
     Text(Arc<str>),
     /// An observation.
-    Observation(Arc<Frame>),
+    Observation(Arc<Observation>),
 }
 
 /// A connection's exclusive access to a slot. Dropping it parks the session, or removes a closed one.
@@ -202,7 +202,7 @@ impl SessionRegistry {
     }
 
     /// For each session that drives on a twin, the viewpoints of its next frame.
-    pub(crate) fn viewpoints_on(&self, twin: &str) -> Vec<Vec<Eye>> {
+    pub(crate) fn viewpoints_on(&self, twin: &str) -> Vec<Vec<Viewpoint>> {
         let entries = self.entries.lock();
         let views = entries.values().filter_map(|entry| entry.view.as_ref());
         views.filter(|view| view.twin == twin).map(|view| view.viewpoints.clone()).collect()
@@ -216,9 +216,8 @@ impl SessionRegistry {
         loop {
             tokio::time::sleep(period).await;
             let now = Instant::now();
-            let expired = |parked: Parked| {
-                now.saturating_duration_since(parked.since) >= self.resume_grace
-            };
+            let expired =
+                |parked: Parked| now.saturating_duration_since(parked.since) >= self.resume_grace;
             self.end_parked(|parked| expired(parked).then_some(parked.outcome)).await;
         }
     }
@@ -273,7 +272,7 @@ impl SlotGuard {
             version: version.number,
             step: session.episode().step(),
             world_from_rig: session.episode().world_from_rig(),
-            viewpoints: session.eyes(),
+            viewpoints: session.viewpoints(),
         };
         if let Some(entry) = self.registry.entries.lock().get_mut(&self.name) {
             entry.view = Some(view);

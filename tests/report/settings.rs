@@ -23,10 +23,10 @@ use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
+    Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
 };
 use wildcity_twin::residency::{Cache, Resident};
-use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
 
 use crate::reported::{commit, commit_reaching, drive, rig};
 use crate::skies::demo_sky;
@@ -385,7 +385,10 @@ async fn least_db_of_session(
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
-    let opening = Opening { profile, ..Opening::twin("street", Outputs::colour(Encoding::Raw)) };
+    let opening = SessionOptions {
+        profile,
+        ..SessionOptions::twin("street", Outputs::colour(Encoding::Raw))
+    };
     let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
     session.reset(0, None).await.unwrap();
     let mut frame = session.observe(poses.to_vec()).await.unwrap();
@@ -410,7 +413,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -452,7 +455,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: Record::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

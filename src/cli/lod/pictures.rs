@@ -38,7 +38,7 @@ pub(super) fn draw(
     let backend = lod.backend.backend()?;
     let resident = Cache::new(catalog).open(&version.manifest.twin, Some(version.number))?;
     output::make_dir(out)?;
-    let eyes = wildcity_session::eyes(&views);
+    let eyes = wildcity_session::viewpoints(&views);
     let bar = progress::count("rendering");
     bar.set_length(profiles.len() as u64);
     let mut drawn: Vec<Vec<RgbImage>> = Vec::new();

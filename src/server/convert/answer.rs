@@ -13,7 +13,7 @@ use wildcity_protocol::message::{
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    Encoding, Maps, Outcome, Session, Summary, TrajectorySummary, TwinSummary,
+    Encoding, EpisodeSummary, Outcome, PixelMaps, Session, TrajectorySummary, TwinSummary,
 };
 use wildcity_sim::{Dynamics, Model};
 use wildcity_twin::store::Version;
@@ -58,7 +58,7 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let Maps { depth, opacity, normals } = session.maps();
+    let PixelMaps { depth, opacity, normals } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     let outputs = message::Outputs {
@@ -131,8 +131,8 @@ pub(crate) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
 }
 
 /// The answer to `close`.
-pub(crate) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
-    let Summary { outcome, steps, time_us, distance_m, least_trust } = *summary;
+pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault> {
+    let EpisodeSummary { outcome, steps, time_us, distance_m, least_trust } = *summary;
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
         Outcome::OffModel => message::Outcome::OffModel,
@@ -141,7 +141,7 @@ pub(crate) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
         Outcome::AgentLost => message::Outcome::AgentLost,
         Outcome::ServerError => message::Outcome::ServerError,
     };
-    let summary = message::Summary { outcome, steps, time_us, distance_m, least_trust };
+    let summary = message::EpisodeSummary { outcome, steps, time_us, distance_m, least_trust };
     text(&Answer::Closed { seq, summary })
 }
 

@@ -62,7 +62,9 @@ pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError>
 }
 
 /// The lens and the windshield of a camera to the wire; a pinhole has neither.
-pub(super) fn lens_and_windshield_to(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Windshield>) {
+pub(super) fn lens_and_windshield_to(
+    camera: &Camera,
+) -> (Option<wire::Lens>, Option<wire::Windshield>) {
     let Intrinsics { lens, windshield, .. } = Intrinsics::of(camera);
     (lens.map(lens_to), windshield.map(windshield_to))
 }

@@ -244,7 +244,7 @@ fn of_store(error: &StoreError) -> WireFault {
     match error {
         StoreError::Name { .. } => at(Code::InvalidName, "twin"),
         StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
-        StoreError::NoVersion { .. } | StoreError::Collected { .. } => {
+        StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
             at(Code::UnknownVersion, "version")
         }
         StoreError::Overlap { .. } | StoreError::Conflict { .. } => plain(Code::Conflict),
@@ -252,28 +252,28 @@ fn of_store(error: &StoreError) -> WireFault {
         StoreError::Gaussians(_)
         | StoreError::Clamped { .. }
         | StoreError::Profile(_)
-        | StoreError::Field { .. }
+        | StoreError::FieldMismatch { .. }
         | StoreError::ManifestSize { .. } => plain(Code::PushRefused),
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
-        StoreError::NotSynced { .. } | StoreError::Unsettled { .. } | StoreError::Url { .. } => {
-            plain(Code::Internal)
-        }
+        StoreError::NotSynced { .. }
+        | StoreError::OutcomeUnknown { .. }
+        | StoreError::Url { .. } => plain(Code::Internal),
         StoreError::Io { .. }
         | StoreError::Leased { .. }
         | StoreError::Damaged { .. }
         | StoreError::Format { .. }
-        | StoreError::CellTwice { .. }
-        | StoreError::NoteSize { .. }
+        | StoreError::DuplicateCell { .. }
+        | StoreError::SideFileSize { .. }
         | StoreError::Rig(_)
         | StoreError::Trajectory(_)
-        | StoreError::TrajectoryName { .. } => at(Code::TwinDamaged, "twin"),
+        | StoreError::DuplicateTrajectory { .. } => at(Code::TwinDamaged, "twin"),
     }
 }
 
 fn of_residency(error: &ResidencyError) -> WireFault {
     match error {
         ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => at(Code::Busy, "twin"),
-        ResidencyError::Late { .. } => plain(Code::DeadlineExceeded),
+        ResidencyError::TimedOut { .. } => plain(Code::DeadlineExceeded),
         ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
             at(Code::TwinDamaged, "twin")
         }
@@ -313,7 +313,7 @@ mod tests {
             cause: kind.into(),
         };
         let name = || "city".to_owned();
-        let unsettled = StoreError::Unsettled {
+        let unsettled = StoreError::OutcomeUnknown {
             name: name(),
             number: 2,
             cause: io::ErrorKind::TimedOut.into(),
@@ -345,7 +345,7 @@ mod tests {
             (unsettled, Code::Internal, 500),
             (not_synced, Code::Internal, 500),
             (url, Code::Internal, 500),
-            (StoreError::Collected { name: name(), number: 2 }, Code::UnknownVersion, 404),
+            (StoreError::GarbageCollected { name: name(), number: 2 }, Code::UnknownVersion, 404),
             (format, Code::TwinDamaged, 500),
             (StoreError::Conflict { name: name(), number: 2 }, Code::Conflict, 409),
             (overlap, Code::Conflict, 409),

@@ -57,9 +57,9 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
     let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
     let files = files.into_iter().enumerate();
-    let preview_poses = preview.poses.map(|poses| {
-        poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_POSES)
-    });
+    let preview_poses = preview
+        .poses
+        .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_POSES));
     let request = PushRequest {
         id,
         twin,
@@ -69,7 +69,9 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         cells: match cells {
             None => CellSelection::Touched,
             Some(http::CellSelection::All(http::AllCells::All)) => CellSelection::All,
-            Some(http::CellSelection::Listed(cells)) => CellSelection::These(cells.into_iter().collect()),
+            Some(http::CellSelection::Listed(cells)) => {
+                CellSelection::These(cells.into_iter().collect())
+            }
         },
         record: record.map(|text| parse_field("record", &text)).transpose()?,
         levels,
@@ -110,8 +112,7 @@ pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
         State::Refused => http::PushState::Refused,
         State::Failed => http::PushState::Failed,
     };
-    let progress =
-        http::Progress { done: status.progress.done, total: status.progress.total };
+    let progress = http::Progress { done: status.progress.done, total: status.progress.total };
     let version = status.version.as_ref();
     json!(http::Push {
         id: id.to_owned(),

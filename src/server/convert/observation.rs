@@ -6,17 +6,21 @@ use serde::Serialize;
 
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
-use wildcity_protocol::observation::{Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust};
-use wildcity_scene::geometry::camera::Pinhole;
-use wildcity_session::{
-    DType, Frame, HEADER_PREFIX_BYTES, PastImage, Session, TensorKind,
+use wildcity_protocol::observation::{
+    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
 };
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_session::{DType, HEADER_PREFIX_BYTES, PastImageInfo, Session, TensorKind};
 
 use super::answer::{camera, encoding, pose, text};
 
 /// Completes an observation: writes the header, which names the tensors and has the metadata, into the
 /// room that the frame reserved for it.
-pub(crate) fn observation(seq: u64, session: &Session, mut frame: Frame) -> Result<Frame, Fault> {
+pub(crate) fn observation(
+    seq: u64,
+    session: &Session,
+    mut frame: wildcity_session::Observation,
+) -> Result<wildcity_session::Observation, Fault> {
     let image_names = image_names(session, &frame);
     let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
     for tensor in &frame.tensors {
@@ -70,9 +74,9 @@ struct TensorInfo<'a> {
 }
 
 /// Prefix of the names of each image's tensors: without the `/rgb` at the end.
-fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
+fn image_names(session: &Session, frame: &wildcity_session::Observation) -> Vec<String> {
     let several = frame.images.iter().any(|image| image.pose > 0);
-    let name = |image: &wildcity_session::Image| {
+    let name = |image: &wildcity_session::ImageInfo| {
         let camera = &session.cameras()[image.camera].name;
         if several {
             format!("pose/{}/camera/{camera}", image.pose)
@@ -83,11 +87,16 @@ fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
     frame.images.iter().map(name).collect()
 }
 
-fn past_tensor(session: &Session, past: &PastImage) -> String {
+fn past_tensor(session: &Session, past: &PastImageInfo) -> String {
     format!("camera/{}/history/{}/rgb", session.cameras()[past.camera].name, past.back)
 }
 
-fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> ObservationMetadata {
+fn metadata(
+    seq: u64,
+    session: &Session,
+    frame: &wildcity_session::Observation,
+    image_names: &[String],
+) -> ObservationMetadata {
     let episode = session.episode();
     let version = &session.resident().version;
     let time_us = episode.time_us();
@@ -114,7 +123,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             cy,
             lens,
             windshield,
-            seen: session.seen(index),
+            seen: session.visible_share(index),
             camera_to_rig,
             shutter_start_us: time_us - exposed_us,
             shutter_end_us: time_us,
@@ -122,19 +131,15 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             trust: None,
         }
     };
-    let drawn = |(drawn, name): (&wildcity_session::Image, &String)| {
-        Image {
-            pose: drawn.pose as u64,
-            trust: drawn.trust.map(trust),
-            ..image(drawn.camera, format!("{name}/rgb"), drawn.time_us, &drawn.hash)
-        }
+    let drawn = |(drawn, name): (&wildcity_session::ImageInfo, &String)| Image {
+        pose: drawn.pose as u64,
+        trust: drawn.trust.map(trust),
+        ..image(drawn.camera, format!("{name}/rgb"), drawn.time_us, &drawn.hash)
     };
-    let past = |past: &PastImage| {
-        Image {
-            back: past.back as u64,
-            trust: past.trust.map(trust),
-            ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
-        }
+    let past = |past: &PastImageInfo| Image {
+        back: past.back as u64,
+        trust: past.trust.map(trust),
+        ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
     };
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
@@ -181,4 +186,3 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
     let wildcity_session::Trust { value, distance_m, angle_rad, low_coverage, outside } = trust;
     Trust { value, distance_m, angle_rad, low_coverage, outside }
 }
-

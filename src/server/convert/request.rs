@@ -10,7 +10,7 @@ use wildcity_protocol::{PROTOCOL, unknown_field};
 use wildcity_scene::ProfileChanges;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{
-    Encoding, ImagePart, Maps, Opening, Outputs, RigChoice, SessionError, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, Model};
@@ -46,7 +46,7 @@ pub(crate) enum Command {
         /// Its name, if the client chose one.
         name: Option<String>,
         /// What is opened.
-        opening: Box<Opening>,
+        opening: Box<SessionOptions>,
     },
     /// Carries out a step.
     Step {
@@ -240,7 +240,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         message::Encoding::Png => Encoding::Png,
         message::Encoding::Raw => Encoding::Raw,
     };
-    let opening = Opening {
+    let opening = SessionOptions {
         twin: name_of("twin", open.twin)?,
         version: open.version,
         seed: open.seed,
@@ -251,7 +251,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
             encoding,
-            maps: Maps { depth, opacity, normals: normals.unwrap_or(false) },
+            maps: PixelMaps { depth, opacity, normals: normals.unwrap_or(false) },
             frames,
             trust: trust.unwrap_or(false),
             periods_us: period_us.unwrap_or_default(),

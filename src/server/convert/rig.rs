@@ -48,4 +48,3 @@ fn camera_of(field: &str, camera: message::RigCamera) -> Result<RigCamera, Fault
     })?;
     Ok(RigCamera { name, camera: checked, rig_from_camera, shutter, appearance })
 }
-

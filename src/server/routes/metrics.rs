@@ -27,7 +27,7 @@ pub(super) async fn show(
     let gauges = GaugeValues {
         sessions: state.sessions.count(),
         connections: state.limits.connections - free_connections,
-        frames_queued: state.engine.queued(),
+        frames_queued: state.engine.queued_frames(),
         uploads: spooled.uploads,
         spool_bytes: spooled.bytes,
         pushes_open: state.pushes.open_count(),

@@ -66,14 +66,8 @@ async fn run(
     files: Vec<SourceFile>,
 ) {
     let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
-    let published = wildcity_push::publish(
-        &state.engine,
-        &state.pushes,
-        &push,
-        request,
-        files,
-        &viewpoints,
-    );
+    let published =
+        wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
     let result = tokio::select! {
         result = published => result,
         () = state.stopped() => Err(PushError::ShuttingDown),

@@ -38,7 +38,7 @@ pub(super) async fn show(
     match twins.iter().find(|twin| twin.name == name) {
         Some(twin) => Ok(Json(convert::twin(twin)).into_response()),
         None => {
-            // Opening it gives the reason why it is not listed.
+            // SessionOptions it gives the reason why it is not listed.
             let catalog = state.engine.catalog().clone();
             blocking(move || catalog.version(&name, None)).await?;
             let reason = "the twin was made while it was looked for; ask again";
@@ -58,7 +58,7 @@ pub(super) async fn versions(
     let listed = blocking(move || {
         let versions = engine.catalog().versions(&name)?;
         // Read after the log: a push holds the latest version before it commits the next.
-        let held = engine.held_latest(&name);
+        let held = engine.pinned_latest(&name);
         Ok::<_, StoreError>((versions, held))
     });
     let (versions, held) = listed.await?;
@@ -79,7 +79,7 @@ pub(super) async fn rollback(
     let version = blocking(move || {
         let version = engine.catalog().rollback(&name, number)?;
         // A push that is being made ready must not keep the rollback from being the latest.
-        engine.hold_instead(&name, version.number);
+        engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok::<_, StoreError>(version)
     });
