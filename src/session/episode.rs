@@ -324,18 +324,18 @@ mod tests {
         let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
         let still = begun(at(0.0, 0.0), 100_000);
         let driven = driven(3, 100_000, 3.0);
-        assert_eq!(views(&driven, &camera, 9.0)[0].rolling, None, "global");
+        assert_eq!(views(&driven, &camera, 9.0)[0].rolling_shutter, None, "global");
         camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
-        assert_eq!(views(&still, &camera, 0.0)[0].rolling, None, "it stands");
+        assert_eq!(views(&still, &camera, 0.0)[0].rolling_shutter, None, "it stands");
         // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
         for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {
             let view = views(&driven, &camera, x_m)[0];
             assert!((view.world_from_camera.position_m.x - x_m - 1.5).abs() < 1e-9);
-            let first = view.rolling.unwrap().world_from_camera_first;
+            let first = view.rolling_shutter.unwrap().world_from_camera_first;
             assert!((first.position_m.x - first_m).abs() < 1e-9, "{first:?}");
         }
         let stopped = moved(&driven, at(9.0, 0.0), false).unwrap();
-        assert_eq!(views(&stopped, &camera, 9.0)[0].rolling, None, "it stands again");
+        assert_eq!(views(&stopped, &camera, 9.0)[0].rolling_shutter, None, "it stands again");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use tokio::time::Instant;
 
 use crate::limits;
-use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::{Frame, Target, View};
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -98,7 +98,7 @@ impl Engine {
             (new, loaded) = (kept, kept_loaded);
             let was = self.draw(before?, manifest.profile, views.clone()).await?;
             let will_be = self.draw(after?, changed.profile, views).await?;
-            let psnr_db = psnr_db_of_bytes(was.iter().zip(&will_be));
+            let psnr_db = psnr_db_u8(was.iter().zip(&will_be));
             golden.push(PsnrPreview { world_from_rig, psnr_db });
         }
         Ok(golden)

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
-use wildcity_render::compare::drawing::{Drawing, draw};
-use wildcity_render::compare::errors::Errors;
+use wildcity_render::compare::errors::ImageErrors;
+use wildcity_render::compare::images::{RenderedImage, render_images};
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
@@ -369,9 +369,9 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     let scene = Scene::from_gaussians(&wildcity_generate::canyon(30_000, &mut |_, _| {}));
     let at = |pose: &Pose| {
         let views = View::of_rig(&rig().cameras, *pose);
-        draw(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
+        render_images(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
     };
-    let colours = |drawing: Drawing| {
+    let colours = |drawing: RenderedImage| {
         let rgba = drawing.rgba.chunks_exact(4);
         rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect()
     };
@@ -484,7 +484,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
 
 #[test]
 fn json_says_what_it_has_no_number_for() {
-    let errors = Errors {
+    let errors = ImageErrors {
         psnr_db: f64::INFINITY,
         ssim: f64::NAN,
         max: 0.0,

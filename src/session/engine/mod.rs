@@ -88,7 +88,7 @@ impl Engine {
         let EngineSettings { cache, episodes, backend, step_timeout } = settings;
         let (jobs, queue) = mpsc::channel::<Job>(limits::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
-        for number in 0..backend.frames_at_once().max(1) {
+        for number in 0..backend.frames_in_flight().max(1) {
             let queue = queue.clone();
             std::thread::Builder::new()
                 .name(format!("render-{number}"))
@@ -388,7 +388,7 @@ mod tests {
             "takes"
         }
 
-        fn frames_at_once(&self) -> usize {
+        fn frames_in_flight(&self) -> usize {
             self.0
         }
 
@@ -396,7 +396,7 @@ mod tests {
             &self,
             _: &wildcity_render::Frame<'_>,
             _: &mut [wildcity_render::Target<'_>],
-            _: wildcity_render::Finished<'_>,
+            _: wildcity_render::OnViewDone<'_>,
         ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
             Ok(wildcity_render::FrameStats::default())
         }
