@@ -141,7 +141,7 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
         Outcome::AgentLost => message::Outcome::AgentLost,
         Outcome::ServerError => message::Outcome::ServerError,
     };
-    let summary = message::EpisodeSummary { outcome, steps, time_us, distance_m, least_trust };
+    let summary = message::Summary { outcome, steps, time_us, distance_m, least_trust };
     text(&Answer::Closed { seq, summary })
 }
 
