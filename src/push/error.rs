@@ -132,7 +132,7 @@ mod tests {
     use std::io;
 
     use super::*;
-    use wildcity_scene::Record;
+    use wildcity_scene::RecordFormat;
 
     /// A client sends a failed push again, and must not send a refused one again.
     #[test]
@@ -151,7 +151,7 @@ mod tests {
             settings: Vec::new(),
         };
         let clamped = StoreError::Clamped {
-            record: Record::default(),
+            record: RecordFormat::default(),
             field: "mean",
             count: 1,
             gaussians: 2,

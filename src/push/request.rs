@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{Record, RenderProfile};
+use wildcity_scene::{RecordFormat, RenderProfile};
 
 use crate::error::PushError;
 use crate::limits;
@@ -27,7 +27,7 @@ pub struct PushRequest {
     /// The cells that the push replaces.
     pub cells: CellSelection,
     /// How Gaussians are stored; as in the rest of the twin if there is none.
-    pub record: Option<Record>,
+    pub record: Option<RecordFormat>,
     /// Whether levels of detail are made.
     pub levels: bool,
     /// Changes of the twin's render profile, each as `near=0.2`.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use wildcity_render::Backend;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_twin::store::DiskCacheSettings;
 
 use crate::auth::Tokens;
@@ -31,7 +31,7 @@ pub struct Config {
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// Changes of the render profile of every twin; a session may change more.
-    pub profile: ProfileChanges,
+    pub profile: ProfileOverrides,
     /// Time-outs, counts and bytes.
     pub limits: Limits,
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use tokio::sync::{Semaphore, watch};
 
 use wildcity_push::PushQueue;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_session::Engine;
 
 use crate::auth::Tokens;
@@ -25,7 +25,7 @@ pub(crate) struct ServerState {
     pub(crate) stopping: watch::Receiver<bool>,
     pub(crate) limits: Limits,
     /// Changes of the render profile of every twin.
-    pub(crate) profile: ProfileChanges,
+    pub(crate) profile: ProfileOverrides,
     pub(crate) tokens: Option<Tokens>,
     /// The spool, or why there is none.
     pub(crate) spool: Result<Arc<Spool>, String>,

@@ -15,7 +15,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
     Encoding, EpisodeSummary, Outcome, PixelMaps, Session, TrajectorySummary, TwinSummary,
 };
-use wildcity_sim::{Dynamics, Model};
+use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
@@ -158,9 +158,9 @@ pub(crate) fn twin(twin: &TwinSummary) -> serde_json::Value {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::DynamicsModel::Teleport,
-        Model::Kinematic => message::DynamicsModel::Kinematic,
-        Model::Dynamic => message::DynamicsModel::Dynamic,
+        EgoModel::Teleport => message::DynamicsModel::Teleport,
+        EgoModel::Kinematic => message::DynamicsModel::Kinematic,
+        EgoModel::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

@@ -302,7 +302,7 @@ mod tests {
     use std::io;
 
     use super::*;
-    use wildcity_scene::Record;
+    use wildcity_scene::RecordFormat;
 
     /// What a commit can end with, over WebSocket or over HTTP.
     #[test]
@@ -331,7 +331,7 @@ mod tests {
             settings: Vec::new(),
         };
         let clamped = StoreError::Clamped {
-            record: Record::default(),
+            record: RecordFormat::default(),
             field: "mean",
             count: 1,
             gaussians: 2,

@@ -7,13 +7,13 @@ use serde::Deserialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::{self, Request};
 use wildcity_protocol::{PROTOCOL, unknown_field};
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{
     Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
-use wildcity_sim::{Dynamics, Model};
+use wildcity_sim::{Dynamics, EgoModel};
 
 use super::field::{name_of, pose_of, poses_of};
 use super::non_finite::{NonFinite, find_non_finite};
@@ -246,7 +246,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         seed: open.seed,
         start: open.start.map(start_of).transpose()?,
         rig,
-        profile: ProfileChanges::new(open.profile),
+        profile: ProfileOverrides::new(open.profile),
         outputs: Outputs {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
@@ -273,9 +273,9 @@ fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
         }
     };
     let model = match model {
-        message::DynamicsModel::Teleport => Model::Teleport,
-        message::DynamicsModel::Kinematic => Model::Kinematic,
-        message::DynamicsModel::Dynamic => Model::Dynamic,
+        message::DynamicsModel::Teleport => EgoModel::Teleport,
+        message::DynamicsModel::Kinematic => EgoModel::Kinematic,
+        message::DynamicsModel::Dynamic => EgoModel::Dynamic,
     };
     Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }
