@@ -11,9 +11,10 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Record, RenderProfile, Rig, Trajectory};
 use wildcity_twin::ingest::{self, Axes};
-use wildcity_twin::store::{NewSky, NewVersion, Storage, StoreError};
+use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
-use super::places::Twins;
+use super::directories::Twins;
+use super::profile_options::ProfileOptions;
 use super::progress;
 use super::sky_source::SkySource;
 
@@ -63,12 +64,8 @@ pub(super) struct Import {
     #[command(flatten)]
     sky: SkySource,
 
-    /// How the scene's trainer rendered, where it differs from gsplat; may be given again. Keys:
-    /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop; and how much detail is drawn:
-    /// tau_px (0 for all of it), reach_m; sky_error (0: the sky is evaluated for every pixel, else the
-    /// error of the map that it is baked into); background, as 0.5,0.6,0.8.
-    #[arg(long, value_name = "KEY=VALUE")]
-    profile: Vec<String>,
+    #[command(flatten)]
+    profile: ProfileOptions,
 
     /// In how many bits Gaussians are stored: f32 (exact), h52, q32, q24; the number is bytes at SH
     /// degree 1, before compression.
@@ -100,7 +97,7 @@ Formats, and the axes that they usually have; files of one extension differ, so 
                       what the USD layers around it turn is not looked at
 
 Examples:
-  wildcity import skull.ply --twin skull --axes y-down-z-forward --profile near=0.2
+  wildcity import skull.ply --twin skull --axes y-down-z-forward --set near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
@@ -123,10 +120,7 @@ impl Import {
             return Err(StoreError::Name { name: self.twin }.into());
         }
         let axes = self.axes.parse::<Axes>()?.scaled(self.scale)?;
-        let mut profile = RenderProfile::default();
-        for setting in &self.profile {
-            profile.set(setting)?;
-        }
+        let profile = self.profile.load()?.apply(RenderProfile::default())?;
         let sky = self.sky.read(&self.axes)?;
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
@@ -156,7 +150,7 @@ impl Import {
             trajectories,
             sky: sky.map(NewSky::Put),
             provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
-            storage: Storage { record: self.record, levels: !self.no_lod },
+            storage: StorageOptions { record: self.record, levels: !self.no_lod },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
         // The file was sound, so what cannot be used now was made by the options.
@@ -199,7 +193,7 @@ fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
     for path in paths {
         let trajectory = read_trajectory(path)?;
         if read.iter().any(|before| before.name == trajectory.name) {
-            return Err(StoreError::TrajectoryName { name: trajectory.name })
+            return Err(StoreError::DuplicateTrajectory { name: trajectory.name })
                 .with_context(|| format!("{}", path.display()));
         }
         read.push(trajectory);

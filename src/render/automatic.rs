@@ -9,7 +9,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
 use super::compare::psnr::{MIN_PSNR_DB, psnr_db};
 use super::cpu::{Cpu, CpuError, Simd};
-use super::gpu::{AdapterChoice, Gpu, GpuError, Limits};
+use super::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
 use super::{Backend, Frame, RenderError, Target, View};
 
 /// A backend, and why it and no other.
@@ -25,7 +25,7 @@ pub struct Selection {
 ///
 /// # Errors
 /// As [`Cpu::new`].
-pub fn select(threads: usize, simd: Simd, limits: Limits) -> Result<Selection, CpuError> {
+pub fn select(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Selection, CpuError> {
     let cpu = Cpu::new(threads, simd)?;
     let reason = match Gpu::with_limits(&AdapterChoice::Hardware, threads, limits) {
         Ok(gpu) => match self_test(&gpu, &cpu) {
@@ -140,7 +140,7 @@ mod tests {
     use crate::{FrameStats, OnViewDone};
 
     fn broken(stage: &str, part: &str, slip: &str) -> Gpu {
-        let shaders = Shaders::default().with_slip(stage, part, slip).unwrap();
+        let shaders = Shaders::default().with_mutation(stage, part, slip).unwrap();
         Gpu::with_shaders(&AdapterChoice::Best, 1, shaders)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers")
     }

@@ -2,14 +2,14 @@
 //! pinhole.
 
 use glam::DVec3;
-use wildcity::geometry::camera::{Rolls, Windshield, WindshieldReference};
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::compare::gaussians::{GaussianSpec, scene_of};
-use wildcity::render::compare::reprojection::ReprojectionErrors;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::{RenderError, RollingShutter, View};
-use wildcity::scene::{RenderProfile, Rig, Scene};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::ReprojectionErrors;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::{RenderError, RollingShutter, View};
+use wildcity_scene::geometry::camera::{Rolls, Windshield, WindshieldReference};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, psnr, render, render_one, try_render, view_along};
@@ -144,7 +144,7 @@ fn a_real_cars_points_land_where_its_lenses_say() {
 fn without_a_lens_nothing_of_it_is_compiled() {
     let broken = || {
         let shaders = Shaders::default();
-        shaders.with_slip("project_bent", "struct Exposed {", "struct Nothing {").unwrap()
+        shaders.with_mutation("project_bent", "struct Exposed {", "struct Nothing {").unwrap()
     };
     let (street, profile) = (Scene::from_gaussians(&street(300, 0, 1)), RenderProfile::default());
     render_one(&gpu_with(broken()), &street, &profile, straight());
@@ -159,11 +159,11 @@ fn a_pinhole_beside_a_lens_is_drawn_to_the_byte() {
     let (street, profile) = (Scene::from_gaussians(&street(5_000, 1, 2)), RenderProfile::default());
     let gpu = gpu();
     let alone = render(&gpu, &street, &profile, &[straight()]);
-    let pipelines = gpu.usage().unwrap().made.pipelines;
+    let pipelines = gpu.usage().unwrap().totals.pipelines;
     let [before, after] = [bent_views()[1], bent_views()[7]];
     let together = render(&gpu, &street, &profile, &[before, straight(), after]);
     assert!(together[1..2] == alone);
-    assert_eq!(gpu.usage().unwrap().made.pipelines, pipelines + 2, "cull and project");
+    assert_eq!(gpu.usage().unwrap().totals.pipelines, pipelines + 2, "cull and project");
     assert!(render(&gpu, &street, &profile, &[straight()]) == alone);
-    assert_eq!(gpu.usage().unwrap().made.pipelines, pipelines + 2);
+    assert_eq!(gpu.usage().unwrap().totals.pipelines, pipelines + 2);
 }

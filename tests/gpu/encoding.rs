@@ -3,22 +3,22 @@
 use std::f64::consts::{PI, TAU};
 
 use glam::{DQuat, DVec3};
-use wildcity::render::gpu::Gpu;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::stage::Stage;
-use wildcity::render::{Frame, View};
-use wildcity::scene::chunk::{CLUSTER, column};
-use wildcity::scene::{RenderProfile, Scene, sh};
+use wildcity_render::gpu::Gpu;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::stage::Stage;
+use wildcity_render::{Frame, View};
+use wildcity_scene::chunk::{CLUSTER, column};
+use wildcity_scene::{RenderProfile, Scene, sh};
 
-use crate::blobs::{GaussianSpec, forward_view, scene_of};
 use crate::definition::{self, Splat};
+use crate::gaussians::{GaussianSpec, forward_view, scene_of};
 use crate::gpu::{gpu, gpu_with};
 use crate::scene_files::Random;
 
 /// Three clusters side by side in one chunk, all before the camera, with colours of a degree.
-fn wall(sh_degree: u8) -> wildcity::scene::Gaussians {
+fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     let mut random = Random(71);
-    let mut wall = crate::blobs::gaussians_of(&[]);
+    let mut wall = crate::gaussians::gaussians_of(&[]);
     wall.sh_degree = sh_degree;
     for i in 0..3 * CLUSTER {
         let (x, y) = ((i % 32) as f64, (i / 32) as f64);
@@ -100,7 +100,7 @@ fn t10_a_colour_is_off_by_half_a_step_of_its_clusters_largest() {
         // 50 C0 / 65,534 are 2.2e-4: the bound is one that is reached.
         assert!(second > 1.5e-4, "degree {degree}: off by {second:e} only, was the outlier seen?");
     }
-    let slip = Shaders::default().with_slip("project", "0.28209479177387814 *", "0.2815 *");
+    let slip = Shaders::default().with_mutation("project", "0.28209479177387814 *", "0.2815 *");
     let (beyond, _) = beyond_the_bound(&gpu_with(slip.unwrap()), &Scene::from_gaussians(&wall(0)));
     assert_eq!(beyond.len(), 3, "two thousandths were not noticed: {beyond:?}");
 }

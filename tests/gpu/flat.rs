@@ -4,11 +4,11 @@ use std::fs;
 use std::ops::Range;
 
 use glam::DVec3;
-use wildcity::render::gpu::Gpu;
-use wildcity::render::{Backend, Frame, OnViewDone, RenderError, Target, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::gpu::Gpu;
+use wildcity_render::{Backend, Frame, OnViewDone, RenderError, Target, View};
+use wildcity_scene::{RenderProfile, Scene};
 
-use crate::blobs::{self, GaussianSpec};
+use crate::gaussians::{self, GaussianSpec};
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::view_along;
 use crate::streets::street;
@@ -64,7 +64,7 @@ fn three_at_once() {
         ..GaussianSpec::default()
     };
     // One row of tiles may have 2,048 splats.
-    let too_many = blobs::scene_of(&(0..3_000).map(layer).collect::<Vec<_>>());
+    let too_many = gaussians::scene_of(&(0..3_000).map(layer).collect::<Vec<_>>());
     let streets = [300, 900].map(|n| street(n, 1, 62));
     let step = |step: u32| {
         let scene = Scene::from_gaussians(&streets[step as usize % 2]);

@@ -1,8 +1,8 @@
 //! Frames that exceed a device are drawn in parts, and nobody can tell.
 
 use glam::DVec3;
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::{Gaussians, RenderProfile, Scene};
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{agree, cpu, render, render_one, view_along};
@@ -35,12 +35,12 @@ fn the_image_does_not_depend_on_the_parts() {
         let scene = Scene::from_gaussians(&cloud);
         let whole = gpu();
         let expected = render(&whole, &scene, &profile, &views);
-        assert_eq!(whole.usage().unwrap().parts, 1);
+        assert_eq!(whole.usage().unwrap().regions, 1);
         // Groups of views, and bands of views.
         let parts = [256 << 10, 128 << 10, 64 << 10].map(|binding_bytes| {
             let limited = gpu_with_limits(bindings(binding_bytes));
             assert!(render(&limited, &scene, &profile, &views) == expected, "{binding_bytes} B");
-            limited.usage().unwrap().parts
+            limited.usage().unwrap().regions
         });
         let bands = parts[2] > 2 * views.len() as u64;
         assert!(parts.is_sorted() && parts[0] >= 2 && bands, "{parts:?}");
@@ -55,7 +55,7 @@ fn parts_are_known_from_the_frame_before() {
     let expected = render(&limited, &scene, &profile, &views);
     render(&limited, &other, &profile, &views);
     let known = limited.usage().unwrap();
-    assert!(known.retries > 0 && known.parts > 4, "nothing was cut: {known:?}");
+    assert!(known.retries > 0 && known.regions > 4, "nothing was cut: {known:?}");
     for _ in 0..3 {
         assert!(render(&limited, &scene, &profile, &views) == expected);
         render(&limited, &other, &profile, &views);
@@ -64,9 +64,9 @@ fn parts_are_known_from_the_frame_before() {
 
     // What fits again is drawn at once.
     let small = Scene::from_gaussians(&street(2_000, 1, 34));
-    let before = limited.usage().unwrap().parts;
+    let before = limited.usage().unwrap().regions;
     render(&limited, &small, &profile, &views);
-    assert_eq!(limited.usage().unwrap().parts, before + 1);
+    assert_eq!(limited.usage().unwrap().regions, before + 1);
 }
 
 #[test]
@@ -133,7 +133,7 @@ fn more_instances_than_lavapipe_holds_at_once() {
 fn exceeds_lavapipe(scene: &Scene, view: View) {
     let limited = gpu_with_limits(bindings(128 << 20));
     let image = render_one(&limited, scene, &RenderProfile::default(), view);
-    let parts = limited.usage().unwrap().parts;
+    let parts = limited.usage().unwrap().regions;
     assert!(parts >= 2, "it fitted");
     let truth = render_one(&cpu(), scene, &RenderProfile::default(), view);
     agree(&image, &truth).unwrap();

@@ -3,15 +3,15 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::{Lens, OpenCv, Pinhole};
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, RenderError, View};
-use wildcity::scene::appearance::{Appearance, Overlay};
-use wildcity::scene::sky::{CubeMap, Model};
-use wildcity::scene::{RenderProfile, Scene, Sky};
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, RenderError, View};
+use wildcity_scene::appearance::{Appearance, Overlay};
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::{Lens, OpenCv, Pinhole};
+use wildcity_scene::sky::{CubeMap, Model};
+use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::cameras::bent_views;
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
@@ -191,7 +191,7 @@ fn what_cameras_make_of_colours() {
 fn without_a_sky_nothing_of_it_is_compiled() {
     let broken = || {
         let shaders = Shaders::default();
-        shaders.with_slip("rasterize_map", "fn sky(view: u32", "fn sky(view: Nothing").unwrap()
+        shaders.with_mutation("rasterize_map", "fn sky(view: u32", "fn sky(view: Nothing").unwrap()
     };
     let view = all_around()[0];
     render_one(&gpu_with(broken()), &Scene::default(), &RenderProfile::DEFAULT, view);
@@ -207,7 +207,7 @@ fn slips_are_caught() {
     let caught = |variant, profile: &RenderProfile, views: &[View], slips: &[(&str, &str)]| {
         let truths = render(&cpu(), &empty(sky()), profile, views);
         for (part, slip) in slips {
-            let shaders = Shaders::default().with_slip(variant, part, slip).expect(part);
+            let shaders = Shaders::default().with_mutation(variant, part, slip).expect(part);
             let images = render(&gpu_with(shaders), &empty(sky()), profile, views);
             let off = images.iter().zip(&truths).map(|(a, b)| max_difference(&a.rgba, &b.rgba));
             assert!(off.fold(0.0, f32::max) > 1e-3, "{part} went unnoticed");

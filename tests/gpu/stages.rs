@@ -3,21 +3,21 @@
 
 use std::sync::LazyLock;
 
-use wildcity::render::cpu::Cpu;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::hybrid::{HybridBackend, bisect};
-use wildcity::render::layout::Cutoffs;
-use wildcity::render::psnr::MIN_PSNR_DB;
-use wildcity::render::stage::{Stage, StageOutputs};
-use wildcity::render::{Backend, Frame, RenderError, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::compare::psnr::MIN_PSNR_DB;
+use wildcity_render::cpu::Cpu;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::hybrid::{HybridBackend, bisect};
+use wildcity_render::layout::Cutoffs;
+use wildcity_render::stage::{Stage, StageOutputs};
+use wildcity_render::{Backend, Frame, RenderError, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::cameras::bent_views;
 use crate::definition::{self, Splat};
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{Image, agree, cpu, render};
-use crate::slips::{LENS_SLIPS, SLIPS, misty_street, wide_views};
+use crate::mutations::{LENS_MUTATIONS, MUTATIONS, misty_street, wide_views};
 use crate::streets::{demo_street, street, street_views};
 
 /// One frame, what the cpu backend makes of it, and what the definition makes of the same buffers.
@@ -219,9 +219,9 @@ impl Backend for GoOn<'_> {
     fn render(
         &self,
         frame: &Frame<'_>,
-        targets: &mut [wildcity::render::Target<'_>],
-        finished: wildcity::render::OnViewDone<'_>,
-    ) -> Result<wildcity::render::FrameStats, wildcity::render::RenderError> {
+        targets: &mut [wildcity_render::Target<'_>],
+        finished: wildcity_render::OnViewDone<'_>,
+    ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
         self.gpu.resume(self.between, frame, targets, finished)
     }
 }
@@ -290,20 +290,21 @@ fn each_stage_does_what_its_twins_do() {
 fn a_slip_in_a_lens_fails_its_projection() {
     assert_eq!(BENT.wrong(&gpu()), []);
     let noticed = |(part, text): &&(&str, &str)| {
-        let broken = Shaders::default().with_slip("project_bent", part, text);
+        let broken = Shaders::default().with_mutation("project_bent", part, text);
         let broken = gpu_with(broken.unwrap_or_else(|| panic!("{part:?} has no place")));
         let found = broken.run_through(&BENT.frame(), None, Stage::Project).unwrap();
         BENT.object_to_project(&found).iter().all(Option::is_some)
     };
-    let unnoticed: Vec<&(&str, &str)> = LENS_SLIPS.iter().filter(|slip| !noticed(slip)).collect();
+    let unnoticed: Vec<&(&str, &str)> =
+        LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
     assert!(unnoticed.is_empty(), "{unnoticed:#?}");
 }
 
 #[test]
 fn a_slip_fails_its_own_stage_alone_and_the_bisection_names_it() {
     let (cpu, truth) = (cpu(), &*TRUTH);
-    for slip in SLIPS {
-        let broken = Shaders::default().with_slip(slip.shader, slip.part, slip.text);
+    for slip in MUTATIONS {
+        let broken = Shaders::default().with_mutation(slip.shader, slip.part, slip.text);
         let broken = gpu_with(broken.unwrap_or_else(|| panic!("{slip:?} has no place")));
         let wrong = truth.wrong(&broken);
         let names: Vec<&str> = wrong.iter().map(|(name, _)| *name).collect();
@@ -323,7 +324,7 @@ fn a_slip_fails_its_own_stage_alone_and_the_bisection_names_it() {
 #[test]
 fn depths_that_are_not_rounded_once_are_seen() {
     let truth = &*TRUTH;
-    let broken = Shaders::default().with_slip("project", "exact_m.x + exact_m.y", "exact_m.x");
+    let broken = Shaders::default().with_mutation("project", "exact_m.x + exact_m.y", "exact_m.x");
     let broken = gpu_with(broken.unwrap());
     let wrong = truth.wrong(&broken);
     let [("project", twins)] = &wrong[..] else { panic!("{wrong:?}") };

@@ -1,12 +1,12 @@
 //! Normals: of surfaces whose normal is known, through every lens, and where surfaces end.
 
 use glam::{DQuat, DVec3};
-use wildcity::geometry::Pose;
-use wildcity::geometry::camera::Rolls;
-use wildcity::render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, Frame, RenderError, RollingShutter, Target, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, Frame, RenderError, RollingShutter, Target, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::cpu;
 use crate::lenses::lenses;
@@ -75,7 +75,7 @@ fn a_wall_faces_where_it_does() {
     views.push(("pinhole", forward_view([160, 100], 90.0)));
     views.push((
         "rolling",
-        View { rolling_shutter: Some(rolling_shutter), ..ahead([160, 100], 90.0) },
+        View { rolling_shutter: Some(rolling_shutter), ..forward_view([160, 100], 90.0) },
     ));
     for (name, view) in views {
         for backend in [&cpu() as &dyn Backend, &Reference] {

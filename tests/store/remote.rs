@@ -1,19 +1,19 @@
 //! An object store that fails: waited for, asked again, and told from one that has lost something.
 
-use std::path::Path;
-use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use wildcity::scene::Gaussians;
-use wildcity::store::{CacheSettings, Catalog, NewVersion, Patience, Storage, StoreError, Version};
+use wildcity_scene::Gaussians;
+use wildcity_twin::store::{
+    Catalog, DiskCacheSettings, NewVersion, RetryPolicy, StorageOptions, StoreError, Version,
+};
 
 use crate::places::{cells_alone, change};
-use crate::s3::{Fault, S3, keys, quick};
-use crate::scene_files::{gaussians, inria_columns, ply};
-use crate::{street, wildcity};
+use crate::s3::{Fault, S3, quick};
+use crate::scene_files::gaussians;
+use crate::support::street;
 
 fn commit(catalog: &Catalog, scene: &Gaussians) -> Result<Version, StoreError> {
-    let new = NewVersion { storage: Storage::default(), ..street(scene) };
+    let new = NewVersion { storage: StorageOptions::default(), ..street(scene) };
     catalog.commit(new, &mut |_, _| {})
 }
 
@@ -60,7 +60,7 @@ fn a_record_that_nobody_can_ask_for_is_said_to_be_unknown() {
     s3.fail("PUT", "street/log/", 1, Fault::AnswerLost);
     s3.fail("GET", "street/log/0000000002", 3, Fault::Status(500));
     let error = commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap_err();
-    assert!(matches!(error, StoreError::Unsettled { number: 2, .. }), "{error}");
+    assert!(matches!(error, StoreError::OutcomeUnknown { number: 2, .. }), "{error}");
     // As it happens, it is there, and the same again is the same.
     assert_eq!(commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap().number, 2);
 }
@@ -140,7 +140,7 @@ fn what_the_disk_has_is_not_asked_for() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
     let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
-    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let cache = DiskCacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
     let read_all = |catalog: &Catalog| {
         let version = catalog.version("street", None).unwrap();
         for chunk in &version.manifest.chunks {
@@ -164,7 +164,7 @@ fn what_the_disk_has_is_not_asked_for() {
 fn what_only_the_disk_has_is_lost() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
-    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let cache = DiskCacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
     let catalog = s3.cached(Some(&cache)).unwrap();
     let first = commit(&catalog, &gaussians(500, 0, 50.0, 1)).unwrap();
     commit(&catalog, &gaussians(500, 0, 50.0, 2)).unwrap();
@@ -187,10 +187,10 @@ fn a_section_is_not_waited_for_as_long_as_a_cell() {
     let s3 = S3::start();
     let version = commit(&s3.catalog(), &gaussians(500, 0, 50.0, 1)).unwrap();
     let (section_timeout, section_tries) = (Duration::from_millis(200), 2);
-    let patience = Patience { section_timeout, section_tries, ..Patience::default() };
+    let patience = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
     let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, patience).unwrap();
     let chunk = &version.manifest.chunks[0];
-    assert_eq!(catalog.skim(&version, chunk).unwrap(), chunk.bytes);
+    assert_eq!(catalog.read_and_discard(&version, chunk).unwrap(), chunk.bytes);
     s3.fail("GET", "/objects/", 2, Fault::Silence);
     let began = Instant::now();
     let error = catalog.section(&version, chunk, &chunk.sections[0]).unwrap_err();
@@ -212,70 +212,4 @@ fn from_within_a_runtime_it_is_as_from_without() {
     // The catalog is dropped there, too.
     let number = runtime.block_on(async move { catalog.version("street", None).unwrap().number });
     assert_eq!(number, 1);
-}
-
-#[test]
-fn commands_take_a_url() {
-    let s3 = S3::start();
-    let dir = tempfile::tempdir().unwrap();
-    let source = dir.path().join("street.ply");
-    std::fs::write(&source, ply(&gaussians(500, 0, 50.0, 1), &inria_columns(0, false))).unwrap();
-    let run = |arguments: &[&str]| {
-        let mut command = wildcity();
-        command.args(arguments).args(["--twins", &S3::url()]).env("XDG_CACHE_HOME", dir.path());
-        let output = s3.environment(&mut command).output().unwrap();
-        let said = |bytes: &[u8]| String::from_utf8(bytes.to_owned()).unwrap();
-        (output.status.code(), said(&output.stdout), said(&output.stderr))
-    };
-    let (code, out, error) = run(&["import", source.to_str().unwrap(), "--twin", "street"]);
-    assert_eq!(code, Some(0), "{error}");
-    assert!(out.contains("s3://bucket/twins/street"), "{out}");
-    let (code, out, error) = run(&["inspect", "street"]);
-    assert_eq!(code, Some(0), "{error}");
-    assert!(out.contains("gaussians   500"), "{out}");
-    let (code, out, _) = run(&["twin", "log", "street"]);
-    assert!(code == Some(0) && out.contains("import"), "{out}");
-    let (code, out, error) = run(&["bench", "load", "street", "--repeat", "1"]);
-    assert!(code == Some(0) && out.contains("bare bytes"), "{out}{error}");
-    let mut command = wildcity();
-    let output = command.args(["inspect", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(said.contains("cannot use ftp://bucket/x for twins: one of s3://"), "{said}");
-}
-
-#[test]
-fn a_killed_import_leaves_the_old_version_or_the_new_one() {
-    let s3 = S3::start();
-    let dir = tempfile::tempdir().unwrap();
-    let source = dir.path().join("new.ply");
-    std::fs::write(&source, ply(&gaussians(20_000, 0, 220.0, 1), &inria_columns(0, false)))
-        .unwrap();
-    let catalog = s3.catalog();
-    let old = commit(&catalog, &gaussians(1_000, 0, 220.0, 2)).unwrap();
-    let puts = keys(&s3.twins()).len();
-    let mut killed_on_the_way = 0;
-    for more in [0, 1, 3, 8, 15, 25, 40] {
-        let mut import = import(&s3, &source).spawn().unwrap();
-        let deadline = Instant::now() + Duration::from_secs(60);
-        while keys(&s3.twins()).len() <= puts + more && import.try_wait().unwrap().is_none() {
-            assert!(Instant::now() < deadline, "the import hangs");
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        killed_on_the_way += usize::from(import.try_wait().unwrap().is_none());
-        import.kill().unwrap();
-        import.wait().unwrap();
-        let now = catalog.version("street", None).unwrap();
-        assert!(now == old || now.manifest.gaussians() == 20_000, "after {more}");
-        assert_eq!(catalog.verify("street", &mut |_, _| {}).unwrap().damaged.len(), 0);
-    }
-    assert!(killed_on_the_way >= 2, "only {killed_on_the_way} were killed on the way");
-    assert!(import(&s3, &source).status().unwrap().success());
-    assert_eq!(catalog.version("street", None).unwrap().manifest.gaussians(), 20_000);
-}
-
-fn import(s3: &S3, source: &Path) -> Command {
-    let mut import = wildcity();
-    s3.environment(&mut import).arg("import").arg(source);
-    import.args(["--twin", "street", "--twins", &S3::url()]).stdout(Stdio::null());
-    import
 }

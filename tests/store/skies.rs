@@ -1,36 +1,21 @@
 //! The sky of a version: kept, shared, replaced, taken away, damaged, collected.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use glam::{DMat3, DVec3};
-use wildcity::ingest;
-use wildcity::residency::Cache;
-use wildcity::scene::RenderProfile;
-use wildcity::scene::sky::Model;
-use wildcity::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::sky::Model;
+use wildcity_twin::ingest;
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{
+    Catalog, CommitKind, NewSky, NewVersion, Retention, SkyBytes, StorageOptions, VersionChange,
+};
 
 use crate::places::{cells_alone, everywhere};
-use crate::scene_files::{Tensor, gaussians, safetensors};
-use crate::{commit, street, wildcity};
-
-/// A small network of gentle weights; another one for every `seed`.
-fn tensors(seed: usize) -> Vec<Tensor> {
-    let tensor = |name: &'static str, shape: &[usize]| {
-        let count: usize = shape.iter().product();
-        let values = (0..count).map(|i| 0.1 * (((i + seed) * 7 % 11) as f64 - 5.0)).collect();
-        (name, shape.to_vec(), values)
-    };
-    vec![
-        tensor("sky_head.layers.0.weight", &[8, 9]),
-        tensor("sky_head.layers.0.bias", &[8]),
-        tensor("sky_head.layers.1.weight", &[8, 17]),
-        tensor("sky_head.layers.1.bias", &[8]),
-        tensor("sky_head.layers.2.weight", &[3, 8]),
-        tensor("sky_head.layers.2.bias", &[3]),
-    ]
-}
+use crate::scene_files::{gaussians, safetensors};
+use crate::sky_network::tensors;
+use crate::support::{commit, street};
 
 fn sky_bytes(seed: usize) -> SkyBytes {
     let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
@@ -38,12 +23,12 @@ fn sky_bytes(seed: usize) -> SkyBytes {
     SkyBytes { bytes: read.bytes.into(), image: None, sky_from_world: DMat3::IDENTITY }
 }
 
-fn with_sky(change: Option<NewSky>) -> Change {
-    Change { sky: Some(change), ..cells_alone() }
+fn with_sky(change: Option<NewSky>) -> VersionChange {
+    VersionChange { sky: Some(change), ..cells_alone() }
 }
 
 /// The storage of twins by `street`.
-fn storage() -> Storage {
+fn storage() -> StorageOptions {
     street(&gaussians(0, 0, 1.0, 1)).storage
 }
 
@@ -61,11 +46,11 @@ fn a_sky_comes_back_and_versions_share_it() {
 
         // What a change does not name stays; another one takes its place; and none.
         let change = |base, change| {
-            let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+            let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
             commit.change(base, change).unwrap()
         };
         let profile = Some(RenderProfile { near: 0.2, ..RenderProfile::DEFAULT });
-        let second = change(1, Change { profile, ..cells_alone() });
+        let second = change(1, VersionChange { profile, ..cells_alone() });
         assert_eq!(second.manifest.sky, Some(named.clone()));
         let third = change(2, with_sky(put(2)));
         assert_ne!(third.manifest.sky, second.manifest.sky);
@@ -81,7 +66,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         let direction = DVec3::new(0.6, 0.0, 0.8);
         let rgb = |seed| {
             let model = ingest::sky::decode(&sky_bytes(seed).bytes, None).unwrap();
-            wildcity::scene::Sky::new(model, DMat3::IDENTITY).rgb(direction)
+            wildcity_scene::Sky::new(model, DMat3::IDENTITY).rgb(direction)
         };
         assert_eq!(one.sky().unwrap().rgb(direction), rgb(1));
         assert_eq!(three.sky().unwrap().rgb(direction), rgb(2));
@@ -93,7 +78,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         assert!(four.scene(&[], &RenderProfile::DEFAULT).unwrap().sky.is_none());
         let bytes = one.sky().unwrap().bytes() as u64;
         assert!(bytes > 6 * 129 * 129 * 8);
-        assert_eq!(one.whole_bytes(), four.whole_bytes() + bytes);
+        assert_eq!(one.total_bytes(), four.total_bytes() + bytes);
     });
 }
 
@@ -104,7 +89,7 @@ fn garbage_collection_and_fsck_know_it() {
         let scene = gaussians(300, 0, 10.0, 1);
         let put = |seed| Some(NewSky::Put(sky_bytes(seed)));
         catalog.commit(NewVersion { sky: put(1), ..street(&scene) }, &mut |_, _| {}).unwrap();
-        let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+        let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
         commit.change(1, with_sky(put(2))).unwrap();
         let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound());
@@ -112,7 +97,7 @@ fn garbage_collection_and_fsck_know_it() {
         // Two manifests, a table, a chunk, and two skies.
         assert_eq!(checked.verified.objects, 6);
 
-        let keep = Keep { versions: 1, grace: Duration::ZERO };
+        let keep = Retention { versions: 1, grace: Duration::ZERO };
         catalog.collect("street", keep, false).unwrap();
         let removed = catalog.collect("street", keep, false).unwrap().removed;
         assert_eq!(removed.objects, 2, "a manifest and a sky");
@@ -165,54 +150,9 @@ fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
         let new = NewVersion { sky: Some(NewSky::Put(sky)), ..street(&scene) };
         let error = commit(dir.path(), new).unwrap_err().to_string();
         assert!(error.contains(wanted), "{error}");
-        assert_eq!(crate::files(&dir.path().join("street")), Vec::<std::path::PathBuf>::new());
+        assert_eq!(
+            crate::support::files(&dir.path().join("street")),
+            Vec::<std::path::PathBuf>::new()
+        );
     }
-}
-
-#[test]
-fn on_the_command_line() {
-    let dir = tempfile::tempdir().unwrap();
-    let at = |name: &str| dir.path().join(name);
-    let run = |arguments: &[&str]| {
-        let output =
-            wildcity().args(arguments).args([Path::new("--twins"), &at("twins")]).output().unwrap();
-        let said = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-        (output.status.code(), said(output.stdout), said(output.stderr))
-    };
-    let scene = gaussians(300, 0, 10.0, 1);
-    let columns = crate::scene_files::inria_columns(0, false);
-    std::fs::write(at("scene.ply"), crate::scene_files::ply(&scene, &columns)).unwrap();
-    std::fs::write(at("sky.safetensors"), safetensors(&tensors(1), &[])).unwrap();
-    let (ply, sky) = (at("scene.ply"), at("sky.safetensors"));
-    let (ply, sky) = (ply.to_str().unwrap(), sky.to_str().unwrap());
-
-    let axes = ["--axes", "y-down-z-forward"];
-    let import = ["import", ply, "--twin", "street", "--sky", sky];
-    let (code, _, error) = run(&[&import[..], &axes].concat());
-    assert_eq!(code, Some(0), "{error}");
-    let catalog = Catalog::open(&at("twins")).unwrap();
-    let version = catalog.version("street", None).unwrap();
-    // A network has the axes of its scene: the world's z, up, is the file's -y.
-    let named = version.manifest.sky.clone().unwrap();
-    assert_eq!(named.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
-    let (_, said, _) = run(&["inspect", "street"]);
-    assert!(said.contains(&format!("sky         {}", &named.object[..16])), "{said}");
-
-    let (code, _, error) = run(&["twin", "sky", "street", "--remove"]);
-    assert_eq!(code, Some(0), "{error}");
-    let without = catalog.version("street", None).unwrap();
-    assert_eq!((without.number, &without.manifest.sky), (2, &None));
-    assert_eq!(without.manifest.chunks, version.manifest.chunks);
-    let (code, said, _) = run(&["twin", "sky", "street", "--sky", sky, "--sky-axes", "identity"]);
-    assert_eq!(code, Some(0));
-    assert!(said.starts_with("twin street version 3: a sky of"), "{said}");
-    let again = catalog.version("street", None).unwrap().manifest.sky.unwrap();
-    assert_eq!(again.object, named.object);
-    assert_eq!(again.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
-
-    let (code, _, error) = run(&["twin", "sky", "street"]);
-    assert_eq!(code, Some(2), "neither a sky nor --remove: {error}");
-    let (code, _, error) = run(&["twin", "sky", "street", "--sky", ply]);
-    assert_eq!(code, Some(1));
-    assert!(error.contains("scene.ply: sky header, start: it is no safetensors file"), "{error}");
 }

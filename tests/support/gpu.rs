@@ -1,12 +1,14 @@
 //! A GPU for tests. Lavapipe counts as one, so every machine can have one and no test skips.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::ops::Deref;
 use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError, Limits};
-use wildcity::render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
+use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 /// The best device of this machine.
 pub(crate) fn gpu() -> Watched {
@@ -24,12 +26,12 @@ pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
 }
 
 /// Bindings of so many bytes.
-pub(crate) fn bindings(binding_bytes: u64) -> Limits {
-    Limits { binding_bytes, ..Limits::default() }
+pub(crate) fn bindings(binding_bytes: u64) -> MemoryLimits {
+    MemoryLimits { binding_bytes, ..MemoryLimits::default() }
 }
 
 /// The same with less of the device than it has.
-pub(crate) fn gpu_with_limits(limits: Limits) -> Watched {
+pub(crate) fn gpu_with_limits(limits: MemoryLimits) -> Watched {
     watched(|| Gpu::with_limits(&AdapterChoice::Best, 0, limits))
 }
 

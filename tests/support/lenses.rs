@@ -1,16 +1,16 @@
 //! A camera of every model, and what each must show.
 
 use glam::{DQuat, DVec2, DVec3};
-use wildcity::geometry::camera::{
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::centroid;
+use wildcity_render::reference;
+use wildcity_render::{Backend, RollingShutter, View};
+use wildcity_scene::geometry::camera::{
     Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Rolls, Windshield,
     WindshieldReference,
 };
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::compare::gaussians::{GaussianSpec, scene_of};
-use wildcity::render::compare::reprojection::centroid;
-use wildcity::render::reference;
-use wildcity::render::{Backend, RollingShutter, View};
-use wildcity::scene::{Rays, RenderProfile, Scene};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{psnr, render_one, view_along};
 use crate::streets::street;

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use glam::DVec3;
 use safetensors::SafeTensors;
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
-use wildcity::ingest;
-use wildcity::render::View;
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::View;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_scene::{RenderProfile, Scene};
+use wildcity_twin::ingest;
 
 use crate::data::real;
 use crate::images::view_along;
@@ -33,7 +33,7 @@ pub(crate) fn gsplat() -> Option<Truth> {
     let at = DVec3::new(0.123, 0.456, -8.0);
     let view = View {
         camera: Camera::ideal(width_px, height_px, pinhole),
-        ..look([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
+        ..view_along([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
     };
     let rgba = out.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
     let rgba = rgba.collect();

@@ -11,7 +11,7 @@ use super::timed::{Timed, time};
 use crate::cli::limits;
 use crate::cli::progress;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gpu::{self, AdapterChoice, FrameWork, Roofline};
+use wildcity_render::gpu::{self, AdapterChoice, FrameCounts, Roofline};
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{RenderProfile, Rig, Scene};
@@ -113,18 +113,18 @@ impl Gpu {
             time(cpu, &frame, self.repeat, "cpu")
         });
         let cpu = cpu.transpose()?;
-        let stages = stages(&own, &usage.last, roofline);
+        let stages = stages(&own, &usage.last_frame, roofline);
         Ok(SceneReport {
             gaussians,
             mirror_bytes: usage.mirror_bytes,
-            visible_pairs: usage.last.splats,
-            touches: usage.last.touches,
-            instances: usage.last.instances,
+            visible_pairs: usage.last_frame.splats,
+            touches: usage.last_frame.touches,
+            instances: usage.last_frame.instances,
             evaluations: own.stats.evaluations,
             frames: self.repeat,
-            parts: usage.parts.saturating_sub(before.parts),
+            parts: usage.regions.saturating_sub(before.regions),
             retries: usage.retries.saturating_sub(before.retries),
-            host_ms: host(&own, &usage.last, &stages),
+            host_ms: host(&own, &usage.last_frame, &stages),
             stages,
             step_ms: own.step_ms(),
             cpu_step_ms: cpu.as_ref().map(Timed::step_ms),
@@ -140,19 +140,19 @@ fn views() -> anyhow::Result<Vec<View>> {
     Ok(View::of_rig(&rig.cameras, Pose::IDENTITY))
 }
 
-fn stages(own: &Timed, work: &FrameWork, roofline: &Roofline) -> Vec<StageReport> {
-    let bytes = work.bytes().into_iter();
+fn stages(own: &Timed, work: &FrameCounts, roofline: &Roofline) -> Vec<StageReport> {
+    let bytes = work.stage_bytes().into_iter();
     let stages = bytes.filter_map(|(stage, bytes)| {
         let device_ms = own.stats.stages_ms.iter().find(|(name, _)| *name == stage)?.1;
-        let operations = if stage == "rasterize" { work.operations() } else { 0 };
+        let operations = if stage == "rasterize" { work.rasterize_operations() } else { 0 };
         Some(StageReport::new(stage, device_ms, bytes, operations, roofline))
     });
     stages.collect()
 }
 
 /// What is not the device's own time: what the host timed, and what is left of the step.
-fn host(own: &Timed, work: &FrameWork, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
-    let bytes = work.bytes();
+fn host(own: &Timed, work: &FrameCounts, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
+    let bytes = work.stage_bytes();
     let is_host = |name: &str| bytes.iter().all(|(stage, _)| *stage != name);
     let timed = own.stats.stages_ms.iter().filter(|(name, _)| is_host(name));
     let mut host_ms: Vec<(&'static str, f64)> = timed.copied().collect();

@@ -24,7 +24,7 @@ use super::resolve::{Planes, Wanted};
 use super::scan::Scan;
 use super::shaders::Shaders;
 use super::sort::{Columns, Sort};
-use super::traffic::FrameWork;
+use super::traffic::FrameCounts;
 use crate::constants::{DEPTH_BITS, TILE_PX};
 use crate::layout::Cutoffs;
 use crate::stage::{Stage, StageOutputs};
@@ -59,9 +59,9 @@ pub(super) struct Chain {
     /// Attempts that drew nothing, since buffers were too small.
     pub(super) retries: u64,
     /// Parts that frames were drawn in.
-    pub(super) parts: u64,
+    pub(super) regions: u64,
     /// What the last frame counted.
-    pub(super) last: FrameWork,
+    pub(super) last_frame: FrameCounts,
 }
 
 /// What a frame begins with.
@@ -127,8 +127,8 @@ impl Chain {
             },
             cuts: Cuts::default(),
             retries: 0,
-            parts: 0,
-            last: FrameWork::default(),
+            regions: 0,
+            last_frame: FrameCounts::default(),
             device,
         };
         chain.device.check()?;
@@ -197,7 +197,7 @@ impl Chain {
                 read_back.unmap();
             }
         }
-        self.parts += drawn.len() as u64;
+        self.regions += drawn.len() as u64;
         self.cuts.remember(subject, drawn, self.limit());
         self.finish(read_back, &gpu_frame, stats)
     }
@@ -215,7 +215,7 @@ impl Chain {
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, gpu_frame.tiles);
         let mut read_back = self.ring.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, gpu_frame.tiles, tiles_per_page);
-        self.last = FrameWork::new(frame, planes, &gpu_frame);
+        self.last_frame = FrameCounts::new(frame, planes, &gpu_frame);
         Ok((gpu_frame, read_back))
     }
 
@@ -260,7 +260,7 @@ impl Chain {
                     return Err(RenderError::TooMany { what, limit });
                 }
                 count(stats, &counters);
-                self.last.add(source.items(), &counters);
+                self.last_frame.add(source.items(), &counters);
                 return Ok(needs);
             }
             if needs.pieces(self.limit()) > 1 {

@@ -190,10 +190,10 @@ pub(super) struct Device {
     /// The first thing that went wrong since the last look.
     fault: Arc<Mutex<Option<String>>>,
     /// What was made and run, so that who pays for what can be shown.
-    made: Counted,
+    totals: Counted,
 }
 
-/// [`Made`] in the making.
+/// [`DeviceTotals`] in the making.
 #[derive(Debug, Default)]
 struct Counted {
     pipelines: AtomicU64,
@@ -203,7 +203,7 @@ struct Counted {
 
 /// What was made and run on a device since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Made {
+pub struct DeviceTotals {
     /// Kernels that were compiled.
     pub pipelines: u64,
     /// Buffers, those that grew anew.
@@ -242,7 +242,7 @@ impl Device {
             note(&refused, error.to_string());
         }));
         device.set_device_lost_callback(move |_, message| note(&lost, message));
-        Ok(Self { device, queue, info, limits, binding_limit, fault, made: Counted::default() })
+        Ok(Self { device, queue, info, limits, binding_limit, fault, totals: Counted::default() })
     }
 
     /// Tells of what went wrong since the last call.
@@ -312,26 +312,26 @@ impl Device {
     }
 
     /// What was made and run since the device was opened.
-    pub(super) fn made(&self) -> Made {
-        let Counted { pipelines, buffers, dispatches } = &self.made;
+    pub(super) fn totals(&self) -> DeviceTotals {
+        let Counted { pipelines, buffers, dispatches } = &self.totals;
         let [pipelines, buffers, dispatches] =
             [pipelines, buffers, dispatches].map(|count| count.load(Relaxed));
-        Made { pipelines, buffers, dispatches }
+        DeviceTotals { pipelines, buffers, dispatches }
     }
 
     /// A kernel was compiled.
     pub(super) fn count_pipeline(&self) {
-        self.made.pipelines.fetch_add(1, Relaxed);
+        self.totals.pipelines.fetch_add(1, Relaxed);
     }
 
     /// A kernel is started.
     pub(super) fn count_dispatch(&self) {
-        self.made.dispatches.fetch_add(1, Relaxed);
+        self.totals.dispatches.fetch_add(1, Relaxed);
     }
 
     /// A buffer of its own, at least 256 bytes.
     pub(super) fn buffer(&self, label: &str, bytes: u64, usage: BufferUsages) -> Buffer {
-        self.made.buffers.fetch_add(1, Relaxed);
+        self.totals.buffers.fetch_add(1, Relaxed);
         self.device.create_buffer(&BufferDescriptor {
             label: Some(label),
             size: bytes.next_multiple_of(256).max(256),

@@ -33,9 +33,9 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
-pub use device::{AdapterChoice, DeviceInfo, GpuError, Made, devices};
+pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
-pub use traffic::FrameWork;
+pub use traffic::FrameCounts;
 
 use self::chain::Chain;
 use self::device::Device;
@@ -54,7 +54,7 @@ pub struct Gpu {
     /// The device and its driver, the same for as long as the backend lives.
     info: AdapterInfo,
     shaders: Shaders,
-    limits: Limits,
+    limits: MemoryLimits,
     /// Delivers images, and runs what `finished` does with them.
     deliver: ThreadPool,
     /// Culls clusters: threads of its own, so that a frame that is drawn does not wait for one that
@@ -67,7 +67,7 @@ pub struct Gpu {
 
 /// How much of a device is used, where that is less than what it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
+pub struct MemoryLimits {
     /// Bytes of resident Gaussians: what was not drawn for longest goes when there would be more.
     pub mirror_bytes: u64,
     /// Bytes that a binding may hold; below `limits::BINDING_BYTES_MIN` it is that. Frames that need
@@ -75,7 +75,7 @@ pub struct Limits {
     pub binding_bytes: u64,
 }
 
-impl Default for Limits {
+impl Default for MemoryLimits {
     /// What the device has.
     fn default() -> Self {
         Self { mirror_bytes: u64::MAX, binding_bytes: u64::MAX }
@@ -84,7 +84,7 @@ impl Default for Limits {
 
 /// What a device holds and has done since it was opened.
 #[derive(Clone, Debug, PartialEq)]
-pub struct GpuUse {
+pub struct GpuUsage {
     /// The adapter's name.
     pub name: String,
     /// Bytes of resident Gaussians.
@@ -94,11 +94,11 @@ pub struct GpuUse {
     /// Attempts at drawing that drew nothing, since buffers were too small.
     pub retries: u64,
     /// Parts that frames were drawn in: one for each that fits.
-    pub parts: u64,
+    pub regions: u64,
     /// What the last frame counted.
-    pub last: FrameWork,
+    pub last_frame: FrameCounts,
     /// Pipelines, buffers and dispatches so far.
-    pub made: Made,
+    pub totals: DeviceTotals,
 }
 
 impl Gpu {
@@ -107,7 +107,7 @@ impl Gpu {
     /// # Errors
     /// There is no such device, or it cannot do what the stages need.
     pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
-        Self::open(choice, threads, Shaders::default(), Limits::default())
+        Self::open(choice, threads, Shaders::default(), MemoryLimits::default())
     }
 
     /// The same with other shaders: for tests that break one and see that it is noticed.
@@ -119,7 +119,7 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, shaders, Limits::default())
+        Self::open(choice, threads, shaders, MemoryLimits::default())
     }
 
     /// The same with less of the device than it has.
@@ -129,7 +129,7 @@ impl Gpu {
     pub fn with_limits(
         choice: &AdapterChoice,
         threads: usize,
-        limits: Limits,
+        limits: MemoryLimits,
     ) -> Result<Self, GpuError> {
         Self::open(choice, threads, Shaders::default(), limits)
     }
@@ -138,15 +138,17 @@ impl Gpu {
         choice: &AdapterChoice,
         threads: usize,
         shaders: Shaders,
-        limits: Limits,
+        limits: MemoryLimits,
     ) -> Result<Self, GpuError> {
         if threads > limits::RENDER_THREADS {
             let limit = limits::RENDER_THREADS;
             let reason = format!("{threads} are too many; 0 to {limit} are accepted");
             return Err(GpuError::Threads { reason });
         }
-        let limits =
-            Limits { binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN), ..limits };
+        let limits = MemoryLimits {
+            binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
+            ..limits
+        };
         let device = Device::open(choice, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
@@ -167,16 +169,16 @@ impl Gpu {
     }
 
     /// What the device holds; `None` while it is lost.
-    pub fn usage(&self) -> Option<GpuUse> {
+    pub fn usage(&self) -> Option<GpuUsage> {
         let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
-        chain.as_ref().map(|chain| GpuUse {
+        chain.as_ref().map(|chain| GpuUsage {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
             allocated_bytes: chain.device.allocated_bytes(),
             retries: chain.retries,
-            parts: chain.parts,
-            last: chain.last,
-            made: chain.device.made(),
+            regions: chain.regions,
+            last_frame: chain.last_frame,
+            totals: chain.device.totals(),
         })
     }
 
@@ -205,7 +207,7 @@ impl Gpu {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.render_with(frame, targets, finished, |chain, wanted| {
-            chain.go_on(between, frame, wanted)
+            chain.resume(between, frame, wanted)
         })
     }
 
@@ -221,7 +223,7 @@ impl Gpu {
         last: Stage,
     ) -> Result<StageOutputs, RenderError> {
         frame.check_views()?;
-        self.in_turn(|chain| chain.through(frame, done, last, &self.cull))
+        self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
 
     /// Does something on the device, which is opened again if it was lost. The device is free for

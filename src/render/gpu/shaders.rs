@@ -85,7 +85,7 @@ impl Shaders {
 
     /// The same with the first `part` of a variant replaced, or `None` if it does not have it: how tests
     /// break a shader to see that it is noticed.
-    pub fn with_slip(mut self, stage: &str, part: &str, slip: &str) -> Option<Self> {
+    pub fn with_mutation(mut self, stage: &str, part: &str, slip: &str) -> Option<Self> {
         let stages = Arc::make_mut(&mut self.stages);
         let (_, source) = stages.iter_mut().find(|(name, _)| *name == stage)?;
         if !source.contains(part) {

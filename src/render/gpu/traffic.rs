@@ -12,7 +12,7 @@ use wildcity_scene::sh;
 
 /// What the last frame counted.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct FrameWork {
+pub struct FrameCounts {
     /// SH degree of the scene.
     pub sh_degree: u8,
     /// Views, their pixels, and how many 32-bit planes of these were asked for.
@@ -37,7 +37,7 @@ pub struct FrameWork {
     pub batches: u64,
 }
 
-impl FrameWork {
+impl FrameCounts {
     /// Of a frame of which nothing is drawn yet.
     pub(super) fn new(frame: &Frame<'_>, planes: Planes, gpu_frame: &GpuFrame) -> Self {
         Self {
@@ -77,7 +77,7 @@ impl FrameWork {
     /// | | macro tile | range 8, written once and read twice |
     /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
     /// | | instance, tile, pixel | place 4; range 8; 4 for each value that is asked for |
-    pub fn bytes(&self) -> [(&'static str, u64); 6] {
+    pub fn stage_bytes(&self) -> [(&'static str, u64); 6] {
         let Self { clusters, splats, touches, instances, tiles, macros, .. } = *self;
         let cluster = CLUSTER as u64;
         let geometry = 4 * u64::from(GEOMETRY_WORDS);
@@ -110,7 +110,7 @@ impl FrameWork {
     /// Multiply-adds and instructions of their cost that rasterize cannot do without: five per splat
     /// of a batch and pixel of the tile, for `d`, `u` (two), the exponent and its comparison. What is
     /// touched takes ten more; pixels that have stopped take none.
-    pub fn operations(&self) -> u64 {
+    pub fn rasterize_operations(&self) -> u64 {
         5 * self.batches * u64::from(RASTER_BATCH) * u64::from(TILE_PX * TILE_PX)
     }
 }

@@ -21,7 +21,7 @@ impl Chain {
     ///
     /// # Errors
     /// The device fails, or the frame needs more than it can hold.
-    pub(in crate::gpu) fn go_on(
+    pub(in crate::gpu) fn resume(
         &mut self,
         between: &StageOutputs,
         frame: &Frame<'_>,
@@ -43,7 +43,7 @@ impl Chain {
     ///
     /// # Errors
     /// The device fails, or the frame needs more than it can hold.
-    pub(in crate::gpu) fn through(
+    pub(in crate::gpu) fn run_through(
         &mut self,
         frame: &Frame<'_>,
         done: Option<&StageOutputs>,

@@ -16,17 +16,17 @@ use half::f16;
 
 use wildcity_scene::{Gaussians, sh};
 
-use super::unpacked::{self, Budget};
+use super::unpack_budget::{self, UnpackBudget};
 use super::validate::{self, Field};
-use super::{IngestError, check_count, joined};
+use super::{IngestError, check_count};
 use msgpack::Value;
 
 const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
 /// Reads a payload.
-pub(super) fn read(payload: &[u8], budget: &mut Budget) -> Result<Gaussians, IngestError> {
-    let limit = unpacked::limit_bytes(payload.len() as u64);
+pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
+    let limit = unpack_budget::limit_bytes(payload.len() as u64);
     let mut bytes = Vec::new();
     let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
@@ -46,7 +46,7 @@ pub(super) fn read(payload: &[u8], budget: &mut Budget) -> Result<Gaussians, Ing
     for name in layers {
         check_activations(data, name)?;
         let part = Layer { state, name }.read()?;
-        joined::append(&mut all, &part, 0..part.len());
+        all.append(&part);
         check_count(all.len() as u64)?;
     }
     validate::check(&all, &Field::plain_name)?;
