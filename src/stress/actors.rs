@@ -3,7 +3,7 @@
 use glam::{DMat3, DQuat, DVec3};
 
 use super::order::evenly;
-use super::{Case, CaseRun, Run};
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
 use wildcity_render::compare::images::max_difference;
@@ -13,14 +13,16 @@ pub(super) const T25: Case = Case {
     number: "T25",
     what: "colours of SH degree 3 that turn with their actor",
     bound: "as a camera that turns the other way, within 5e-4; agrees with f64",
-    run: Run::Light(t25),
+    body: CaseBody::Light(t25),
 };
 
-fn t25(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let actor = actor();
-    let (profile, view) = (RenderProfile::default(), forward_view([160, 120], 150.0));
-    let still = trial.agreed("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
-    trial.holds("seen", still.opacity.iter().any(|&o| o > 0.9));
+    let profile = RenderProfile::default();
+    let view = forward_view([160, 120], 150.0);
+    let still =
+        run.render_and_compare("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
+    run.check("seen", still.opacity.iter().any(|&o| o > 0.9));
     for (what, turn) in [
         ("turned about y", DQuat::from_rotation_y(1.1)),
         ("turned about all", DQuat::from_rotation_x(2.5) * DQuat::from_rotation_z(0.4)),
@@ -29,11 +31,11 @@ fn t25(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let turned = Scene::from_gaussians(&turned(&actor, turn));
         let mut moved = view;
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
-        let drawing = trial.agreed(what, &turned, &profile, moved)?;
+        let drawing = run.render_and_compare(what, &turned, &profile, moved)?;
         let off = max_difference(&still.rgba, &drawing.rgba);
         // A device keeps colours in steps of 1/32,767 of the largest of 256 neighbours, of 16
         // coefficients: below 5e-4. The others keep f32.
-        trial.at_most(format!("{what}: off by"), off.into(), 5e-4);
+        run.check_at_most(format!("{what}: off by"), off.into(), 5e-4);
     }
     Ok(())
 }

@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec2, DVec3};
 
 use super::order::evenly;
-use super::{Case, CaseRun, Run};
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
 use wildcity_render::compare::images::crop_view;
 use wildcity_render::compare::psnr::psnr_db;
@@ -16,7 +16,7 @@ pub(super) const T22: Case = Case {
     number: "T22",
     what: "a Gaussian an eighth as deep as it is far, through a fisheye: six points for all of it",
     bound: "agrees with f64; centre within 0.2 px and spread within 3 % of 20,000 points of it",
-    run: Run::Light(t22),
+    body: CaseBody::Light(t22),
 };
 
 /// A fisheye of 160 x 120 px, and what is wide and close before it.
@@ -32,10 +32,11 @@ fn wide() -> (Camera, GaussianSpec) {
     (Camera { lens, ..Camera::ideal(160, 120, pinhole) }, blob)
 }
 
-fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (camera, blob) = wide();
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
-    let drawing = trial.agreed("six points", &scene_of(&[blob]), &profile, view)?;
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
+    let drawing = run.render_and_compare("six points", &scene_of(&[blob]), &profile, view)?;
     let pixels = drawing.opacity.iter().enumerate().map(|(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         (f64::from(opacity), at_px)
@@ -43,7 +44,7 @@ fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (drawn_px, drawn_px2) = moments(pixels);
     let (point_px, point_px2) = sampled(&camera, &blob);
 
-    trial.at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
+    run.check_at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
     // What is drawn ends where alpha is below the cut, at r² = 2 ln(opacity / cut): a Gaussian up to r has
     // 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. And the renderer blurs.
     let left = profile.alpha_cut / blob.opacity;
@@ -54,7 +55,7 @@ fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     {
         let blur = if axis == "xy" { 0.0 } else { profile.blur };
         let off = (drawn / share - blur - point).abs() / size_px2;
-        trial.at_most(format!("spread along {axis} off by"), off, 0.03);
+        run.check_at_most(format!("spread along {axis} off by"), off, 0.03);
     }
     Ok(())
 }
@@ -86,35 +87,37 @@ pub(super) const T23: Case = Case {
     number: "T23",
     what: "a fisheye of 220°, with something behind it and all around it; what is beyond the fold of OpenCV's lens",
     bound: "agrees with f64; what the lens does not see is exactly nothing; nothing is mirrored at a fold",
-    run: Run::Light(t23),
+    body: CaseBody::Light(t23),
 };
 
-fn t23(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
     let camera = Camera { lens, ..Camera::ideal(120, 100, pinhole) };
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
     let ball = |mean_m: DVec3| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
 
-    let behind = trial.draw(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
-    trial.holds("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
+    let behind = run.render(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
+    run.check("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
     let (sin, cos) = 100_f64.to_radians().sin_cos();
-    let beside = trial.agreed("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
-    trial.holds("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
+    let beside =
+        run.render_and_compare("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
+    run.check("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
 
     let wall =
         GaussianSpec { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..GaussianSpec::default() };
-    let wall = trial.agreed("all around", &scene_of(&[wall]), &profile, view)?;
+    let wall = run.render_and_compare("all around", &scene_of(&[wall]), &profile, view)?;
     let wrong = wall.opacity.iter().enumerate().filter(|&(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
         (opacity > 0.0) != camera.unproject(at_px).is_some()
     });
-    trial.at_most("pixels wrong about the lens' field:", wrong.count() as f64, 0.0);
-    folded(trial)
+    run.check_at_most("pixels wrong about the lens' field:", wrong.count() as f64, 0.0);
+    folded(run)
 }
 
 /// Balls within and beyond the fold of a lens whose image turns back there.
-fn folded(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // r (1 + k3 r⁶) rises up to a slope of r = 0.8, where it is 6/7 of it; at 1.107 it is back at the axis.
     const FOLD: f64 = 0.8;
     const FOCAL_PX: f64 = 80.0;
@@ -122,26 +125,32 @@ fn folded(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = OpenCv::new([0.0, 0.0, k3, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: FOCAL_PX, fy: FOCAL_PX, cx: 80.0, cy: 60.0 };
     let camera = Camera { lens: Lens::opencv(lens), ..Camera::ideal(160, 120, pinhole) };
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
     let ball = |slope: f64, around: f64| GaussianSpec {
         mean_m: 5.0 * DVec3::new(slope * around.cos(), slope * around.sin(), 1.0),
         sigma_m: DVec3::splat(0.02),
         ..GaussianSpec::default()
     };
-    let within = trial.agreed("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
-    trial.holds("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
+    let within =
+        run.render_and_compare("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
+    run.check("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
     // As if there were no fold they would land within 0.65 focal lengths of the axis. What is beyond the field
     // may reach over its edge, which is at 0.68, by as much as the blur.
     let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
     let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
-    let drawing =
-        trial.agreed("beyond the fold", &scene_of(&beyond.collect::<Vec<_>>()), &profile, view)?;
+    let drawing = run.render_and_compare(
+        "beyond the fold",
+        &scene_of(&beyond.collect::<Vec<_>>()),
+        &profile,
+        view,
+    )?;
     let mirrored = drawing.opacity.iter().enumerate().filter(|&(pixel, _)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         at_px.distance(DVec2::new(80.0, 60.0)) < 0.65 * FOCAL_PX
     });
     let most = mirrored.fold(0.0_f32, |most, (_, &opacity)| most.max(opacity));
-    trial.at_most("beyond the fold: opacity of what is mirrored", most.into(), 0.0);
+    run.check_at_most("beyond the fold: opacity of what is mirrored", most.into(), 0.0);
     Ok(())
 }
 
@@ -149,10 +158,10 @@ pub(super) const T24: Case = Case {
     number: "T24",
     what: "rolling shutter at 30 m/s and 30 ms, in a curve",
     bound: "agrees with f64; at least 42 dB of every row by itself, from where the camera then stands, by rays",
-    run: Run::Light(t24),
+    body: CaseBody::Light(t24),
 };
 
-fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t24(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     const SIZE_PX: [u32; 2] = [96, 64];
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 48.0, cy: 32.0 };
     let camera = Camera::ideal(SIZE_PX[0], SIZE_PX[1], pinhole);
@@ -166,19 +175,20 @@ fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         };
         let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first });
         let view = View { rolling_shutter, ..View::new(camera, Pose::IDENTITY) };
-        let drawing = trial.agreed(format!("{direction:?}"), &balls, &profile, view)?;
-        let (mut drawn, mut truth) = (Vec::new(), Vec::new());
+        let drawing = run.render_and_compare(format!("{direction:?}"), &balls, &profile, view)?;
+        let mut drawn = Vec::new();
+        let mut truth = Vec::new();
         for row in (0..SIZE_PX[1]).step_by(5) {
             let at_px = DVec2::splat(f64::from(row) + 0.5);
             let still = View::new(camera, view.world_from_camera_at(at_px));
             let own = crop_view(still, [0, row as i32], [SIZE_PX[0], 1]);
-            truth.extend(trial.truth(&balls, &exact, own)?.rgba);
+            truth.extend(run.render_reference(&balls, &exact, own)?.rgba);
             let first = 4 * (row * SIZE_PX[0]) as usize;
             drawn.extend_from_slice(&drawing.rgba[first..first + 4 * SIZE_PX[0] as usize]);
         }
         let what = format!("{direction:?}, row by row: dB");
         let differences = drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b));
-        trial.at_least_db(what, psnr_db(differences), 42.0);
+        run.check_at_least_db(what, psnr_db(differences), 42.0);
     }
     Ok(())
 }
@@ -212,7 +222,8 @@ mod tests {
         beta: f64,
     ) -> (f64, DVec2, [f64; 3]) {
         let scale = 3.0 * alpha * alpha;
-        let (w0, w) = ((scale - 3.0) / scale, 0.5 / scale);
+        let w0 = (scale - 3.0) / scale;
+        let w = 0.5 / scale;
         let land = |unit: DVec3| {
             camera.project_beyond(blob.mean_m + blob.rotation * (blob.sigma_m * unit))
         };
@@ -245,7 +256,8 @@ mod tests {
     #[test]
     fn what_weights_of_minus_99_would_do() {
         let (camera, blob) = wide();
-        let (six, taylor) = ([1.0, 0.0], [0.1, 2.0]);
+        let six = [1.0, 0.0];
+        let taylor = [0.1, 2.0];
         assert_eq!(unscented(&camera, &blob, six[0], six[1]).0, 0.0);
         assert!((unscented(&camera, &blob, taylor[0], taylor[1]).0 + 99.0).abs() < 1e-9);
         for (rule, most_px, most) in [(six, 0.01, 0.02), (taylor, 0.001, 0.01)] {

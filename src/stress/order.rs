@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3};
 
 use super::places::street_view;
-use super::{Case, CaseRun, Run};
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
@@ -13,10 +13,10 @@ pub(super) const T6: Case = Case {
     number: "T6",
     what: "two walls of duplicates in one plane",
     bound: "the lower id in front; the same bytes 100 times",
-    run: Run::Light(t6),
+    body: CaseBody::Light(t6),
 };
 
-fn t6(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t6(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let grid = |rgb: [f64; 3]| {
         (0..100).map(move |i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i % 10), 0.1 * f64::from(i / 10), 5.0),
@@ -25,17 +25,18 @@ fn t6(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         })
     };
     let blobs: Vec<GaussianSpec> = grid([1.0, 0.0, 0.0]).chain(grid([0.0, 1.0, 0.0])).collect();
-    let (scene, profile, view) =
-        (scene_of(&blobs), RenderProfile::default(), forward_view([200, 150], 150.0));
-    let drawing = trial.agreed("the walls", &scene, &profile, view)?;
+    let scene = scene_of(&blobs);
+    let profile = RenderProfile::default();
+    let view = forward_view([200, 150], 150.0);
+    let drawing = run.render_and_compare("the walls", &scene, &profile, view)?;
     let center = 4 * (80 * 200 + 110);
     let [red, green] = [0, 1].map(|channel| drawing.rgba[center + channel]);
-    trial.holds("the first of each pair is in front", red > green);
+    run.check("the first of each pair is in front", red > green);
     let mut equal = true;
     for _ in 1..100 {
-        equal &= trial.draw(&scene, &profile, view)? == drawing;
+        equal &= run.render(&scene, &profile, view)? == drawing;
     }
-    trial.holds("100 drawings have the same bytes", equal);
+    run.check("100 drawings have the same bytes", equal);
     Ok(())
 }
 
@@ -43,10 +44,10 @@ pub(super) const T8: Case = Case {
     number: "T8",
     what: "a turn on the spot before two crossing ellipsoids",
     bound: "every frame agrees with f64; what pops is what f64 pops within 2/255",
-    run: Run::Light(t8),
+    body: CaseBody::Light(t8),
 };
 
-fn t8(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // Their centres change places in depth in the middle of the turn: there one image jumps to another,
     // since whole Gaussians are sorted. It is measured, and it is no more than the definition's.
     let bar = |angle: f64, x: f64, rgb| GaussianSpec {
@@ -58,13 +59,14 @@ fn t8(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     };
     let crossing = scene_of(&[bar(0.8, 0.02, [1.0, 0.2, 0.1]), bar(-0.8, -0.02, [0.1, 0.3, 1.0])]);
     let profile = RenderProfile::default();
-    let (mut pops, mut last) = ([0.0_f32; 2], None);
+    let mut pops = [0.0_f32; 2];
+    let mut last = None;
     for step in -10..=10 {
         let yaw = (0.05 * f64::from(step)).to_radians();
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
         let view = view_along([160, 120], 150.0, DVec3::ZERO, forward, DVec3::Y);
-        let drawing = trial.agreed(format!("step {step}"), &crossing, &profile, view)?;
-        let truth = trial.truth(&crossing, &profile, view)?;
+        let drawing = run.render_and_compare(format!("step {step}"), &crossing, &profile, view)?;
+        let truth = run.render_reference(&crossing, &profile, view)?;
         if let Some((drawing_before, truth_before)) = &last {
             let jump = |before: &Vec<f32>, now: &Vec<f32>| max_difference(before, now);
             pops[0] = pops[0].max(jump(drawing_before, &drawing.rgba));
@@ -73,9 +75,9 @@ fn t8(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         last = Some((drawing.rgba, truth.rgba));
     }
     let [pop, popped_truth] = pops.map(f64::from);
-    trial.holds("it pops", pop > 0.1);
+    run.check("it pops", pop > 0.1);
     let what = format!("pops by {pop:.3}, by definition {popped_truth:.3}: apart");
-    trial.at_most(what, (pop - popped_truth).abs(), 2.0 / 255.0);
+    run.check_at_most(what, (pop - popped_truth).abs(), 2.0 / 255.0);
     Ok(())
 }
 
@@ -83,12 +85,17 @@ pub(super) const T20: Case = Case {
     number: "T20",
     what: "sort and scan over dozens of blocks, in the subgroups that the device has",
     bound: "agrees with f64 (4, 8 and 16 threads: tests/gpu/determinism.rs)",
-    run: Run::Light(t20),
+    body: CaseBody::Light(t20),
 };
 
-fn t20(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t20(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let street = Scene::from_gaussians(&wildcity_generate::canyon(60_000, &mut |_, _| {}));
-    trial.agreed("a street", &street, &RenderProfile::default(), street_view([240, 135]))?;
+    run.render_and_compare(
+        "a street",
+        &street,
+        &RenderProfile::default(),
+        street_view([240, 135]),
+    )?;
     Ok(())
 }
 
@@ -96,11 +103,11 @@ pub(super) const T21: Case = Case {
     number: "T21",
     what: "70 million sort keys in one frame",
     bound: "sixteen views as each of them alone, one of them as f64; or a device refuses it with the number that fits",
-    run: Run::Heavy(t21),
+    body: CaseBody::Heavy(t21),
 };
 
 /// Sixteen views of 4,400,000 Gaussians each, and each of them alone.
-fn t21(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t21(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let n = 4_400_000;
     let mut dust = Gaussians::with_capacity(0, n);
     for i in 0..n {
@@ -120,16 +127,16 @@ fn t21(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         })
         .collect();
     let profile = RenderProfile::default();
-    let together = match trial.draw_all(&scene, &profile, &views) {
+    let together = match run.render_all(&scene, &profile, &views) {
         Ok(together) => together,
-        Err(error) => return trial.refused(error),
+        Err(error) => return run.accept_limit(error),
     };
     for (index, (view, drawing)) in views.iter().zip(&together).enumerate() {
-        let alone = trial.draw(&scene, &profile, *view)?;
-        trial.holds(format!("view {index} as alone"), alone == *drawing);
+        let alone = run.render(&scene, &profile, *view)?;
+        run.check(format!("view {index} as alone"), alone == *drawing);
     }
-    let truth = trial.truth(&scene, &profile, views[7])?;
-    trial.compare("view 7", &together[7], &truth);
+    let truth = run.render_reference(&scene, &profile, views[7])?;
+    run.check_agreement("view 7", &together[7], &truth);
     Ok(())
 }
 
@@ -137,10 +144,10 @@ pub(super) const T27: Case = Case {
     number: "T27",
     what: "thousands of surfels of one facade that the camera faces head-on",
     bound: "agrees with f64: their order is that of depths, not of rounding errors",
-    run: Run::Light(t27),
+    body: CaseBody::Light(t27),
 };
 
-fn t27(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t27(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // A facade that the camera faces exactly: all depths are equal, and as sums of f32 they are not.
     let turn = DQuat::from_rotation_y(0.7) * DQuat::from_rotation_x(0.3);
     let surfels = (0..4_000).map(|i| {
@@ -159,8 +166,8 @@ fn t27(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     view.world_from_camera.position_m = DVec3::new(21.3, 17.7, 9.1);
     view.world_from_camera.rotation = turn;
     let profile = RenderProfile::default();
-    let drawing = trial.agreed("the facade", &facade, &profile, view)?;
-    trial.holds("it is covered", drawing.opacity.iter().all(|&o| o > 0.5));
+    let drawing = run.render_and_compare("the facade", &facade, &profile, view)?;
+    run.check("it is covered", drawing.opacity.iter().all(|&o| o > 0.5));
     Ok(())
 }
 

@@ -285,7 +285,7 @@ fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
     let view = passing();
     for step in 0..200 {
         let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
-        let landed = view.project_beyond(point_m, 1.0);
+        let landed = view.project_extrapolated(point_m, 1.0);
         let exposed = Rolls::LeftToRight.fraction(landed.at_px, &view.camera);
         assert!((exposed - landed.fraction).abs() < 1e-6, "{point_m}: {landed:?}");
     }
@@ -320,7 +320,8 @@ fn t22_six_points_scatter_as_a_million() {
 
     let mut random = crate::scene_files::Random(77);
     let mut normal = || {
-        let (u, v) = (random.unit().max(1e-300), random.unit());
+        let u = random.unit().max(1e-300);
+        let v = random.unit();
         (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
     };
     let samples: Vec<DVec2> = (0..200_000)

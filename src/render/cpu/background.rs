@@ -157,17 +157,15 @@ impl PerPixelRays {
 
 /// The colours of a cube map in directions of any length, by bilinear interpolation: as [`CubeMap::rgb`].
 #[inline(always)]
-fn sample_cube_map<S: Simd>(
-    simd: S,
-    map: &Arc<CubeMap>,
-    direction: Vec3x16<S>,
-) -> [f32x16<S>; 3] {
+fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) -> [f32x16<S>; 3] {
     let splat = |value: f32| f32x16::splat(simd, value);
 
     // The face: the axis with the largest magnitude, and its sign. With each face number, the coordinates
     // right and down in it, and the magnitude ahead.
     let Vec3x16 { x, y, z } = direction;
-    let (ax, ay, az) = (x.abs(), y.abs(), z.abs());
+    let ax = x.abs();
+    let ay = y.abs();
+    let az = z.abs();
     let is_x = ax.simd_ge(ay) & ax.simd_ge(az);
     let is_y = ay.simd_ge(az);
     let zero = splat(0.0);

@@ -120,7 +120,8 @@ impl Bins {
     ) -> Result<(), RenderError> {
         // One job per segment, in order of views.
         let grids: Vec<Grid> = views.iter().map(Grid::new).collect();
-        let segments_of = |view| sorted.view(view).chunks(SEGMENT).map(move |keys| Job { view, keys });
+        let segments_of =
+            |view| sorted.view(view).chunks(SEGMENT).map(move |keys| Job { view, keys });
         let jobs: Vec<Job<'_>> = (0..views.len()).flat_map(segments_of).collect();
         if self.segments.len() < jobs.len() {
             self.segments.resize_with(jobs.len(), Segment::default);

@@ -1,6 +1,6 @@
 //! The cpu backend, the default: f32, SIMD chosen at run time, all cores.
 //!
-//! Each file is a stage: [`project`], [`sort`], [`bin`], [`rasterize`], [`resolve`]. The images are
+//! Each file is a stage: `project`, `sort`, `bin`, `rasterize`, `resolve`. The images are
 //! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
 //! splats in one order. Scratch buffers are kept from frame to frame.
 

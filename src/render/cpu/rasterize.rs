@@ -123,8 +123,7 @@ fn rasterize_band<S: Simd>(
         let tile = input.bins.tile(view, row * columns as usize + column as usize);
         let at_px = [column * TILE_PX, row as u32 * TILE_PX];
         let mut sums = TileSums::default();
-        evaluations +=
-            rasterize_tile(simd, input, tile, at_px, &mut batch, &mut sums, wants_depth);
+        evaluations += rasterize_tile(simd, input, tile, at_px, &mut batch, &mut sums, wants_depth);
         if let Some(background) = background {
             background.add(simd, at_px, &mut scratch, &mut sums);
         }

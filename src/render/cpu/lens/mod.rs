@@ -103,9 +103,7 @@ impl LensProjection {
                 // The series gives radii in focal lengths.
                 let px_from_round = [[pinhole.fx as f32, 0.0], [0.0, pinhole.fy as f32]];
                 let max_error = MAX_SERIES_ERROR_PX / pinhole.fx.max(pinhole.fy);
-                Model::round(max_rad(), px_from_round, max_error, &|angle| {
-                    lens.radius().at(angle)
-                })?
+                Model::round(max_rad(), px_from_round, max_error, &|angle| lens.radius().at(angle))?
             }
             Lens::FTheta(lens) => {
                 // The series gives radii in pixels.
@@ -214,9 +212,7 @@ impl LensProjection {
                     x_px: (x.mul_add(radial, tangential_x) + prism_x).mul_add(fx, cx),
                     y_px: (y.mul_add(radial, tangential_y) + prism_y).mul_add(fy, cy),
                     // Points behind the camera are outside, and so is a NaN (a point beside it).
-                    margin: z
-                        .simd_gt(splat(0.0))
-                        .select(splat(*max_slope2) - r2, splat(-1.0)),
+                    margin: z.simd_gt(splat(0.0)).select(splat(*max_slope2) - r2, splat(-1.0)),
                 }
             }
         }

@@ -85,17 +85,12 @@ impl SimdShutter {
         remaining: f32x16<S>,
     ) -> f32x16<S> {
         let translation_m = self.translation(simd, remaining);
-        translation_m.z
-            + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
+        translation_m.z + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
     }
 
     /// How far the camera's centre has yet to move, in metres, in its frame at the end of the exposure.
     #[inline(always)]
-    pub(in crate::cpu) fn translation<S: Simd>(
-        &self,
-        simd: S,
-        remaining: f32x16<S>,
-    ) -> Vec3x16<S> {
+    pub(in crate::cpu) fn translation<S: Simd>(&self, simd: S, remaining: f32x16<S>) -> Vec3x16<S> {
         Vec3x16::splat(simd, self.translation_m).scale(remaining)
     }
 
@@ -127,12 +122,7 @@ impl SimdShutter {
     /// Rodrigues' formula without the vector itself: `sin θ (k × v) + (1 - cos θ) k × (k × v)`, with
     /// `1 - cos θ = 2 sin²(θ/2)`, which does not cancel for small angles.
     #[inline(always)]
-    fn rotation_change<S: Simd>(
-        &self,
-        simd: S,
-        v: Vec3x16<S>,
-        remaining: f32x16<S>,
-    ) -> Vec3x16<S> {
+    fn rotation_change<S: Simd>(&self, simd: S, v: Vec3x16<S>, remaining: f32x16<S>) -> Vec3x16<S> {
         let axis = Vec3x16::splat(simd, self.axis);
         let angle_rad = remaining * f32x16::splat(simd, self.rotation_rad);
         let sine = sin(simd, angle_rad);

@@ -35,10 +35,18 @@ pub(super) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<
     let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
     let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
     // Below each product holds the factor 2 of the matrix.
-    let (x2, y2, z2) = (x + x, y + y, z + z);
-    let (xx, yy, zz) = (x * x2, y * y2, z * z2);
-    let (xy, xz, yz) = (x * y2, x * z2, y * z2);
-    let (wx, wy, wz) = (w * x2, w * y2, w * z2);
+    let x2 = x + x;
+    let y2 = y + y;
+    let z2 = z + z;
+    let xx = x * x2;
+    let yy = y * y2;
+    let zz = z * z2;
+    let xy = x * y2;
+    let xz = x * z2;
+    let yz = y * z2;
+    let wx = w * x2;
+    let wy = w * y2;
+    let wz = w * z2;
     [
         Vec3x16 { x: one - yy - zz, y: xy + wz, z: xz - wy },
         Vec3x16 { x: xy - wz, y: one - xx - zz, z: yz + wx },

@@ -33,8 +33,12 @@ pub(super) fn color<S: Simd>(
         add(3, splat(-sh::C1) * x);
         if degree > 1 {
             // Degree 2: quadratic.
-            let (xx, yy, zz) = (x * x, y * y, z * z);
-            let (xy, yz, xz) = (x * y, y * z, x * z);
+            let xx = x * x;
+            let yy = y * y;
+            let zz = z * z;
+            let xy = x * y;
+            let yz = y * z;
+            let xz = x * z;
             add(4, splat(sh::C2[0]) * xy);
             add(5, splat(sh::C2[1]) * yz);
             add(6, splat(sh::C2[2]) * (zz + zz - xx - yy));

@@ -50,12 +50,8 @@ impl<S: Simd> Ellipse<S> {
         let blur = splat(blur_px2) * units_per_px * units_per_px;
 
         let minors = v0.cross(v1);
-        let moments = Moments {
-            xx: v0.dot(v0),
-            yy: v1.dot(v1),
-            xy: v0.dot(v1),
-            det: minors.dot(minors),
-        };
+        let moments =
+            Moments { xx: v0.dot(v0), yy: v1.dot(v1), xy: v0.dot(v1), det: minors.dot(minors) };
         let log2_unit = splat(LOG2_UNIT) * units_per_px;
         let ellipse = Self::from_moments(moments, blur, log2_unit);
         Self {
@@ -72,11 +68,7 @@ impl<S: Simd> Ellipse<S> {
     /// `q(dx, dy) = (dx, dy) Σ′⁻¹ (dx, dy)ᵀ = (c dx - b dy)²/(c det) + dy²/c`, and so
     /// `l0 = √c/√det`, `l1 = -b/(√c √det)` and `l2 = 1/√c`, each times `log2_unit`.
     #[inline(always)]
-    pub(super) fn from_moments(
-        moments: Moments<S>,
-        blur: f32x16<S>,
-        log2_unit: f32x16<S>,
-    ) -> Self {
+    pub(super) fn from_moments(moments: Moments<S>, blur: f32x16<S>, log2_unit: f32x16<S>) -> Self {
         let Moments { xx, yy, xy, det: det_before } = moments;
         let det = blur.mul_add(xx + yy + blur, det_before);
         let sigma_x = (xx + blur).sqrt();

@@ -251,8 +251,8 @@ fn surely_unseen<S: Simd>(
     // Out: the distance from the image is more than any splat reaches, and no point comes near the axis'
     // other end, where the lens is not continued.
     let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
-    let out_px = (least_rad - splat(bound.windshield_rad + bound.image_rad))
-        * splat(bound.least_px_per_rad);
+    let out_px =
+        (least_rad - splat(bound.windshield_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
     let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
     // Close to the camera the bounds above do not hold, and nothing is decided.
     let far = translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5));
@@ -327,7 +327,10 @@ fn project_one(
 
     // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
     let blur = f64::from(cutoffs.blur_px2);
-    let (mut xx, mut yy, mut xy, mut det_before) = (0.0, 0.0, 0.0, 0.0);
+    let mut xx = 0.0;
+    let mut yy = 0.0;
+    let mut xy = 0.0;
+    let mut det_before = 0.0;
     for (i, column_px) in root_px.iter().enumerate() {
         xx += column_px.x * column_px.x;
         yy += column_px.y * column_px.y;
