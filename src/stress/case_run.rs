@@ -232,7 +232,7 @@ impl fmt::Display for Check {
             Bound::AtMost(most) => {
                 write!(f, "{what} {}, at most {}", number(*measured), number(most))
             }
-            Bound::True if self.check() => write!(f, "{what}"),
+            Bound::True if self.holds() => write!(f, "{what}"),
             Bound::True => write!(f, "not: {what}"),
             Bound::AtLeastDb(least) => {
                 write!(f, "{what} {}, at least {}", number(*measured), number(least))

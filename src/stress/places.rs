@@ -1,4 +1,4 @@
-//! Closer than a hand, around and behind the camera, ten kilometres deep, and far from the origin.
+//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far from the origin.
 
 use glam::DVec3;
 
@@ -28,8 +28,8 @@ fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             }]);
             let what = format!("{z} m, near {near} m");
             let view = forward_view([160, 120], 1800.0);
-            let drawing = run.render_and_compare(what.clone(), &close, &profile, view)?;
-            let drawn = drawing.opacity.iter().any(|&o| o > 0.0);
+            let image = run.render_and_compare(what.clone(), &close, &profile, view)?;
+            let drawn = image.opacity.iter().any(|&o| o > 0.0);
             run.check(format!("{what}: drawn as near says"), drawn == (z > near));
         }
     }
@@ -39,7 +39,7 @@ fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T5: Case = Case {
     number: "T5",
     what: "the camera inside a Gaussian; a centre behind it",
-    bound: "agrees with f64; nothing of what is behind",
+    bound: "agrees with f64; the centre behind is not drawn",
     body: CaseBody::Light(t5),
 };
 
@@ -67,14 +67,14 @@ pub(super) const T7: Case = Case {
 };
 
 fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let mut blobs = Vec::new();
+    let mut specs = Vec::new();
     let mut centers = Vec::new();
-    // Along +x, where chunks follow each other, so that centres keep their f32.
+    // The pairs lie along +x, where each chunk holds its own part, so that centres keep their f32 values.
     for (i, x) in [0.0101_f32, 0.5, 3.0, 70.0, 1000.0, 9999.0].into_iter().enumerate() {
         let slope = (i as f64 - 2.5) * 0.3;
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
             let x = f64::from(x);
-            blobs.push(GaussianSpec {
+            specs.push(GaussianSpec {
                 mean_m: DVec3::new(x, -slope * x, 0.0),
                 sigma_m: DVec3::splat(0.02 * x),
                 rgb,
@@ -85,10 +85,10 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }
     let view = view_along([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
-    let drawing =
-        run.render_and_compare("pairs", &scene_of(&blobs), &RenderProfile::default(), view)?;
+    let image =
+        run.render_and_compare("pairs", &scene_of(&specs), &RenderProfile::default(), view)?;
     for (x, pixel) in centers {
-        let [red, green] = [0, 1].map(|channel| drawing.rgba[4 * pixel + channel]);
+        let [red, green] = [0, 1].map(|channel| image.rgba[4 * pixel + channel]);
         run.check(format!("{x} m: the nearer one is in front"), red > 0.8 && green < 0.2);
     }
     Ok(())
@@ -97,7 +97,7 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T9: Case = Case {
     number: "T9",
     what: "the twin's origin 1e4, 5e5 and 4.5e6 m away",
-    bound: "equal to the origin's within 1/255",
+    bound: "equal to the image at the origin within 1/255",
     body: CaseBody::Light(t9),
 };
 
@@ -108,7 +108,7 @@ fn t9(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let here = run.render(&Scene::from_gaussians(&near), &profile, view)?;
     run.check("something is seen", here.opacity.iter().any(|&o| o > 0.9));
     for away_m in [1e4, 5e5, 4.5e6] {
-        // Multiples of a cell, so that the chunks hold the same numbers.
+        // Multiples of a cell's size, so that the chunks hold the same numbers.
         let away = DVec3::new(1.0, -1.0, 1.0) * (away_m / 64.0_f64).round() * 64.0;
         let mut far = near.clone();
         for mean in &mut far.means_m {
@@ -125,17 +125,17 @@ fn t9(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 
 pub(super) const T10: Case = Case {
     number: "T10",
-    what: "a street 1,000 km off through the record of 32 B",
+    what: "a street 1,000 km from the origin, encoded in the record of 32 B",
     bound: "centres within half a step of 2^-16 m, drawn at 60 dB or more",
     body: CaseBody::Light(t10),
 };
 
 fn t10(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    through(run, Record::Q32)
+    encoded_street(run, Record::Q32)
 }
 
-/// A street through a record.
-fn through(run: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
+/// T10 with any record.
+fn encoded_street(run: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
     let away = DVec3::new(64.0 * 15_625.0, 64.0 * 15_625.0, 0.0);
     for mean in &mut street.means_m {
@@ -150,8 +150,8 @@ fn through(run: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
             off_m = off_m.max((chunk.value(index, column) - again.value(index, column)).abs());
         }
     }
-    // A cell is 64 m wide and its range a power of two: steps of 64 / 2^23 m, as the range is from
-    // -32 to 32 m and no wider than a cell.
+    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The bound is half a step of
+    // 128 m / 2^23 = 2^-16 m.
     run.check_at_most("centres off by m", off_m.into(), 0.5 * 128.0 / f64::from(1 << 23));
     let mut view = street_view([200, 120]);
     view.world_from_camera.position_m += away;
@@ -163,7 +163,7 @@ fn through(run: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// A camera in the middle of [`wildcity_generate::canyon`], along it.
+/// A camera in the middle of [`wildcity_generate::canyon`] that looks along it.
 pub(super) fn street_view(size_px: [u32; 2]) -> View {
     let focal_px = 0.75 * f64::from(size_px[0]);
     view_along(size_px, focal_px, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z)
@@ -177,7 +177,7 @@ mod tests {
     #[test]
     fn a_coarser_record_misses_the_bound_of_centres() {
         let mut run = CaseRun::new(&Reference);
-        through(&mut run, Record::Q24).unwrap();
+        encoded_street(&mut run, Record::Q24).unwrap();
         let missed: Vec<String> =
             run.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();
         assert!(missed.contains(&"centres off by m".to_owned()), "{missed:?}");

@@ -1,4 +1,4 @@
-//! Needles, dust, walls, and what lies beside the view.
+//! Needles, dust, walls, and Gaussians beside the view.
 
 use glam::{DQuat, DVec3};
 
@@ -12,7 +12,7 @@ use wildcity_scene::RenderProfile;
 pub(super) const T1: Case = Case {
     number: "T1",
     what: "needles of 1,000 to 10,000 px, all angles",
-    bound: "opacity within 2e-3 of f64, but for 1/255 where one finds it just below the cut; none culled",
+    bound: "opacity within 2e-3 of f64, except for 1/255 where only one finds it above the cut; none culled",
     body: CaseBody::Light(t1),
 };
 
@@ -26,12 +26,12 @@ fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
                 ..GaussianSpec::default()
             }]);
-            let drawing = run.render(&needle, &profile, view)?;
+            let image = run.render(&needle, &profile, view)?;
             let what = format!("{sigma_px} px at {degrees}°");
-            run.check(format!("{what}: seen"), drawing.opacity.iter().any(|&o| o > 0.5));
+            run.check(format!("{what}: seen"), image.opacity.iter().any(|&o| o > 0.5));
             if !run.is_reference() {
                 let truth = run.render_reference(&needle, &profile, view)?;
-                let [drawn, decided] = apart(&drawing.opacity, &truth.opacity);
+                let [drawn, decided] = apart(&image.opacity, &truth.opacity);
                 run.check_at_most(format!("{what}: opacity off by"), drawn, 2e-3);
                 run.check_at_most(format!("{what}: the cut off by"), decided, 1.01 / 255.0);
             }
@@ -40,7 +40,7 @@ fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// Largest difference where both are drawn, and where only one is.
+/// The largest difference where both opacities are above 0, and where only one is.
 fn apart(a: &[f32], b: &[f32]) -> [f64; 2] {
     let both = |(a, b): &(&f32, &f32)| (**a > 0.0) == (**b > 0.0);
     let most = |is_both: bool| {
@@ -70,9 +70,9 @@ fn t2(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 ..GaussianSpec::default()
             }]);
             let what = format!("({x}, {y}) m at {angle} rad");
-            let drawing =
+            let image =
                 run.render_and_compare(what, &long, &profile, forward_view([320, 240], 200.0))?;
-            some_seen |= drawing.opacity.iter().any(|&o| o > 0.5);
+            some_seen |= image.opacity.iter().any(|&o| o > 0.5);
         }
     }
     run.check("some reach into the image", some_seen);
@@ -82,7 +82,7 @@ fn t2(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T3: Case = Case {
     number: "T3",
     what: "splats larger than the screen",
-    bound: "agrees with f64; covers every pixel alike; once in the list of each tile",
+    bound: "agrees with f64; covers every pixel evenly; once in the list of each tile",
     body: CaseBody::Light(t3),
 };
 
@@ -92,10 +92,10 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let wall = GaussianSpec { sigma_m: DVec3::splat(sigma_m), ..GaussianSpec::default() };
         let what = format!("{sigma_m} m");
         let view = forward_view([333, 250], 300.0);
-        let drawing = run.render_and_compare(what.clone(), &scene_of(&[wall]), &profile, view)?;
-        let off = drawing.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
+        let image = run.render_and_compare(what.clone(), &scene_of(&[wall]), &profile, view)?;
+        let off = image.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
         run.check_at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
-        // Forty of them, on 4 x 5 macro tiles of a device: a whole workgroup lists them.
+        // Forty walls on the 4 x 5 macro tiles of a device, so that a whole workgroup lists them.
         let walls = (0..40_u32).map(|i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i), 0.0, 5.0 + 0.1 * f64::from(i)),
             opacity: 0.03,
@@ -105,7 +105,7 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let what = format!("forty of {sigma_m} m");
         let view = forward_view([444, 280], 300.0);
         run.render_and_compare(what.clone(), &walls, &profile, view)?;
-        // The definition has no tiles.
+        // The reference backend has no tiles.
         if !run.is_reference() {
             let tiles = 444_u32.div_ceil(TILE_PX) * 280_u32.div_ceil(TILE_PX);
             let listed = run.stats(&walls, &profile, view)?.instances;
@@ -123,7 +123,7 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T13: Case = Case {
     number: "T13",
     what: "scales of 1e-8 m, ratios of 1e6",
-    bound: "as wide as the blur: agrees with f64, a centre keeps its opacity within 1e-4",
+    bound: "as wide as the blur: agrees with f64; the opacity at the centre is kept within 1e-4",
     body: CaseBody::Light(t13),
 };
 
@@ -139,9 +139,9 @@ fn t13(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         )?;
     }
     let dust = scene_of(&[GaussianSpec { sigma_m: DVec3::splat(1e-8), ..GaussianSpec::default() }]);
-    let drawing = run.render_and_compare("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
-    // The middle of 9 px is the centre of a pixel, which has all of it.
-    let off = (drawing.opacity[4 * 9 + 4] - 0.9).abs();
+    let image = run.render_and_compare("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
+    // The middle of an image of 9 px is the centre of a pixel, where alpha is the full opacity.
+    let off = (image.opacity[4 * 9 + 4] - 0.9).abs();
     run.check_at_most("dust: its centre's opacity from 0.9", off.into(), 1e-4);
     Ok(())
 }
@@ -154,7 +154,8 @@ pub(super) const T26: Case = Case {
 };
 
 fn t26(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // 22 km long, 1 mm thin, a centimetre before a lens of 1,000 px: xx² is 1e37.
+    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal length of 1,000 px: xx²
+    // is 1e37.
     for angle in [0.0, 0.4, 0.8, 1.3] {
         let needle = scene_of(&[GaussianSpec {
             mean_m: DVec3::new(0.0, 0.0, 0.0101),
@@ -164,8 +165,8 @@ fn t26(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         }]);
         let what = format!("at {angle} rad");
         let view = forward_view([160, 120], 1000.0);
-        let drawing = run.render_and_compare(what, &needle, &RenderProfile::default(), view)?;
-        let seen = drawing.opacity.iter().any(|&o| o > 0.5);
+        let image = run.render_and_compare(what, &needle, &RenderProfile::default(), view)?;
+        let seen = image.opacity.iter().any(|&o| o > 0.5);
         run.check(format!("at {angle} rad: seen"), seen);
     }
     Ok(())
