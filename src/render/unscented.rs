@@ -27,7 +27,7 @@ use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::geometry::camera::{Cone, WIDEST_RAD};
+use wildcity_scene::geometry::camera::{FieldCone, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond the lens' field a centre may lie and still be drawn, in radians: as far as a pinhole of 62°
@@ -108,7 +108,8 @@ impl<'a> UnscentedView<'a> {
         };
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
-        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = Cone::of(&view.camera);
+        let FieldCone { image_rad, least_px_per_rad, most_px_per_rad } =
+            FieldCone::of(&view.camera);
         let cull_bound = CullBound {
             max_center_rad: max_center_angle_rad(&view.camera),
             image_rad,

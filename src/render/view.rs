@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 
@@ -22,7 +22,7 @@ pub struct View {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingShutter {
     /// In which order rows or columns are exposed.
-    pub direction: Rolls,
+    pub direction: ShutterDirection,
     /// The camera's pose when the first row or column is exposed.
     pub world_from_camera_first: Pose,
 }
@@ -100,7 +100,7 @@ impl View {
 
     /// Whether it is a pinhole at rest, without a windshield: the camera that one matrix projects.
     pub fn is_static_pinhole(&self) -> bool {
-        self.camera.is_ideal() && self.rolling_shutter.is_none()
+        self.camera.is_pinhole() && self.rolling_shutter.is_none()
     }
 
     /// The camera's pose when a place of its image, in pixels, is exposed.
@@ -158,7 +158,7 @@ impl View {
         let project_at = |fraction: f64, world_from_camera: Pose| {
             let from_camera_m = world_m - world_from_camera.position_m;
             let point_m = world_from_camera.rotation.inverse() * from_camera_m;
-            let at_px = self.camera.project_beyond(point_m);
+            let at_px = self.camera.project_extrapolated(point_m);
             ProjectedPoint { at_px, fraction, world_from_camera, point_m }
         };
         let Some(rolling_shutter) = &self.rolling_shutter else {
@@ -207,13 +207,13 @@ impl View {
         let reversed =
             |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
         let remaining = match direction {
-            Rolls::TopToBottom => [0.0, rows[0], rows[1]],
-            Rolls::BottomToTop => {
+            ShutterDirection::TopToBottom => [0.0, rows[0], rows[1]],
+            ShutterDirection::BottomToTop => {
                 let [slope, start] = reversed(rows, height_px);
                 [0.0, slope, start]
             }
-            Rolls::LeftToRight => [columns[0], 0.0, columns[1]],
-            Rolls::RightToLeft => {
+            ShutterDirection::LeftToRight => [columns[0], 0.0, columns[1]],
+            ShutterDirection::RightToLeft => {
                 let [slope, start] = reversed(columns, width_px);
                 [slope, 0.0, start]
             }

@@ -74,7 +74,7 @@ pub fn view_along(
         cy: 0.5 * f64::from(height_px),
     };
     let world_from_camera = Pose { position_m, rotation: DQuat::from_mat3(&axes).normalize() };
-    View::new(Camera::ideal(width_px, height_px, pinhole), world_from_camera)
+    View::new(Camera::from_pinhole(width_px, height_px, pinhole), world_from_camera)
 }
 
 /// A view whose image is a part of another view's image. The part may reach beyond the image's edges.

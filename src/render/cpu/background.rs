@@ -16,12 +16,12 @@ use super::resolve::{BLOCKS, TileSums, block_corner};
 use crate::constants::BLOCK_PX;
 use crate::{Frame, RenderError, View};
 use wildcity_scene::chunk::LANES;
-use wildcity_scene::sky::{CubeMap, Drawn, SKY_CUT, Scratch};
+use wildcity_scene::sky::{CubeMap, DrawableSky, SKY_CUT, Scratch};
 
 /// The background of one view.
 #[derive(Debug)]
 pub(super) struct Background {
-    sky: Drawn,
+    sky: DrawableSky,
     rays: PixelRays,
 }
 
@@ -65,8 +65,8 @@ impl Background {
     /// Scratch memory for evaluating a sky network; `None` for a cube map.
     pub(super) fn scratch(&self) -> Option<Scratch> {
         match &self.sky {
-            Drawn::Exact(network) => Some(network.scratch()),
-            Drawn::Map(_) => None,
+            DrawableSky::Network(network) => Some(network.scratch()),
+            DrawableSky::CubeMap(_) => None,
         }
     }
 
@@ -120,14 +120,14 @@ impl Background {
 
         // Colours of the sky there, weighted by the transmittance that is left.
         let rgb = match (&self.sky, scratch) {
-            (Drawn::Map(map), _) => sample_cube_map(simd, map, direction),
-            (Drawn::Exact(network), Some(scratch)) => {
+            (DrawableSky::CubeMap(map), _) => sample_cube_map(simd, map, direction),
+            (DrawableSky::Network(network), Some(scratch)) => {
                 let unit = direction.scale(splat(1.0) / direction.dot(direction).sqrt());
                 let rgb = network.rgb(simd, [unit.x, unit.y, unit.z], scratch);
                 [0, 1, 2].map(|c: usize| f32x16::load_array_ref(simd, &rgb[c]))
             }
             // `scratch` is made for every network.
-            (Drawn::Exact(_), None) => return,
+            (DrawableSky::Network(_), None) => return,
         };
         let weight = shows.select(transmittance, splat(0.0));
         for (sum, color) in sums.rgb.iter_mut().zip(rgb) {
@@ -179,7 +179,7 @@ fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) 
     let [face, right, down, ahead] = [choose(0), choose(1), choose(2), choose(3)];
 
     // The cell of texels, and the place within it.
-    let [scale, offset] = map.look_up();
+    let [scale, offset] = map.lookup_scale_offset();
     let half = splat(0.5 * scale as f32);
     let middle = splat((0.5 * scale + offset) as f32);
     let u = (right / ahead).mul_add(half, middle);

@@ -85,11 +85,11 @@ impl LensProjection {
         let model = match lens {
             // A pinhole behind a windshield or in motion: slopes without a distortion.
             Lens::Pinhole => {
-                let max_slope2 = view.camera.straight_slope().powi(2) as f32 * INSIDE;
+                let max_slope2 = view.camera.extrapolation_slope().powi(2) as f32 * INSIDE;
                 Model::Slopes { focal_px, k: [0.0; 6], p: [0.0; 2], s: [0.0; 4], max_slope2 }
             }
             Lens::OpenCv(lens) => {
-                let max_slope = view.camera.straight_slope().min(lens.limit_slope());
+                let max_slope = view.camera.extrapolation_slope().min(lens.limit_slope());
                 let max_slope2 = (max_slope * max_slope) as f32;
                 Model::Slopes {
                     focal_px,
@@ -250,7 +250,7 @@ mod tests {
     use glam::{DMat3, DQuat, DVec2, DVec3};
     use wildcity_scene::Rig;
     use wildcity_scene::geometry::Pose;
-    use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, Rolls};
+    use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, ShutterDirection};
 
     /// The cameras of two real rigs (one is behind a windshield) and one camera of each other model, each
     /// with its name and how many of 4,000 directions up to the end of its field must be found within it.
@@ -260,7 +260,8 @@ mod tests {
         let mut cameras: Vec<_> =
             real.map(|mounted| (mounted.name, mounted.camera, 3_800)).collect();
         let windshield = cameras.iter().find_map(|(_, camera, _)| camera.windshield);
-        let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+        let ideal =
+            Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
         let k = [-0.12, 0.03, -0.002, 0.01, 0.002, 0.0005];
         let p = [0.0015, -0.001];
         let opencv = Lens::opencv(OpenCv::new(k, p, [0.001, -0.0005, -0.0008, 0.0004]));
@@ -283,7 +284,7 @@ mod tests {
             position_m: pose.rotation * DVec3::new(-0.05, 0.0, -0.9),
             rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
         };
-        let direction = Rolls::BottomToTop;
+        let direction = ShutterDirection::BottomToTop;
         [
             at_rest,
             View {

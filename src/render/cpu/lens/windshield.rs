@@ -94,7 +94,7 @@ pub(super) fn fades_within_image(camera: &Camera) -> bool {
         let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
         let in_full = at_px.is_some_and(|at_px| {
             camera.unproject(at_px).is_some_and(|outside| {
-                let found = camera.project_beyond(outside).distance(at_px) < 1e-6;
+                let found = camera.project_extrapolated(outside).distance(at_px) < 1e-6;
                 // The margin of 0.02 covers what lies between two of the 32.
                 found && outside.z >= full_z + 0.02
             })
