@@ -76,8 +76,8 @@ fn each_model_is_its_formula() {
                 let polynomial =
                     |t: f64| (0..6).map(|i| lens.polynomial()[i] * t.powi(i as i32)).sum::<f64>();
                 let radius_px = match lens.reference() {
-                    Reference::AngleToPixel => polynomial(theta),
-                    Reference::PixelToAngle => {
+                    FThetaReference::AngleToPixel => polynomial(theta),
+                    FThetaReference::PixelToAngle => {
                         let mut low = 0.0;
                         let mut high = 200.0;
                         for _ in 0..100 {
