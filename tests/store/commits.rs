@@ -326,7 +326,8 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
     let said = twice.put(&gaussians(9, 2, 1.0, 1), None, &mut |_, _| {}).unwrap_err().to_string();
     assert_eq!(
         said,
-        "sh_degree is 2, but twin \"street\" has 0: store them so, or replace the whole twin"
+        "sh_degree is 2, but twin \"street\" has 0: store the Gaussians with 0, or replace \
+         the whole twin"
     );
     drop(twice);
 

@@ -111,7 +111,7 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
     let mut profile = street(&good).profile;
     profile.blur = f64::NAN;
     let cases = [
-        (NewVersion { name: "../etc", ..street(&good) }, "\"../etc\" is not a name of a twin"),
+        (NewVersion { name: "../etc", ..street(&good) }, "\"../etc\" cannot be the name of a twin"),
         (street(&bad), "Gaussian 3: ln_scales[2] is NaN"),
         (NewVersion { profile, ..street(&good) }, "profile field blur is NaN"),
         (NewVersion { trajectories: vec![empty], ..street(&good) }, "has no keyframes"),
