@@ -85,7 +85,7 @@ fn what_is_no_frame_is_refused_with_the_reason() {
     let refused = |axes: &str| axes.parse::<Axes>().unwrap_err().to_string();
     assert!(refused("sideways").contains("y-down-z-forward (OpenCV"), "{}", refused("sideways"));
     assert!(refused("1 0 0 0 1 0 0 0").contains("nine numbers"));
-    assert!(refused("2 0 0 0 1 0 0 0 1").contains("length 1 and at right angles"));
+    assert!(refused("2 0 0 0 1 0 0 0 1").contains("length 1 and be at right angles"));
     assert!(refused("1 0 0 1 0 0 0 0 1").contains("at right angles"));
     assert!(refused("NaN 0 0 0 1 0 0 0 1").contains("at right angles"));
     for scale in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e9] {

@@ -113,7 +113,7 @@ fn camera_lists_say_what_is_wrong() {
     assert!(hidden.ends_with("not starting with ."), "{hidden}");
     for field in ["shutter", "exposure", "overlay"] {
         let of_rigs = refusal(good.replacen('{', &format!("{{\"{field}\": {{}}, "), 1));
-        assert!(of_rigs.starts_with("camera \"a\": a camera list has no "), "{of_rigs}");
+        assert!(of_rigs.starts_with("camera \"a\": a camera in a list has no "), "{of_rigs}");
         assert!(of_rigs.contains(&format!("leave {field} out")), "{of_rigs}");
     }
     assert_eq!(refusal("[]".into()), "the camera list is empty");
@@ -155,8 +155,8 @@ fn a_ply_header_that_means_nothing_is_named_by_line() {
         (changed("float y", "list uchar int y"), "line 6: \"property list uchar int y\": lists"),
         (changed("float y", "half y"), "line 6: \"half\" is not a type"),
         (changed("float y", "float x"), "line 6: property x occurs twice"),
-        (changed("float y", "float y y"), "line 6: \"property float y y\" means nothing"),
-        (changed("element vertex 0\n", ""), "line 4: a property comes after its element"),
+        (changed("float y", "float y y"), "line 6: \"property float y y\" is unknown in a header"),
+        (changed("element vertex 0\n", ""), "line 4: there is no element before the property"),
         (changed("element vertex", "element point"), "end: there is no element vertex"),
         (changed("format binary_little_endian 1.0\n", ""), "end: there is no line format"),
         (changed("property float rot_2\n", ""), "element vertex: there is no property rot_2"),

@@ -143,9 +143,9 @@ fn nodes_turn_scale_and_move_splats() {
     assert_alike(&read, &wanted, within, "node");
 
     let text = refusal(&glb(gltf(&g, r#","scale":[1,2,1]"#, "")));
-    assert!(text.starts_with("glTF header, node 0: its matrix is no rotation"), "{text}");
+    assert!(text.starts_with("glTF header, node 0: its matrix is not a rotation"), "{text}");
     let text = refusal(&glb(gltf(&g, r#","children":[0]"#, "")));
-    assert_eq!(text, "glTF header, node 0: is reached twice; a tree has one way to each");
+    assert_eq!(text, "glTF header, node 0: is reached twice; in a tree, each node has one parent");
 }
 
 #[test]

@@ -93,7 +93,10 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
             changed(spz4(&g), 44, &(1u64 << 60).to_le_bytes()),
             "SPZ body: the header promises 1152921",
         ),
-        (changed(spz4(&g), 16, &huge), "SPZ header, bytes 16 to 19: 4294967295 is no place"),
+        (
+            changed(spz4(&g), 16, &huge),
+            "SPZ header, bytes 16 to 19: the table cannot be at 4294967295",
+        ),
         (changed(ksplat(&g, 0), 4, &huge), ".ksplat body: the header promises 4398046514176 bytes"),
         (
             changed(ksplat(&g, 0), 4096, &huge),
@@ -125,7 +128,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
         ),
         (
             json(r#""bufferView":0"#, r#""bufferView":99"#),
-            "accessor 0 has no bufferView that is there",
+            "accessor 0 has no bufferView that exists",
         ),
         (
             json(r#""buffer":0"#, r#""buffer":0,"byteStride":4"#),
@@ -138,7 +141,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
         ),
         (
             json(r#""kernel":"ellipse""#, r#""extensions":{"KHR_x_compression_spz_2":{}}"#),
-            "is packed by KHR_x_compression_spz_2",
+            "is compressed by KHR_x_compression_spz_2",
         ),
     ] {
         let text = refusal(&file);
@@ -230,7 +233,7 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
         ),
         (
             meta(r#""file":1,"offset":0"#, r#""file":1,"offset":1"#),
-            "SOG header, lod-meta.json: two leaves have",
+            "SOG header, lod-meta.json: two leaves share",
         ),
         (meta(r#""offset":20"#, r#""offset":26"#), "SOG header, lod-meta.json: Gaussians to 46 of"),
         (
@@ -319,6 +322,9 @@ fn a_splat_is_told_by_its_first_record() {
     for text in
         ["0.1234 0.5678 0.9012 0.3456 0.7890 0.1234", "id;x;y;z;opacity;1;2;3;4;5;6;7;8;9;10"]
     {
-        assert!(refusal(text.as_bytes()).contains("as no format does that is read"), "{text}");
+        assert!(
+            refusal(text.as_bytes()).contains("which is none of the formats that can be read"),
+            "{text}"
+        );
     }
 }

@@ -111,7 +111,7 @@ fn what_is_wrong_with_a_mesh_is_said() {
         refusal(&file)
     };
     // Two bytes pad 102 to 104.
-    assert!(with(3, &[4]).contains("a corner of [0, 2, 4] is not there"));
+    assert!(with(3, &[4]).contains("a corner of [0, 2, 4] does not exist"));
     let nowhere = with(104, &f32::NAN.to_le_bytes().repeat(12));
     assert!(nowhere.contains("neither splats nor triangles with an area"), "{nowhere}");
 }

@@ -195,7 +195,7 @@ fn six_images_of_a_folder() {
 #[test]
 fn images_that_cannot_be_are_refused() {
     let said = read(&png(&RgbImage::new(50, 40)), None).unwrap_err();
-    assert!(said.contains("50 x 40 pixels are neither a panorama"), "{said}");
+    assert!(said.contains("50 x 40 pixels are not a panorama"), "{said}");
     let side = CubeMap::MAX_SIDE_PX as u32 + 1;
     let said = read(&png(&RgbImage::new(side, 6 * side)), None).unwrap_err();
     assert!(said.contains("1537 pixels wide; 1 to 1536"), "{said}");

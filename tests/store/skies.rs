@@ -144,7 +144,7 @@ fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
     let image = SkyBytes { image: Some(0), ..sky_bytes(1) };
     for (sky, wanted) in [
         (sharp, "set sky_error to"),
-        (garbage, "it is no safetensors file, no PNG and no JPEG"),
+        (garbage, "it is not a safetensors file, a PNG, or a JPEG"),
         (image, "there is no image 0"),
     ] {
         let new = NewVersion { sky: Some(NewSky::Put(sky)), ..street(&scene) };

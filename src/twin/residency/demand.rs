@@ -24,7 +24,7 @@ pub struct SectionRef {
     pub section: usize,
 }
 
-/// The coarsest level of a block whose error is at most `tau_px` pixels from a distance, as an index into the
+/// The coarsest level of a block with an error of at most `tau_px` pixels at a distance, as an index into the
 /// block's sections in order of level.
 pub(super) fn coarsest_level(
     block: &[Section],

@@ -25,7 +25,7 @@ pub(super) struct Requests<C> {
     /// until the section is loaded.
     queue: BTreeMap<QueueKey, SectionRef>,
     requests: BTreeMap<u64, Request<C>>,
-    /// Sections whose last load failed.
+    /// Sections with a failed last load.
     failures: BTreeMap<SlotId, RetryState>,
     /// Number of requests so far. It numbers requests, and is the time of last use of their sections.
     number: u64,
@@ -80,7 +80,7 @@ struct Frame<C> {
     missing: usize,
 }
 
-/// A section whose load failed and is tried again.
+/// A failed load that is tried again.
 struct RetryState {
     attempts: u32,
     not_before: Instant,

@@ -17,9 +17,9 @@ pub struct FsckReport {
     pub gaps: Vec<u64>,
     /// Records that cannot be read.
     pub records: Vec<(u64, StoreError)>,
-    /// Versions whose objects garbage collection removed.
+    /// Versions that garbage collection removed the objects of.
     pub collected: Vec<u64>,
-    /// ObjectBackend that no version names: garbage, or of a commit that runs.
+    /// Objects that no version names: garbage, or of a running commit.
     pub unreferenced: ObjectTotals,
     /// Whether there is staging of a running or killed commit.
     pub staging: bool,
@@ -28,7 +28,7 @@ pub struct FsckReport {
 /// The result of re-reading objects.
 #[derive(Debug)]
 pub struct VerifyReport {
-    /// ObjectBackend that were compared with their hashes.
+    /// Number of objects that were compared with their hashes.
     pub objects: usize,
     /// Total size of the chunks, in bytes, according to the manifests.
     pub bytes: u64,
@@ -57,15 +57,15 @@ impl Catalog {
     /// and what is left over. `progress` gets the bytes done and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. DamagedObject is no error: it
-    /// is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. Damage is no error, but part of
+    /// the result.
     pub fn fsck(
         &self,
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<FsckReport, StoreError> {
         check_name(name)?;
-        // ListedObject first, so that what is committed meanwhile is not taken for left over.
+        // Listed first, so that objects committed meanwhile are not reported as left over.
         let listed = self.objects.list_objects(name)?;
         let numbers = self.numbers(name)?;
         let present: BTreeSet<u64> = numbers.iter().copied().collect();
@@ -100,7 +100,8 @@ impl Catalog {
     /// and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. DamagedObject is no error: it is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error, but part of
+    /// the result.
     pub fn verify(
         &self,
         name: &str,

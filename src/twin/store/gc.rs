@@ -30,29 +30,29 @@ pub struct Retention {
 /// The result of a garbage collection.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct CollectionReport {
-    /// Versions whose objects are kept, ascending: the latest ones, and older ones in use.
+    /// Versions that are kept, ascending: the latest ones, and older ones in use.
     pub kept: Vec<u64>,
-    /// ObjectBackend that were removed.
+    /// Objects that were removed.
     pub removed: ObjectTotals,
-    /// ObjectBackend that are garbage, and may be removed after the grace period.
+    /// Objects that are garbage, and may be removed after the grace period.
     pub noted: ObjectTotals,
 }
 
 /// A number of objects, and their total size.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ObjectTotals {
-    /// ObjectBackend.
+    /// Number of objects.
     pub objects: u64,
     /// Their total size, in bytes.
     pub bytes: u64,
 }
 
-/// ObjectBackend that are garbage, by hash, and when they were first found to be, in microseconds since 1970.
+/// Objects that are garbage, by hash, with the time when they were first found to be, in microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
 /// The side file with the candidates.
 const CANDIDATES: &str = "gc/candidates";
-/// The side file with the versions whose objects were removed.
+/// The side file with the versions that were removed.
 const COLLECTED: &str = "gc/collected";
 
 /// What a run does.
@@ -61,7 +61,7 @@ struct CollectionPlan {
     collected: CollectionReport,
     candidates: Candidates,
     remove: Vec<String>,
-    /// Versions whose objects are removed.
+    /// Versions that lose objects.
     gone: BTreeSet<u64>,
 }
 
@@ -122,7 +122,7 @@ impl Catalog {
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
     }
 
-    /// Versions whose objects were removed.
+    /// Versions that lost objects to garbage collection.
     pub(super) fn collected(&self, name: &str) -> Result<BTreeSet<u64>, StoreError> {
         self.read_side_json(name, COLLECTED)
     }

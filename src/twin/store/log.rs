@@ -44,8 +44,8 @@ impl std::fmt::Display for CommitKind {
     }
 }
 
-/// A record of the log, stored as JSON. How a version came about is here and not in the manifest, whose hash depends
-/// on its content alone.
+/// A record of the log, stored as JSON. How a version came about is here and not in the manifest, because the hash of a
+/// manifest depends on the content of the version alone.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LogRecord {

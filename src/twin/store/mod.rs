@@ -5,7 +5,7 @@
 //! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks, and skies, named by their BLAKE3
 //! <twins>/<name>/leases/...             versions in use, and until when
 //! <twins>/<name>/gc/candidates          objects that no kept version needs, and since when
-//! <twins>/<name>/gc/collected           versions whose objects were removed
+//! <twins>/<name>/gc/collected           versions that were removed
 //!
 //! <twins>/.staging/<name>@<commit>/     objects of a commit in preparation, invisible to readers
 //! <twins>/.staging/<name>@<commit>/lock locked by the commit's process as long as the process lives

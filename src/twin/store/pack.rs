@@ -16,7 +16,7 @@ use super::StoreError;
 use super::backend::Staging;
 use super::chunk_file::{self, ChunkHeader, LevelOfBlock, PackedSection};
 
-/// The fewest Gaussians whose blocks are packed in parallel: enough to occupy all cores, and few compared with a scene.
+/// The smallest batch of Gaussians that is packed in parallel: enough to occupy all cores, and few compared with a scene.
 const BATCH_GAUSSIANS: usize = 1 << 16;
 
 /// How Gaussians are stored.

@@ -26,7 +26,7 @@ pub enum NewSky {
 pub struct SkyBytes {
     /// The bytes that [`sky::decode`] reads.
     pub bytes: Arc<[u8]>,
-    /// The training image whose appearance it is drawn with, as an index; the mean of all if `None`.
+    /// Index of the training image with the appearance that it is drawn in; the mean of all if `None`.
     pub image: Option<u32>,
     /// Rotates directions in the world to the sky's own axes; orthonormal.
     pub sky_from_world: DMat3,

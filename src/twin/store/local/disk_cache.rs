@@ -22,7 +22,7 @@ use crate::store::layout::{check_hash, is_hash};
 
 use super::files::{WRITING, create_dirs, entries};
 
-/// A part whose modification time is older than this gets a new one when it is used.
+/// A part gets a new modification time when it is used and the old one is older than this.
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
 /// Age after which an unfinished file is taken for one that a killed process left.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);

@@ -2,7 +2,7 @@
 
 use std::io::ErrorKind;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use object_store::path::Path as Key;
@@ -137,7 +137,7 @@ impl Remote {
             let bytes = read()?;
             match check_hash(&bytes, hash) {
                 Ok(()) => return Ok(bytes),
-                Err(_) if tries < limits::SOUND_TRIES => {
+                Err(_) if tries < limits::VERIFIED_READ_TRIES => {
                     self.runner.count(RequestCounter::Retry);
                     tries += 1;
                 }
