@@ -5,9 +5,9 @@ use serde::Serialize;
 use super::ReportError;
 use super::measure::{Measurement, SampleResult, least};
 use super::settings::{Family, Sent};
-use wildcity_render::compare::numbers::number;
+use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -52,7 +52,7 @@ pub struct EncodingCost {
     /// Whether sessions get their images so unless they ask for another encoding.
     pub by_default: bool,
     /// Least PSNR of a window at any place, in dB, of what arrives.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub least_db: f64,
     /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
     /// chance can make it less than 0.
@@ -155,7 +155,7 @@ impl Recommendation {
     ///
     /// # Errors
     /// Names the change that cannot be made.
-    pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
+    pub fn changes(&self) -> Result<ProfileOverrides, ProfileError> {
         let mut profile = RenderProfile::default();
         self.profile.iter().try_for_each(|change| profile.set(change))?;
         let bad =
@@ -167,7 +167,7 @@ impl Recommendation {
             let value = all.get(key).ok_or_else(|| bad(key, "it is not written".to_owned()))?;
             Ok((key.to_owned(), value.clone()))
         };
-        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileChanges::new)
+        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileOverrides::new)
     }
 
     /// What starts a server that draws so, with the profile in a file.

@@ -1,4 +1,5 @@
-//! One scene, a skull, in every format: each Gaussian is within the steps of the format, and images reach a PSNR.
+//! One scene, a skull, in every format: each Gaussian is within the steps of the format, and images
+//! reach a PSNR.
 
 use std::collections::HashMap;
 
@@ -8,7 +9,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 use wildcity_twin::ingest::{self, Axes};
 
 use crate::data;
-use crate::images::{cpu, look, psnr, render};
+use crate::images::{cpu, psnr, render, view_along};
 
 /// Tolerances to the original's numbers.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +41,8 @@ const KHR: &str = "-1 0 0 0 -1 0 0 0 1";
 
 #[test]
 fn splat() {
-    // f32 positions and scales; bytes that were truncated, not rounded. Colours are clamped to 0 and 1.
+    // f32 positions and scales; bytes that were truncated, not rounded. Colours are clamped to 0
+    // and 1.
     let steps = Steps {
         mean_m: 0.0,
         quat: 1.5 / 128.0,
@@ -80,7 +82,8 @@ fn spz() {
             }
         },
     };
-    // The largest component follows from the others, so it is off by three times as much where all are 0.5.
+    // The largest component follows from the others, so it is off by three times as much where all
+    // are 0.5.
     let three = Steps { quat: 3.0 * 0.51 * 0.7072 / 511.0, ..two };
     for (file, axes, steps) in [
         ("skull.rub.v2.spz", RUB, two),
@@ -186,7 +189,8 @@ fn ksplat() {
             dc.for_each(|c| *c = c.clamp(-1.7725, 1.7725));
         },
     };
-    // Colours above 1 before the higher degrees darken them, a fifth of all blue values, are clamped to 1.
+    // Colours above 1 before the higher degrees darken them, a fifth of all blue values, are
+    // clamped to 1.
     check(
         "skull_small.c0.sh2.ksplat",
         SAME,
@@ -331,7 +335,7 @@ fn losses_db(read: &Gaussians, original: &Gaussians) -> Vec<f64> {
     let views = [DVec3::new(0.0, 0.0, -1.0), DVec3::new(0.8, -0.5, -0.4)].map(|side| -> View {
         let centre_m = DVec3::new(0.0, -0.53, 0.04);
         let forward = -side.normalize();
-        look([480, 480], 480.0, centre_m - 2.2 * forward, forward, DVec3::Y)
+        view_along([480, 480], 480.0, centre_m - 2.2 * forward, forward, DVec3::Y)
     });
     let profile = RenderProfile { near: 0.2, ..RenderProfile::default() };
     let images =

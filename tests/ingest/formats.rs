@@ -1,4 +1,5 @@
-//! Scenes written by small writers of every format are read back, within the precision of the format.
+//! Scenes written by small writers of every format are read back, within the precision of the
+//! format.
 
 use wildcity_scene::Gaussians;
 use wildcity_twin::ingest;
@@ -81,7 +82,8 @@ fn spz_comes_back() {
             dc: 0.0131,
             sh: 0.0079,
         };
-        // w follows from x, y, z and length 1: where it is nearly 0, it is off by √(2 √3 0.5/127.5).
+        // w follows from x, y, z and length 1: where it is nearly 0, it is off by √(2 √3
+        // 0.5/127.5).
         let two = Within { quat: 0.118, ..within };
         for (name, file, within) in [
             ("2", gzip(&spz_plain(&g, 2)), two),
@@ -175,7 +177,8 @@ fn sog_comes_back_as_folder_and_archive() {
     }
 }
 
-/// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an environment.
+/// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an
+/// environment.
 pub(crate) fn streamed() -> Files {
     let place = |file: usize, offset: usize, count: usize| {
         format!(r#"{{"file":{file},"offset":{offset},"count":{count}}}"#)

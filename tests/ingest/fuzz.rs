@@ -1,7 +1,8 @@
 //! Arbitrary and nearly valid bytes never cause a panic or an absurd allocation.
 //!
 //! [`every_parser_survives_what_chance_makes`] is the fuzz target of every parser: it damages the
-//! corpus, one small scene per format and a mesh, beneath checksums. It runs for a second by default; to run it for a night:
+//! corpus, one small scene per format and a mesh, beneath checksums. It runs for a second by
+//! default; to run it for a night:
 //!
 //! ```text
 //! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release --test ingest chance
@@ -144,7 +145,8 @@ fn every_parser_survives_what_chance_makes() {
                 Ok(g) => {
                     let colours = 3 * wildcity_scene::sh::coefficients(g.sh_degree);
                     assert_eq!(g.sh.len(), g.len() * colours);
-                    // A mesh always gets the full number of Gaussians, however small its surface is.
+                    // A mesh always gets the full number of Gaussians, however small its surface
+                    // is.
                     let most = if case.name == "mesh" { 210_000 } else { 10_000 };
                     assert!(g.len() < most, "{} Gaussians", g.len());
                 }

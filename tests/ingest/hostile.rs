@@ -27,7 +27,8 @@ fn files_truncated_anywhere_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         case.write(dir.path());
         for (part, (name, bytes)) in case.files.iter().enumerate() {
-            // Small files are cut at every byte; larger ones at some, at varying offsets within words.
+            // Small files are cut at every byte; larger ones at some, at varying offsets within
+            // words.
             for end in (0..bytes.len()).step_by((bytes.len() / 40) | 1) {
                 // One record less is a smaller scene, because the format has no count.
                 let is_whole = case.name == ".splat" && end > 0 && end % 32 == 0;

@@ -1,4 +1,5 @@
-//! Reading formats of other programs: what is written is read back, and damage is refused with an error that names it.
+//! Reading formats of other programs: what is written is read back, and damage is refused with an
+//! error that names it.
 
 #[path = "../support/data.rs"]
 mod data;

@@ -7,8 +7,9 @@ use wildcity_twin::ingest;
 use crate::format_files::glb;
 use crate::{data, read, refusal};
 
-/// A square of 2 m at z = 1 with red and green at the left corners and blue at the right ones, of two
-/// triangles with indices; `primitive` and `more` are JSON within the primitive and the document.
+/// A square of 2 m at z = 1 with red and green at the left corners and blue at the right ones, of
+/// two triangles with indices; `primitive` and `more` are JSON within the primitive and the
+/// document.
 pub(crate) fn square(primitive: &str, more: &str) -> Vec<u8> {
     let positions: [[f32; 3]; 4] =
         [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]];
@@ -116,7 +117,8 @@ fn errors_of_meshes_name_the_cause() {
     assert!(nowhere.contains("neither splats nor triangles with an area"), "{nowhere}");
 }
 
-/// Many slivers without area, and as long as possible, beside a square. None of them becomes a Gaussian.
+/// Many slivers without area, and as long as possible, beside a square. None of them becomes a
+/// Gaussian.
 #[test]
 fn slivers_take_no_memory() {
     let mut sliver = square("", "");

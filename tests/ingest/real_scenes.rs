@@ -190,7 +190,8 @@ fn every_component_type_of_gltf_is_read() {
         assert!(g.means_m.iter().all(|m| *m == [1.0, 2.0, 3.0]));
         // x alone, as f32 and as normalised i8 and i16.
         assert!(g.quats_wxyz.iter().all(|q| *q == [0.0, 1.0, 0.0, 0.0]));
-        // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised i16.
+        // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised
+        // i16.
         let scales = [[0.2, -0.1, 0.7], [1., -2., 3.], [1., 0., -1.], [2., -3., 4.], [1., 0., -1.]];
         assert_eq!(g.ln_scales[3..8], scales);
         let opacities = g.logit_opacities.iter().map(|logit| 1.0 / (1.0 + (-logit).exp()));

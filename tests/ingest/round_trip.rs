@@ -99,7 +99,8 @@ fn progress_ends_at_the_file_size() {
 fn the_hash_is_that_of_the_bytes_that_were_read() {
     let scene = gaussians(20_000, 1, 1.0, 6);
     let mut tensors = gsplat_tensors(&scene);
-    // Tensors in another order than they are needed, with unknown ones in the middle and at the end.
+    // Tensors in another order than they are needed, with unknown ones in the middle and at the
+    // end.
     tensors.reverse();
     tensors.insert(2, ("step", vec![1], vec![30_000.0]));
     tensors.push(("seed", vec![3], vec![1.0; 3]));

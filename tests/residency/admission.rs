@@ -119,7 +119,8 @@ fn the_end_of_a_frame_makes_room_at_once() {
         while cache.stats().waits == before {
             std::thread::yield_now();
         }
-        // Time for the loader to find that there is no room, and to sleep. (A loader that is late finds room.)
+        // Time for the loader to find that there is no room, and to sleep. (A loader that is late
+        // finds room.)
         std::thread::sleep(wildcity_twin::limits::ROOM_POLL / 4);
         let dropped = Instant::now();
         drop(first);

@@ -1,4 +1,5 @@
-//! The drawn sections are a function of the pose: the amount of memory changes when a frame is drawn, never its pixels.
+//! The drawn sections are a function of the pose: the amount of memory changes when a frame is
+//! drawn, never its pixels.
 
 use wildcity_scene::RenderProfile;
 use wildcity_twin::residency::{BlockIndex, Cache, Resident, RigExtent, demand};

@@ -1,4 +1,5 @@
-//! A section that cannot be read stops only the frames that need it, and only for as long as it cannot be read.
+//! A section that cannot be read stops only the frames that need it, and only for as long as it
+//! cannot be read.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};

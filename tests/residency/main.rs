@@ -1,5 +1,5 @@
-//! Streaming: a frame is the same whatever is in memory, and no failure, wait, or race of one session stops the
-//! others.
+//! Streaming: a frame is the same whatever is in memory, and no failure, wait, or race of one
+//! session stops the others.
 
 #[path = "../support/city.rs"]
 mod city_twin;

@@ -64,7 +64,8 @@ fn versions_share_the_memory_of_common_sections() {
     let changed = new.chunks.iter().find(|c| !old.chunks.iter().any(|o| Arc::ptr_eq(o, c)));
     assert_eq!(cache.stats().held_bytes - old_bytes, changed.unwrap().bytes() as u64);
 
-    // The old version is unchanged, and a version that is opened again finds its sections in memory.
+    // The old version is unchanged, and a version that is opened again finds its sections in
+    // memory.
     let loads = cache.stats().loads;
     drop((old, first, new, second));
     let again = all_of(&cache.open("street", Some(1)).unwrap());

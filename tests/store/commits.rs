@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
 use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
     Version, VersionChange, VersionSettings,
@@ -11,7 +11,7 @@ use wildcity_twin::store::{
 use crate::scene_files::gaussians;
 use crate::support::{commit, files, street, turn};
 
-const EXACT: StorageOptions = StorageOptions { record: Record::F32, levels: false };
+const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels: false };
 
 /// The settings of `street`.
 fn settings() -> VersionSettings {
@@ -214,7 +214,8 @@ fn a_whole_version_replaces_nothing_that_changed_since_its_base() {
     // Cells that were changed back equal the base.
     assert_eq!(catalog.rollback("street", 1).unwrap().hash, first.hash);
     assert_eq!(unaware.replace(Some(1), same).unwrap().number, 4);
-    // Without a base, the latest version is replaced, whatever it contains; so it is with the latest as base.
+    // Without a base, the latest version is replaced, whatever it contains; so it is with the
+    // latest as base.
     let (commit, settings) = whole(&catalog, Some("near=0.4"));
     assert_eq!(commit.replace(None, settings).unwrap().number, 5);
     let (commit, settings) = whole(&catalog, Some("near=0.5"));

@@ -75,7 +75,8 @@ fn one_flipped_bit_anywhere_in_a_chunk_is_found() {
     let hash = twin.version.manifest.chunks[2].object.clone();
     let path = twin.object(&hash);
     let size = fs::metadata(&path).unwrap().len() as usize;
-    // Magic, format, the table's length, hash, and padding, and the table itself: drawing does not need them.
+    // Magic, format, the table's length, hash, and padding, and the table itself: drawing does not
+    // need them.
     for byte in [0, 8, 12, 17, 4000, 4096, 4500] {
         flip(&path, byte);
         twin.assert_verify_finds(&hash);

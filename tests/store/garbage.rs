@@ -116,7 +116,8 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
-/// Holds in a directory. In an object store, only the grace period protects objects that no version names yet.
+/// Holds in a directory. In an object store, only the grace period protects objects that no version
+/// names yet.
 #[test]
 fn a_commit_in_preparation_is_not_disturbed() {
     let place = Place::Directory(tempfile::tempdir().unwrap());

@@ -1,4 +1,5 @@
-//! An object store that fails: time-outs, retries, and the difference between a failing store and a lost object.
+//! An object store that fails: time-outs, retries, and the difference between a failing store and a
+//! lost object.
 
 use std::time::{Duration, Instant};
 
@@ -26,8 +27,9 @@ fn a_commit_with_a_lost_answer_is_committed_once() {
     let s3 = S3::start();
     let catalog = s3.catalog();
     commit(&catalog, &gaussians(200, 0, 20.0, 1)).unwrap();
-    // The answer is lost in several ways: the connection breaks, or a proxy answers with an error. A change
-    // of cells that another commit changed since would be refused; here, the other commit is this one's first attempt.
+    // The answer is lost in several ways: the connection breaks, or a proxy answers with an error.
+    // A change of cells that another commit changed since would be refused; here, the other commit
+    // is this one's first attempt.
     let faults = [Fault::AnswerLost, Fault::Denied(500), Fault::Denied(409), Fault::Denied(412)];
     for (base, fault) in (1..).zip(faults) {
         s3.fail("PUT", "street/log/", 1, fault);
@@ -41,7 +43,8 @@ fn a_commit_with_a_lost_answer_is_committed_once() {
 fn a_failed_put_of_a_record_is_retried() {
     let s3 = S3::start();
     let catalog = s3.catalog();
-    // 409: another client writes the same key at this moment. It is unknown which one wins; here, neither does.
+    // 409: another client writes the same key at this moment. It is unknown which one wins; here,
+    // neither does.
     for (number, status) in (1..).zip([500, 503, 409, 412]) {
         s3.fail("PUT", "street/log/", 2, Fault::Status(status));
         let version = commit(&catalog, &gaussians(200, 0, 20.0, number)).unwrap();

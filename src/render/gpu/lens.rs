@@ -9,11 +9,12 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growing::Growing;
 use super::layout::Lens;
-use crate::unscented::widest_rad;
-use crate::view::StillToCome;
+use crate::unscented::max_center_angle_rad;
+use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
 use wildcity_scene::geometry::camera::{
-    self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
+    self, FTheta, FThetaReference, Fisheye, MonotonePolynomial, OpenCv, Windshield,
+    WindshieldReference,
 };
 
 /// The views' lenses on the device.
@@ -25,11 +26,13 @@ pub(super) struct Lenses {
 impl Lenses {
     /// Sends what a frame's views have; nothing, where all are pinholes at rest.
     pub(super) fn hold(&mut self, device: &Device, frame: &Frame<'_>) {
-        if frame.views.iter().all(View::is_ideal) {
+        if frame.views.iter().all(View::is_static_pinhole) {
             return;
         }
         let mut lenses = [Lens::zeroed(); MAX_VIEWS];
-        for (lens, view) in lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_ideal()) {
+        for (lens, view) in
+            lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_static_pinhole())
+        {
             *lens = Lens::of(view);
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
@@ -50,16 +53,16 @@ impl Lens {
         let mut lens = Self {
             center_px: [pinhole.cx as f32, pinhole.cy as f32],
             linear: columns(DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy))),
-            widest_rad: widest_rad(camera) as f32,
+            widest_rad: max_center_angle_rad(camera) as f32,
             by_distance: camera.depth_is_distance().into(),
             bent: 1,
             ..Self::zeroed()
         };
         match &camera.lens {
-            camera::Lens::Pinhole => lens.set_end(camera.straight_slope()),
+            camera::Lens::Pinhole => lens.set_end(camera.extrapolation_slope()),
             camera::Lens::OpenCv(of) => {
                 lens.set_opencv(of);
-                lens.set_end(camera.straight_slope().min(of.limit_slope()));
+                lens.set_end(camera.extrapolation_slope().min(of.limit_slope()));
             }
             camera::Lens::Fisheye(of) => lens.set_fisheye(of),
             camera::Lens::FTheta(of) => lens.set_ftheta(of),
@@ -67,7 +70,7 @@ impl Lens {
         if let Some(windshield) = &camera.windshield {
             lens.set_windshield(windshield);
         }
-        if let Some(still) = view.still_to_come() {
+        if let Some(still) = view.shutter_motion() {
             lens.set_rolling(&still);
         }
         lens
@@ -90,15 +93,15 @@ impl Lens {
 
     fn set_ftheta(&mut self, lens: &FTheta) {
         self.model = match lens.reference() {
-            Reference::AngleToPixel => 2,
-            Reference::PixelToAngle => 3,
+            FThetaReference::AngleToPixel => 2,
+            FThetaReference::PixelToAngle => 3,
         };
         self.linear = columns(lens.linear());
         self.set_rising(lens.rising());
     }
 
     /// In shares of the end no power of a distance in pixels leaves f32.
-    fn set_rising(&mut self, rising: &Rising) {
+    fn set_rising(&mut self, rising: &MonotonePolynomial) {
         let end = rising.end();
         self.end = end as f32;
         self.end_value = rising.at(end) as f32;
@@ -129,7 +132,7 @@ impl Lens {
         }
     }
 
-    fn set_rolling(&mut self, still: &StillToCome) {
+    fn set_rolling(&mut self, still: &ShutterMotion) {
         let [a, b, c] = still.share.map(|value| value as f32);
         self.rolls = [a, b, c, 0.0];
         self.moved_world_m = still.moved_world_m.as_vec3().to_array();

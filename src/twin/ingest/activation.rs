@@ -4,8 +4,8 @@ use wildcity_scene::sh;
 
 use super::validate::LN_SCALE;
 
-/// Largest absolute logit. An opacity of 255/255 is 1, which has an infinite logit; the sigmoid of 20
-/// is 1 in f32.
+/// Largest absolute logit. An opacity of 255/255 is 1, which has an infinite logit; the sigmoid of
+/// 20 is 1 in f32.
 const MAX_LOGIT: f64 = 20.0;
 
 /// The logit of an opacity from 0 to 1; NaN outside of that, which validation refuses.
@@ -13,8 +13,8 @@ pub(super) fn logit(opacity: f64) -> f32 {
     (opacity / (1.0 - opacity)).ln().clamp(-MAX_LOGIT, MAX_LOGIT) as f32
 }
 
-/// The natural logarithm of a standard deviation. Zero, to which narrow types round small ones, becomes the smallest
-/// allowed value. A negative one becomes NaN, which validation refuses.
+/// The natural logarithm of a standard deviation. Zero, to which narrow types round small ones,
+/// becomes the smallest allowed value. A negative one becomes NaN, which validation refuses.
 pub(super) fn ln_scale(scale: f64) -> f32 {
     let ln = scale.ln() as f32;
     if ln < LN_SCALE[0] { LN_SCALE[0] } else { ln }

@@ -49,7 +49,8 @@ impl Archive {
         Ok(Self { zip, budget })
     }
 
-    /// The file with a name that, without folders, satisfies the condition; of several, the one in the fewest folders.
+    /// The file with a name that, without folders, satisfies the condition; of several, the one in
+    /// the fewest folders.
     fn find(&self, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
         let names = self.zip.file_names();
         let wanted = names.filter(|name| is_wanted(name.rsplit('/').next().unwrap_or(name)));
@@ -66,7 +67,8 @@ impl SceneFiles for Archive {
         }
         self.budget.unpack("zip", name, size.into())?;
         let mut bytes = Vec::new();
-        // One byte more, so that the checksum is compared, and a file longer than its entry says is refused.
+        // One byte more, so that the checksum is compared, and a file longer than its entry says is
+        // refused.
         let read = file.take(size + 1).read_to_end(&mut bytes);
         read.map_err(|e| error(name, format!("it is damaged: {e}; copy the archive again")))?;
         if bytes.len() as u64 != size {

@@ -1,6 +1,7 @@
 //! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
-//! No format says which axes its coordinates have (two PLY files may differ), so an import has options for them.
+//! No format says which axes its coordinates have (two PLY files may differ), so an import has
+//! options for them.
 
 use std::str::FromStr;
 
@@ -17,7 +18,8 @@ pub struct Axes {
     metres_per_unit: f64,
 }
 
-/// Name, description, and the twin's x, y, z axes in the file's axes, which are the rows of `twin_from_file`.
+/// Name, description, and the twin's x, y, z axes in the file's axes, which are the rows of
+/// `twin_from_file`.
 const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
     ("identity", "x, y, z stay; z is up", [[1., 0., 0.], [0., 1., 0.], [0., 0., 1.]]),
     (
@@ -41,7 +43,8 @@ impl Axes {
     /// The file has a twin's axes and unit.
     pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
 
-    /// How far an entry of `M Mᵀ` may be from the identity's: a matrix typed with four digits is accepted.
+    /// How far an entry of `M Mᵀ` may be from the identity's: a matrix typed with four digits is
+    /// accepted.
     const MAX_ERROR: f64 = 1e-3;
 
     /// From a matrix. Its rows are the twin's axes in the file's axes.
@@ -88,8 +91,8 @@ impl Axes {
 
     /// Rotates and then scales Gaussians in place. The identity changes no bit.
     ///
-    /// A reflection `M` moves each ellipsoid as the rotation `-M` does, because an ellipsoid equals its own
-    /// point reflection through its centre. The colours follow `M` itself.
+    /// A reflection `M` moves each ellipsoid as the rotation `-M` does, because an ellipsoid equals
+    /// its own point reflection through its centre. The colours follow `M` itself.
     pub fn apply(&self, gaussians: &mut Gaussians) {
         if self.twin_from_file != DMat3::IDENTITY {
             self.rotate(gaussians);
@@ -116,7 +119,7 @@ impl Axes {
             let turned = rotation * DQuat::from_xyzw(x, y, z, w);
             *quat = [turned.w, turned.x, turned.y, turned.z].map(|q| q as f32);
         }
-        let turn = sh::Turn::new(matrix, gaussians.sh_degree);
+        let turn = sh::ShRotation::new(matrix, gaussians.sh_degree);
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);
         }
@@ -126,7 +129,8 @@ impl Axes {
 impl FromStr for Axes {
     type Err = IngestError;
 
-    /// Parses the name of a preset, or the nine numbers of the matrix, row by row, separated by commas or spaces.
+    /// Parses the name of a preset, or the nine numbers of the matrix, row by row, separated by
+    /// commas or spaces.
     fn from_str(text: &str) -> Result<Self, IngestError> {
         if let Some((_, _, rows)) = PRESETS.iter().find(|(name, ..)| *name == text) {
             return Self::from_rows(*rows);

@@ -177,7 +177,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         (Some(position), None) | (None, Some(position)) => position,
         _ => return Err(CamerasError::Position { name }),
     };
-    // glam's columns are the file's rows, so this matrix is the inverse: the rotation of world_from_camera.
+    // glam's columns are the file's rows, so this matrix is the inverse: the rotation of
+    // world_from_camera.
     let rotation = DMat3::from_cols_array_2d(&entry.rotation);
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));

@@ -1,11 +1,11 @@
 //! `.ksplat`, the format of mkkellogg's GaussianSplats3D, version 0.1: levels 0 to 2, SH degrees 0
 //! to 2.
 //!
-//! A header of 4096 bytes, one of 1024 per section, then the sections: sizes of the buckets that are
-//! not full, centres of all buckets, records. A record is position, standard deviations, rotation
-//! (w, x, y, z), colour and opacity (4 u8, of 255), and the higher colour coefficients: each
-//! degree's all of red, then green, then blue. Level 0 has f32; levels 1 and 2 have positions of 16
-//! bits around their bucket's centre and f16; level 2 has coefficients of 8 bits.
+//! A header of 4096 bytes, one of 1024 per section, then the sections: sizes of the buckets that
+//! are not full, centres of all buckets, records. A record is position, standard deviations,
+//! rotation (w, x, y, z), colour and opacity (4 u8, of 255), and the higher colour coefficients:
+//! each degree's all of red, then green, then blue. Level 0 has f32; levels 1 and 2 have positions
+//! of 16 bits around their bucket's centre and f16; level 2 has coefficients of 8 bits.
 
 use std::io::{self, Read};
 
@@ -213,8 +213,8 @@ impl Section {
             }
         };
         for degree in 1..=usize::from(self.sh_degree) {
-            // Degree l has 2 l + 1 coefficients. The degrees below l have l² in sum, of which the one of degree 0 is not
-            // here; each has three channels.
+            // Degree l has 2 l + 1 coefficients. The degrees below l have l² in sum, of which the
+            // one of degree 0 is not here; each has three channels.
             let of_this = 2 * degree + 1;
             let before = 3 * (degree * degree - 1);
             for k in 0..of_this {

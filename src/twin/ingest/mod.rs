@@ -1,13 +1,14 @@
-//! Reads scenes, skies, and camera lists from the formats of other programs, one module per format. The format
-//! is detected from the first bytes of a file, not from its name.
+//! Reads scenes, skies, and camera lists from the formats of other programs, one module per format.
+//! The format is detected from the first bytes of a file, not from its name.
 //!
-//! Formats that can be streamed are read in one pass, through small buffers, into [`Gaussians`]. Archives, images,
-//! and glTF buffers are held in memory whole, up to limits. Every Gaussian is checked before it is returned.
-//! In memory, Gaussians take about as much as in an uncompressed file: a compressed PLY of 16 bytes per
-//! Gaussian becomes columns of 68 bytes.
+//! Formats that can be streamed are read in one pass, through small buffers, into [`Gaussians`].
+//! Archives, images, and glTF buffers are held in memory whole, up to limits. Every Gaussian is
+//! checked before it is returned. In memory, Gaussians take about as much as in an uncompressed
+//! file: a compressed PLY of 16 bytes per Gaussian becomes columns of 68 bytes.
 //!
-//! Files are read through a buffer, not memory-mapped: the one pass that fills the columns also finds damage and computes
-//! the hash, and a file that another process shortens cannot kill this one. So no `unsafe` is needed.
+//! Files are read through a buffer, not memory-mapped: the one pass that fills the columns also
+//! finds damage and computes the hash, and a file that another process shortens cannot kill this
+//! one. So no `unsafe` is needed.
 
 mod activation;
 mod archive;
@@ -57,12 +58,12 @@ pub fn read(path: &Path, progress: Progress<'_>) -> Result<Gaussians, IngestErro
     read_hashed(path, progress).map(|(gaussians, _)| gaussians)
 }
 
-/// As [`read`], and the BLAKE3 of the bytes that were read, 64 lower-case hex digits. It identifies the source of a
-/// twin, even if the file is changed later.
+/// As [`read`], and the BLAKE3 of the bytes that were read, 64 lower-case hex digits. It identifies
+/// the source of a twin, even if the file is changed later.
 ///
-/// For a scene in several files it is the BLAKE3 of their hashes in hex, one per line: first the given
-/// file, then the files that it names, in the order in which they are named. `b3sum --no-names FILE.. |
-/// b3sum` prints the same.
+/// For a scene in several files it is the BLAKE3 of their hashes in hex, one per line: first the
+/// given file, then the files that it names, in the order in which they are named. `b3sum
+/// --no-names FILE.. | b3sum` prints the same.
 ///
 /// # Errors
 /// As [`read`].
@@ -155,8 +156,8 @@ impl Format {
             [b'g', b'l', b'T', b'F', ..] => Self::Glb,
             // Version 0.1, and two unused bytes.
             [0, 1, 0, 0, ..] => Self::Ksplat,
-            // A safetensors file starts with a length of eight bytes, at most three of which are not zero. So JSON has
-            // no zero among its first eight bytes, and safetensors has.
+            // A safetensors file starts with a length of eight bytes, at most three of which are
+            // not zero. So JSON has no zero among its first eight bytes, and safetensors has.
             _ if start.trim_ascii_start().starts_with(b"{")
                 && !start.iter().take(8).any(|&b| b == 0) =>
             {

@@ -169,8 +169,8 @@ struct Body<'a, R> {
 }
 
 impl<R: Read> Body<'_, R> {
-    /// Calls `take` with each row of `N` numbers of a tensor. Tensors do not overlap, so it starts no earlier than the
-    /// previous one ended; what lies between is skipped.
+    /// Calls `take` with each row of `N` numbers of a tensor. Tensors do not overlap, so it starts
+    /// no earlier than the previous one ended; what lies between is skipped.
     fn rows<const N: usize>(
         &mut self,
         tensor: &TensorInfo,

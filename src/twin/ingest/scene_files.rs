@@ -11,7 +11,8 @@ use super::{FileError, IngestError, Progress, file};
 
 /// Reads the files that a scene names.
 pub(super) trait SceneFiles {
-    /// Reads a whole file of at most `limit_bytes`. The name is relative to the folder of the file given first, with `/`.
+    /// Reads a whole file of at most `limit_bytes`. The name is relative to the folder of the file
+    /// given first, with `/`.
     fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError>;
 
     /// How much the scene may unpack.

@@ -3,10 +3,10 @@
 //! safetensors: `sky_head.layers.{0,1,2}.{weight,bias}` and, if there are appearances,
 //! `appearance_embedding.weight` `[images, n]`; F32 or F16; tensors of other names are skipped.
 //!
-//! Images, PNG or JPEG, are distinguished by their aspect ratio: 2:1 is an equirectangular panorama, 4:3 and 3:4 are
-//! crosses, 1:6 and 6:1 strips of the faces +x, -x, +y, -y, +z, -z. A folder has the faces as px, nx, py,
-//! ny, pz, nz. x is right, y up and z ahead, in the middle of a panorama and of a cross: left-handed, like
-//! cube maps.
+//! Images, PNG or JPEG, are distinguished by their aspect ratio: 2:1 is an equirectangular
+//! panorama, 4:3 and 3:4 are crosses, 1:6 and 6:1 strips of the faces +x, -x, +y, -y, +z, -z. A
+//! folder has the faces as px, nx, py, ny, pz, nz. x is right, y up and z ahead, in the middle of a
+//! panorama and of a cross: left-handed, like cube maps.
 //!
 //! A twin stores one of two: those tensors in F32 and no others, or a PNG of six faces, one
 //! below the other.
@@ -22,7 +22,7 @@ use half::f16;
 use image::{DynamicImage, ImageFormat, ImageReader, RgbImage};
 
 use crate::limits;
-use wildcity_scene::sky::{CubeMap, FACES, Layer, Model, Network, SkyError};
+use wildcity_scene::sky::{CubeMap, FACES, Layer, Network, SkyError, SkyModel};
 
 use super::file::{self, FileError};
 use super::{IngestError, read_whole};
@@ -33,11 +33,11 @@ pub struct SkyFile {
     /// The sky as a twin stores it, which [`decode`] reads.
     pub bytes: Vec<u8>,
     /// The decoded sky.
-    pub model: Model,
+    pub model: SkyModel,
 }
 
-/// Reads a sky from a file, or from the six images of a folder. `image` is the index of the training image with the
-/// appearance that a network is evaluated for; the mean of all if `None`.
+/// Reads a sky from a file, or from the six images of a folder. `image` is the index of the
+/// training image with the appearance that a network is evaluated for; the mean of all if `None`.
 ///
 /// # Errors
 /// It is not a sky, or one that cannot be used.
@@ -65,17 +65,17 @@ pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestErr
 ///
 /// # Errors
 /// As [`read`].
-pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<Model, IngestError> {
+pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<SkyModel, IngestError> {
     if bytes.get(8) == Some(&b'{') {
         let Weights { layers, appearances } = Weights::read(bytes)?;
-        return Ok(Model::network(Network::new(layers, appearances.of(image)?)?));
+        return Ok(SkyModel::network(Network::new(layers, appearances.of(image)?)?));
     }
     if let Some(image) = image {
         return Err(SkyError::Image { image, count: 0 }.into());
     }
     let strip = picture(bytes)?;
     let map = CubeMap::from_faces(strip.width() as usize, strip.as_raw())?;
-    Ok(Model::cube(map))
+    Ok(SkyModel::cube(map))
 }
 
 /// A network's tensors.
@@ -84,7 +84,8 @@ struct Weights {
     appearances: Appearances,
 }
 
-/// The appearance embedding: a row of numbers for every image of the training set; empty if the network has none.
+/// The appearance embedding: a row of numbers for every image of the training set; empty if the
+/// network has none.
 struct Appearances {
     count: usize,
     length: usize,
@@ -236,8 +237,9 @@ fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     }))
 }
 
-/// The faces of an equirectangular panorama, at its resolution in the middle of each face. There, a face of
-/// `n` pixels has `n / 2` pixels per radian, and the panorama has `width / 2π`; so `n = width / π`.
+/// The faces of an equirectangular panorama, at its resolution in the middle of each face. There, a
+/// face of `n` pixels has `n / 2` pixels per radian, and the panorama has `width / 2π`; so `n =
+/// width / π`.
 fn panorama(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     let (width, height) = picture.dimensions();
     let side = (f64::from(width) / PI).ceil() as u32;

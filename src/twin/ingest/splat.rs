@@ -1,7 +1,7 @@
 //! `.splat`, the format of antimatter15's web viewer: records of 32 bytes, without a header.
 //!
-//! A record is position (3 f32), standard deviations (3 f32), colour and opacity (4 u8, of 255), and
-//! the rotation (w, x, y, z) as u8 around 128. Colours do not depend on the direction.
+//! A record is position (3 f32), standard deviations (3 f32), colour and opacity (4 u8, of 255),
+//! and the rotation (w, x, y, z) as u8 around 128. Colours do not depend on the direction.
 
 use std::io::Read;
 
@@ -13,8 +13,9 @@ use super::{IngestError, activation, check_count};
 /// Bytes of a Gaussian.
 const RECORD_BYTES: usize = 32;
 
-/// Whether a file that starts like this is likely to be one. There is no magic number, but the first rotation must be
-/// a unit quaternion, the position near the origin, and the scales not negative. Text fails these tests.
+/// Whether a file that starts like this is likely to be one. There is no magic number, but the
+/// first rotation must be a unit quaternion, the position near the origin, and the scales not
+/// negative. Text fails these tests.
 pub(super) fn is_likely(start: &[u8]) -> bool {
     start.first_chunk().is_some_and(|record| {
         let [means_m, scales, ..] = numbers(record);

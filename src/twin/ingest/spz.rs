@@ -27,7 +27,8 @@ const HEADER_4_BYTES: u64 = 32;
 const STREAM_ENTRY_BYTES: u64 = 16;
 /// Set if there are extensions: before the table in version 4, after the payload in the others.
 const FLAG_EXTENSIONS: u8 = 2;
-/// The factor that colours were multiplied by before quantisation, so that values beyond 0 to 1 fit into a byte.
+/// The factor that colours were multiplied by before quantisation, so that values beyond 0 to 1 fit
+/// into a byte.
 const COLOUR_SCALE: f64 = 0.15;
 
 /// Reads a file that starts with the header, of a known size.

@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 use super::StoreError;
 use super::layout::{object_key, record_key};
 
-/// A directory or an object store with twins. Callers have checked all names of twins and all hashes.
+/// A directory or an object store with twins. Callers have checked all names of twins and all
+/// hashes.
 pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The directory, or the URL.
     fn root(&self) -> &Path;
@@ -36,7 +37,8 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Reads a range of an object and compares it with a hash of that range.
     ///
     /// # Errors
-    /// [`StoreError::Damaged`] if the object ends before the range does; nothing is allocated for it then.
+    /// [`StoreError::Damaged`] if the object ends before the range does; nothing is allocated for
+    /// it then.
     fn read_range(
         &self,
         name: &str,
@@ -60,8 +62,8 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Names of the twins with a commit that has begun and not ended: it runs, or it was killed.
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError>;
 
-    /// Removes what killed commits of a twin left: their staging, and objects that they placed and that `named` does
-    /// not contain. Running commits are not affected.
+    /// Removes what killed commits of a twin left: their staging, and objects that they placed and
+    /// that `named` does not contain. Running commits are not affected.
     fn remove_abandoned(
         &self,
         name: &str,
@@ -71,20 +73,20 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// All objects of a twin, in order of their hashes.
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
 
-    /// Removes the objects that `which` returns. Where the backend has locks, publishing is locked from
-    /// before `which` is called.
+    /// Removes the objects that `which` returns. Where the backend has locks, publishing is locked
+    /// from before `which` is called.
     fn remove_objects(
         &self,
         name: &str,
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError>;
 
-    /// File names in a folder of a twin's side files. A side file is small and not part of any version: a lease, or
-    /// the state of garbage collection.
+    /// File names in a folder of a twin's side files. A side file is small and not part of any
+    /// version: a lease, or the state of garbage collection.
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;
 
-    /// Reads a side file of at most [`limits::SIDE_FILE_BYTES`](crate::limits::SIDE_FILE_BYTES); `None` if it does
-    /// not exist.
+    /// Reads a side file of at most [`limits::SIDE_FILE_BYTES`](crate::limits::SIDE_FILE_BYTES);
+    /// `None` if it does not exist.
     fn read_side_file(&self, name: &str, file: &str) -> Result<Option<Vec<u8>>, StoreError>;
 
     /// Writes a side file, in place of an older one of that name.
@@ -110,21 +112,22 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
 /// Writes the content of an object.
 pub(super) type WriteObject<'a> = Box<dyn FnOnce(&mut dyn Write) -> io::Result<()> + 'a>;
 
-/// Objects of a commit in preparation, which no reader sees yet. Dropping it before it is published removes them
-/// where the backend can.
+/// Objects of a commit in preparation, which no reader sees yet. Dropping it before it is published
+/// removes them where the backend can.
 pub(super) trait Staging: Debug + Send {
     /// Writes one object, and names it by its hash.
     fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError>;
 
-    /// Waits until no other commit publishes a version of this twin, and keeps others from publishing until this is
-    /// dropped. Does nothing where the backend has no locks.
+    /// Waits until no other commit publishes a version of this twin, and keeps others from
+    /// publishing until this is dropped. Does nothing where the backend has no locks.
     fn lock_publishing(&mut self) -> Result<(), StoreError>;
 
-    /// Makes objects visible, and then the log record. The caller has called [`Staging::lock_publishing`].
+    /// Makes objects visible, and then the log record. The caller has called
+    /// [`Staging::lock_publishing`].
     ///
     /// # Errors
-    /// [`StoreError::Conflict`] if the number is taken. Nothing is visible then, unless the error is
-    /// [`StoreError::NotSynced`].
+    /// [`StoreError::Conflict`] if the number is taken. Nothing is visible then, unless the error
+    /// is [`StoreError::NotSynced`].
     fn publish(
         &mut self,
         hashes: &BTreeSet<&str>,
@@ -132,8 +135,8 @@ pub(super) trait Staging: Debug + Send {
         record: &[u8],
     ) -> Result<(), StoreError>;
 
-    /// Puts objects in the place of those of an existing version, which repairs damaged and missing ones, and makes its
-    /// record durable. The caller has called [`Staging::lock_publishing`].
+    /// Puts objects in the place of those of an existing version, which repairs damaged and missing
+    /// ones, and makes its record durable. The caller has called [`Staging::lock_publishing`].
     fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError>;
 
     /// Where its objects lie, for messages.

@@ -58,8 +58,8 @@ pub struct Version {
 }
 
 impl Catalog {
-    /// Opens a directory of twins, which need not exist yet, and removes what killed commits left; or opens
-    /// the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
+    /// Opens a directory of twins, which need not exist yet, and removes what killed commits left;
+    /// or opens the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
     /// credentials from the environment.
     ///
     /// # Errors
@@ -69,7 +69,8 @@ impl Catalog {
         Self::open_cached(dir, None)
     }
 
-    /// As [`Catalog::open`], and caches parts of remote twins on the local disk. Local twins need no cache.
+    /// As [`Catalog::open`], and caches parts of remote twins on the local disk. Local twins need
+    /// no cache.
     ///
     /// # Errors
     /// As [`Catalog::open`]; the cache's directory cannot be created.
@@ -88,8 +89,8 @@ impl Catalog {
         Ok(catalog)
     }
 
-    /// Opens the twins within an object store that is open already. All keys begin with `prefix`; messages name
-    /// the store by `url`.
+    /// Opens the twins within an object store that is open already. All keys begin with `prefix`;
+    /// messages name the store by `url`.
     ///
     /// # Errors
     /// The prefix is invalid, or the cache's directory cannot be created.
@@ -137,8 +138,8 @@ impl Catalog {
         Ok(twins)
     }
 
-    /// Number of a twin's latest version, from the names of the log's records alone. The records are not
-    /// read, so a damaged one causes no error.
+    /// Number of a twin's latest version, from the names of the log's records alone. The records
+    /// are not read, so a damaged one causes no error.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed.
@@ -170,7 +171,8 @@ impl Catalog {
     /// All versions of a twin in order of their numbers, from the log alone.
     ///
     /// # Errors
-    /// [`StoreError::Name`] or [`StoreError::NoTwin`]; [`StoreError::Damaged`] for a record that cannot be parsed.
+    /// [`StoreError::Name`] or [`StoreError::NoTwin`]; [`StoreError::Damaged`] for a record that
+    /// cannot be parsed.
     pub fn versions(&self, name: &str) -> Result<Vec<LogEntry>, StoreError> {
         let entry = |number| {
             let LogRecord { manifest: hash, created_us, commit, parent, kind } =
@@ -208,8 +210,8 @@ impl Catalog {
             .map_err(|reason| of_section(self.objects.object_path(twin, &chunk.object), reason))
     }
 
-    /// Reads a chunk's object to its end without checking or keeping it, to measure the speed of reading.
-    /// Returns its size in bytes.
+    /// Reads a chunk's object to its end without checking or keeping it, to measure the speed of
+    /// reading. Returns its size in bytes.
     ///
     /// # Errors
     /// It cannot be read.
@@ -221,13 +223,15 @@ impl Catalog {
         self.objects.read_and_discard(&version.manifest.twin, &chunk.object)
     }
 
-    /// Checks that a chunk's object, and the table of contents in it, are what was committed. Reads all of it.
+    /// Checks that a chunk's object, and the table of contents in it, are what was committed. Reads
+    /// all of it.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
-        // The hash is compared first: its error says more than what a damaged table of contents leads to.
+        // The hash is compared first: its error says more than what a damaged table of contents
+        // leads to.
         let start = self.objects.read_start(name, &chunk.object, most)?;
         let path = self.objects.object_path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)
@@ -262,7 +266,8 @@ impl Catalog {
         Ok(record)
     }
 
-    /// JSON with the fields in the order of the type, so that the same content gives the same bytes.
+    /// JSON with the fields in the order of the type, so that the same content gives the same
+    /// bytes.
     pub(super) fn encode(&self, content: &impl serde::Serialize) -> Result<Vec<u8>, StoreError> {
         serde_json::to_vec(content).map_err(|e| StoreError::io("encode for", self.dir())(e.into()))
     }

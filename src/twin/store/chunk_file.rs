@@ -8,16 +8,19 @@
 //!        begins a page: no section touches more pages than it must.
 //! ```
 //!
-//! A section is a sequence of parts of up to 65,536 Gaussians each: a length u32, and that many bytes
-//! of zstd-compressed records (`scene::record`). Any section can be read, checked, and decoded by itself.
+//! A section is a sequence of parts of up to 65,536 Gaussians each: a length u32, and that many
+//! bytes of zstd-compressed records (`scene::record`). Any section can be read, checked, and
+//! decoded by itself.
 //!
-//! The tables of all chunks together are the table that a manifest names. It is an object of its own, 78 bytes a
-//! section, because as JSON 100,000 sections would take 25 MB. Each chunk object repeats its own part of the table, so that
-//! it can be read without the manifest; `verify` compares the two.
+//! The tables of all chunks together are the table that a manifest names. It is an object of its
+//! own, 78 bytes a section, because as JSON 100,000 sections would take 25 MB. Each chunk object
+//! repeats its own part of the table, so that it can be read without the manifest; `verify`
+//! compares the two.
 //!
-//! What is read, decoded, and drawn as one unit is a section: one level of detail of one block of 16 m, within a cell of
-//! 64 m. It becomes one `scene::Chunk`, so the renderer knows nothing of levels. A sparse cell, such as a skyline, is one
-//! block: with 3,000 blocks of three Gaussians each, the demo street took 9 ms more per frame.
+//! What is read, decoded, and drawn as one unit is a section: one level of detail of one block of
+//! 16 m, within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer knows nothing of
+//! levels. A sparse cell, such as a skyline, is one block: with 3,000 blocks of three Gaussians
+//! each, the demo street took 9 ms more per frame.
 
 use std::io::{self, Write};
 
@@ -29,7 +32,7 @@ use crate::limits;
 use wildcity_scene::chunk::{Chunk, LANES, Lanes, columns};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
-use wildcity_scene::record::{Clamped, PART, Record};
+use wildcity_scene::record::{Clamped, PART_GAUSSIANS, RecordFormat};
 
 const MAGIC: [u8; 8] = *b"WILDCHNK";
 /// The layout that this build reads and writes.
@@ -53,7 +56,7 @@ pub(super) struct ChunkHeader {
     pub(super) cell: [i32; 2],
     pub(super) origin_m: DVec3,
     pub(super) sh_degree: u8,
-    pub(super) record: Record,
+    pub(super) record: RecordFormat,
 }
 
 /// One level of detail of one block.
@@ -96,12 +99,12 @@ struct Row {
 pub(super) fn pack(
     chunk: &Chunk,
     LevelOfBlock { block, level, error_m }: LevelOfBlock,
-    record: Record,
+    record: RecordFormat,
     clamped: &mut Clamped,
 ) -> io::Result<PackedSection> {
     let mut bytes = Vec::new();
-    for start in (0..chunk.len()).step_by(PART) {
-        let part = record.encode(chunk, start..chunk.len().min(start + PART), clamped);
+    for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
+        let part = record.encode(chunk, start..chunk.len().min(start + PART_GAUSSIANS), clamped);
         let part = zstd::bulk::compress(&part, ZSTD_LEVEL)?;
         bytes.extend((part.len() as u32).to_le_bytes());
         bytes.extend(part);
@@ -109,7 +112,7 @@ pub(super) fn pack(
     let mut bounds = Bounds::EMPTY;
     for index in 0..chunk.len() {
         let mean_m = [0, 1, 2].map(|axis| f64::from(chunk.value(index, axis)));
-        bounds.add(DVec3::from_array(mean_m), chunk.reach_m(index));
+        bounds.add(DVec3::from_array(mean_m), chunk.half_extent_m(index));
     }
     let section = Section {
         block,
@@ -142,7 +145,8 @@ pub(super) fn write(
         sections: packed.iter().map(|packed| Row::of(&packed.section)).collect(),
     };
 
-    // Give each section its offset. Integers have a fixed size, so the offsets do not change the table's own size.
+    // Give each section its offset. Integers have a fixed size, so the offsets do not change the
+    // table's own size.
     let table_bytes = encode(&contents)?.len();
     let mut end = (PAGE_BYTES + table_bytes).next_multiple_of(PAGE_BYTES) as u64;
     for row in &mut contents.sections {
@@ -192,14 +196,14 @@ pub(super) fn unpack(
     chunk: &ChunkEntry,
     section: &Section,
     sh_degree: u8,
-    record: Record,
+    record: RecordFormat,
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
     let width = columns(sh_degree);
     let mut lanes = Vec::new();
     let mut rest = bytes;
-    for start in (0..count).step_by(PART) {
-        let here = (count - start).min(PART);
+    for start in (0..count).step_by(PART_GAUSSIANS) {
+        let here = (count - start).min(PART_GAUSSIANS);
         let (length, after) = rest.split_first_chunk().ok_or("it ends before its last part")?;
         let length = u32::from_le_bytes(*length) as usize;
         let part = after.get(..length).ok_or("it ends within a part")?;
@@ -219,7 +223,11 @@ pub(super) fn unpack(
 }
 
 /// The table of all chunks.
-pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io::Result<Vec<u8>> {
+pub(super) fn table(
+    chunks: &[ChunkEntry],
+    sh_degree: u8,
+    record: RecordFormat,
+) -> io::Result<Vec<u8>> {
     let mut table = Vec::new();
     for chunk in chunks {
         let sections = chunk.sections.iter().map(Row::of).collect();
@@ -242,7 +250,7 @@ pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io:
 pub(super) fn fill(
     chunks: &mut [ChunkEntry],
     sh_degree: u8,
-    record: Record,
+    record: RecordFormat,
     mut table: &[u8],
 ) -> Result<(), String> {
     for chunk in chunks {
@@ -263,8 +271,8 @@ pub(super) fn fill(
     if table.is_empty() { Ok(()) } else { Err("it has more cells than the manifest".into()) }
 }
 
-/// Checks that an object's own table of contents agrees with the manifest's. `start` is the start of the object, up to
-/// [`limits::CHUNK_TABLE_BYTES`] and a page.
+/// Checks that an object's own table of contents agrees with the manifest's. `start` is the start
+/// of the object, up to [`limits::CHUNK_TABLE_BYTES`] and a page.
 ///
 /// # Errors
 /// Says what is wrong.
@@ -289,7 +297,8 @@ pub(super) fn check_start(start: &[u8], chunk: &ChunkEntry) -> Result<(), String
     if same { Ok(()) } else { Err("its table of contents is not the manifest's".into()) }
 }
 
-/// Checks that every block has level 0 without error, and then consecutive levels with rising errors.
+/// Checks that every block has level 0 without error, and then consecutive levels with rising
+/// errors.
 fn check_levels(chunk: &ChunkEntry) -> Result<(), String> {
     for block in chunk.sections.chunk_by(|a, b| a.block == b.block) {
         let numbered = block.iter().enumerate().all(|(k, section)| usize::from(section.level) == k);
@@ -339,7 +348,8 @@ fn decode(bytes: &[u8]) -> Result<(Contents, usize), String> {
         .map_err(|error| format!("a table of contents does not decode: {error}"))
 }
 
-/// Fixed-size integers, and a limit, without which a short input could request an allocation of any size.
+/// Fixed-size integers, and a limit, without which a short input could request an allocation of any
+/// size.
 fn encoding() -> impl Config {
     const LIMIT: usize = limits::CHUNK_TABLE_BYTES;
     bincode::config::standard().with_fixed_int_encoding().with_limit::<LIMIT>()
@@ -374,14 +384,14 @@ mod tests {
         let lost = &mut Clamped::default();
         let packed = [(0, 0.0, 300), (1, 0.5, 100)].map(|(level, error_m, count)| {
             let level = LevelOfBlock { block: 10, level, error_m };
-            pack(&chunk(count), level, Record::Q32, lost).unwrap()
+            pack(&chunk(count), level, RecordFormat::Q32, lost).unwrap()
         });
         let mut bytes = Vec::new();
         let header = ChunkHeader {
             cell: cell.cell,
             origin_m: cell.origin_m,
             sh_degree: 0,
-            record: Record::Q32,
+            record: RecordFormat::Q32,
         };
         let (sections, bounds) = write(&mut bytes, &header, packed.into()).unwrap();
         let entry = ChunkEntry {
@@ -398,7 +408,7 @@ mod tests {
 
     fn filled(entry: &ChunkEntry, table: &[u8]) -> Result<Vec<Section>, String> {
         let mut chunks = [ChunkEntry { sections: Vec::new(), ..entry.clone() }];
-        fill(&mut chunks, 0, Record::Q32, table).map(|()| chunks[0].sections.clone())
+        fill(&mut chunks, 0, RecordFormat::Q32, table).map(|()| chunks[0].sections.clone())
     }
 
     #[test]
@@ -413,7 +423,7 @@ mod tests {
         for section in [full, coarse] {
             let start = section.offset_bytes as usize;
             let own = &bytes[start..start + section.bytes as usize];
-            let chunk = unpack(own, &entry, section, 0, Record::Q32).unwrap();
+            let chunk = unpack(own, &entry, section, 0, RecordFormat::Q32).unwrap();
             assert_eq!((chunk.cell(), chunk.len()), (entry.cell, section.count as usize));
         }
     }
@@ -421,7 +431,7 @@ mod tests {
     #[test]
     fn a_table_comes_back_and_one_that_lies_is_refused() {
         let (_, entry) = object();
-        let table = table(std::slice::from_ref(&entry), 0, Record::Q32).unwrap();
+        let table = table(std::slice::from_ref(&entry), 0, RecordFormat::Q32).unwrap();
         assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
         // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
         assert_eq!(table.len(), 42 + 2 * 78);
@@ -433,7 +443,7 @@ mod tests {
         let refused = |change: &dyn Fn(&mut ChunkEntry)| {
             let mut other = entry.clone();
             change(&mut other);
-            let table = super::table(&[other], 0, Record::Q32).unwrap();
+            let table = super::table(&[other], 0, RecordFormat::Q32).unwrap();
             filled(&entry, &table).unwrap_err()
         };
         assert!(refused(&|e| e.cell[0] += 1).contains("something else of cell"));
@@ -482,7 +492,7 @@ mod tests {
         let own = &bytes[start..start + section.bytes as usize];
         let refused = |own: &[u8], count: u32| {
             let section = Section { count, ..section };
-            unpack(own, &entry, &section, 0, Record::Q32).unwrap_err()
+            unpack(own, &entry, &section, 0, RecordFormat::Q32).unwrap_err()
         };
         for cut in 0..own.len() {
             refused(&own[..cut], 300);
@@ -496,7 +506,7 @@ mod tests {
             let mut own = own.to_vec();
             own[at] ^= 0x40;
             // The hash is looked at before: here it only must not panic.
-            let _ = unpack(&own, &entry, &section, 0, Record::Q32);
+            let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32);
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Making a version: cells are written one after the other, invisible to readers, and then published at once.
+//! Making a version: cells are written one after the other, invisible to readers, and then
+//! published at once.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,8 +18,8 @@ use super::pack::{CellPacker, StorageOptions};
 use super::settings::{VersionChange, VersionSettings};
 use super::{Catalog, StoreError, Version, chunk_file};
 
-/// A version in preparation. Dropped before it is published, it leaves nothing behind. Several commits of one
-/// twin may be in preparation at once; only publishing waits for others.
+/// A version in preparation. Dropped before it is published, it leaves nothing behind. Several
+/// commits of one twin may be in preparation at once; only publishing waits for others.
 #[derive(Debug)]
 pub struct Commit {
     catalog: Catalog,
@@ -76,12 +77,12 @@ impl Catalog {
         })
     }
 
-    /// Makes an old version the latest, under a new number, so that the versions since then are kept. If it is the latest
-    /// already, it is returned, and no new one is made.
+    /// Makes an old version the latest, under a new number, so that the versions since then are
+    /// kept. If it is the latest already, it is returned, and no new one is made.
     ///
     /// # Errors
-    /// As [`Catalog::version`]; a version that cannot be read in full is not restored. A failed rollback
-    /// leaves nothing behind, except for [`StoreError::NotSynced`].
+    /// As [`Catalog::version`]; a version that cannot be read in full is not restored. A failed
+    /// rollback leaves nothing behind, except for [`StoreError::NotSynced`].
     pub fn rollback(&self, name: &str, number: u64) -> Result<Version, StoreError> {
         // Checked early, before anything is written; restoring checks again, and more thoroughly.
         self.version(name, Some(number))?;
@@ -95,15 +96,16 @@ impl Commit {
         &self.id
     }
 
-    /// Writes Gaussians, in metres along the twin's axes, as whole cells with their levels of detail; only the
-    /// cells of `only`, if given. `progress` gets the number of Gaussians written and in all.
+    /// Writes Gaussians, in metres along the twin's axes, as whole cells with their levels of
+    /// detail; only the cells of `only`, if given. `progress` gets the number of Gaussians written
+    /// and in all.
     ///
     /// A twin of any size can be put part by part, as long as no cell is in two parts.
     ///
     /// # Errors
-    /// Before anything is written: a Gaussian that cannot be used, a cell that was put before, an SH
-    /// degree other than that of an earlier part. Otherwise what could not be written; nothing of
-    /// this call is part of the version then.
+    /// Before anything is written: a Gaussian that cannot be used, a cell that was put before, an
+    /// SH degree other than that of an earlier part. Otherwise what could not be written; nothing
+    /// of this call is part of the version then.
     pub fn put(
         &mut self,
         gaussians: &Gaussians,
@@ -125,11 +127,11 @@ impl Commit {
         Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
     }
 
-    /// Publishes exactly what was put as the latest version, all or nothing. If the latest version has the same
-    /// content, it is returned, and no new one is made.
+    /// Publishes exactly what was put as the latest version, all or nothing. If the latest version
+    /// has the same content, it is returned, and no new one is made.
     ///
-    /// With a `base`, nothing is replaced that other commits changed since that version. Without one,
-    /// the latest version is replaced, whatever it contains.
+    /// With a `base`, nothing is replaced that other commits changed since that version. Without
+    /// one, the latest version is replaced, whatever it contains.
     ///
     /// # Errors
     /// [`StoreError::Overlap`] if others changed since `base` what this would replace; or what
@@ -155,12 +157,13 @@ impl Commit {
         })
     }
 
-    /// Publishes the version `base` with the cells that were put in place of its own, all or nothing. What others
-    /// committed since `base` is kept, as long as it is in other cells.
+    /// Publishes the version `base` with the cells that were put in place of its own, all or
+    /// nothing. What others committed since `base` is kept, as long as it is in other cells.
     ///
     /// # Errors
-    /// [`StoreError::Overlap`] if others changed the same since `base`; [`StoreError::FieldMismatch`] if
-    /// the Gaussians were stored in another way than the twin's; otherwise as [`Commit::replace`].
+    /// [`StoreError::Overlap`] if others changed the same since `base`;
+    /// [`StoreError::FieldMismatch`] if the Gaussians were stored in another way than the twin's;
+    /// otherwise as [`Commit::replace`].
     pub fn change(self, base: u64, change: VersionChange) -> Result<Version, StoreError> {
         change.check()?;
         self.check_clamped()?;
@@ -185,8 +188,9 @@ impl Commit {
     /// Publishes an old version as the latest, if all of its objects exist.
     fn restore(self, number: u64) -> Result<Version, StoreError> {
         self.publish(Some(number), |commit, _| {
-            // Publishing is locked: a garbage collection that removed objects has ended, and has recorded the versions.
-            // The disk cache may still have objects that were removed, so it is not used.
+            // Publishing is locked: a garbage collection that removed objects has ended, and has
+            // recorded the versions. The disk cache may still have objects that were removed, so it
+            // is not used.
             let uncached = commit.catalog.uncached();
             let Version { hash, manifest, .. } = uncached.version(&commit.name, Some(number))?;
             for chunk in &manifest.chunks {
@@ -217,7 +221,8 @@ impl Commit {
         })
     }
 
-    /// A version's manifest with the cells that were put in place of its own. The table is still the version's.
+    /// A version's manifest with the cells that were put in place of its own. The table is still
+    /// the version's.
     fn merge(
         &mut self,
         mut manifest: Manifest,
@@ -240,8 +245,9 @@ impl Commit {
         Ok(manifest)
     }
 
-    /// Checks that the `new` manifest reverts nothing that others changed from the base to the latest version. Where both
-    /// made the same change, nothing is lost; the other may have been this commit's own first attempt.
+    /// Checks that the `new` manifest reverts nothing that others changed from the base to the
+    /// latest version. Where both made the same change, nothing is lost; the other may have been
+    /// this commit's own first attempt.
     fn check_overlap(
         &self,
         base: &Version,
@@ -281,8 +287,8 @@ impl Commit {
         Ok(HashedManifest { manifest, hash })
     }
 
-    /// Publishes the manifest that `build` makes, given the number of the latest version. If another commit takes the next
-    /// number first, the manifest is built again on that version.
+    /// Publishes the manifest that `build` makes, given the number of the latest version. If
+    /// another commit takes the next number first, the manifest is built again on that version.
     fn publish(
         mut self,
         parent: Option<u64>,

@@ -14,7 +14,8 @@ pub struct Diff {
     pub cells: Vec<CellDiff>,
     /// Number of cells that are the same in both.
     pub kept: u64,
-    /// Fields of the manifest that differ, among `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`.
+    /// Fields of the manifest that differ, among `profile`, `sh_degree`, `record`, `rig`,
+    /// `trajectories`, `sky`.
     pub settings: Vec<&'static str>,
 }
 
@@ -39,7 +40,8 @@ pub struct CellSize {
 }
 
 impl Catalog {
-    /// The differences between version `before` and version `after` of a twin, from their manifests alone.
+    /// The differences between version `before` and version `after` of a twin, from their manifests
+    /// alone.
     ///
     /// # Errors
     /// As [`Catalog::version`].

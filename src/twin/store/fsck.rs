@@ -57,8 +57,8 @@ impl Catalog {
     /// and what is left over. `progress` gets the bytes done and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. Damage is no error, but part of
-    /// the result.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. Damage is no error,
+    /// but part of the result.
     pub fn fsck(
         &self,
         name: &str,
@@ -96,12 +96,12 @@ impl Catalog {
         })
     }
 
-    /// Compares every object of every version of a twin with its hash. `progress` gets the bytes done
-    /// and in all.
+    /// Compares every object of every version of a twin with its hash. `progress` gets the bytes
+    /// done and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error, but part of
-    /// the result.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error,
+    /// but part of the result.
     pub fn verify(
         &self,
         name: &str,
@@ -114,7 +114,8 @@ impl Catalog {
         self.reread(name, &numbers, progress).map(|(verified, _)| verified)
     }
 
-    /// Compares the objects of some versions with their hashes. Also returns the hashes that they name.
+    /// Compares the objects of some versions with their hashes. Also returns the hashes that they
+    /// name.
     fn reread(
         &self,
         name: &str,

@@ -1,10 +1,12 @@
-//! Garbage collection: removes, in two steps, objects that no kept version and no version in use names.
+//! Garbage collection: removes, in two steps, objects that no kept version and no version in use
+//! names.
 //!
-//! The first run notes them as candidates. A later run, after the grace period, removes the candidates that are
-//! still garbage and were not written since. So a process that reads a version at the first run has that long
-//! to lease it, and a commit that needs an object again has written it again. In a directory, publishing is
-//! locked while objects are removed. In an object store, a commit that puts an object again in the seconds
-//! of its removal loses it: collect there only while no push can bring back what has been garbage for a day.
+//! The first run notes them as candidates. A later run, after the grace period, removes the
+//! candidates that are still garbage and were not written since. So a process that reads a version
+//! at the first run has that long to lease it, and a commit that needs an object again has written
+//! it again. In a directory, publishing is locked while objects are removed. In an object store, a
+//! commit that puts an object again in the seconds of its removal loses it: collect there only
+//! while no push can bring back what has been garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -47,7 +49,8 @@ pub struct ObjectTotals {
     pub bytes: u64,
 }
 
-/// Objects that are garbage, by hash, with the time when they were first found to be, in microseconds since 1970.
+/// Objects that are garbage, by hash, with the time when they were first found to be, in
+/// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
 /// The side file with the candidates.
@@ -66,12 +69,12 @@ struct CollectionPlan {
 }
 
 impl Catalog {
-    /// Removes what has been garbage for the grace period, and notes what is garbage now. With `dry_run`, nothing is
-    /// removed or noted.
+    /// Removes what has been garbage for the grace period, and notes what is garbage now. With
+    /// `dry_run`, nothing is removed or noted.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read. Then it is unknown
-    /// which objects it names, and nothing is removed.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read.
+    /// Then it is unknown which objects it names, and nothing is removed.
     pub fn collect(
         &self,
         name: &str,
@@ -87,8 +90,8 @@ impl Catalog {
         }
         if !plan.remove.is_empty() {
             self.objects.remove_objects(name, &mut || {
-                // Versions may have been published or leased since the first plan. This plan is made while publishing is
-                // locked; in an object store, just before the removal.
+                // Versions may have been published or leased since the first plan. This plan is
+                // made while publishing is locked; in an object store, just before the removal.
                 plan = self.plan(name, keep, &before, now_us)?;
                 self.mark_collected(name, &plan.gone, now_us)?;
                 Ok(plan.remove.clone())
@@ -101,11 +104,13 @@ impl Catalog {
         Ok(plan.collected)
     }
 
-    /// Records that versions are collected, before their objects are removed: otherwise they would seem damaged.
+    /// Records that versions are collected, before their objects are removed: otherwise they would
+    /// seem damaged.
     ///
     /// # Errors
-    /// [`StoreError::Leased`] if one was leased at this moment. A lease is written first and then reads this record;
-    /// here, the record is written first and then the leases are read. So at least one of the two sees the other.
+    /// [`StoreError::Leased`] if one was leased at this moment. A lease is written first and then
+    /// reads this record; here, the record is written first and then the leases are read. So at
+    /// least one of the two sees the other.
     fn mark_collected(
         &self,
         name: &str,

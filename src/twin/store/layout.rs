@@ -1,4 +1,5 @@
-//! Where the parts of a twin lie below the root of a directory or an object store, and what their names may be.
+//! Where the parts of a twin lie below the root of a directory or an object store, and what their
+//! names may be.
 
 use std::path::PathBuf;
 
@@ -6,7 +7,8 @@ use crate::limits;
 
 use super::StoreError;
 
-/// Path of a log record below the root. The number has ten digits, so that names sort as numbers do.
+/// Path of a log record below the root. The number has ten digits, so that names sort as numbers
+/// do.
 pub(super) fn record_key(name: &str, number: u64) -> String {
     format!("{name}/log/{number:010}")
 }

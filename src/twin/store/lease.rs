@@ -1,5 +1,5 @@
-//! Leases: a process that uses a version records it with an expiry time, and garbage collection keeps the version until
-//! then.
+//! Leases: a process that uses a version records it with an expiry time, and garbage collection
+//! keeps the version until then.
 
 use std::time::Duration;
 
@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use super::log::now_us;
 use super::{Catalog, StoreError};
 
-/// A version in use. The lease ends when it is dropped, or when it was not renewed for its duration.
+/// A version in use. The lease ends when it is dropped, or when it was not renewed for its
+/// duration.
 #[derive(Debug)]
 pub struct Lease {
     catalog: Catalog,
@@ -30,8 +31,8 @@ pub(super) struct LeaseRecord {
 const FOLDER: &str = "leases";
 
 impl Catalog {
-    /// Records that a version of a twin is in use by `holder` (a text for people), until the duration has
-    /// passed since this call or the last [`Lease::renew`].
+    /// Records that a version of a twin is in use by `holder` (a text for people), until the
+    /// duration has passed since this call or the last [`Lease::renew`].
     ///
     /// # Errors
     /// As [`Catalog::version`] for a version that does not exist; the lease cannot be written.
@@ -68,7 +69,8 @@ impl Catalog {
         let mut leases = Vec::new();
         for id in self.objects.list_side_files(name, FOLDER)? {
             let read = self.objects.read_side_file(name, &format!("{FOLDER}/{id}"))?;
-            // A missing file is a lease that ended meanwhile. A damaged one cannot say which version it holds.
+            // A missing file is a lease that ended meanwhile. A damaged one cannot say which
+            // version it holds.
             let record =
                 read.and_then(|record| serde_json::from_slice::<LeaseRecord>(&record).ok());
             leases.extend(record.filter(|record| record.id == id));
@@ -81,15 +83,15 @@ impl Lease {
     /// Restarts the duration.
     ///
     /// # Errors
-    /// It cannot be written; then it keeps its previous expiry time. [`StoreError::GarbageCollected`] if it had
-    /// ended, and the version's objects were removed.
+    /// It cannot be written; then it keeps its previous expiry time.
+    /// [`StoreError::GarbageCollected`] if it had ended, and the version's objects were removed.
     pub fn renew(&mut self) -> Result<(), StoreError> {
         let for_us = i64::try_from(self.duration.as_micros()).unwrap_or(i64::MAX);
         self.record.until_us = now_us().saturating_add(for_us);
         let record = self.catalog.encode(&self.record)?;
         self.catalog.objects.write_side_file(&self.name, &self.record.file(), &record)?;
-        // Garbage collection first records what it removes, and then reads the leases. Here it is the other way
-        // around, so that at least one of the two sees the other.
+        // Garbage collection first records what it removes, and then reads the leases. Here it is
+        // the other way around, so that at least one of the two sees the other.
         self.catalog.check_not_collected(&self.name, self.record.version)
     }
 }

@@ -1,4 +1,5 @@
-//! A twin's log: for each version the hash of its manifest, when it was committed, and how it came about.
+//! A twin's log: for each version the hash of its manifest, when it was committed, and how it came
+//! about.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -15,7 +16,8 @@ pub struct LogEntry {
     pub created_us: i64,
     /// Identity of the commit that made it; `None` for versions from before commits had one.
     pub commit: Option<String>,
-    /// The version that it was made from: the base of a push, or the version that a rollback restored.
+    /// The version that it was made from: the base of a push, or the version that a rollback
+    /// restored.
     pub parent: Option<u64>,
     /// How it came about.
     pub kind: CommitKind,
@@ -44,8 +46,8 @@ impl std::fmt::Display for CommitKind {
     }
 }
 
-/// A record of the log, stored as JSON. How a version came about is here and not in the manifest, because the hash of a
-/// manifest depends on the content of the version alone.
+/// A record of the log, stored as JSON. How a version came about is here and not in the manifest,
+/// because the hash of a manifest depends on the content of the version alone.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LogRecord {

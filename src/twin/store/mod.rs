@@ -12,35 +12,38 @@
 //! <twins>/.staging/<name>.lock          locked while a version is published
 //! ```
 //!
-//! Paths that begin with `.staging` exist in directories only. In an object store, objects are uploaded to their
-//! final keys.
+//! Paths that begin with `.staging` exist in directories only. In an object store, objects are
+//! uploaded to their final keys.
 //!
 //! # Decisions
 //!
-//! **A commit writes objects first and its log record last.** A version is a manifest, which names a table and chunks
-//! by their hashes; a twin is a numbered log of manifests. The record `log/<n + 1>` is *put only if absent*: with
-//! a hard link in a directory, with a conditional put in an object store. That is the only atomic operation, and the
-//! one that S3, GCS, Azure, and a disk have in common. Whenever a commit is interrupted, readers see either the old
-//! version or the new one.
+//! **A commit writes objects first and its log record last.** A version is a manifest, which names
+//! a table and chunks by their hashes; a twin is a numbered log of manifests. The record `log/<n +
+//! 1>` is *put only if absent*: with a hard link in a directory, with a conditional put in an
+//! object store. That is the only atomic operation, and the one that S3, GCS, Azure, and a disk
+//! have in common. Whenever a commit is interrupted, readers see either the old version or the new
+//! one.
 //!
 //! **On conflict, the commit reads the winning record.** Its own record means that the answer to an
-//! earlier attempt was lost: the commit succeeded. Changes to other cells mean that the commit is rebased on the winner.
-//! Changes to the same cells are an error that names them ([`StoreError::Overlap`]).
+//! earlier attempt was lost: the commit succeeded. Changes to other cells mean that the commit is
+//! rebased on the winner. Changes to the same cells are an error that names them
+//! ([`StoreError::Overlap`]).
 //!
-//! **The log record, not the manifest, says when and how a version came about.** So a version's hash is a
-//! hash of its content, and a rollback is a record with an old hash.
+//! **The log record, not the manifest, says when and how a version came about.** So a version's
+//! hash is a hash of its content, and a rollback is a record with an old hash.
 //!
-//! **In a directory, several commits of one twin may be in preparation**, each in a folder of its own. Its lock
-//! is released by the kernel when the process ends, however it ends. A second lock per twin is held
-//! while publishing, while removing what killed commits left, and during garbage collection, so that no commit relies on
-//! an object that is being removed. An object store has no such lock: what a killed commit left is garbage like any
-//! other, and garbage is removed in two steps, noted by one run and removed by another after a day.
+//! **In a directory, several commits of one twin may be in preparation**, each in a folder of its
+//! own. Its lock is released by the kernel when the process ends, however it ends. A second lock
+//! per twin is held while publishing, while removing what killed commits left, and during garbage
+//! collection, so that no commit relies on an object that is being removed. An object store has no
+//! such lock: what a killed commit left is garbage like any other, and garbage is removed in two
+//! steps, noted by one run and removed by another after a day.
 //!
-//! **Requests to object stores are timed and retried in one place** (`remote/retry.rs`); `object_store`'s own retries
-//! are off.
+//! **Requests to object stores are timed and retried in one place** (`remote/retry.rs`);
+//! `object_store`'s own retries are off.
 //!
-//! **The disk cache compares every part with its hash on every read**, which takes less time than decoding it. So the
-//! cache needs neither fsync nor recovery, and a damaged part is fetched again.
+//! **The disk cache compares every part with its hash on every read**, which takes less time than
+//! decoding it. So the cache needs neither fsync nor recovery, and a damaged part is fetched again.
 
 mod backend;
 mod catalog;

@@ -47,8 +47,9 @@ impl<'a> NewVersion<'a> {
 }
 
 impl Catalog {
-    /// Writes a version and makes it the latest, all or nothing. If the latest version has the same content, it is
-    /// returned, and no new one is made. `progress` gets the number of Gaussians written and in all.
+    /// Writes a version and makes it the latest, all or nothing. If the latest version has the same
+    /// content, it is returned, and no new one is made. `progress` gets the number of Gaussians
+    /// written and in all.
     ///
     /// # Errors
     /// Names what cannot be accepted, before anything is written; or as [`super::Commit::replace`].

@@ -1,4 +1,5 @@
-//! Packs the Gaussians of whole cells into chunk objects: the blocks of many cells in parallel, level by level.
+//! Packs the Gaussians of whole cells into chunk objects: the blocks of many cells in parallel,
+//! level by level.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -10,27 +11,28 @@ use wildcity_scene::chunk::{CellRun, Partition};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::ChunkEntry;
 use wildcity_scene::record::Clamped;
-use wildcity_scene::{Chunk, Gaussians, Record, lod};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, lod};
 
 use super::StoreError;
 use super::backend::Staging;
 use super::chunk_file::{self, ChunkHeader, LevelOfBlock, PackedSection};
 
-/// The smallest batch of Gaussians that is packed in parallel: enough to occupy all cores, and few compared with a scene.
+/// The smallest batch of Gaussians that is packed in parallel: enough to occupy all cores, and few
+/// compared with a scene.
 const BATCH_GAUSSIANS: usize = 1 << 16;
 
 /// How Gaussians are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StorageOptions {
     /// The record format, which decides the number of bits per Gaussian.
-    pub record: Record,
+    pub record: RecordFormat,
     /// Whether levels of detail are made.
     pub levels: bool,
 }
 
 impl Default for StorageOptions {
     fn default() -> Self {
-        Self { record: Record::default(), levels: true }
+        Self { record: RecordFormat::default(), levels: true }
     }
 }
 
@@ -65,8 +67,8 @@ impl<'a> CellPacker<'a> {
         self.cells.iter().map(|run| run.run.len() as u64).sum()
     }
 
-    /// Writes an object for each cell. Returns the chunks in order, and counts of the values that the record could not
-    /// hold. `progress` gets the number of Gaussians written and in all.
+    /// Writes an object for each cell. Returns the chunks in order, and counts of the values that
+    /// the record could not hold. `progress` gets the number of Gaussians written and in all.
     pub(super) fn put(
         &self,
         staging: &mut dyn Staging,

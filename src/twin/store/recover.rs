@@ -6,12 +6,14 @@ use std::io::{self, ErrorKind};
 use super::{Catalog, StoreError};
 
 impl Catalog {
-    /// Removes what killed commits left: their staging, and objects that they placed without a record.
+    /// Removes what killed commits left: their staging, and objects that they placed without a
+    /// record.
     ///
     /// A process with read-only access leaves this to processes that may write.
     pub(super) fn remove_abandoned_commits(&self) -> Result<(), StoreError> {
         for name in self.objects.unfinished_commits()? {
-            // If a version is damaged, it is unknown which objects it named, so every object is kept.
+            // If a version is damaged, it is unknown which objects it named, so every object is
+            // kept.
             match self.objects.remove_abandoned(&name, &|| self.named_by_all(&name).ok()) {
                 Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
                 removed => removed?,

@@ -26,7 +26,8 @@ pub enum NewSky {
 pub struct SkyBytes {
     /// The bytes that [`sky::decode`] reads.
     pub bytes: Arc<[u8]>,
-    /// Index of the training image with the appearance that it is drawn in; the mean of all if `None`.
+    /// Index of the training image with the appearance that it is drawn in; the mean of all if
+    /// `None`.
     pub image: Option<u32>,
     /// Rotates directions in the world to the sky's own axes; orthonormal.
     pub sky_from_world: DMat3,
@@ -42,7 +43,7 @@ impl NewSky {
             Self::Kept(_) => Ok(()),
             Self::Put(SkyBytes { bytes, image, sky_from_world }) => {
                 let sky = Sky::new(sky::decode(bytes, *image)?, *sky_from_world);
-                sky.drawn(profile.sky_error).map_err(crate::ingest::IngestError::Sky)?;
+                sky.drawable(profile.sky_error).map_err(crate::ingest::IngestError::Sky)?;
                 Ok(())
             }
         }

@@ -51,7 +51,8 @@ impl<'a> Column<'a> {
             component.ok_or(format!("componentType {} is not read", accessor.component_type))?;
         let row_bytes = (component.bytes() * width) as u64;
         let stride = view.byte_stride.unwrap_or(row_bytes);
-        // glTF allows 4 to 252. A stride shorter than a row would make rows overlap, so that few bytes become many rows.
+        // glTF allows 4 to 252. A stride shorter than a row would make rows overlap, so that few
+        // bytes become many rows.
         if stride < row_bytes || stride > 252 {
             return Err(format!("byteStride {stride}; {row_bytes} to 252 are possible"));
         }

@@ -1,5 +1,5 @@
-//! The parts of a glTF document that splats need; others are skipped. The gltf crate drops attributes that core glTF
-//! does not define, so splats have a document type of their own.
+//! The parts of a glTF document that splats need; others are skipped. The gltf crate drops
+//! attributes that core glTF does not define, so splats have a document type of their own.
 
 use std::collections::BTreeMap;
 

@@ -1,7 +1,8 @@
-//! Ordinary meshes: their triangles are covered with flat Gaussians in the colour of their material.
+//! Ordinary meshes: their triangles are covered with flat Gaussians in the colour of their
+//! material.
 //!
-//! Long triangles are halved first (`triangle.rs` covers each). The colour is the product of the material's base colour,
-//! its texture, and the vertex colours, without lighting.
+//! Long triangles are halved first (`triangle.rs` covers each). The colour is the product of the
+//! material's base colour, its texture, and the vertex colours, without lighting.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -64,7 +65,8 @@ pub(super) fn read(
     let halved = seen.flat_map(|triangle| {
         let whole = vec![triangle.clone()];
         let halved = triangle.halved(longest_m);
-        // Beyond the limit, a triangle stays whole: its Gaussian reaches beyond its ends, but takes no more memory.
+        // Beyond the limit, a triangle stays whole: its Gaussian reaches beyond its ends, but takes
+        // no more memory.
         match parts_left.checked_sub(halved.len()) {
             Some(left) => {
                 parts_left = left;

@@ -1,11 +1,11 @@
 //! glTF and GLB with KHR_gaussian_splatting.
 //!
 //! Source: the extension's text in KhronosGroup/glTF. Every primitive that has the extension is
-//! read, with the transforms of its nodes: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1) and
-//! SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in earlier
-//! drafts it was its logarithm, which is detected by negative values: no standard deviation is negative. Kernel,
-//! colour space, projection, and sorting are ignored, as the extension allows; the render profile
-//! says how the trainer rendered.
+//! read, with the transforms of its nodes: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1)
+//! and SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in
+//! earlier drafts it was its logarithm, which is detected by negative values: no standard deviation
+//! is negative. Kernel, colour space, projection, and sorting are ignored, as the extension allows;
+//! the render profile says how the trainer rendered.
 //!
 //! The triangles of a scene without splats are covered with flat Gaussians (`mesh.rs`).
 

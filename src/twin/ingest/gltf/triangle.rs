@@ -1,7 +1,8 @@
 //! Covers a triangle with flat Gaussians.
 //!
-//! A triangle is cut into k² similar ones, each about as large as its share of the whole surface. Each part becomes
-//! a Gaussian with the mean and covariance of a uniform triangle, widened so that neighbours leave no gaps.
+//! A triangle is cut into k² similar ones, each about as large as its share of the whole surface.
+//! Each part becomes a Gaussian with the mean and covariance of a uniform triangle, widened so that
+//! neighbours leave no gaps.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3, DVec4};
 use image::RgbaImage;
@@ -9,13 +10,15 @@ use image::RgbaImage;
 use crate::ingest::activation;
 use wildcity_scene::Gaussians;
 
-/// Ratio of a Gaussian's standard deviation to that of its triangle. Triangles of a regular mesh with edges of length L
-/// have 0.20 L, and their centres are 0.58 L apart: a standard deviation of 0.6 of that distance leaves no gaps.
+/// Ratio of a Gaussian's standard deviation to that of its triangle. Triangles of a regular mesh
+/// with edges of length L have 0.20 L, and their centres are 0.58 L apart: a standard deviation of
+/// 0.6 of that distance leaves no gaps.
 const WIDER: f64 = 1.7;
-/// Longest edge of a triangle that becomes one Gaussian, in edges of a square with the area of a share. The Gaussian of a
-/// longer, narrow triangle would reach beyond its ends.
+/// Longest edge of a triangle that becomes one Gaussian, in edges of a square with the area of a
+/// share. The Gaussian of a longer, narrow triangle would reach beyond its ends.
 pub(super) const LONGEST: f64 = 4.0;
-/// The most halvings of one triangle. Every second one halves its length, so a rail of 4 m becomes pieces of 6 cm.
+/// The most halvings of one triangle. Every second one halves its length, so a rail of 4 m becomes
+/// pieces of 6 cm.
 const HALVINGS: u32 = 12;
 /// Ratio of thickness to length.
 const FLATNESS: f64 = 0.02;
@@ -49,8 +52,8 @@ impl Triangle {
         if area_m2.is_finite() { area_m2 } else { 0.0 }
     }
 
-    /// Cuts the triangle across its longest edge, again and again, until that edge is short, or not much longer than the
-    /// triangle is wide.
+    /// Cuts the triangle across its longest edge, again and again, until that edge is short, or not
+    /// much longer than the triangle is wide.
     pub(super) fn halved(self, longest_m: f64) -> Vec<Self> {
         let mut whole = vec![(self, 0)];
         let mut parts = Vec::new();
@@ -79,7 +82,8 @@ impl Triangle {
 
     /// Number of parts that each edge is cut into; 0 for a triangle without area.
     pub(super) fn cuts(&self, share_m2: f64) -> u32 {
-        // A triangle is at most the whole surface, so this is at most the square root of MESH_GAUSSIANS.
+        // A triangle is at most the whole surface, so this is at most the square root of
+        // MESH_GAUSSIANS.
         (self.area_m2() / share_m2).sqrt().ceil() as u32
     }
 
@@ -109,8 +113,9 @@ impl Triangle {
         }
     }
 
-    /// Rotation (w, x, y, z) and standard deviations, in metres, of each part. A uniform triangle has the
-    /// covariance Σ (corner - centre)(corner - centre)ᵀ / 12, the same for upright and inverted parts.
+    /// Rotation (w, x, y, z) and standard deviations, in metres, of each part. A uniform triangle
+    /// has the covariance Σ (corner - centre)(corner - centre)ᵀ / 12, the same for upright and
+    /// inverted parts.
     fn shape(&self, cuts: u32) -> Option<([f32; 4], [f64; 3])> {
         let [a, b, c] = self.corners_m;
         let normal = (b - a).cross(c - a).try_normalize()?;
@@ -123,8 +128,8 @@ impl Triangle {
             covariance += DMat2::from_cols(d * d.x, d * d.y);
         }
         covariance *= (WIDER / f64::from(cuts)).powi(2) / 12.0;
-        // The eigenvectors and eigenvalues of a symmetric 2 x 2 matrix: the angle of the major axis is atan2(2 xy, xx - yy) / 2,
-        // the variances are (xx + yy) / 2 ± √((xx - yy)² / 4 + xy²).
+        // The eigenvectors and eigenvalues of a symmetric 2 x 2 matrix: the angle of the major axis
+        // is atan2(2 xy, xx - yy) / 2, the variances are (xx + yy) / 2 ± √((xx - yy)² / 4 + xy²).
         let [xx, xy, yy] = [covariance.x_axis.x, covariance.x_axis.y, covariance.y_axis.y];
         let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
         let spread = (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
@@ -180,8 +185,8 @@ mod tests {
         }
     }
 
-    /// The parts together have the triangle's own mean, and its covariance: that of their centres and
-    /// their own, which is widened.
+    /// The parts together have the triangle's own mean, and its covariance: that of their centres
+    /// and their own, which is widened.
     #[test]
     fn the_parts_have_the_moments_of_the_whole() {
         let whole = triangle([[1.0, 2.0, 3.0], [4.0, 2.5, 2.0], [0.0, 5.0, 7.0]]);

@@ -2,9 +2,9 @@
 //!
 //! Source: what NVIDIA's 3dgrut writes. `nre_data.state_dict` has, per layer of
 //! `.gaussians_nodes.LAYER`, arrays of f16 or f32 with their shapes: positions, rotations (w, x, y,
-//! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the
-//! higher degrees, coefficient-major, then red, green, blue), of which n_active_features degrees
-//! count. A layer of tracked objects is skipped, because it has no fixed place. Positions are in the
+//! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the higher
+//! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
+//! layer of tracked objects is skipped, because it has no fixed place. Positions are in the
 //! payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;

@@ -1,9 +1,10 @@
-//! PLY as compressed by PlayCanvas: 16 bytes per Gaussian, in chunks of 256 that share a value range.
+//! PLY as compressed by PlayCanvas: 16 bytes per Gaussian, in chunks of 256 that share a value
+//! range.
 //!
-//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has packed_position and
-//! packed_scale (11, 10, 11 bits from the top, within the chunk's range), packed_rotation (2
-//! bits for the largest component, 3 x 10 for the others) and packed_color (4 x 8: colour within
-//! the chunk's range, opacity). An element sh holds f_rest in 8 bits.
+//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has
+//! packed_position and packed_scale (11, 10, 11 bits from the top, within the chunk's range),
+//! packed_rotation (2 bits for the largest component, 3 x 10 for the others) and packed_color (4 x
+//! 8: colour within the chunk's range, opacity). An element sh holds f_rest in 8 bits.
 
 use std::io::BufRead;
 
@@ -135,7 +136,8 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     activation::quat_of_smallest_three((word >> 30) as usize, others)
 }
 
-/// Decodes 8 bits over [-4, 4]: 0 and 255 are the ends exactly, other values are at the middle of their step.
+/// Decodes 8 bits over [-4, 4]: 0 and 255 are the ends exactly, other values are at the middle of
+/// their step.
 fn unpack_coefficient(byte: f64) -> f64 {
     let unit = match byte {
         0.0 => 0.0,

@@ -114,7 +114,8 @@ impl Header {
         self.elements.iter().find(|element| element.name == name)
     }
 
-    /// Compares the size that the header implies with the file's, before anything is allocated for it.
+    /// Compares the size that the header implies with the file's, before anything is allocated for
+    /// it.
     pub(super) fn check_size(&self, file_bytes: u64) -> Result<(), IngestError> {
         let size = |e: &Element| u128::from(e.count) * e.stride as u128;
         let promised = self.elements.iter().map(size).sum();

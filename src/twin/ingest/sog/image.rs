@@ -82,8 +82,8 @@ pub(super) struct Palette {
 const ENTRIES_PER_ROW: usize = 64;
 
 impl Palette {
-    /// Decodes an image, and checks its number of entries and its degree where they are known. Its width implies
-    /// the degree, too.
+    /// Decodes an image, and checks its number of entries and its degree where they are known. Its
+    /// width implies the degree, too.
     pub(super) fn decode(
         part: (String, Vec<u8>),
         entries: Option<u64>,

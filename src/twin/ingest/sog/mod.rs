@@ -1,5 +1,5 @@
-//! SOG, the spatially ordered Gaussians of PlayCanvas: a meta.json and lossless WebP images, one pixel per
-//! Gaussian, in a folder or an archive.
+//! SOG, the spatially ordered Gaussians of PlayCanvas: a meta.json and lossless WebP images, one
+//! pixel per Gaussian, in a folder or an archive.
 //!
 //! Source: the format's description and readers in playcanvas/splat-transform. Images: means_l and
 //! means_u (low and high bytes of 16 bits between mins and maxs, of `sign(x) ln(1 + |x|)`), quats
@@ -23,8 +23,8 @@ use meta::{Meta, Tables};
 
 const FORMAT: &str = "SOG";
 
-/// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty or ends
-/// in `/`.
+/// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty
+/// or ends in `/`.
 pub(super) fn read(
     json: &[u8],
     folder: &str,

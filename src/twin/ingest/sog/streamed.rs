@@ -1,7 +1,7 @@
 //! Streamed SOG: lod-meta.json and a SOG folder per block of every level of detail.
 //!
-//! Every leaf of its tree has one range of Gaussians per level, 0 being the finest. A twin makes its
-//! own levels of detail, so only the finest range of every leaf is read.
+//! Every leaf of its tree has one range of Gaussians per level, 0 being the finest. A twin makes
+//! its own levels of detail, so only the finest range of every leaf is read.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -12,7 +12,8 @@ use super::files::{create_dirs, entries};
 
 /// Name of the directory of what is being committed.
 pub(super) const STAGING: &str = ".staging";
-/// Separates the twin's name from the commit's in the name of a staging directory. Neither contains it.
+/// Separates the twin's name from the commit's in the name of a staging directory. Neither contains
+/// it.
 pub(super) const SEPARATOR: char = '@';
 /// The file in a staging directory that its commit keeps locked.
 pub(super) const LOCK: &str = "lock";
@@ -74,9 +75,9 @@ impl Local {
         Ok(())
     }
 
-    /// Removes the empty directories of a twin; the twin's own, too, if it never had a version, because it has no
-    /// side files then. Side files are written without the publish lock, so their directories are kept. The caller holds
-    /// the publish lock.
+    /// Removes the empty directories of a twin; the twin's own, too, if it never had a version,
+    /// because it has no side files then. Side files are written without the publish lock, so their
+    /// directories are kept. The caller holds the publish lock.
     pub(super) fn remove_empty(&self, name: &str) {
         let twin = self.root.join(name);
         for prefix in entries(&twin.join("objects")).unwrap_or_default() {
@@ -95,8 +96,8 @@ impl Local {
         Ok(file)
     }
 
-    /// Opens the publish lock. Its file is never removed: otherwise two commits could lock two files of one
-    /// name.
+    /// Opens the publish lock. Its file is never removed: otherwise two commits could lock two
+    /// files of one name.
     pub(super) fn publish_lock(&self, name: &str) -> Result<PublishLock, StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
         let file = File::options().create(true).append(true).open(&path);

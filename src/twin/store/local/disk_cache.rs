@@ -6,9 +6,9 @@
 //! <cache>/lock                locked by the process that removes parts to make room
 //! ```
 //!
-//! Every part is compared with its hash on every read, which costs less than decoding it. So nothing
-//! needs to be synced: a part that a power cut damaged is fetched again. A part's modification time is the time of its
-//! last use, to within a minute.
+//! Every part is compared with its hash on every read, which costs less than decoding it. So
+//! nothing needs to be synced: a part that a power cut damaged is fetched again. A part's
+//! modification time is the time of its last use, to within a minute.
 
 use std::fs::{self, File};
 use std::io::ErrorKind;
@@ -26,8 +26,8 @@ use super::files::{WRITING, create_dirs, entries};
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
 /// Age after which an unfinished file is taken for one that a killed process left.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);
-/// Each process makes room once it has written one part in this many of the limit, so that several processes together
-/// stay close to the limit.
+/// Each process makes room once it has written one part in this many of the limit, so that several
+/// processes together stay close to the limit.
 const SLACK: u64 = 16;
 
 /// A directory of cached parts.
@@ -80,7 +80,8 @@ impl DiskCache {
         sound
     }
 
-    /// Caches a part that has this hash. Failures are ignored: without the cache, reading is slow but correct.
+    /// Caches a part that has this hash. Failures are ignored: without the cache, reading is slow
+    /// but correct.
     pub(in crate::store) fn put(&self, hash: &str, bytes: &[u8]) {
         let size = bytes.len() as u64;
         if size > self.limit_bytes / SLACK {
@@ -111,8 +112,8 @@ impl DiskCache {
         self.dir.join(&hash[..2]).join(hash)
     }
 
-    /// Removes the least recently used parts until there is room for what is written before the next call.
-    /// One process at a time does this; concurrent callers return at once.
+    /// Removes the least recently used parts until there is room for what is written before the
+    /// next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");
         let lock = File::options().create(true).append(true).open(&path);

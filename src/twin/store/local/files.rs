@@ -67,8 +67,8 @@ pub(super) fn create_parent(path: &Path) -> Result<(), StoreError> {
     path.parent().map_or(Ok(()), create_dirs)
 }
 
-/// Creates a directory and the missing ones above it, and syncs each: what is written into a directory is lost
-/// in a power cut if the directory's own entry is.
+/// Creates a directory and the missing ones above it, and syncs each: what is written into a
+/// directory is lost in a power cut if the directory's own entry is.
 pub(super) fn create_dirs(dir: &Path) -> Result<(), StoreError> {
     // The parent of "twins" is "", which is the current directory.
     if dir.as_os_str().is_empty() || dir.is_dir() {

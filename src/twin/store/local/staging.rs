@@ -11,7 +11,8 @@ use crate::store::backend::{Staging, StoredObject, WriteObject};
 use super::directory::{LOCK, Local, SEPARATOR, STAGING};
 use super::files::{BUFFER_BYTES, HashingFile, create_parent, sync, sync_parent};
 
-/// Objects of a commit that no reader sees yet. Dropped before it is published, it leaves nothing behind.
+/// Objects of a commit that no reader sees yet. Dropped before it is published, it leaves nothing
+/// behind.
 #[derive(Debug)]
 pub(super) struct LocalStaging {
     local: Local,
@@ -19,7 +20,8 @@ pub(super) struct LocalStaging {
     pub(super) dir: PathBuf,
     /// Objects that did not exist before this commit placed them.
     placed: Vec<PathBuf>,
-    /// The publish lock. While it is held, no other commit can rely on an object that may be removed again.
+    /// The publish lock. While it is held, no other commit can rely on an object that may be
+    /// removed again.
     publish_lock: Option<File>,
     /// Released by the kernel when the process ends, however it ends.
     _lock: File,
@@ -28,7 +30,8 @@ pub(super) struct LocalStaging {
 impl LocalStaging {
     /// Creates the directory, and locks it for as long as the process lives.
     pub(super) fn begin(local: &Local, name: &str, commit: &str) -> Result<Self, StoreError> {
-        // Removing abandoned directories takes this lock, too, and must not find this one before its own lock is taken.
+        // Removing abandoned directories takes this lock, too, and must not find this one before
+        // its own lock is taken.
         let _publish_lock = local.lock_publishing(name)?;
         let dir = local.root.join(STAGING).join(format!("{name}{SEPARATOR}{commit}"));
         fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;

@@ -114,7 +114,8 @@ impl Remote {
             Err(StoreError::Io { cause, .. }) => cause.kind() == ErrorKind::Other,
             Err(_) => false,
         };
-        // Stores differ in how they answer a range past the end: with fewer bytes, or with an error.
+        // Stores differ in how they answer a range past the end: with fewer bytes, or with an
+        // error.
         if short
             && let Ok(ObjectMeta { size, .. }) = self.head(key)
             && size < bytes.end
@@ -124,8 +125,8 @@ impl Remote {
         read
     }
 
-    /// Reads until the bytes have their hash, a bounded number of times: bytes damaged in transit are not damaged in the
-    /// store.
+    /// Reads until the bytes have their hash, a bounded number of times: bytes damaged in transit
+    /// are not damaged in the store.
     pub(super) fn read_verified(
         &self,
         key: &str,

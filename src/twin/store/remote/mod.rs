@@ -1,8 +1,9 @@
-//! Twins in an object store: S3, GCS, Azure. Only this folder names `object_store`, except that a catalog can be opened
-//! over a store that is open already.
+//! Twins in an object store: S3, GCS, Azure. Only this folder names `object_store`, except that a
+//! catalog can be opened over a store that is open already.
 //!
-//! Objects are uploaded to their final keys, under their hashes. No reader sees them before a log record names a
-//! manifest that names them. What a killed commit left is removed by garbage collection alone.
+//! Objects are uploaded to their final keys, under their hashes. No reader sees them before a log
+//! record names a manifest that names them. What a killed commit left is removed by garbage
+//! collection alone.
 
 mod client;
 mod retry;

@@ -69,7 +69,8 @@ pub(super) enum RequestCounter {
     Failure,
 }
 
-/// The threads that requests run on. Any thread may wait for a request, even one of another runtime.
+/// The threads that requests run on. Any thread may wait for a request, even one of another
+/// runtime.
 #[derive(Debug)]
 pub(super) struct RequestRunner {
     /// `None` only while this is dropped.
@@ -106,8 +107,8 @@ impl RequestRunner {
         Traffic { requests, retries, failures, ..Traffic::default() }
     }
 
-    /// Makes a request until it succeeds, fails with an error that retrying cannot change, or has had all attempts. Only
-    /// for idempotent requests.
+    /// Makes a request until it succeeds, fails with an error that retrying cannot change, or has
+    /// had all attempts. Only for idempotent requests.
     pub(super) fn run<T, F>(&self, request: impl Fn() -> F + Send + 'static) -> io::Result<T>
     where
         T: Send + 'static,

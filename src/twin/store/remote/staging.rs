@@ -53,7 +53,8 @@ impl RemoteStaging {
 }
 
 impl Staging for RemoteStaging {
-    /// Begins to upload one object. It is uploaded even if it exists, so that garbage collection sees it as new.
+    /// Begins to upload one object. It is uploaded even if it exists, so that garbage collection
+    /// sees it as new.
     ///
     /// # Errors
     /// An earlier upload failed.
@@ -79,16 +80,18 @@ impl Staging for RemoteStaging {
         Ok(StoredObject { hash, bytes })
     }
 
-    /// An object store has no locks: of two commits with one number, the second gets [`StoreError::Conflict`].
+    /// An object store has no locks: of two commits with one number, the second gets
+    /// [`StoreError::Conflict`].
     fn lock_publishing(&mut self) -> Result<(), StoreError> {
         Ok(())
     }
 
-    /// Puts the record, if there is none with its number. If the answer is lost, the record that exists tells what
-    /// happened, because no two commits write the same record.
+    /// Puts the record, if there is none with its number. If the answer is lost, the record that
+    /// exists tells what happened, because no two commits write the same record.
     ///
     /// # Errors
-    /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if the record cannot be read either.
+    /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if the record cannot be read
+    /// either.
     fn publish(
         &mut self,
         _hashes: &BTreeSet<&str>,
