@@ -372,7 +372,8 @@ fn a_rollback_gives_an_old_version_a_new_number_in_the_log() {
     assert_eq!(catalog.rollback("street", 2).unwrap().number, 4);
 
     let log = catalog.versions("street").unwrap();
-    let entries: Vec<_> = log.iter().map(|entry| (entry.number, entry.kind, entry.parent)).collect();
+    let entries: Vec<_> =
+        log.iter().map(|entry| (entry.number, entry.kind, entry.parent)).collect();
     assert_eq!(
         entries,
         [
