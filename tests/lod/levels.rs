@@ -6,7 +6,7 @@ use wildcity_render::View;
 use wildcity_scene::chunk::{Partition, column};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_scene::{Chunk, Gaussians, Record, Scene, lod};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, Scene, lod};
 use wildcity_twin::store::{Catalog, StorageOptions};
 
 use crate::{commit, decibels, eyes, stored, streets, tau};
@@ -40,7 +40,7 @@ fn moments(chunk: &Chunk) -> Vec<(DVec3, f64, f64)> {
 #[test]
 fn tau_zero_is_level_zero_everywhere() {
     let (scene, views) = streets::demo_street();
-    let resident = stored(&scene, Record::F32, true);
+    let resident = stored(&scene, RecordFormat::F32, true);
     let drawn = resident.scene(&eyes(&views), &tau(0.0));
     assert_eq!(drawn.gaussians(), scene.len());
     let db = decibels(&drawn, &Scene::from_gaussians(&scene), &views);
@@ -49,12 +49,12 @@ fn tau_zero_is_level_zero_everywhere() {
 
 #[test]
 fn a_pixel_of_error_is_hardly_seen_on_the_street() {
-    // All six cameras at a quarter of their size: at their full size, a pixel is so small that hardly
-    // anything of a street of 300 m is merged.
+    // All six cameras at a quarter of their size: at their full size, a pixel is so small that
+    // hardly anything of a street of 300 m is merged.
     let (scene, _) = streets::demo_street();
     let views = quarter_rig();
     let truth = Scene::from_gaussians(&scene);
-    let resident = stored(&scene, Record::F32, true);
+    let resident = stored(&scene, RecordFormat::F32, true);
     let mut before = scene.len();
     for (tau_px, wanted_db) in [(1.0, 45.0), (2.0, 41.0), (4.0, 37.0), (8.0, 33.0)] {
         let drawn = resident.scene(&eyes(&views), &tau(tau_px));
@@ -79,7 +79,7 @@ fn quarter_rig() -> Vec<View> {
 }
 
 #[test]
-fn every_level_keeps_its_word() {
+fn every_level_keeps_its_error_bound() {
     let (scene, _) = streets::demo_street();
     let mut checked = 0;
     for block in blocks(&scene).iter().filter(|block| block.len() > 500).step_by(9) {
@@ -90,10 +90,10 @@ fn every_level_keeps_its_word() {
             assert!(level.error_m >= error_m && level.chunk.len() < count);
             (error_m, count) = (level.error_m, level.chunk.len());
             let nodes = moments(&level.chunk);
-            // Nothing of what covers the picture is lost.
+            // Opacity times area is conserved.
             let now: f64 = nodes.iter().map(|node| node.2).sum();
             assert!((now / whole - 1.0).abs() < 1e-4, "{now} of {whole}");
-            // Everything has somebody near and wide enough that may stand for it.
+            // Each Gaussian has a near and wide enough one that represents it.
             for (mean, sigma, _) in &leaves {
                 let nearest = nodes.iter().map(|(node, node_sigma, _)| {
                     node.distance(*mean) + 3.0 * (sigma - node_sigma).max(0.0)

@@ -6,7 +6,7 @@ use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
 use wildcity_render::{Backend, View};
 use wildcity_scene::geometry::camera::{
-    Bivariate, FTheta, Field, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
+    Bivariate, FTheta, FThetaReference, FieldMask, Fisheye, Lens, OpenCv, Pinhole, Windshield,
     WindshieldReference,
 };
 use wildcity_scene::geometry::{Camera, CameraError, Pose};
@@ -31,7 +31,7 @@ fn every_pixel_comes_back_to_where_it_was() {
                     let off_px = back_px.distance(at_px);
                     assert!(off_px < 1e-8, "{name} at {at_px}: {off_px:e} px off");
                 }
-                let beyond_px = camera.project_beyond(direction);
+                let beyond_px = camera.project_extrapolated(direction);
                 assert!(beyond_px.distance(at_px) < 1e-8, "{name} at {at_px}, continued");
                 seen += 1;
             }
@@ -45,18 +45,22 @@ fn each_model_is_its_formula() {
     let point = DVec3::new(0.7, -0.4, 2.0);
     for (name, camera) in lenses() {
         let Pinhole { fx, fy, cx, cy } = camera.pinhole;
-        let (x, y) = (point.x / point.z, point.y / point.z);
-        let (r2, theta) = (x * x + y * y, x.hypot(y).atan());
+        let x = point.x / point.z;
+        let y = point.y / point.z;
+        let r2 = x * x + y * y;
+        let theta = x.hypot(y).atan();
         let at_px = match camera.lens {
             _ if camera.windshield.is_some() => continue,
             Lens::OpenCv(lens) => {
-                let ([k1, k2, k3, k4, k5, k6], [p1, p2], [s1, s2, s3, s4]) =
-                    (lens.k(), lens.p(), lens.s());
+                let [k1, k2, k3, k4, k5, k6] = lens.k();
+                let [p1, p2] = lens.p();
+                let [s1, s2, s3, s4] = lens.s();
                 let icd = (1.0 + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
                     / (1.0 + k4 * r2 + k5 * r2.powi(2) + k6 * r2.powi(3));
                 let u = x * icd + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
                 let v = y * icd + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-                let (prism_u, prism_v) = (s1 * r2 + s2 * r2 * r2, s3 * r2 + s4 * r2 * r2);
+                let prism_u = s1 * r2 + s2 * r2 * r2;
+                let prism_v = s3 * r2 + s4 * r2 * r2;
                 DVec2::new(fx * (u + prism_u) + cx, fy * (v + prism_v) + cy)
             }
             Lens::Fisheye(lens) => {
@@ -72,9 +76,10 @@ fn each_model_is_its_formula() {
                 let polynomial =
                     |t: f64| (0..6).map(|i| lens.polynomial()[i] * t.powi(i as i32)).sum::<f64>();
                 let radius_px = match lens.reference() {
-                    Reference::AngleToPixel => polynomial(theta),
-                    Reference::PixelToAngle => {
-                        let (mut low, mut high) = (0.0, 200.0);
+                    FThetaReference::AngleToPixel => polynomial(theta),
+                    FThetaReference::PixelToAngle => {
+                        let mut low = 0.0;
+                        let mut high = 200.0;
                         for _ in 0..100 {
                             let middle = 0.5 * (low + high);
                             let ends =
@@ -85,7 +90,8 @@ fn each_model_is_its_formula() {
                     }
                 };
                 let [c, d, e] = lens.linear_cde();
-                let (u, v) = (radius_px * x / r2.sqrt(), radius_px * y / r2.sqrt());
+                let u = radius_px * x / r2.sqrt();
+                let v = radius_px * y / r2.sqrt();
                 DVec2::new(c * u + d * v + cx, e * u + v + cy)
             }
             Lens::Pinhole => DVec2::new(fx * x + cx, fy * y + cy),
@@ -100,12 +106,14 @@ fn a_windshield_turns_rays_as_its_polynomials_say_and_back() {
     let camera = lenses()[4].1;
     let windshield = camera.windshield.unwrap();
     let point = DVec3::new(0.7, -0.4, 2.0).normalize();
-    let (phi, theta) = (point.x.asin(), point.y.asin());
+    let phi = point.x.asin();
+    let theta = point.y.asin();
     let [h, v] = [windshield.horizontal(), windshield.vertical()].map(|polynomial| {
         let c = polynomial.coefficients();
         c[0] + c[1] * phi + c[2] * phi * phi + (c[3] + c[4] * phi) * theta + c[5] * theta * theta
     });
-    let (x, y) = (h.sin(), v.sin());
+    let x = h.sin();
+    let y = v.sin();
     let inside = DVec3::new(x, y, (1.0 - x * x - y * y).sqrt());
     let without = Camera { windshield: None, ..camera };
     let off_px = camera.project(point).unwrap().distance(without.project(inside).unwrap());
@@ -148,7 +156,7 @@ fn zero_distortion_is_a_pinhole_by_another_name() {
 #[test]
 fn a_lens_ends_before_it_folds_back() {
     let wide = Pinhole { fx: 40.0, fy: 40.0, cx: 80.0, cy: 50.0 };
-    let ideal = Camera::ideal(160, 100, wide);
+    let ideal = Camera::from_pinhole(160, 100, wide);
     // θ - θ³/6 turns at √2 rad; x (1 - 0.3 r²) at r = 1.05, and is 0.8 at 0.82.
     let fisheye = Fisheye::new([-1.0 / 6.0, 0.0, 0.0, 0.0], None);
     let fisheye = Camera { lens: Lens::Fisheye(fisheye), ..ideal };
@@ -164,7 +172,7 @@ fn a_lens_ends_before_it_folds_back() {
         assert!(camera.project(DVec3::new(sin, 0.0, cos)).is_some(), "within");
         assert_eq!(camera.project(DVec3::NEG_Z), None, "behind");
         assert_eq!(camera.unproject(DVec2::new(1.0, 1.0)), None, "the corner");
-        let field = Field::of(&camera).expect("a part of the image");
+        let field = FieldMask::of(&camera).expect("a part of the image");
         for (row, [first, end]) in field.columns.iter().enumerate() {
             for column in 0..camera.width_px {
                 let at_px = DVec2::new(f64::from(column) + 0.5, row as f64 + 0.5);
@@ -172,15 +180,15 @@ fn a_lens_ends_before_it_folds_back() {
                 assert_eq!(seen, camera.unproject(at_px).is_some(), "{at_px}");
             }
         }
-        let share = field.share(&camera);
+        let share = field.visible_share(&camera);
         assert!((0.1..0.8).contains(&share), "{share}");
     }
-    assert_eq!(Field::of(&ideal), None);
+    assert_eq!(FieldMask::of(&ideal), None);
 }
 
 #[test]
 fn absurd_coefficients_are_refused_with_the_reason() {
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 90.0, cx: 80.0, cy: 50.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 90.0, cx: 80.0, cy: 50.0 });
     let refused = |lens| {
         let error = Camera { lens, ..ideal }.check().unwrap_err();
         assert!(error.to_string().contains(error.field()), "{error}");
@@ -189,8 +197,9 @@ fn absurd_coefficients_are_refused_with_the_reason() {
     let opencv = |k| Lens::opencv(OpenCv::new(k, [0.0; 2], [0.0; 4]));
     let skewed = |p, s| Lens::opencv(OpenCv::new([0.0; 6], p, s));
     let fisheye = |k, most| Lens::Fisheye(Fisheye::new(k, most));
-    let ftheta =
-        |polynomial, cde| Lens::FTheta(FTheta::new(Reference::AngleToPixel, polynomial, cde, 1.2));
+    let ftheta = |polynomial, cde| {
+        Lens::FTheta(FTheta::new(FThetaReference::AngleToPixel, polynomial, cde, 1.2))
+    };
     for (lens, field, reason) in [
         (opencv([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens.k", "finite"),
         (opencv([1e12, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens.k", "1e9"),
@@ -229,7 +238,7 @@ fn absurd_coefficients_are_refused_with_the_reason() {
 /// An OpenCV lens with its axis in the middle of an image.
 fn distorted([width, height]: [u32; 2], f: f64, lens: OpenCv) -> Camera {
     let pinhole = Pinhole { fx: f, fy: f, cx: f64::from(width) / 2.0, cy: f64::from(height) / 2.0 };
-    Camera { lens: Lens::opencv(lens), ..Camera::ideal(width, height, pinhole) }
+    Camera { lens: Lens::opencv(lens), ..Camera::from_pinhole(width, height, pinhole) }
 }
 
 /// A direction, by how far off the axis and along it, and its azimuth.
@@ -244,11 +253,9 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
     let mut accepted = 0;
     for set in 0..600 {
         let size = |of: usize, sizes: [f64; 4]| sizes[set / of % 4];
-        let (radial, tangential, prism) = (
-            size(1, [0.01, 0.1, 1.0, 10.0]),
-            size(4, [0.0, 1e-3, 0.02, 0.3]),
-            size(16, [0.0, 1e-3, 0.02, 0.3]),
-        );
+        let radial = size(1, [0.01, 0.1, 1.0, 10.0]);
+        let tangential = size(4, [0.0, 1e-3, 0.02, 0.3]);
+        let prism = size(16, [0.0, 1e-3, 0.02, 0.3]);
         let k = [0; 6].map(|_| within(radial));
         let rational = if set % 3 == 0 { 0.0 } else { 1.0 };
         let k = [k[0], k[1], k[2], rational * k[3], rational * k[4], rational * k[5]];
@@ -376,7 +383,7 @@ fn a_lens_shows_all_of_its_field() {
 fn behind(windshield: Windshield, max_angle_rad: f64) -> Camera {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(max_angle_rad)));
     let pinhole = Pinhole { fx: 55.0, fy: 55.0, cx: 100.0, cy: 100.0 };
-    Camera { lens, windshield: Some(windshield), ..Camera::ideal(200, 200, pinhole) }
+    Camera { lens, windshield: Some(windshield), ..Camera::from_pinhole(200, 200, pinhole) }
 }
 
 #[test]
@@ -398,7 +405,8 @@ fn a_windshield_that_folds_where_it_fades_is_refused() {
 fn windshields_neither_fold_nor_lose_what_is_behind_them() {
     let mut random = Random(9);
     let mut within = |most: f64| most * (2.0 * random.unit() - 1.0);
-    let (mut accepted, mut fading) = (0, 0);
+    let mut accepted = 0;
+    let mut fading = 0;
     for set in 0..240 {
         let most = [1e-3, 0.01, 0.05, 0.1][set % 4];
         let limit_rad = [1.0, 1.3, 1.5, 1.7][set / 4 % 4];
@@ -428,7 +436,8 @@ fn windshields_neither_fold_nor_lose_what_is_behind_them() {
             let (right, down) = outside.any_orthonormal_pair();
             let [x, y] = [right, down].map(|across| {
                 let beside = 1e-5 * across;
-                camera.project_beyond(outside + beside) - camera.project_beyond(outside - beside)
+                camera.project_extrapolated(outside + beside)
+                    - camera.project_extrapolated(outside - beside)
             });
             assert!(x.perp_dot(y) * outside.dot(right.cross(down)) > 0.0, "{camera:?}: {at_px}");
         }

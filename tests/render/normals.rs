@@ -5,7 +5,7 @@ use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, RenderError, RollingShutter, Target, View};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::cpu;
@@ -67,7 +67,7 @@ fn a_wall_faces_where_it_does() {
     let scene = scene_of(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
     let rolling_shutter =
-        RollingShutter { direction: Rolls::TopToBottom, world_from_camera_first: way };
+        RollingShutter { direction: ShutterDirection::TopToBottom, world_from_camera_first: way };
     let mut views: Vec<(&str, View)> = lenses()
         .into_iter()
         .map(|(name, camera)| (name, View::new(camera, Pose::IDENTITY)))
@@ -97,7 +97,8 @@ fn an_edge_belongs_to_neither_side() {
     let scene = scene_of(&[board, behind].concat());
     let drawn = draw(&cpu(), &scene, forward_view([160, 100], 90.0));
     // The board's last discs fade out over some pixels, whose depth is between the two and has a slope.
-    let (mut on_one, mut slopes) = (0, 0);
+    let mut on_one = 0;
+    let mut slopes = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
         if (depth_m - 2.0).abs() < 0.01 || (depth_m - 4.0).abs() < 0.02 {
             on_one += 1;

@@ -1,28 +1,28 @@
-//! Cameras, both ways.
+//! Lenses, windshields, shutters and exposures, both ways.
 
 use wildcity_protocol::camera as wire;
 use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::camera::{
-    Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
+    Camera, CameraError, FThetaReference, Shutter, ShutterDirection, WindshieldReference,
 };
 
-/// Wire to lens.
+/// A lens from the wire.
 pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
     match lens {
         wire::Lens::Opencv { k, p, s } => LensFields::Opencv { k, p, s },
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
         wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                wire::FthetaReference::AngleToPixel => Reference::AngleToPixel,
-                wire::FthetaReference::PixelToAngle => Reference::PixelToAngle,
+                wire::FthetaReference::AngleToPixel => FThetaReference::AngleToPixel,
+                wire::FthetaReference::PixelToAngle => FThetaReference::PixelToAngle,
             };
             LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
     }
 }
 
-/// Wire to windshield.
+/// A windshield from the wire.
 pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     let wire::Windshield { reference, horizontal, vertical } = windshield;
     let reference = match reference {
@@ -32,7 +32,7 @@ pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     WindshieldFields { reference, horizontal, vertical }
 }
 
-/// Wire to what a camera makes of an image of a size.
+/// The exposure and the overlay of a camera from the wire; `size_px` is the width and height of its image.
 pub(super) fn appearance_of(
     exposure: Option<wire::Exposure>,
     overlay: Option<&str>,
@@ -43,38 +43,40 @@ pub(super) fn appearance_of(
     Appearance::new(exposure.transpose()?, overlay, size_px)
 }
 
-/// Exposure to wire.
+/// An exposure to the wire.
 pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposure {
     wire::Exposure { matrix: Some(matrix), gain: None, offset }
 }
 
-/// Wire to shutter.
+/// A shutter from the wire.
 pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        wire::ShutterDirection::TopToBottom => Rolls::TopToBottom,
-        wire::ShutterDirection::BottomToTop => Rolls::BottomToTop,
-        wire::ShutterDirection::LeftToRight => Rolls::LeftToRight,
-        wire::ShutterDirection::RightToLeft => Rolls::RightToLeft,
+        wire::ShutterDirection::TopToBottom => ShutterDirection::TopToBottom,
+        wire::ShutterDirection::BottomToTop => ShutterDirection::BottomToTop,
+        wire::ShutterDirection::LeftToRight => ShutterDirection::LeftToRight,
+        wire::ShutterDirection::RightToLeft => ShutterDirection::RightToLeft,
     };
     let shutter = Shutter { direction, duration_us };
     shutter.check().map(|()| shutter)
 }
 
-/// Camera to wire: what it is beyond a pinhole.
-pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Windshield>) {
+/// The lens and the windshield of a camera to the wire; a pinhole has neither.
+pub(super) fn lens_and_windshield_to(
+    camera: &Camera,
+) -> (Option<wire::Lens>, Option<wire::Windshield>) {
     let Intrinsics { lens, windshield, .. } = Intrinsics::of(camera);
     (lens.map(lens_to), windshield.map(windshield_to))
 }
 
-/// Shutter to wire.
+/// A shutter to the wire.
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        Rolls::TopToBottom => wire::ShutterDirection::TopToBottom,
-        Rolls::BottomToTop => wire::ShutterDirection::BottomToTop,
-        Rolls::LeftToRight => wire::ShutterDirection::LeftToRight,
-        Rolls::RightToLeft => wire::ShutterDirection::RightToLeft,
+        ShutterDirection::TopToBottom => wire::ShutterDirection::TopToBottom,
+        ShutterDirection::BottomToTop => wire::ShutterDirection::BottomToTop,
+        ShutterDirection::LeftToRight => wire::ShutterDirection::LeftToRight,
+        ShutterDirection::RightToLeft => wire::ShutterDirection::RightToLeft,
     };
     wire::Shutter { direction, duration_us }
 }
@@ -85,8 +87,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
         LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
         LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                Reference::AngleToPixel => wire::FthetaReference::AngleToPixel,
-                Reference::PixelToAngle => wire::FthetaReference::PixelToAngle,
+                FThetaReference::AngleToPixel => wire::FthetaReference::AngleToPixel,
+                FThetaReference::PixelToAngle => wire::FthetaReference::PixelToAngle,
             };
             wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
         }

@@ -1,0 +1,91 @@
+//! The nearest of the items of a drive, without a look at each of them.
+
+use glam::DVec3;
+
+use crate::geometry::Bounds;
+
+/// Items in the order of a drive, in boxes of `BOX_ITEMS` that follow each other.
+///
+/// A search looks at every box, and into few: of 84 km at 0.5 m, 2,600 boxes and some hundred of
+/// 168,000 keyframes.
+#[derive(Clone, Debug)]
+pub struct BoxIndex {
+    bounds: Vec<Bounds>,
+    items: usize,
+}
+
+/// Near the root of 168,000, half of it: looking into a box costs more than looking at one.
+const BOX_ITEMS: usize = 64;
+
+impl BoxIndex {
+    /// Of items that lie in these bounds, in order.
+    pub fn new(items: &[Bounds]) -> Self {
+        let union = |chunk: &[Bounds]| chunk.iter().fold(Bounds::EMPTY, |all, one| all.union(one));
+        Self { bounds: items.chunks(BOX_ITEMS).map(union).collect(), items: items.len() }
+    }
+
+    /// The item of the least cost, the first of several, and its cost. A cost is in metres, and no less
+    /// than the distance between the point and the item's bounds; the less it exceeds that, the faster.
+    pub fn min_cost(&self, point_m: DVec3, cost_m: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
+        let distances_m = self.bounds.iter().map(|bounds| bounds.distance_m(point_m));
+        let (nearest, _) =
+            distances_m.enumerate().min_by(|(_, a_m), (_, b_m)| a_m.total_cmp(b_m))?;
+        let mut best: Option<(usize, f64)> = None;
+        let look_into = |place: usize, best: &mut Option<(usize, f64)>| {
+            let first = place * BOX_ITEMS;
+            for item in first..(first + BOX_ITEMS).min(self.items) {
+                let cost = cost_m(item);
+                let less = |(known, least): (usize, f64)| (cost, item) < (least, known);
+                if best.is_none_or(less) {
+                    *best = Some((item, cost));
+                }
+            }
+        };
+        look_into(nearest, &mut best);
+        for (place, bounds) in self.bounds.iter().enumerate() {
+            let may_be_less = |(_, least)| bounds.distance_m(point_m) <= least;
+            if place != nearest && best.is_none_or(may_be_less) {
+                look_into(place, &mut best);
+            }
+        }
+        best
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::cell::Cell;
+
+    /// Around a block of 100 x 60 m, twice, a metre a pose.
+    fn drive() -> Vec<DVec3> {
+        let at = |way_m: f64| match way_m % 320.0 {
+            m if m < 100.0 => DVec3::new(m, 0.0, 0.0),
+            m if m < 160.0 => DVec3::new(100.0, m - 100.0, 0.0),
+            m if m < 260.0 => DVec3::new(260.0 - m, 60.0, 0.0),
+            m => DVec3::new(0.0, 320.0 - m, 0.0),
+        };
+        (0..640).map(|i| at(f64::from(i))).collect()
+    }
+
+    #[test]
+    fn the_first_of_the_nearest_as_if_all_were_looked_at() {
+        let drive = drive();
+        let point = |at_m: &DVec3| Bounds { min_m: *at_m, max_m: *at_m };
+        let boxes = BoxIndex::new(&drive.iter().map(point).collect::<Vec<_>>());
+        let looked_at = Cell::new(0);
+        for i in 0..400 {
+            let (x_m, y_m) = (f64::from(i % 20) * 7.0 - 20.0, f64::from(i / 20) * 5.0 - 20.0);
+            let place_m = DVec3::new(x_m, y_m, 1.0);
+            let cost_m = |item: usize| {
+                looked_at.set(looked_at.get() + 1);
+                drive[item].distance(place_m)
+            };
+            let slow = drive.iter().map(|at_m| at_m.distance(place_m)).enumerate();
+            let slow = slow.min_by(|(_, a), (_, b)| a.total_cmp(b));
+            assert_eq!(boxes.min_cost(place_m, cost_m), slow, "{place_m}");
+        }
+        assert!(looked_at.get() < 400 * 640 / 2, "{} of {}", looked_at.get(), 400 * 640);
+        assert_eq!(BoxIndex::new(&[]).min_cost(DVec3::ZERO, |_| 0.0), None);
+    }
+}

@@ -1,0 +1,287 @@
+//! A network for 16 directions at once, in f32.
+//!
+//! The appearance is the same for every direction: its products are part of the biases. Eight outputs
+//! are summed side by side, so that an input is read once for all of them.
+
+use fearless_simd::{f32x16, i32x16, prelude::*};
+
+use super::Network;
+use crate::chunk::{LANES, Lanes};
+
+/// Outputs that are summed side by side.
+const GROUP: usize = 8;
+
+/// A network whose appearance is folded into its biases.
+#[derive(Clone, Debug)]
+pub struct InferenceNetwork {
+    octaves: usize,
+    identity: bool,
+    skip: bool,
+    /// Values of a direction and its octaves.
+    encoded: usize,
+    /// Outputs of a hidden layer, rounded up to whole groups: those added are 0.
+    width: usize,
+    layers: [Dense; 3],
+}
+
+/// A layer, group by group of outputs.
+#[derive(Clone, Debug)]
+struct Dense {
+    inputs: usize,
+    /// `[groups, inputs]`.
+    weight: Vec<[f32; GROUP]>,
+    /// `[groups]`.
+    bias: Vec<[f32; GROUP]>,
+}
+
+/// What an evaluation writes on its way: made once, used for many.
+#[derive(Clone, Debug)]
+pub struct Scratch {
+    /// The first layer's outputs, and behind them the encoded direction.
+    joined: Vec<Lanes>,
+    hidden: Vec<Lanes>,
+    logits: [Lanes; GROUP],
+}
+
+impl InferenceNetwork {
+    /// The same network.
+    pub fn new(network: &Network) -> Self {
+        let [first, second, third] = network.layers();
+        let encoded = first.inputs - network.appearance().len();
+        let width = first.outputs.next_multiple_of(GROUP);
+        // Inputs of the second layer: the first one's outputs, then the encoded direction.
+        let joined = |input: usize| match input {
+            _ if input < width => (input < first.outputs).then_some(input),
+            _ => Some(input - width + first.outputs),
+        };
+        let joined_inputs = if network.skip() { width + encoded } else { width };
+        let appearance = network.appearance();
+        let folded = |layer: &super::Layer, output: usize, from: usize| {
+            let row = &layer.weight[output * layer.inputs..][..layer.inputs];
+            let products = row.iter().skip(from).zip(appearance);
+            let sum: f64 = products.map(|(&w, &a)| f64::from(w) * f64::from(a)).sum();
+            (f64::from(layer.bias[output]) + sum) as f32
+        };
+        Self {
+            octaves: network.octaves(),
+            identity: network.identity(),
+            skip: network.skip(),
+            encoded,
+            width,
+            layers: [
+                Dense::new(first, encoded, Some, |output| folded(first, output, encoded)),
+                Dense::new(second, joined_inputs, joined, |output| {
+                    // Behind the last input there is no weight: nothing is folded without a skip.
+                    folded(second, output, first.outputs + encoded)
+                }),
+                Dense::new(
+                    third,
+                    width,
+                    |input| (input < first.outputs).then_some(input),
+                    |output| third.bias[output],
+                ),
+            ],
+        }
+    }
+
+    /// Outputs of a hidden layer, a multiple of 8.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Octaves of sines and cosines.
+    pub fn octaves(&self) -> usize {
+        self.octaves
+    }
+
+    /// Values of a direction and its octaves.
+    pub fn encoded(&self) -> usize {
+        self.encoded
+    }
+
+    /// Whether the direction itself is one of them.
+    pub fn identity(&self) -> bool {
+        self.identity
+    }
+
+    /// Whether the second layer reads them again, behind the first one's outputs.
+    pub fn skip(&self) -> bool {
+        self.skip
+    }
+
+    /// All numbers, layer by layer and output by output: the bias, and then the weights of inputs, four by
+    /// four, those of the encoded direction filled up with zeros.
+    pub fn weights(&self) -> Vec<[f32; 4]> {
+        let mut rows = Vec::new();
+        for (layer, outputs) in self.layers.iter().zip([self.width, self.width, 3]) {
+            for output in 0..outputs {
+                let (group, k) = (output / GROUP, output % GROUP);
+                rows.push([layer.bias[group][k], 0.0, 0.0, 0.0]);
+                let weights = &layer.weight[group * layer.inputs..][..layer.inputs];
+                rows.extend(weights.chunks(4).map(|four| {
+                    std::array::from_fn(|i| four.get(i).map_or(0.0, |weight| weight[k]))
+                }));
+            }
+        }
+        rows
+    }
+
+    /// Memory of its numbers, in bytes.
+    pub fn bytes(&self) -> usize {
+        let of_layer = |layer: &Dense| (layer.weight.len() + layer.bias.len()) * 4 * GROUP;
+        self.layers.iter().map(of_layer).sum()
+    }
+
+    /// Room for evaluations.
+    pub fn scratch(&self) -> Scratch {
+        let zero = |len| vec![Lanes([0.0; LANES]); len];
+        Scratch {
+            joined: zero(self.width + self.encoded),
+            hidden: zero(self.width),
+            logits: [Lanes([0.0; LANES]); GROUP],
+        }
+    }
+
+    /// Red, green, blue in (0, 1) towards 16 unit directions: x, y, z.
+    #[inline(always)]
+    pub fn rgb<S: Simd>(
+        &self,
+        simd: S,
+        direction: [f32x16<S>; 3],
+        scratch: &mut Scratch,
+    ) -> [[f32; LANES]; 3] {
+        let Scratch { joined, hidden, logits } = scratch;
+        let (first, input) = joined.split_at_mut(self.width);
+        self.encode(simd, direction, input);
+        let [one, two, three] = &self.layers;
+        one.apply::<S, true>(simd, input, first);
+        let read = if self.skip { joined.len() } else { self.width };
+        two.apply::<S, true>(simd, &joined[..read], hidden);
+        three.apply::<S, false>(simd, hidden, logits);
+        let mut rgb = [[0.0; LANES]; 3];
+        for (rgb, logits) in rgb.iter_mut().zip(&*logits) {
+            for (value, logit) in rgb.iter_mut().zip(&logits.0) {
+                *value = 1.0 / (1.0 + (-logit).exp());
+            }
+        }
+        rgb
+    }
+
+    #[inline(always)]
+    fn encode<S: Simd>(&self, simd: S, direction: [f32x16<S>; 3], input: &mut [Lanes]) {
+        let mut next = 0;
+        if self.identity {
+            for (axis, to) in direction.iter().zip(&mut *input) {
+                axis.store_array(&mut to.0);
+            }
+            next = 3;
+        }
+        for quarter in [0.0, 0.5] {
+            let mut scale = 1.0;
+            for _ in 0..self.octaves {
+                for axis in direction {
+                    let scaled = axis * f32x16::splat(simd, scale);
+                    sine(simd, scaled, quarter).store_array(&mut input[next].0);
+                    next += 1;
+                }
+                scale *= 2.0;
+            }
+        }
+    }
+}
+
+impl Dense {
+    /// From a layer whose input `source(i)` becomes input `i`; there is none where it is `None`.
+    fn new(
+        layer: &super::Layer,
+        inputs: usize,
+        source: impl Fn(usize) -> Option<usize>,
+        bias: impl Fn(usize) -> f32,
+    ) -> Self {
+        let groups = layer.outputs.div_ceil(GROUP);
+        let of = |group: usize, value: &dyn Fn(usize) -> f32| -> [f32; GROUP] {
+            std::array::from_fn(|k| {
+                let output = group * GROUP + k;
+                if output < layer.outputs { value(output) } else { 0.0 }
+            })
+        };
+        let weight = (0..groups * inputs).map(|at| {
+            let (group, input) = (at / inputs, at % inputs);
+            let weight = |output: usize| {
+                source(input).map_or(0.0, |source| layer.weight[output * layer.inputs + source])
+            };
+            of(group, &weight)
+        });
+        let weight = weight.collect();
+        Self { inputs, weight, bias: (0..groups).map(|group| of(group, &bias)).collect() }
+    }
+
+    #[inline(always)]
+    fn apply<S: Simd, const RELU: bool>(&self, simd: S, from: &[Lanes], to: &mut [Lanes]) {
+        let zero = f32x16::splat(simd, 0.0);
+        let groups = self.weight.chunks_exact(self.inputs).zip(&self.bias);
+        for ((weights, bias), to) in groups.zip(to.chunks_exact_mut(GROUP)) {
+            let mut sums = [zero; GROUP];
+            for k in 0..GROUP {
+                sums[k] = f32x16::splat(simd, bias[k]);
+            }
+            for (weight, value) in weights.iter().zip(from) {
+                let value = f32x16::load_array_ref(simd, &value.0);
+                for k in 0..GROUP {
+                    sums[k] = f32x16::splat(simd, weight[k]).mul_add(value, sums[k]);
+                }
+            }
+            for k in 0..GROUP {
+                let sum = if RELU { sums[k].max(zero) } else { sums[k] };
+                sum.store_array(&mut to[k].0);
+            }
+        }
+    }
+}
+
+/// `sin(x + quarter π)` for `quarter` 0, and 0.5: the cosine. Within 1.5e-7 for |x| up to 1,000.
+///
+/// x less the nearest multiple of π (for the cosine, of π/2 and whole π), in three parts of π of which
+/// the first two have so few bits that their products are exact; then the minimax fit of degree 9, 5e-9
+/// off on [-π/2, π/2]. Adding π/2 to x instead would round it to 4e-6 at 64.
+#[inline(always)]
+fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let whole = x.mul_add(splat(std::f32::consts::FRAC_1_PI), splat(0.5 - quarter)).floor();
+    let turns = -(whole + splat(quarter));
+    let r = turns.mul_add(splat(3.140_625), x);
+    let r = turns.mul_add(splat(9.677_41e-4), r);
+    let r = turns.mul_add(splat(-8.742_278e-8), r);
+    let square = r * r;
+    let fit = square
+        .mul_add(splat(2.600_054_6e-6), splat(-1.980_661_5e-4))
+        .mul_add(square, splat(8.333_017e-3))
+        .mul_add(square, splat(-1.666_665_7e-1));
+    let sine = (fit * square).mul_add(r, r);
+    // Every half turn changes the sign; and the cosine falls where the sine of the rest rises.
+    let half_turns: i32x16<S> = whole.to_int();
+    let odd = if quarter > 0.0 { half_turns + 1 } else { half_turns };
+    let bits: i32x16<S> = sine.bitcast();
+    (bits ^ (odd << 31)).bitcast()
+}
+
+#[cfg(test)]
+mod tests {
+    use fearless_simd::{Level, dispatch};
+
+    use super::*;
+
+    #[test]
+    fn sines_are_sines() {
+        for i in -64_000..=64_000 {
+            let x = i as f32 / 640.0;
+            for (quarter, truth) in [(0.0, f64::from(x).sin()), (0.5, f64::from(x).cos())] {
+                let value = dispatch!(Level::new(), simd => {
+                    sine(simd, f32x16::splat(simd, x), quarter).to_array()[0]
+                });
+                let off = (f64::from(value) - truth).abs();
+                assert!(off < 1.5e-7, "{x}, {quarter}: {value}, truly {truth}");
+            }
+        }
+    }
+}

@@ -1,0 +1,142 @@
+//! Sideways at constant speed, in closed form: at any speed and for any time.
+
+use glam::{DMat2, DVec2};
+
+use super::vehicle::LateralDynamics;
+
+/// What turns the wheel: the steering angle follows what it is told, `dδ/dt = (told - δ) / lag`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Steering {
+    /// The angle of the front wheels, in radians, to the left.
+    pub(super) angle_rad: f64,
+    /// What it is told to be.
+    pub(super) target_rad: f64,
+    /// Its lag, in seconds.
+    pub(super) lag_s: f64,
+}
+
+/// The solution of `|v| dz/dt = G z + v steer δ(t)` for a speed v, from a state z.
+///
+/// δ is `told + (δ - told) e^(-t / lag)`, so a particular solution is `c + d e^(-t / lag)` with
+/// `G c = -v steer told` and `(G + |v| / lag) d = -v steer (δ - told)`; what remains decays as the
+/// matrix exponential of `G t / |v|`. All is finite as v goes to 0, where z is 0 at once: the car rolls
+/// as it is steered. `G + |v| / lag` is regular wherever no eigenvalue is that of the lag, -10 1/s: they
+/// are below -14 at up to 10 m/s backwards, and forwards below -23 or complex.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ConstantSpeed {
+    speed_m_s: f64,
+    lag_s: f64,
+    matrix: DMat2,
+    settled: DVec2,
+    lagging: DVec2,
+    fading: DVec2,
+}
+
+impl Steering {
+    /// The angle after a time in seconds.
+    pub(super) fn after(&self, time_s: f64) -> f64 {
+        self.target_rad + (self.angle_rad - self.target_rad) * (-time_s / self.lag_s).exp()
+    }
+}
+
+impl ConstantSpeed {
+    pub(super) fn new(
+        tyres: &LateralDynamics,
+        speed_m_s: f64,
+        steering: Steering,
+        sideways: DVec2,
+    ) -> Self {
+        let Steering { angle_rad, target_rad, lag_s } = steering;
+        let matrix = tyres.matrix(speed_m_s);
+        let with_lag = matrix + DMat2::from_diagonal(DVec2::splat(speed_m_s.abs() / lag_s));
+        let settled = -(matrix.inverse() * tyres.steer) * (speed_m_s * target_rad);
+        let lagging = -(with_lag.inverse() * tyres.steer) * (speed_m_s * (angle_rad - target_rad));
+        let fading = sideways - settled - lagging;
+        Self { speed_m_s, lag_s, matrix, settled, lagging, fading }
+    }
+
+    /// Lateral velocity (m/s) and yaw rate (rad/s) after a time in seconds, and by how much the car has
+    /// turned until then, in radians.
+    pub(super) fn after(&self, time_s: f64) -> (DVec2, f64) {
+        let lag = (-time_s / self.lag_s).exp();
+        let stretch_s2_m = time_s / self.speed_m_s.abs();
+        // At a crawl the slowest eigenvalue of G is -178 m/s²: e^-1780 is less than an f64 can be.
+        let faded = if stretch_s2_m < 10.0 {
+            exponential(self.matrix * stretch_s2_m) * self.fading
+        } else {
+            DVec2::ZERO
+        };
+        // Of G t / |v| the integral of the exponential is |v| G^-1 (e^(G t / |v|) - 1).
+        let turned = self.settled * time_s
+            + self.lagging * (self.lag_s * (1.0 - lag))
+            + self.matrix.inverse() * (faded - self.fading) * self.speed_m_s.abs();
+        (self.settled + self.lagging * lag + faded, turned.y)
+    }
+}
+
+/// The exponential of a matrix: `e^μ (cosh ν + sinh ν / ν (M - μ))`, where μ is half its trace and
+/// `(M - μ)² = ν²`. With ν² below 0 these are cosine and sine; none of it overflows where the real parts
+/// of the eigenvalues `μ ± ν` are not positive.
+fn exponential(matrix: DMat2) -> DMat2 {
+    let mean = 0.5 * (matrix.x_axis.x + matrix.y_axis.y);
+    let rest = matrix - DMat2::from_diagonal(DVec2::splat(mean));
+    let square = -rest.determinant();
+    let root = square.abs().sqrt();
+    let (even, odd) = if root < 1e-4 {
+        // cosh ν = 1 + ν²/2, sinh ν / ν = 1 + ν²/6, up to 1e-16 of each.
+        (mean.exp() * (1.0 + square / 2.0), mean.exp() * (1.0 + square / 6.0))
+    } else if square < 0.0 {
+        (mean.exp() * root.cos(), mean.exp() * root.sin() / root)
+    } else if root < 1.0 {
+        (mean.exp() * root.cosh(), mean.exp() * root.sinh() / root)
+    } else {
+        let (slow, fast) = ((mean + root).exp(), (mean - root).exp());
+        (0.5 * (slow + fast), 0.5 * (slow - fast) / root)
+    };
+    DMat2::from_diagonal(DVec2::splat(even)) + rest * odd
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ego::vehicle::Vehicle;
+
+    fn series(matrix: DMat2) -> DMat2 {
+        let scaled = matrix * 2f64.powi(-12);
+        let (mut sum, mut term) = (DMat2::IDENTITY, DMat2::IDENTITY);
+        for k in 1..12 {
+            term = term * scaled * (1.0 / f64::from(k));
+            sum += term;
+        }
+        (0..12).fold(sum, |power, _| power * power)
+    }
+
+    #[test]
+    fn the_exponential_is_its_series() {
+        let tyres = Vehicle::DEFAULT.tyres();
+        // At 13.34 m/s both eigenvalues are one.
+        for speed in [2.0, 5.0, 13.3, 13.34, 13.341, 13.4, 30.0, 60.0, -3.0, -10.0f64] {
+            for time_s in [1e-6, 1e-3, 0.05, 0.2] {
+                let matrix = tyres.matrix(speed) * (time_s / speed.abs());
+                let error = exponential(matrix) - series(matrix);
+                let worst = error.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+                assert!(worst < 1e-12, "{speed} m/s, {time_s} s: {worst}");
+            }
+        }
+    }
+
+    #[test]
+    fn at_a_crawl_the_car_rolls_as_it_is_steered() {
+        let (car, tyres) = (Vehicle::DEFAULT, Vehicle::DEFAULT.tyres());
+        let steering = Steering { angle_rad: 0.3, target_rad: 0.3, lag_s: 0.1 };
+        for speed in [0.0, 1e-300, 1e-9, -1e-9, 1e-3] {
+            let (z, turned) =
+                ConstantSpeed::new(&tyres, speed, steering, DVec2::new(1.0, -2.0)).after(0.1);
+            let rolls = speed * 0.3 / car.wheelbase_m;
+            assert!((z.y - rolls).abs() <= 1e-7 * rolls.abs(), "{speed}: {z}");
+            assert!((z.x - rolls * car.rear_to_cg_m).abs() <= 1e-6 * rolls.abs(), "{speed}: {z}");
+            // What was sliding has stopped within |v| / 178 s.
+            assert!((turned - 0.1 * rolls).abs() <= 0.02 * speed.abs(), "{speed}: {turned}");
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! The kinematic model over a step: an arc, exactly.
+
+use glam::DVec2;
+
+use super::Action;
+use super::single_track::SingleTrackState;
+use super::speed::Drive;
+use super::vehicle::Vehicle;
+
+/// The car after a step in seconds of constant acceleration and curvature, which it has at once, its speed
+/// within bounds that 0 lies in (m/s). It rolls without slipping.
+pub(super) fn rolled(
+    from: &SingleTrackState,
+    car: &Vehicle,
+    action: Action,
+    step_s: f64,
+    bounds_m_s: [f64; 2],
+) -> SingleTrackState {
+    let Action { acceleration_m_s2, curvature_1_m } = action;
+    // A drive that gives what it is told has no lag, whatever the number.
+    let drive = Drive {
+        speed_m_s: from.speed_m_s,
+        acceleration_m_s2,
+        target_m_s2: acceleration_m_s2,
+        lag_s: car.lag_s,
+    };
+    let (phases, _) = drive.phases(step_s, bounds_m_s);
+    let mean = |from_m_s: f64, to_m_s: f64| 0.5 * (from_m_s + to_m_s);
+    let length_m: f64 = phases
+        .iter()
+        .map(|phase| phase.duration_s * mean(phase.drive.speed_m_s, phase.end_m_s))
+        .sum();
+    let speed_m_s = phases.last().map_or(from.speed_m_s, |phase| phase.end_m_s);
+    let (way_m, turned_rad) = arc(length_m, curvature_1_m);
+    let yaw_rate_rad_s = speed_m_s * curvature_1_m;
+    SingleTrackState {
+        position_m: from.position_m + DVec2::from_angle(from.yaw_rad).rotate(way_m),
+        yaw_rad: from.yaw_rad + turned_rad,
+        speed_m_s,
+        lateral_m_s: yaw_rate_rad_s * car.rear_to_cg_m,
+        yaw_rate_rad_s,
+        steering_rad: (curvature_1_m * car.wheelbase_m).atan(),
+        acceleration_m_s2,
+    }
+}
+
+/// The way along an arc, in the frame of its start (metres along x forward and y left), and by how much
+/// it turns, in radians: `(sin(κ s) / κ, (1 - cos(κ s)) / κ)`, which has no 0 / 0 as written here.
+pub(super) fn arc(length_m: f64, curvature_1_m: f64) -> (DVec2, f64) {
+    let half = 0.5 * length_m * curvature_1_m;
+    let chord_m = if half.abs() < 1e-4 {
+        // sin h / h = 1 - h²/6, up to 1e-18.
+        length_m * (1.0 - half * half / 6.0)
+    } else {
+        length_m * half.sin() / half
+    };
+    (chord_m * DVec2::from_angle(half), 2.0 * half)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arcs_are_arcs() {
+        for (length_m, curvature) in [(3.0, 0.2), (-3.0, 0.2), (6.0, -1e-3), (1.0, 1.99e-4)] {
+            let (way_m, turned) = arc(length_m, curvature);
+            let angle: f64 = length_m * curvature;
+            // 1 - cos as 2 sin², which loses nothing.
+            let aside = 2.0 * (0.5 * angle).sin().powi(2) / curvature;
+            assert!((way_m - DVec2::new(angle.sin() / curvature, aside)).length() < 1e-12);
+            assert!((turned - angle).abs() < 1e-15);
+        }
+        assert_eq!(arc(2.0, 0.0), (DVec2::new(2.0, 0.0), 0.0));
+        assert_eq!(arc(0.0, 0.2), (DVec2::ZERO, 0.0));
+    }
+}
