@@ -6,8 +6,9 @@ use wildcity_render::compare::psnr::RIGHT_DB;
 use wildcity_render::relay::bisect;
 use wildcity_render::{Backend, Frame};
 
+use super::backend_options::HardwareOptions;
 use super::progress;
-use super::scene_source::{Machine, SceneSource};
+use super::scene_source::SceneSource;
 
 /// Find the stage of the gpu backend that is wrong, if one is.
 ///
@@ -24,7 +25,7 @@ pub(super) struct Bisect {
     source: SceneSource,
 
     #[command(flatten)]
-    machine: Machine,
+    hardware: HardwareOptions,
 }
 
 const EXAMPLES: &str = "\
@@ -35,7 +36,7 @@ Examples:
 impl Bisect {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
-        let (cpu, gpu) = (self.machine.cpu()?, self.machine.gpu()?);
+        let (cpu, gpu) = (self.hardware.cpu()?, self.hardware.gpu()?);
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
         let mut out = io::stdout().lock();

@@ -13,7 +13,8 @@ use wildcity_scene::{Record, RenderProfile, Rig, Trajectory};
 use wildcity_twin::ingest::{self, Axes};
 use wildcity_twin::store::{NewSky, NewVersion, Storage, StoreError};
 
-use super::places::Twins;
+use super::directories::Twins;
+use super::profile_options::ProfileOptions;
 use super::progress;
 use super::sky_source::SkySource;
 
@@ -63,12 +64,8 @@ pub(super) struct Import {
     #[command(flatten)]
     sky: SkySource,
 
-    /// How the scene's trainer rendered, where it differs from gsplat; may be given again. Keys:
-    /// near, far, blur, antialiased, alpha_cap, alpha_cut, stop; and how much detail is drawn:
-    /// tau_px (0 for all of it), reach_m; sky_error (0: the sky is evaluated for every pixel, else the
-    /// error of the map that it is baked into); background, as 0.5,0.6,0.8.
-    #[arg(long, value_name = "KEY=VALUE")]
-    profile: Vec<String>,
+    #[command(flatten)]
+    profile: ProfileOptions,
 
     /// In how many bits Gaussians are stored: f32 (exact), h52, q32, q24; the number is bytes at SH
     /// degree 1, before compression.
@@ -100,7 +97,7 @@ Formats, and the axes that they usually have; files of one extension differ, so 
                       what the USD layers around it turn is not looked at
 
 Examples:
-  wildcity import skull.ply --twin skull --axes y-down-z-forward --profile near=0.2
+  wildcity import skull.ply --twin skull --axes y-down-z-forward --set near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
@@ -123,10 +120,7 @@ impl Import {
             return Err(StoreError::Name { name: self.twin }.into());
         }
         let axes = self.axes.parse::<Axes>()?.scaled(self.scale)?;
-        let mut profile = RenderProfile::default();
-        for setting in &self.profile {
-            profile.set(setting)?;
-        }
+        let profile = self.profile.load()?.apply(RenderProfile::default())?;
         let sky = self.sky.read(&self.axes)?;
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;

@@ -6,7 +6,7 @@ use wildcity_scene::Manifest;
 use wildcity_scene::geometry::Bounds;
 use wildcity_twin::store::Version;
 
-use super::places::{TwinVersion, Twins};
+use super::directories::{TwinVersion, Twins};
 use super::time::utc;
 
 /// Show what a twin consists of: counts, bounds, hashes, and its chunks.

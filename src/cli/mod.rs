@@ -2,16 +2,18 @@
 
 use std::process::ExitCode;
 
+mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
 mod devices;
+mod directories;
 mod import;
 mod inspect;
 mod limits;
 mod lod;
 mod output;
-mod places;
+mod profile_options;
 mod progress;
 mod push;
 mod render;

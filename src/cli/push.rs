@@ -58,9 +58,9 @@ pub(super) struct Push {
     #[arg(long)]
     no_lod: bool,
 
-    /// How it must be rendered where that changes; may be given again.
-    #[arg(long, value_name = "KEY=VALUE")]
-    profile: Vec<String>,
+    /// Change one field of the twin's render profile, as in `wildcity import`; may be given again.
+    #[arg(long = "set", value_name = "FIELD=VALUE")]
+    settings: Vec<String>,
 
     /// What this version is, for people.
     #[arg(long)]
@@ -134,7 +134,7 @@ impl Push {
             cells,
             record: self.record.clone(),
             levels: !self.no_lod,
-            profile: self.profile.clone(),
+            profile: self.settings.clone(),
             note: self.note.clone(),
             golden: Golden { poses: None, min_psnr_db: self.min_psnr_db },
         };

@@ -7,7 +7,8 @@ use anyhow::Context;
 
 use wildcity_render::{Frame, Target};
 
-use super::scene_source::{Renderer, SceneSource, Shot};
+use super::backend_options::RendererOptions;
+use super::scene_source::{SceneSource, Shot};
 use super::{output, progress};
 
 /// Render cameras of a file to images.
@@ -22,7 +23,7 @@ pub(super) struct Render {
     source: SceneSource,
 
     #[command(flatten)]
-    renderer: Renderer,
+    renderer: RendererOptions,
 
     /// Directory for the images; made if it is missing.
     #[arg(long, value_name = "DIR")]
@@ -38,7 +39,7 @@ Examples:
   wildcity render skull.ply --cameras front.json --out pictures
   wildcity render street --cameras views.json --out truth --backend reference --format npy
   wildcity render street --cameras views.json --out half --cpu-through sort
-  wildcity render scene.ply --cameras views.json --out p --profile near=0.2 --profile alpha_cap=0.999";
+  wildcity render scene.ply --cameras views.json --out p --set near=0.2 --set alpha_cap=0.999";
 
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum Format {

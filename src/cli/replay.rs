@@ -8,8 +8,8 @@ use anyhow::Context;
 use wildcity_session::{Extent, FrameRequest, Recording, Redrawn};
 use wildcity_twin::residency::Cache;
 
-use super::places::Twins;
-use super::scene_source::Engine;
+use super::backend_options::BackendOptions;
+use super::directories::Twins;
 use super::{output, progress};
 
 /// Show a recorded episode, render it again, and compare every frame.
@@ -36,7 +36,7 @@ pub(super) struct Replay {
     twins: Twins,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 }
 
 const EXAMPLES: &str = "\
@@ -58,7 +58,7 @@ impl Replay {
         }
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
-        let backend = self.engine.backend_of(&header.backend)?;
+        let backend = self.backend.backend_of(&header.backend)?;
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());

@@ -9,21 +9,21 @@ use anyhow::{Context, bail, ensure};
 use crate::cli::limits;
 use wildcity_render::gpu::Gpu;
 use wildcity_render::{Backend, RenderError};
-use wildcity_report::believed::believed;
-use wildcity_report::choose::{Recommendation, Wanted, recommend};
-use wildcity_report::ladder::{Ladder, LeftOut, Traits, ladder};
-use wildcity_report::measure::{Bench, Truth};
-use wildcity_report::places::{Sampling, places};
-use wildcity_report::timing::at_one_speed;
-use wildcity_report::{Report, ReportError, Subject, needed, page};
+use wildcity_report::confidence::confidence_by_offset;
+use wildcity_report::measure::normalize_machine_speed;
+use wildcity_report::measure::{Benchmark, ReferenceImages};
+use wildcity_report::recommend::{Goal, Recommendation, recommend};
+use wildcity_report::sample_points::{Sampling, sample_points};
+use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
+use wildcity_report::{Report, ReportError, Subject, feature_costs, page};
 use wildcity_scene::{Rays, Rig};
 use wildcity_stress::CASES;
 use wildcity_stress::table::{self, Candidate, Column};
 use wildcity_twin::residency::Cache;
 
-use super::places::{TwinVersion, Twins};
+use super::backend_options::HardwareOptions;
+use super::directories::{TwinVersion, Twins};
 use super::rig::rig_of;
-use super::scene_source::Machine;
 use super::stress::{Name, candidate};
 use super::{demo, output, progress};
 
@@ -61,13 +61,13 @@ pub(super) struct Command {
     /// Recommend the fastest setting with at least this PSNR in every camera's window at every place, in
     /// dB, before images are encoded.
     #[arg(long, value_name = "DB", value_parser = at_least_db, allow_negative_numbers = true)]
-    at_least_db: Option<Wanted>,
+    at_least_db: Option<Goal>,
 
     /// Recommend the most exact setting of which all but one of twenty steps take at most this time, in
     /// milliseconds, before images are encoded.
     #[arg(long, value_name = "MS", value_parser = at_most_ms, allow_negative_numbers = true)]
     #[arg(conflicts_with = "at_least_db")]
-    at_most_ms: Option<Wanted>,
+    at_most_ms: Option<Goal>,
 
     /// Stations along the drive, each on it and 1, 3 and 5 m beside; around a twin without a drive, four
     /// times as many places. The reference takes about a second for each place and camera.
@@ -95,7 +95,7 @@ pub(super) struct Command {
     no_stress: bool,
 
     #[command(flatten)]
-    machine: Machine,
+    hardware: HardwareOptions,
 }
 
 const EXAMPLES: &str = "\
@@ -122,16 +122,16 @@ impl From<Measurable> for Name {
     }
 }
 
-fn at_least_db(text: &str) -> Result<Wanted, String> {
+fn at_least_db(text: &str) -> Result<Goal, String> {
     match text.parse() {
-        Ok(db) if (0.0..=1000.0).contains(&db) => Ok(Wanted::AtLeastDb(db)),
+        Ok(db) if (0.0..=1000.0).contains(&db) => Ok(Goal::AtLeastDb(db)),
         _ => Err("expected 0 to 1000 dB, as 40".to_owned()),
     }
 }
 
-fn at_most_ms(text: &str) -> Result<Wanted, String> {
+fn at_most_ms(text: &str) -> Result<Goal, String> {
     match text.parse() {
-        Ok(ms) if ms > 0.0 && f64::is_finite(ms) => Ok(Wanted::AtMostMs(ms)),
+        Ok(ms) if ms > 0.0 && f64::is_finite(ms) => Ok(Goal::AtMostMs(ms)),
         _ => Err("expected milliseconds, more than 0, as 20".to_owned()),
     }
 }
@@ -164,7 +164,7 @@ impl Command {
             output::write(&path, text.as_bytes())?;
             writeln!(out, "{}", path.display())?;
         }
-        for LeftOut { what, why } in &report.left_out {
+        for Skipped { what, why } in &report.skipped {
             writeln!(out, "not compared: {what} ({why})")?;
         }
         if let Some(best) = &report.recommendation {
@@ -178,17 +178,17 @@ impl Command {
             writeln!(out, "{}", best.serve(&profile.display().to_string()))?;
         }
         // What was measured is on disk, and says so, too.
-        report.unmet.map_or(Ok(()), |why| bail!(why))
+        report.unmet_reason.map_or(Ok(()), |why| bail!(why))
     }
 
     fn measure(&self) -> anyhow::Result<Report> {
-        let candidates = self.backends.iter().map(|name| candidate((*name).into(), &self.machine));
+        let candidates = self.backends.iter().map(|name| candidate((*name).into(), &self.hardware));
         let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
         let (mut backends, mut absent): (Vec<Box<dyn Backend>>, _) = (Vec::new(), Vec::new());
         for candidate in candidates {
             match candidate {
                 Ok(backend) => backends.push(backend),
-                Err((name, why)) => absent.push(LeftOut::new(format!("backend {name}"), why)),
+                Err((name, why)) => absent.push(Skipped::new(format!("backend {name}"), why)),
             }
         }
         ensure!(!backends.is_empty(), "none of the --backend is there");
@@ -198,16 +198,16 @@ impl Command {
         let own = || manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = named.or_else(own).context("no rig")?;
         let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
-        let places = places(manifest, &rig.cameras, sampling);
+        let places = sample_points(manifest, &rig.cameras, sampling);
 
-        let bench = Bench {
+        let bench = Benchmark {
             resident: &resident,
             backends: &backends,
             places: &places,
             repeat: self.repeat,
             device: &|| self.device(),
         };
-        let truth = |rays: Rays, label| -> anyhow::Result<Truth> {
+        let truth = |rays: Rays, label| -> anyhow::Result<ReferenceImages> {
             let bar = progress::count(label);
             bar.set_length(places.len() as u64);
             let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64));
@@ -217,13 +217,13 @@ impl Command {
             bar.finish_and_clear();
             Ok(truth)
         };
-        let twin = Traits::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+        let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
         let splats = truth(Rays::Splats, "reference")?;
         let rays = twin.bent.then(|| truth(Rays::Exact, "reference, every ray")).transpose()?;
 
         let names: Vec<&str> = backends.iter().map(|backend| backend.name()).collect();
-        let Ladder { settings, mut left_out } = ladder(&twin, &names);
-        left_out.extend(absent);
+        let SettingList { settings, mut skipped } = settings_to_compare(&twin, &names);
+        skipped.extend(absent);
         let bar = progress::state();
         bar.set_length(settings.len() as u64);
         let mut measured = Vec::new();
@@ -238,14 +238,14 @@ impl Command {
                 Ok(one) => measured.push(one),
                 // A map that would be too large.
                 Err(ReportError::Render(why @ RenderError::Sky(_))) => {
-                    left_out.push(LeftOut::new(setting.name.clone(), why.to_string()));
+                    skipped.push(Skipped::new(setting.name.clone(), why.to_string()));
                 }
                 Err(error) => return Err(error.into()),
             }
             bar.inc(1);
         }
         bar.finish_and_clear();
-        at_one_speed(&mut measured);
+        normalize_machine_speed(&mut measured);
 
         let wanted = self.at_least_db.or(self.at_most_ms);
         let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
@@ -271,23 +271,23 @@ impl Command {
                 .map(|b| Column { backend: b.name(), detail: b.detail() })
                 .collect(),
             sampling,
-            places: places.iter().map(|place| place.name.clone()).collect(),
+            sample_points: places.iter().map(|place| place.name.clone()).collect(),
             reference_ms: splats.step_ms,
             settings: measured,
-            left_out,
+            skipped,
             exact_rays_ms: rays.map(|rays| rays.step_ms),
-            believed: believed(&resident, &*backends[0], &places)?,
-            wanted,
+            confidence: confidence_by_offset(&resident, &*backends[0], &places)?,
+            goal: wanted,
             recommendation,
-            unmet,
+            unmet_reason: unmet,
             stress: self.stress()?,
-            needed: needed::rows(&self.machine.cpu()?, &|| self.device())?,
+            feature_costs: feature_costs::count_features(&self.hardware.cpu()?, &|| self.device())?,
         })
     }
 
     /// A device that drew nothing yet, if one is wanted and there.
     fn device(&self) -> Option<Gpu> {
-        if self.backends.contains(&Measurable::Gpu) { self.machine.gpu().ok() } else { None }
+        if self.backends.contains(&Measurable::Gpu) { self.hardware.gpu().ok() } else { None }
     }
 
     /// The stress table on every backend of the report, and on the definition.
@@ -295,7 +295,7 @@ impl Command {
         let backends = self.backends.iter().map(|name| Name::from(*name));
         let names = [Name::Reference].into_iter().chain(backends);
         let names = names.filter(|_| !self.no_stress);
-        let candidates = names.map(|name| candidate(name, &self.machine));
+        let candidates = names.map(|name| candidate(name, &self.hardware));
         let candidates = candidates.collect::<anyhow::Result<Vec<_>>>()?;
         let cases: Vec<_> = if self.no_stress { Vec::new() } else { CASES.iter().collect() };
         let bar = progress::state();

@@ -8,13 +8,12 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
-use crate::cli::limits;
-use wildcity_scene::{ProfileChanges, RenderProfile};
 use wildcity_server::{Limits, Tokens};
 use wildcity_twin::ingest;
 
-use super::places::{Episodes, Twins, Uploads};
-use super::scene_source::{Engine, bytes_of_gib, gib};
+use super::backend_options::{BackendOptions, bytes_of_gib, gib};
+use super::directories::{Episodes, Twins, Uploads};
+use super::profile_options::read_profile;
 
 /// Serve twins to agents over WebSocket.
 ///
@@ -52,7 +51,7 @@ pub(super) struct Serve {
     profile: Option<PathBuf>,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 
     /// What to log, as `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
     #[arg(long, value_name = "FILTER")]
@@ -101,7 +100,7 @@ impl Serve {
             episodes: self.episodes.dir()?,
             uploads: self.uploads.dir()?,
             tokens,
-            backend: Arc::from(self.engine.backend()?),
+            backend: Arc::from(self.backend.backend()?),
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             limits: Limits {
                 resident_bytes: self.memory_gib.map(bytes_of_gib),
@@ -131,15 +130,6 @@ fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
     let text = ingest::read_whole(path, wildcity_server::limits::TOKENS_FILE_BYTES)
         .with_context(cannot)?;
     Tokens::parse(&text).with_context(cannot)
-}
-
-/// A profile file, which must fit a profile: it need not fit every twin's.
-fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
-    let cannot = || format!("--profile {}", path.display());
-    let text = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
-    let changes: ProfileChanges = serde_json::from_slice(&text).with_context(cannot)?;
-    changes.apply(RenderProfile::default()).with_context(cannot)?;
-    Ok(changes)
 }
 
 fn address(text: &str) -> Result<SocketAddr, String> {

@@ -8,8 +8,8 @@ use wildcity_render::reference::Reference;
 use wildcity_stress::table::{self, Candidate};
 use wildcity_stress::{CASES, Case, Verdict};
 
+use super::backend_options::HardwareOptions;
 use super::progress;
-use super::scene_source::Machine;
 
 /// Draw stiff and extreme scenes on every backend, and hold each against its bound.
 ///
@@ -42,7 +42,7 @@ pub(super) struct Stress {
     json: bool,
 
     #[command(flatten)]
-    machine: Machine,
+    hardware: HardwareOptions,
 }
 
 const EXAMPLES: &str = "\
@@ -66,7 +66,7 @@ impl Name {
 
 impl Stress {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let backends = self.backends.iter().map(|name| candidate(*name, &self.machine));
+        let backends = self.backends.iter().map(|name| candidate(*name, &self.hardware));
         let backends = backends.collect::<anyhow::Result<Vec<Candidate>>>()?;
         let all = || CASES.iter().collect();
         let cases = if self.cases.is_empty() { all() } else { self.cases };
@@ -89,11 +89,11 @@ impl Stress {
 }
 
 /// A backend, or why this machine has none of the kind.
-pub(super) fn candidate(name: Name, machine: &Machine) -> anyhow::Result<Candidate> {
+pub(super) fn candidate(name: Name, hardware: &HardwareOptions) -> anyhow::Result<Candidate> {
     Ok(match name {
         Name::Reference => Ok(Box::new(Reference)),
-        Name::Cpu => Ok(Box::new(machine.cpu()?)),
-        Name::Gpu => match machine.gpu() {
+        Name::Cpu => Ok(Box::new(hardware.cpu()?)),
+        Name::Gpu => match hardware.gpu() {
             Ok(gpu) => Ok(Box::new(gpu)),
             Err(error) => Err(("gpu", error.to_string())),
         },

@@ -11,15 +11,15 @@
 //! page       all of it as one HTML page, with plots and pictures
 //! ```
 
-pub mod believed;
-pub mod choose;
-pub mod ladder;
+pub mod confidence;
+mod error_images;
+pub mod feature_costs;
 pub mod measure;
-pub mod needed;
 pub mod page;
-mod pictures;
-pub mod places;
 mod plots;
+pub mod recommend;
+pub mod sample_points;
+pub mod settings;
 pub mod timing;
 
 use serde::Serialize;
@@ -30,13 +30,13 @@ use wildcity_scene::geometry::CameraError;
 use wildcity_scene::profile::ProfileError;
 use wildcity_twin::residency::ResidencyError;
 
-pub use pictures::Pictures;
+pub use error_images::ErrorImages;
 
-use believed::Believed;
-use choose::{Recommendation, Wanted};
-use ladder::LeftOut;
-use measure::Measured;
-use places::{OFFSETS_M, Sampling};
+use confidence::Confidence;
+use measure::Measurement;
+use recommend::{Goal, Recommendation};
+use sample_points::{OFFSETS_M, Sampling};
+use settings::Skipped;
 use wildcity_stress::table::{Column, Table};
 
 /// Everything that was measured of a twin. Numbers that are infinite or NaN are words in JSON and CSV alike:
@@ -50,28 +50,34 @@ pub struct Report {
     /// How it was sampled.
     pub sampling: Sampling,
     /// Where.
-    pub places: Vec<String>,
+    #[serde(rename = "places")]
+    pub sample_points: Vec<String>,
     /// What a step of the reference would take, in milliseconds.
     pub reference_ms: f64,
     /// Every setting, the twin as it is served first.
-    pub settings: Vec<Measured>,
+    pub settings: Vec<Measurement>,
     /// What is not among them.
-    pub left_out: Vec<LeftOut>,
+    #[serde(rename = "left_out")]
+    pub skipped: Vec<Skipped>,
     /// What a step of the reference would take if every pixel's own ray were followed, in milliseconds;
     /// none of pinholes at rest.
     pub exact_rays_ms: Option<f64>,
     /// How far images may be believed beside the recorded drive; empty without one.
-    pub believed: Vec<Believed>,
+    #[serde(rename = "believed")]
+    pub confidence: Vec<Confidence>,
     /// What was asked for, if anything was.
-    pub wanted: Option<Wanted>,
+    #[serde(rename = "wanted")]
+    pub goal: Option<Goal>,
     /// The setting for it.
     pub recommendation: Option<Recommendation>,
     /// Why there is none although one was wanted.
-    pub unmet: Option<String>,
+    #[serde(rename = "unmet")]
+    pub unmet_reason: Option<String>,
     /// Extreme scenes on every backend.
     pub stress: Table,
     /// What scenes with and without each feature hold and run.
-    pub needed: Vec<needed::Row>,
+    #[serde(rename = "needed")]
+    pub feature_costs: Vec<feature_costs::FeatureCounts>,
 }
 
 /// What a report is of.
@@ -126,12 +132,12 @@ pub enum ReportError {
     },
     /// Nothing to look at.
     #[error("there is no place to look from: give at least one station")]
-    NoPlaces,
+    NoSamplePoints,
     /// No setting is good enough.
     #[error(
         "no setting of the ladder gives {wanted}, with a margin; the best reaches {reached:.1}"
     )]
-    OutOfReach {
+    GoalNotReached {
         /// What was wanted.
         wanted: String,
         /// What is possible.
@@ -161,7 +167,7 @@ impl Report {
             "setting,family,backend,step_ms,p95_ms,psnr_db,least_db,{by_offset},ssim,max,p99_9,depth_l1_m,\
              gaussians,scene_bytes,device_bytes,stored_bytes_each,sent_bytes,on_front\n"
         );
-        for (m, is_on) in self.settings.iter().zip(choose::front(&self.settings)) {
+        for (m, is_on) in self.settings.iter().zip(recommend::pareto_front(&self.settings)) {
             let (e, cost) = (&m.errors, &m.cost);
             let backend = self.backends[m.setting.backend].backend;
             let at = |offset| m.psnr_db_by_offset.get(offset).map_or(String::new(), f64::to_string);

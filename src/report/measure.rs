@@ -7,10 +7,10 @@ use std::time::Instant;
 use image::ImageReader;
 use serde::Serialize;
 
-use super::ladder::{Family, Setting};
-use super::places::{OFFSETS_M, Place};
+use super::sample_points::{OFFSETS_M, SamplePoint};
+use super::settings::{Family, Setting};
 use super::timing::{Step, Timed, file};
-use super::{Pictures, ReportError, pictures};
+use super::{ErrorImages, ReportError, error_images};
 use wildcity_render::compare::drawing::{Drawing, draw};
 use wildcity_render::compare::errors::{Errors, Gathered, Image};
 use wildcity_render::compare::numbers::{number, numbers};
@@ -23,13 +23,13 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 use wildcity_twin::residency::{Pinned, Resident};
 
 /// What is measured, and on what.
-pub struct Bench<'a> {
+pub struct Benchmark<'a> {
     /// The twin.
     pub resident: &'a Arc<Resident>,
     /// The backends that [`Setting::backend`] counts through.
     pub backends: &'a [Box<dyn Backend>],
     /// Where.
-    pub places: &'a [Place],
+    pub places: &'a [SamplePoint],
     /// How often a step is timed at each place, after once that is not.
     pub repeat: u32,
     /// Opens a device that drew nothing yet, as that of the gpu backend, or says that there is none.
@@ -41,7 +41,7 @@ const GPU: &str = "gpu";
 
 /// A setting, measured.
 #[derive(Clone, Debug, Serialize)]
-pub struct Measured {
+pub struct Measurement {
     /// What was measured.
     #[serde(flatten)]
     pub setting: Setting,
@@ -51,19 +51,19 @@ pub struct Measured {
     #[serde(serialize_with = "numbers")]
     pub psnr_db_by_offset: Vec<f64>,
     /// The same place by place.
-    pub by_place: Vec<AtPlace>,
+    pub by_place: Vec<SampleResult>,
     /// What it costs at all places on the drive.
     pub cost: Cost,
     /// Median time of a step of the twin as served, timed in turn with this one, in milliseconds.
     pub served_ms: f64,
     /// Where it is worst.
     #[serde(skip)]
-    pub worst: Pictures,
+    pub worst: ErrorImages,
 }
 
 /// A setting at one place.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct AtPlace {
+pub struct SampleResult {
     /// Whether a setting may be chosen by it.
     pub chooses: bool,
     /// PSNR of all its windows together, in dB.
@@ -97,18 +97,22 @@ pub struct Cost {
 }
 
 /// What a setting is compared with: the definition, in full detail and however far, by place and window.
-pub struct Truth {
+pub struct ReferenceImages {
     images: Vec<Vec<Image>>,
     /// Time that a step of all cameras would take, in milliseconds: of the windows, times their share.
     pub step_ms: f64,
 }
 
-impl Bench<'_> {
+impl Benchmark<'_> {
     /// Draws the truth at all places, of splats or ray by ray; tells `progress` how many are done.
     ///
     /// # Errors
     /// The twin cannot be read, or a frame cannot be drawn.
-    pub fn truth(&self, rays: Rays, progress: &mut dyn FnMut(usize)) -> Result<Truth, ReportError> {
+    pub fn truth(
+        &self,
+        rays: Rays,
+        progress: &mut dyn FnMut(usize),
+    ) -> Result<ReferenceImages, ReportError> {
         let profile = RenderProfile { tau_px: 0.0, reach_m: None, rays, ..self.profile() };
         let (mut images, mut step_ms) = (Vec::new(), 0.0);
         for (done, place) in self.places.iter().enumerate() {
@@ -121,14 +125,18 @@ impl Bench<'_> {
             step_ms += start.elapsed().as_secs_f64() * 1e3 * share / self.places.len() as f64;
             images.push(place.windows.iter().zip(&drawings).map(|(v, d)| shown(v, d)).collect());
         }
-        Ok(Truth { images, step_ms })
+        Ok(ReferenceImages { images, step_ms })
     }
 
     /// Measures one setting.
     ///
     /// # Errors
     /// The twin cannot be read, a frame cannot be drawn, or an image cannot be encoded.
-    pub fn measure(&self, setting: &Setting, truth: &Truth) -> Result<Measured, ReportError> {
+    pub fn measure(
+        &self,
+        setting: &Setting,
+        truth: &ReferenceImages,
+    ) -> Result<Measurement, ReportError> {
         let profile = setting.apply(self.profile())?;
         let backend = &*self.backends[setting.backend];
         let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
@@ -175,16 +183,16 @@ impl Bench<'_> {
                 }
             }
             let least_db = least(windows_db);
-            by_place.push(AtPlace { chooses: place.chooses, psnr_db, least_db, p95_ms });
+            by_place.push(SampleResult { chooses: place.chooses, psnr_db, least_db, p95_ms });
         }
         let mut all = Gathered::default();
         by_offset.iter().for_each(|gathered| all.merge(gathered));
         cost.step_ms = quantile(&steps_ms, 0.5);
         let db = |gathered: &Gathered| gathered.errors().map(|errors| errors.psnr_db);
-        let worst = worst.1.map(|(place, image, truth)| pictures::of(place, &image, &truth));
-        Ok(Measured {
+        let worst = worst.1.map(|(place, image, truth)| error_images::of(place, &image, &truth));
+        Ok(Measurement {
             setting: setting.clone(),
-            errors: all.errors().ok_or(ReportError::NoPlaces)?,
+            errors: all.errors().ok_or(ReportError::NoSamplePoints)?,
             psnr_db_by_offset: by_offset.iter().filter_map(db).collect(),
             by_place,
             cost,
@@ -199,7 +207,7 @@ impl Bench<'_> {
         scene: &Scene,
         profile: &RenderProfile,
         views: &[View],
-        place: &Place,
+        place: &SamplePoint,
     ) -> Result<Timed, ReportError> {
         let backend = &*self.backends[setting.backend];
         let own = Step { backend, scene, profile, views, sent: setting.sent };
@@ -232,7 +240,7 @@ impl Bench<'_> {
     }
 }
 
-impl Measured {
+impl Measurement {
     /// Least PSNR of a window at any place, in dB.
     pub fn least_db(&self) -> f64 {
         least(self.by_place.iter().map(|place| place.least_db))
@@ -327,4 +335,18 @@ pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().saturating_sub(1);
     sorted.get((last as f64 * share).round() as usize).copied().unwrap_or(f64::NAN)
+}
+
+/// Scales all times to one speed of the machine: that at which the twin as served took its median time.
+/// A setting that was measured while others compiled is then no slower than the rest. It is the first
+/// backend's time that says how fast the machine was, for settings of the others too.
+pub fn normalize_machine_speed(all: &mut [Measurement]) {
+    let served_ms: Vec<f64> = all.iter().map(|m| m.served_ms).collect();
+    let usual_ms = quantile(&served_ms, 0.5);
+    for m in all {
+        let faster = usual_ms / m.served_ms;
+        m.served_ms = usual_ms;
+        m.cost.step_ms *= faster;
+        m.by_place.iter_mut().flat_map(|place| &mut place.p95_ms).for_each(|ms| *ms *= faster);
+    }
 }

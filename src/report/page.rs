@@ -4,12 +4,12 @@ use std::fmt::Write as _;
 
 use data_encoding::BASE64;
 
-use super::choose::{Wanted, front};
-use super::ladder::{Family, LeftOut};
-use super::measure::Measured;
-use super::pictures::{HEAT_RGB, HEAT_STEPS, Pictures};
-use super::places::OFFSETS_M;
-use super::{Report, ReportError, needed, plots};
+use super::error_images::{ErrorImages, HEAT_RGB, HEAT_STEPS};
+use super::measure::Measurement;
+use super::recommend::{Goal, pareto_front};
+use super::sample_points::OFFSETS_M;
+use super::settings::{Family, Skipped};
+use super::{Report, ReportError, feature_costs, plots};
 use wildcity_stress::Verdict;
 
 const STYLE: &str = "\
@@ -45,7 +45,7 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
         subject.gaussians,
         subject.sh_degree,
         subject.record,
-        report.places.len(),
+        report.sample_points.len(),
         report.sampling.window_px.map(|px| px.to_string()).join(" x "),
         subject.cameras,
         subject.repeat,
@@ -81,8 +81,8 @@ pub fn html(report: &Report) -> Result<String, ReportError> {
 fn recommendation(page: &mut String, report: &Report) {
     if let Some(r) = &report.recommendation {
         let unit = match r.wanted {
-            Wanted::AtLeastDb(_) => "dB",
-            Wanted::AtMostMs(_) => "ms",
+            Goal::AtLeastDb(_) => "dB",
+            Goal::AtMostMs(_) => "ms",
         };
         let _ = write!(
             page,
@@ -99,20 +99,20 @@ fn recommendation(page: &mut String, report: &Report) {
             text(&r.serve("profile.json"))
         );
     }
-    if let (Some(wanted), Some(why)) = (report.wanted, &report.unmet) {
+    if let (Some(wanted), Some(why)) = (report.goal, &report.unmet_reason) {
         let (wanted, why) = (text(&wanted.to_string()), text(why));
         let _ =
             write!(page, "<p class=\"miss\"><b>{wanted}</b>: nothing is recommended: {why}.</p>");
     }
 }
 
-fn table(page: &mut String, all: &[Measured]) {
+fn table(page: &mut String, all: &[Measurement]) {
     page.push_str(
         "<div class=\"wide\"><table><tr><th>setting</th><th>of</th><th>ms a step</th><th>95 %, ms</th><th>PSNR, dB</th>\
          <th>least, dB</th><th>SSIM</th><th>largest</th><th>99.9 %</th><th>depth, m</th>\
          <th>Gaussians</th><th>MB, host</th><th>MB, device</th><th>B each, stored</th><th>kB sent</th></tr>",
     );
-    for (m, is_on) in all.iter().zip(front(all)) {
+    for (m, is_on) in all.iter().zip(pareto_front(all)) {
         let (e, cost) = (&m.errors, &m.cost);
         let _ = write!(
             page,
@@ -151,15 +151,15 @@ fn left_out(page: &mut String, report: &Report) {
         );
     }
     page.push_str("<p>Not compared:</p><ul>");
-    for LeftOut { what, why } in &report.left_out {
+    for Skipped { what, why } in &report.skipped {
         let _ = write!(page, "<li>{}: {}</li>", text(what), text(why));
     }
     page.push_str("</ul>");
 }
 
-fn beside_the_drive(page: &mut String, all: &[Measured]) -> Result<(), ReportError> {
+fn beside_the_drive(page: &mut String, all: &[Measurement]) -> Result<(), ReportError> {
     let shown = [Family::AsServed, Family::Detail, Family::Record, Family::Combined];
-    let lines: Vec<&Measured> = all
+    let lines: Vec<&Measurement> = all
         .iter()
         .filter(|m| {
             shown.contains(&m.setting.family) && m.psnr_db_by_offset.len() == OFFSETS_M.len()
@@ -173,7 +173,7 @@ fn beside_the_drive(page: &mut String, all: &[Measured]) -> Result<(), ReportErr
 }
 
 fn believed(page: &mut String, report: &Report) -> Result<(), ReportError> {
-    if report.believed.is_empty() {
+    if report.confidence.is_empty() {
         return Ok(());
     }
     page.push_str(
@@ -181,8 +181,8 @@ fn believed(page: &mut String, report: &Report) -> Result<(), ReportError> {
          recorded, less with the distance from there, with holes, and with ground that was never \
          trained.</p>",
     );
-    page.push_str(&plots::trust_beside_the_drive(&report.believed)?);
-    for b in &report.believed {
+    page.push_str(&plots::trust_beside_the_drive(&report.confidence)?);
+    for b in &report.confidence {
         let _ = write!(
             page,
             "<figure class=\"believed\"><img alt=\"\" src=\"data:image/jpeg;base64,{}\"><figcaption>{}: \
@@ -202,7 +202,7 @@ fn believed(page: &mut String, report: &Report) -> Result<(), ReportError> {
     Ok(())
 }
 
-fn worst(page: &mut String, all: &[Measured]) {
+fn worst(page: &mut String, all: &[Measurement]) {
     page.push_str(
         "<h2>Where each setting is worst</h2><p>Drawn, by definition, and the largest error of \
                    a pixel's three values:</p><p class=\"key\">",
@@ -214,7 +214,7 @@ fn worst(page: &mut String, all: &[Measured]) {
     }
     page.push_str("</p>");
     for m in all {
-        let Pictures { place, size_px: [width, height], files } = &m.worst;
+        let ErrorImages { place, size_px: [width, height], files } = &m.worst;
         page.push_str("<figure>");
         for file in files.iter().filter(|file| !file.is_empty()) {
             let _ = write!(
@@ -263,18 +263,18 @@ fn stress(page: &mut String, report: &Report) {
 fn only_what_is_needed(page: &mut String, report: &Report) {
     page.push_str("<h2>Only what is needed</h2><p>One step of one small street, with and without each \
                    feature. Counts, so that they are the same on every machine.</p><div class=\"wide\"><table><tr><th>street</th>");
-    for column in needed::COLUMNS {
+    for column in feature_costs::COLUMNS {
         let _ = write!(page, "<th>{}</th>", text(column));
     }
     page.push_str("</tr>");
-    for row in &report.needed {
+    for row in &report.feature_costs {
         let _ = write!(page, "<tr><td>{}</td>", text(row.with));
         for count in row.counts.texts() {
             let _ = write!(page, "<td>{}</td>", text(&count));
         }
         page.push_str("</tr>");
     }
-    let _ = write!(page, "</table></div><p>{}</p>", needed::ABSENT);
+    let _ = write!(page, "</table></div><p>{}</p>", feature_costs::ABSENT);
 }
 
 fn decibels(db: f64) -> String {

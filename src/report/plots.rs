@@ -4,11 +4,11 @@ use plotters::coord::ranged1d::{Ranged, ValueFormatter};
 use plotters::prelude::*;
 
 use super::ReportError;
-use super::believed::Believed;
-use super::choose::front;
-use super::ladder::Family;
-use super::measure::Measured;
-use super::places::OFFSETS_M;
+use super::confidence::Confidence;
+use super::measure::Measurement;
+use super::recommend::pareto_front;
+use super::sample_points::OFFSETS_M;
+use super::settings::Family;
 
 /// Width of a plot with its names, and its least height.
 const SIZE_PX: (u32, u32) = (1060, 520);
@@ -40,10 +40,10 @@ fn color(family: Family) -> RGBColor {
 }
 
 /// Error against time: the Pareto front joined by a line, and what is beaten in grey.
-pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError> {
-    let on_front = front(all);
+pub(super) fn error_against_time(all: &[Measurement]) -> Result<String, ReportError> {
+    let on_front = pareto_front(all);
     let shown = || {
-        let asked = |(m, _): &(&Measured, &bool)| {
+        let asked = |(m, _): &(&Measurement, &bool)| {
             m.setting.family != Family::Rays && !m.errors.psnr_db.is_nan()
         };
         all.iter().zip(&on_front).filter(asked)
@@ -66,7 +66,7 @@ pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError
         let mut mesh = chart.configure_mesh();
         mesh.x_desc("milliseconds a step").y_desc(y).x_label_formatter(&time);
         mesh.light_line_style(WHITE).draw()?;
-        let at = |m: &Measured| (m.cost.step_ms.log10(), shown_db(m.errors.psnr_db));
+        let at = |m: &Measurement| (m.cost.step_ms.log10(), shown_db(m.errors.psnr_db));
         let mut line: Vec<(f64, f64)> =
             shown().filter(|(_, is_on)| **is_on).map(|(m, _)| at(m)).collect();
         line.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -83,7 +83,7 @@ pub(super) fn error_against_time(all: &[Measured]) -> Result<String, ReportError
 }
 
 /// PSNR over the distance from the recorded drive, a line for each setting of a family.
-pub(super) fn error_beside_the_drive(all: &[&Measured]) -> Result<String, ReportError> {
+pub(super) fn error_beside_the_drive(all: &[&Measurement]) -> Result<String, ReportError> {
     let all_db = || all.iter().flat_map(|m| m.psnr_db_by_offset.iter().map(|db| shown_db(*db)));
     let (low, high) = (all_db().fold(MOST_DB, f64::min), all_db().fold(0.0, f64::max));
     plot(all.len(), |root| {
@@ -107,7 +107,7 @@ pub(super) fn error_beside_the_drive(all: &[&Measured]) -> Result<String, Report
 }
 
 /// Trust over the distance from the recorded drive: of an image on average, and from the least to the most.
-pub(super) fn trust_beside_the_drive(all: &[Believed]) -> Result<String, ReportError> {
+pub(super) fn trust_beside_the_drive(all: &[Confidence]) -> Result<String, ReportError> {
     plot(2, |root| {
         let mut chart =
             with_room_for_names(root).build_cartesian_2d(0.0..OFFSETS_M[3] + 0.2, 0.0..1.05)?;

@@ -1,11 +1,11 @@
 //! How long a step takes: in turn with the twin as it is served, since machines are not always as fast.
 
-use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
+use parking_lot::Mutex;
+
 use super::ReportError;
-use super::ladder::Sent;
-use super::measure::{Measured, quantile};
+use super::settings::Sent;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 
@@ -67,15 +67,14 @@ impl Step<'_> {
             let rgb8 = target.rgb8.as_deref().unwrap_or_default();
             let file = file(self.sent, &self.views[view], rgb8);
             let bytes = file.map(|file| file.map_or(rgb8.len(), |file| file.len()) as u64);
-            let mut sum = sent_bytes.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut sum = sent_bytes.lock();
             *sum = sum.clone().and_then(|sum: u64| Ok(sum + bytes?));
         };
         let frame = Frame { scene: self.scene, profile: self.profile, views: self.views };
         let start = Instant::now();
         self.backend.render(&frame, &mut targets, &finished)?;
         let ms = start.elapsed().as_secs_f64() * 1e3;
-        let sent_bytes = sent_bytes.into_inner().unwrap_or_else(PoisonError::into_inner);
-        Ok((ms, sent_bytes.map_err(|reason| ReportError::Encode { reason })?))
+        Ok((ms, sent_bytes.into_inner().map_err(|reason| ReportError::Encode { reason })?))
     }
 }
 
@@ -89,19 +88,5 @@ pub(super) fn file(
     match sent {
         Some(Sent::Jpeg(quality)) => wildcity_session::jpeg(rgb8, width, height, quality).map(Some),
         Some(Sent::Raw) | None => Ok(None),
-    }
-}
-
-/// Scales all times to one speed of the machine: that at which the twin as served took its median time.
-/// A setting that was measured while others compiled is then no slower than the rest. It is the first
-/// backend's time that says how fast the machine was, for settings of the others too.
-pub fn at_one_speed(all: &mut [Measured]) {
-    let served_ms: Vec<f64> = all.iter().map(|m| m.served_ms).collect();
-    let usual_ms = quantile(&served_ms, 0.5);
-    for m in all {
-        let faster = usual_ms / m.served_ms;
-        m.served_ms = usual_ms;
-        m.cost.step_ms *= faster;
-        m.by_place.iter_mut().flat_map(|place| &mut place.p95_ms).for_each(|ms| *ms *= faster);
     }
 }

@@ -1,5 +1,7 @@
 //! Gaussians as a trainer wrote them: raw parameters, before activation.
 
+use std::ops::Range;
+
 use super::sh;
 
 /// Raw Gaussians, as columns of equal length `n`.
@@ -23,7 +25,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// No Gaussians yet, with room for `n`.
+    /// An empty set with room for `n` Gaussians.
     pub fn with_capacity(sh_degree: u8, n: usize) -> Self {
         Self {
             sh_degree,
@@ -35,7 +37,7 @@ impl Gaussians {
         }
     }
 
-    /// Makes room for `n` more, and no further.
+    /// Reserves memory for exactly `n` more Gaussians.
     pub fn reserve_exact(&mut self, n: usize) {
         self.means_m.reserve_exact(n);
         self.quats_wxyz.reserve_exact(n);
@@ -44,7 +46,7 @@ impl Gaussians {
         self.sh.reserve_exact(n * 3 * sh::coefficients(self.sh_degree));
     }
 
-    /// Adds one of others, which have the same SH degree.
+    /// Appends one Gaussian of `others`, which must have the same SH degree.
     pub fn push_from(&mut self, others: &Self, index: usize) {
         self.means_m.push(others.means_m[index]);
         self.quats_wxyz.push(others.quats_wxyz[index]);
@@ -53,25 +55,64 @@ impl Gaussians {
         self.sh.extend_from_slice(others.sh_of(index));
     }
 
-    /// How many.
+    /// Appends all Gaussians of `others`. Where the SH degrees differ, the result has the higher one:
+    /// the missing coefficients are zero, which changes no colour.
+    pub fn append(&mut self, others: &Self) {
+        self.append_range(others, 0..others.len());
+    }
+
+    /// Appends the Gaussians of `others` whose indices are in `range`, as [`Self::append`] does.
+    pub fn append_range(&mut self, others: &Self, range: Range<usize>) {
+        self.raise_sh_degree(others.sh_degree);
+        self.means_m.extend_from_slice(&others.means_m[range.clone()]);
+        self.quats_wxyz.extend_from_slice(&others.quats_wxyz[range.clone()]);
+        self.ln_scales.extend_from_slice(&others.ln_scales[range.clone()]);
+        self.logit_opacities.extend_from_slice(&others.logit_opacities[range.clone()]);
+        let own = 3 * sh::coefficients(others.sh_degree);
+        let raised = 3 * sh::coefficients(self.sh_degree);
+        if own == raised {
+            self.sh.extend_from_slice(&others.sh[range.start * own..range.end * own]);
+            return;
+        }
+        self.sh.reserve(range.len() * raised);
+        for index in range {
+            self.sh.extend_from_slice(others.sh_of(index));
+            self.sh.resize(self.sh.len() + raised - own, 0.0);
+        }
+    }
+
+    /// The Gaussians of some indices, in the order of the indices.
+    pub fn select(&self, indices: impl IntoIterator<Item = usize>) -> Self {
+        let indices = indices.into_iter();
+        let mut selected = Self::with_capacity(self.sh_degree, indices.size_hint().0);
+        for index in indices {
+            selected.push_from(self, index);
+        }
+        selected
+    }
+
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means_m.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means_m.is_empty()
     }
 
-    /// Adds coefficients of zero, which change no colour, up to a degree that is not lower.
+    /// Raises the SH degree to `degree` with coefficients of zero, which change no colour. A lower
+    /// `degree` than the present one changes nothing.
     pub fn raise_sh_degree(&mut self, degree: u8) {
-        let (from, to) = (3 * sh::coefficients(self.sh_degree), 3 * sh::coefficients(degree));
+        let from = 3 * sh::coefficients(self.sh_degree);
+        let to = 3 * sh::coefficients(degree);
         if from < to {
             let mut raised = vec![0.0; self.len() * to];
             for (new, old) in raised.chunks_exact_mut(to).zip(self.sh.chunks_exact(from)) {
                 new[..from].copy_from_slice(old);
             }
-            (self.sh, self.sh_degree) = (raised, degree);
+            self.sh = raised;
+            self.sh_degree = degree;
         }
     }
 
@@ -79,5 +120,64 @@ impl Gaussians {
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Gaussians whose every number names the Gaussian that it belongs to.
+    fn numbered(sh_degree: u8, numbers: &[u8]) -> Gaussians {
+        let mut gaussians = Gaussians::with_capacity(sh_degree, numbers.len());
+        for &number in numbers {
+            gaussians.means_m.push([f64::from(number), 0.5, 0.25]);
+            gaussians.quats_wxyz.push([f32::from(number); 4]);
+            gaussians.ln_scales.push([-f32::from(number); 3]);
+            gaussians.logit_opacities.push(f32::from(number));
+            gaussians.sh.extend(
+                (0..3 * sh::coefficients(sh_degree)).map(|k| 100.0 * f32::from(number) + k as f32),
+            );
+        }
+        gaussians
+    }
+
+    #[test]
+    fn appended_gaussians_come_last() {
+        let mut all = numbered(1, &[1, 2]);
+        all.append(&numbered(1, &[3]));
+        assert_eq!(all, numbered(1, &[1, 2, 3]));
+        all.append_range(&numbered(1, &[7, 8, 9, 10]), 1..3);
+        assert_eq!(all, numbered(1, &[1, 2, 3, 8, 9]));
+        all.append(&Gaussians::default());
+        assert_eq!(all, numbered(1, &[1, 2, 3, 8, 9]));
+    }
+
+    #[test]
+    fn the_higher_sh_degree_wins_on_either_side() {
+        let mut expected = numbered(0, &[1]);
+        expected.raise_sh_degree(2);
+        expected.append(&numbered(2, &[5]));
+        assert_eq!(expected.sh[3..27], [0.0; 24]);
+        assert_eq!(expected.sh[27..], numbered(2, &[5]).sh);
+
+        let mut raised = numbered(0, &[1]);
+        raised.append(&numbered(2, &[5]));
+        assert_eq!(raised, expected);
+
+        let mut first = numbered(2, &[5]);
+        first.append(&numbered(0, &[1]));
+        assert_eq!(first.sh_degree, 2);
+        assert_eq!(first.sh_of(0), numbered(2, &[5]).sh_of(0));
+        assert_eq!(first.sh_of(1)[..3], numbered(0, &[1]).sh);
+        assert_eq!(first.sh_of(1)[3..], [0.0; 24]);
+    }
+
+    #[test]
+    fn selected_gaussians_are_in_the_order_of_their_indices() {
+        let all = numbered(3, &[1, 2, 3, 4]);
+        assert_eq!(all.select([3, 0, 0]), numbered(3, &[4, 1, 1]));
+        assert_eq!(all.select(0..4), all);
+        assert_eq!(all.select([]), Gaussians { sh_degree: 3, ..Gaussians::default() });
     }
 }

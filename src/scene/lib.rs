@@ -13,6 +13,7 @@ pub mod route;
 pub mod sh;
 pub mod sky;
 pub mod trajectory;
+pub mod validate;
 
 pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;

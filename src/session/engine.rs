@@ -369,7 +369,6 @@ impl Drop for Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use wildcity_render;
 
     #[test]
     fn huge_images_are_not_kept() {
@@ -391,11 +390,11 @@ mod tests {
 
         fn render(
             &self,
-            _: &render::Frame<'_>,
-            _: &mut [render::Target<'_>],
-            _: render::Finished<'_>,
-        ) -> Result<render::FrameStats, render::RenderError> {
-            Ok(render::FrameStats::default())
+            _: &wildcity_render::Frame<'_>,
+            _: &mut [wildcity_render::Target<'_>],
+            _: wildcity_render::Finished<'_>,
+        ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
+            Ok(wildcity_render::FrameStats::default())
         }
     }
 

@@ -131,6 +131,3 @@ pub const WORST_PLACES: usize = 4096;
 
 /// Rigs whose worst place in a twin is remembered, so that sessions open at once.
 pub const REMEMBERED_LENSES: usize = 16;
-
-/// Bad Gaussians that are named of one file; the others are counted.
-pub const BAD_GAUSSIANS: usize = 16;

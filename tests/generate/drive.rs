@@ -62,7 +62,7 @@ fn along_the_drive(wanted: impl Fn(DVec3) -> bool) -> Vec<Vec<DVec3>> {
         .map(|&mean_m| DVec3::from_array(mean_m))
         .filter(|mean_m| (-0.5..3.0).contains(&mean_m.z))
         .collect();
-    let at_keyframe = |world_from_rig: &wildcity::geometry::Pose| {
+    let at_keyframe = |world_from_rig: &wildcity_scene::geometry::Pose| {
         let rig_from_world = world_from_rig.inverse();
         means_m
             .iter()

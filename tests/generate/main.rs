@@ -6,8 +6,8 @@ mod pictures;
 
 use std::sync::LazyLock;
 
-use wildcity::generate::{GenerateError, Street, StreetSettings, street};
-use wildcity::scene::Gaussians;
+use wildcity_generate::{GenerateError, Street, StreetSettings, street};
+use wildcity_scene::Gaussians;
 
 /// The street of `scenes/demo.json`, made once for all tests.
 static DEMO: LazyLock<Street> =

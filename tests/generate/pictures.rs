@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DVec2};
-use wildcity::generate::SKY;
-use wildcity::geometry::Camera;
-use wildcity::ingest;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::render::{Backend, Frame, Target, View};
-use wildcity::scene::rig::RigCamera;
-use wildcity::scene::{RenderProfile, Rig, Scene, Sky};
+use wildcity_generate::SKY;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{RenderProfile, Rig, Scene, Sky};
+use wildcity_twin::ingest;
 
 use super::DEMO;
 

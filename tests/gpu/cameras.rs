@@ -2,14 +2,14 @@
 //! pinhole.
 
 use glam::DVec3;
-use wildcity::geometry::camera::{Rolls, Windshield, WindshieldReference};
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::{RenderError, Rolling, View};
-use wildcity::report::points::Points;
-use wildcity::report::stress::blobs::{Blob, scene};
-use wildcity::scene::{RenderProfile, Rig, Scene};
+use wildcity_render::compare::blobs::{Blob, scene};
+use wildcity_render::compare::points::Points;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::{RenderError, Rolling, View};
+use wildcity_scene::geometry::camera::{Rolls, Windshield, WindshieldReference};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, look, psnr, render, render_one, try_render};

@@ -2,11 +2,11 @@
 //! about every splat.
 
 use glam::DVec2;
-use wildcity::geometry::Camera;
-use wildcity::render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
-use wildcity::render::reference;
-use wildcity::render::stage::Between;
-use wildcity::render::{Frame, layout};
+use wildcity_render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
+use wildcity_render::reference;
+use wildcity_render::stage::Between;
+use wildcity_render::{Frame, layout};
+use wildcity_scene::geometry::Camera;
 
 use crate::images::Image;
 

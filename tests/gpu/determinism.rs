@@ -2,8 +2,8 @@
 
 use std::io::Write;
 
-use wildcity::render::gpu::devices;
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::gpu::devices;
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::gpu;
 use crate::images::{render, render_one};

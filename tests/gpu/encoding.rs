@@ -3,12 +3,12 @@
 use std::f64::consts::{PI, TAU};
 
 use glam::{DQuat, DVec3};
-use wildcity::render::gpu::Gpu;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::stage::Stage;
-use wildcity::render::{Frame, View};
-use wildcity::scene::chunk::{CLUSTER, column};
-use wildcity::scene::{RenderProfile, Scene, sh};
+use wildcity_render::gpu::Gpu;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::stage::Stage;
+use wildcity_render::{Frame, View};
+use wildcity_scene::chunk::{CLUSTER, column};
+use wildcity_scene::{RenderProfile, Scene, sh};
 
 use crate::blobs::{Blob, ahead, scene};
 use crate::definition::{self, Splat};
@@ -16,7 +16,7 @@ use crate::gpu::{gpu, gpu_with};
 use crate::scene_files::Random;
 
 /// Three clusters side by side in one chunk, all before the camera, with colours of a degree.
-fn wall(sh_degree: u8) -> wildcity::scene::Gaussians {
+fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     let mut random = Random(71);
     let mut wall = crate::blobs::raw(&[]);
     wall.sh_degree = sh_degree;

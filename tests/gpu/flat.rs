@@ -4,9 +4,9 @@ use std::fs;
 use std::ops::Range;
 
 use glam::DVec3;
-use wildcity::render::gpu::Gpu;
-use wildcity::render::{Backend, Finished, Frame, RenderError, Target, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::gpu::Gpu;
+use wildcity_render::{Backend, Finished, Frame, RenderError, Target, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::blobs::{self, Blob};
 use crate::gpu::{bindings, gpu, gpu_with_limits};

@@ -17,23 +17,18 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
-mod bench;
 mod cameras;
-mod command_line;
 mod definition;
 mod determinism;
-mod devices;
 mod encoding;
-mod extremes;
 mod flat;
 mod mirror;
-mod needed;
+mod mutations;
 mod overlap;
 mod parity;
 mod parts;
 mod sky;
-mod mutations;
 mod stages;
 mod twins;
 
-use wildcity::report::stress::blobs;
+use wildcity_render::compare::blobs;

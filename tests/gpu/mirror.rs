@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::render::gpu::MemoryLimits;
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::chunk::{CellRun, Partition};
-use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
+use wildcity_generate::StreetSettings;
+use wildcity_render::gpu::MemoryLimits;
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::chunk::{CellRun, Partition};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{look, render};
@@ -19,7 +19,7 @@ const BYTES: f64 = 64.0;
 /// The demo street as a twin has it, in blocks of 16 m, each at the coarsest level whose error is at most
 /// a pixel in a camera of so many pixels of focal length that stands at the street's start.
 fn demo(focal_px: f32) -> Scene {
-    let street = generate::street(&StreetSettings::default()).unwrap();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let (gaussians, eye_m) = (street.gaussians, street.trajectory.at_station(0.0).position_m);
     let Partition { cells, order } = Partition::new(&gaussians.means_m);
     let block = |cell: &CellRun, indices: &[u32]| {
@@ -129,7 +129,8 @@ fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
     let (small, large) = (&cells[0], &Scene { chunks: all.collect(), sky: None });
-    let limited = gpu_with_limits(MemoryLimits { mirror_bytes: 1_000_000, ..MemoryLimits::default() });
+    let limited =
+        gpu_with_limits(MemoryLimits { mirror_bytes: 1_000_000, ..MemoryLimits::default() });
     let expected = render(&gpu(), small, &profile, &turning_views());
     for _ in 0..2 {
         assert!(render(&limited, small, &profile, &turning_views()) == expected);

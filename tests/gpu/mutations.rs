@@ -1,9 +1,9 @@
 //! A comparison that cannot fail proves nothing: every stage is broken, and it must be noticed.
 
 use glam::DVec3;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::{Backend, RenderError, View};
-use wildcity::scene::{Gaussians, RenderProfile, Scene};
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::{Backend, RenderError, View};
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, look, render, try_render};

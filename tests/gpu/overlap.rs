@@ -4,9 +4,9 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::{Backend, Finished, Frame, Target};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::{Backend, Finished, Frame, Target};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::gpu_on;
 use crate::images::render_one;

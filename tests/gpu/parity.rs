@@ -1,9 +1,9 @@
 //! Whole images: gpu against cpu, and against images that others made.
 
 use glam::DVec3;
-use wildcity::render::View;
-use wildcity::render::reference::Reference;
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::View;
+use wildcity_render::reference::Reference;
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::data::real;
 use crate::gpu::gpu;

@@ -1,8 +1,8 @@
 //! Frames that exceed a device are drawn in parts, and nobody can tell.
 
 use glam::DVec3;
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::{Gaussians, RenderProfile, Scene};
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{agree, cpu, look, render, render_one};

@@ -3,15 +3,15 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::{Lens, OpenCv, Pinhole};
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, RenderError, View};
-use wildcity::scene::appearance::{Appearance, Overlay};
-use wildcity::scene::sky::{CubeMap, Model};
-use wildcity::scene::{RenderProfile, Scene, Sky};
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, RenderError, View};
+use wildcity_scene::appearance::{Appearance, Overlay};
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::{Lens, OpenCv, Pinhole};
+use wildcity_scene::sky::{CubeMap, Model};
+use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::cameras::bent_views;
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};

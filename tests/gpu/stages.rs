@@ -3,15 +3,15 @@
 
 use std::sync::LazyLock;
 
-use wildcity::render::cpu::Cpu;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu};
-use wildcity::render::layout::Cutoffs;
-use wildcity::render::psnr::RIGHT_DB;
-use wildcity::render::relay::{Relay, bisect};
-use wildcity::render::stage::{Between, Stage};
-use wildcity::render::{Backend, Frame, RenderError, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::compare::psnr::RIGHT_DB;
+use wildcity_render::cpu::Cpu;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::layout::Cutoffs;
+use wildcity_render::relay::{Relay, bisect};
+use wildcity_render::stage::{Between, Stage};
+use wildcity_render::{Backend, Frame, RenderError, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::cameras::bent_views;
 use crate::definition::{self, Splat};
@@ -219,9 +219,9 @@ impl Backend for GoOn<'_> {
     fn render(
         &self,
         frame: &Frame<'_>,
-        targets: &mut [wildcity::render::Target<'_>],
-        finished: wildcity::render::Finished<'_>,
-    ) -> Result<wildcity::render::FrameStats, wildcity::render::RenderError> {
+        targets: &mut [wildcity_render::Target<'_>],
+        finished: wildcity_render::Finished<'_>,
+    ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
         self.gpu.resume(self.between, frame, targets, finished)
     }
 }
@@ -295,7 +295,8 @@ fn a_slip_in_a_lens_fails_its_projection() {
         let found = broken.run_through(&BENT.frame(), None, Stage::Project).unwrap();
         BENT.object_to_project(&found).iter().all(Option::is_some)
     };
-    let unnoticed: Vec<&(&str, &str)> = LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
+    let unnoticed: Vec<&(&str, &str)> =
+        LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
     assert!(unnoticed.is_empty(), "{unnoticed:#?}");
 }
 

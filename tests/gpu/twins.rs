@@ -4,11 +4,11 @@
 use std::collections::BTreeMap;
 
 use naga::{Expression, Literal, Module, TypeInner};
-use wildcity::render::gpu::layout;
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::{MAX_VIEWS, constants};
-use wildcity::scene::chunk;
-use wildcity::scene::sky::SKY_CUT;
+use wildcity_render::gpu::layout;
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::{MAX_VIEWS, constants};
+use wildcity_scene::chunk;
+use wildcity_scene::sky::SKY_CUT;
 
 /// The shared files alone: whatever they declare has a twin.
 fn shared() -> Module {

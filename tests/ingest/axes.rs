@@ -1,6 +1,6 @@
 use glam::{DMat3, DQuat, DVec3};
-use wildcity::ingest::Axes;
-use wildcity::scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, sh};
+use wildcity_twin::ingest::Axes;
 
 use crate::scene_files::gaussians;
 

@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 
 use glam::DVec3;
-use wildcity::ingest::{self, Axes};
-use wildcity::render::View;
-use wildcity::scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity_render::View;
+use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity_twin::ingest::{self, Axes};
 
 use crate::data;
 use crate::images::{cpu, look, psnr, render};

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use wildcity::ingest::{self, IngestError};
-use wildcity::scene::Gaussians;
+use wildcity_scene::Gaussians;
+use wildcity_twin::ingest::{self, IngestError};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, usdz, zip_of,

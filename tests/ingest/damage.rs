@@ -1,6 +1,6 @@
 //! Every kind of damage with the error that it must give.
 
-use wildcity::scene::Gaussians;
+use wildcity_scene::Gaussians;
 
 use crate::scene_files::{
     Tensor, gaussians, gsplat_tensors, inria_columns, ply, ply_header, safetensors,
@@ -67,8 +67,8 @@ fn a_missing_column_is_named_though_the_size_is_wrong_too() {
 #[test]
 fn what_is_no_regular_file_is_refused_at_once() {
     for (path, found) in [("/dev/zero", "a device"), ("/", "a directory")] {
-        let scene = wildcity::ingest::read(path.as_ref(), &mut |_, _| {}).unwrap_err();
-        let cameras = wildcity::ingest::cameras::read(path.as_ref()).unwrap_err();
+        let scene = wildcity_twin::ingest::read(path.as_ref(), &mut |_, _| {}).unwrap_err();
+        let cameras = wildcity_twin::ingest::cameras::read(path.as_ref()).unwrap_err();
         for text in [scene.to_string(), cameras.to_string()] {
             assert!(text.starts_with("not a regular file but ") && text.contains(found), "{text}");
         }
@@ -76,7 +76,7 @@ fn what_is_no_regular_file_is_refused_at_once() {
     let dir = tempfile::tempdir().unwrap();
     let pipe = dir.path().join("pipe");
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
-    let text = wildcity::ingest::read(&pipe, &mut |_, _| {}).unwrap_err().to_string();
+    let text = wildcity_twin::ingest::read(&pipe, &mut |_, _| {}).unwrap_err().to_string();
     assert!(text.starts_with("not a regular file but a pipe"), "{text}");
 }
 
@@ -85,8 +85,8 @@ fn a_file_is_read_up_to_its_limit() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("settings");
     std::fs::write(&path, b"12345").unwrap();
-    assert_eq!(wildcity::ingest::read_whole(&path, 5).unwrap(), b"12345");
-    let text = wildcity::ingest::read_whole(&path, 4).unwrap_err().to_string();
+    assert_eq!(wildcity_twin::ingest::read_whole(&path, 5).unwrap(), b"12345");
+    let text = wildcity_twin::ingest::read_whole(&path, 4).unwrap_err().to_string();
     assert_eq!(text, "larger than 4 bytes");
 }
 
@@ -99,7 +99,7 @@ fn camera_lists_say_what_is_wrong() {
     let refusal = |text: String| {
         std::fs::write(&path, text).unwrap();
         // As the command line prints it: with every source behind it.
-        let error = wildcity::ingest::cameras::read(&path).unwrap_err();
+        let error = wildcity_twin::ingest::cameras::read(&path).unwrap_err();
         let sources = std::iter::successors(std::error::Error::source(&error), |e| e.source());
         sources.fold(error.to_string(), |text, source| format!("{text}: {source}"))
     };
@@ -237,7 +237,7 @@ fn damaged_safetensors_are_refused_with_the_numbers() {
 #[test]
 fn a_file_that_is_not_there_is_an_error() {
     let path = std::path::Path::new("/nonexistent/scene.ply");
-    let text = wildcity::ingest::read(path, &mut |_, _| {}).unwrap_err().to_string();
+    let text = wildcity_twin::ingest::read(path, &mut |_, _| {}).unwrap_err().to_string();
     assert!(text.starts_with("cannot read: "), "{text}");
     assert!(read(&[0; 4]).is_err());
 }

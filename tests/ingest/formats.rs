@@ -1,7 +1,7 @@
 //! What small writers of every format wrote comes back, within what the format keeps.
 
-use wildcity::ingest;
-use wildcity::scene::Gaussians;
+use wildcity_scene::Gaussians;
+use wildcity_twin::ingest;
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,

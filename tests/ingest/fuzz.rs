@@ -70,7 +70,7 @@ proptest! {
             file[at] = byte;
             if let Ok(read) = read(&file) {
                 prop_assert!(read.len() <= 3);
-                prop_assert_eq!(read.sh.len(), read.len() * 3 * wildcity::scene::sh::coefficients(read.sh_degree));
+                prop_assert_eq!(read.sh.len(), read.len() * 3 * wildcity_scene::sh::coefficients(read.sh_degree));
             }
         }
     }
@@ -142,7 +142,7 @@ fn every_parser_survives_what_chance_makes() {
             let read = || case.read_with(folder.path(), part, &bytes);
             let survived = catch_unwind(AssertUnwindSafe(|| match read() {
                 Ok(g) => {
-                    let colours = 3 * wildcity::scene::sh::coefficients(g.sh_degree);
+                    let colours = 3 * wildcity_scene::sh::coefficients(g.sh_degree);
                     assert_eq!(g.sh.len(), g.len() * colours);
                     // A mesh has as many as are allowed it, however little it covers.
                     let most = if case.name == "mesh" { 210_000 } else { 10_000 };

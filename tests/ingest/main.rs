@@ -21,8 +21,8 @@ mod real_scenes;
 mod round_trip;
 mod skies;
 
-use wildcity::ingest::{self, IngestError};
-use wildcity::scene::Gaussians;
+use wildcity_scene::Gaussians;
+use wildcity_twin::ingest::{self, IngestError};
 
 /// Reads a file with these bytes.
 fn read(bytes: &[u8]) -> Result<Gaussians, IngestError> {

@@ -1,8 +1,8 @@
 //! Ordinary meshes become flat Gaussians.
 
 use glam::DVec3;
-use wildcity::ingest;
-use wildcity::scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, sh};
+use wildcity_twin::ingest;
 
 use crate::format_files::glb;
 use crate::{data, read, refusal};

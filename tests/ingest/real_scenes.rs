@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
-use wildcity::ingest;
-use wildcity::scene::Gaussians;
+use wildcity_scene::Gaussians;
+use wildcity_twin::ingest;
 
 use crate::data;
 

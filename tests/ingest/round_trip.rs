@@ -88,7 +88,7 @@ fn progress_ends_at_the_file_size() {
         let path = dir.path().join("scene");
         std::fs::write(&path, &bytes).unwrap();
         let mut reports = Vec::new();
-        wildcity::ingest::read(&path, &mut |done, total| reports.push((done, total))).unwrap();
+        wildcity_twin::ingest::read(&path, &mut |done, total| reports.push((done, total))).unwrap();
         assert!(reports.len() > 2 && reports.is_sorted(), "{reports:?}");
         let size = bytes.len() as u64;
         assert_eq!(reports.last(), Some(&(size, size)));
@@ -108,7 +108,8 @@ fn the_hash_is_that_of_the_bytes_that_were_read() {
         let path = dir.path().join("scene");
         std::fs::write(&path, &bytes).unwrap();
         let mut last = (0, 0);
-        let read = wildcity::ingest::read_hashed(&path, &mut |done, total| last = (done, total));
+        let read =
+            wildcity_twin::ingest::read_hashed(&path, &mut |done, total| last = (done, total));
         assert_eq!(read.unwrap(), (scene.clone(), blake3::hash(&bytes).to_hex().to_string()));
         assert_eq!(last, (bytes.len() as u64, bytes.len() as u64));
     }
@@ -127,7 +128,7 @@ fn progress_is_told_now_and_then_whatever_comes_first() {
     let path = dir.path().join("scene");
     std::fs::write(&path, &file).unwrap();
     let mut reports = 0;
-    assert_eq!(wildcity::ingest::read(&path, &mut |_, _| reports += 1).unwrap(), scene);
+    assert_eq!(wildcity_twin::ingest::read(&path, &mut |_, _| reports += 1).unwrap(), scene);
     assert!((6..12).contains(&reports), "{reports}");
 }
 

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use glam::DVec3;
 use image::{ImageFormat, Rgb, RgbImage};
-use wildcity::ingest::sky::{self, decode};
-use wildcity::scene::sky::{CubeMap, Model, Network};
+use wildcity_scene::sky::{CubeMap, Model, Network};
+use wildcity_twin::ingest::sky::{self, decode};
 
 use crate::scene_files::{Tensor, safetensors};
 

@@ -1,7 +1,7 @@
 use glam::DVec3;
-use wildcity::residency::{Eye, Needed, demand};
-use wildcity::scene::{Manifest, RenderProfile};
-use wildcity::store::Storage;
+use wildcity_scene::{Manifest, RenderProfile};
+use wildcity_twin::residency::{Eye, Needed, demand};
+use wildcity_twin::store::Storage;
 
 use crate::{commit, streets, tau};
 

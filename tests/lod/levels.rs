@@ -1,20 +1,20 @@
 use std::fs;
 
 use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::geometry::Camera;
-use wildcity::render::View;
-use wildcity::scene::chunk::{Partition, column};
-use wildcity::scene::rig::{Rig, RigCamera};
-use wildcity::scene::{Chunk, Gaussians, Record, Scene, lod};
-use wildcity::store::{Catalog, Storage};
+use wildcity_generate::StreetSettings;
+use wildcity_render::View;
+use wildcity_scene::chunk::{Partition, column};
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::{Chunk, Gaussians, Record, Scene, lod};
+use wildcity_twin::store::{Catalog, Storage};
 
 use crate::{commit, decibels, eyes, stored, streets, tau};
 
 /// Blocks of a scene at full detail.
 fn blocks(scene: &Gaussians) -> Vec<Chunk> {
     let Partition { cells, order } = Partition::new(&scene.means_m);
-    let block = |(cell, run): (&wildcity::scene::chunk::CellRun, std::ops::Range<usize>)| {
+    let block = |(cell, run): (&wildcity_scene::chunk::CellRun, std::ops::Range<usize>)| {
         let mut chunk = Chunk::new(cell.cell, cell.origin_m, scene.sh_degree, run.len());
         for &index in &order[run] {
             chunk.push(&cell.record(scene, index as usize));
@@ -68,7 +68,7 @@ fn a_pixel_of_error_is_hardly_seen_on_the_street() {
 
 /// The demo's six cameras, 60 m along its street, at a quarter of their size.
 fn quarter_rig() -> Vec<View> {
-    let street = generate::street(&StreetSettings::default()).unwrap();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let world_from_rig = street.trajectory.at_station(60.0);
     let view = |mounted: &RigCamera| {
         let Camera { width_px, height_px, .. } = mounted.camera;

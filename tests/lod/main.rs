@@ -18,11 +18,11 @@ mod records;
 use std::path::Path;
 use std::sync::Arc;
 
-use wildcity::render::View;
-use wildcity::residency::{Cache, Eye, Pinned, Resident};
-use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Gaussians, Record, RenderProfile, Scene};
-use wildcity::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use wildcity_render::View;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{Gaussians, Record, RenderProfile, Scene};
+use wildcity_twin::residency::{Cache, Eye, Pinned, Resident};
+use wildcity_twin::store::{Catalog, NewVersion, Storage, StoreError, Version};
 
 use images::{cpu, psnr, render};
 

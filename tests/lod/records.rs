@@ -1,8 +1,8 @@
-use wildcity::render::View;
-use wildcity::scene::chunk::{CellRun, Partition, column, columns};
-use wildcity::scene::record::Clamped;
-use wildcity::scene::{Chunk, Gaussians, Record, Scene};
-use wildcity::store::{Storage, StoreError};
+use wildcity_render::View;
+use wildcity_scene::chunk::{CellRun, Partition, column, columns};
+use wildcity_scene::record::Clamped;
+use wildcity_scene::{Chunk, Gaussians, Record, Scene};
+use wildcity_twin::store::{Storage, StoreError};
 
 use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
 
@@ -39,9 +39,9 @@ fn every_record_keeps_the_demo_street() {
 fn every_record_keeps_a_capture() {
     let Some(path) = data::real("scenes/skull/skull.ply") else { return };
     let camera = data::real("reference/skull_front.camera.json").unwrap();
-    let camera = wildcity::ingest::cameras::read(&camera).unwrap().remove(0);
+    let camera = wildcity_twin::ingest::cameras::read(&camera).unwrap().remove(0);
     let views = [View::new(camera.camera, camera.world_from_camera)];
-    let scene = wildcity::ingest::read(&path, &mut |_, _| {}).unwrap();
+    let scene = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     every_record_keeps(&scene, &views, "skull");
 }
 
@@ -74,7 +74,7 @@ fn coded(scene: &Gaussians, record: Record) -> (Chunk, Chunk, Clamped) {
     let lanes = (0..chunk.len().div_ceil(16)).flat_map(|block| chunk.block(block));
     // Garbage, so that what is not decoded is seen.
     let mut lanes: Vec<_> =
-        lanes.map(|lanes| wildcity::scene::chunk::Lanes(lanes.0.map(|_| 7.0))).collect();
+        lanes.map(|lanes| wildcity_scene::chunk::Lanes(lanes.0.map(|_| 7.0))).collect();
     record.decode(&part, scene.sh_degree, chunk.len(), &mut lanes).unwrap();
     let again = Chunk::from_lanes(cell.cell, cell.origin_m, scene.sh_degree, chunk.len(), lanes);
     (chunk, again, clamped)
@@ -152,7 +152,10 @@ fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
         }
         error => panic!("{error}"),
     }
-    assert_eq!(wildcity::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number, 1);
+    assert_eq!(
+        wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number,
+        1
+    );
     commit(dir.path(), &scene, Storage { record: Record::H52, levels: false }).unwrap();
 }
 

@@ -4,7 +4,7 @@ use std::fs;
 
 use safetensors::SafeTensorError;
 use serde_json::{Value, json};
-use wildcity::client::{FrameError, Observation};
+use wildcity_client::{FrameError, Observation};
 
 use super::frames::{Frame, assemble, png};
 use super::observations::{png_frame, raw_frame};

@@ -7,8 +7,8 @@ use tokio_tungstenite::accept_hdr_async;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::handshake::server::{Request as Upgrade, Response};
 use tokio_tungstenite::tungstenite::http::HeaderValue;
-use wildcity::protocol::PROTOCOL;
-use wildcity::protocol::message::Request;
+use wildcity_protocol::PROTOCOL;
+use wildcity_protocol::message::Request;
 
 use super::frames::Frame;
 use super::observations::raw_frame;

@@ -1,8 +1,8 @@
 //! Small observations, and the layout they travel in, written by another hand than the server's.
 
 use serde_json::{Map, Value, json};
-use wildcity::protocol::message::{Encoding, Pose, RigCamera};
-use wildcity::protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
+use wildcity_protocol::message::{Encoding, Pose, RigCamera};
+use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
 
 use super::messages::{front, rear};
 

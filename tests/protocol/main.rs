@@ -18,7 +18,7 @@ use std::path::PathBuf;
 
 /// A file of the project's `protocol` folder.
 fn protocol_path(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("protocol").join(name)
+    root().join("protocol").join(name)
 }
 
 /// Whether files are to be written rather than compared.
@@ -42,7 +42,7 @@ fn check_file(name: &str, contents: &[u8]) {
     }
     assert!(
         fs::read(&path).is_ok_and(|found| found == contents),
-        "{} is not what the types in src/protocol give. If the wire was meant to change: \
+        "{} is not what the types in protocol/src give. If the wire was meant to change: \
          WILDCITY_BLESS=1 cargo test --release --test protocol",
         path.display()
     );
@@ -53,4 +53,14 @@ fn check_json(name: &str, value: &impl serde::Serialize) {
     let mut text = serde_json::to_string_pretty(value).unwrap();
     text.push('\n');
     check_file(name, text.as_bytes());
+}
+
+/// The repository.
+fn root() -> PathBuf {
+    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut above = package.ancestors();
+    above
+        .find(|dir| dir.join("Cargo.lock").is_file())
+        .expect("a package within the repository")
+        .to_owned()
 }

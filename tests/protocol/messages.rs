@@ -1,10 +1,10 @@
 //! Golden text messages: one file per request and per answer.
 
 use serde_json::{Value, json};
-use wildcity::protocol::camera::{Exposure, Lens, Rolls, Shutter};
-use wildcity::protocol::error::Code;
-use wildcity::protocol::message::*;
-use wildcity::protocol::{PROTOCOL, unknown_field};
+use wildcity_protocol::camera::{Exposure, Lens, Rolls, Shutter};
+use wildcity_protocol::error::Code;
+use wildcity_protocol::message::*;
+use wildcity_protocol::{PROTOCOL, unknown_field};
 
 use super::{check_json, read};
 

@@ -1,8 +1,8 @@
 //! Golden observations: the frame, and what a client must find in it.
 
 use serde_json::{Value, json};
-use wildcity::client::{FrameError, ImageView, Observation};
-use wildcity::protocol::message::Encoding;
+use wildcity_client::{FrameError, ImageView, Observation};
+use wildcity_protocol::message::Encoding;
 
 use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
@@ -107,7 +107,7 @@ fn unknown_fields_of_the_metadata_are_ignored() {
     let frame = raw_frame();
     let mut metadata = serde_json::to_value(&frame.metadata).unwrap();
     super::messages::add_unknown_fields(&mut metadata);
-    let known: wildcity::protocol::observation::Observation =
+    let known: wildcity_protocol::observation::Observation =
         serde_json::from_value(metadata).unwrap();
     assert_eq!(known, frame.metadata);
 }

@@ -2,10 +2,10 @@
 
 use schemars::schema_for;
 use serde::de::DeserializeOwned;
-use wildcity::protocol::error::Code;
-use wildcity::protocol::http;
-use wildcity::protocol::message::{Answer, Request};
-use wildcity::protocol::observation::Observation;
+use wildcity_protocol::error::Code;
+use wildcity_protocol::http;
+use wildcity_protocol::message::{Answer, Request};
+use wildcity_protocol::observation::Observation;
 
 use super::read;
 
@@ -78,61 +78,6 @@ fn every_error_code_has_its_row() {
     codes.sort_unstable();
     rows.sort_unstable();
     assert_eq!(rows, codes);
-}
-
-/// The numbers on the page are those of the program.
-#[test]
-fn limits_are_those_of_the_configuration() {
-    use wildcity::config;
-    let page = page();
-    let poses = config::HISTORY_POSES;
-    let seconds = |limit: std::time::Duration| limit.as_secs();
-    for row in [
-        format!("| `ego.history_xyz` | F32 [{poses}, 3] |"),
-        format!("| `ego.history_rot` | F32 [{poses}, 3, 3] |"),
-        format!("| poses of one `observe` | {} |", config::OBSERVE_POSES),
-        format!("| poses of one `prefetch` | {} |", config::PREFETCH_POSES),
-        format!("| poses of one `trajectory` | {} |", config::PATH_POSES),
-        format!("| time of a `trajectory` | {} s |", config::PATH_US / 1_000_000),
-        format!(
-            "±{} m/s², and curvature of the rear axle's way, ±{} 1/m",
-            config::EGO_ACCELERATION_M_S2,
-            config::EGO_CURVATURE_1_M
-        ),
-        format!("by at most {:.2} rad", config::EGO_STEERING_RAD),
-        format!("Both go {} m/s at most", config::EGO_SPEED_M_S),
-        format!("go back, {} m/s at most", config::EGO_REVERSE_M_S),
-        format!("recorded drive within {} m", config::GROUND_NEAR_M),
-        format!("| cameras of a rig | {} |", wildcity::scene::Rig::MAX_CAMERAS),
-        format!("| message to the server | {} MiB |", config::INBOUND_MESSAGE_BYTES >> 20),
-        format!("| `hello` after connecting | {} s |", seconds(config::HELLO_TIMEOUT)),
-        format!("| silence between requests | {} s |", seconds(config::IDLE_TIMEOUT)),
-        format!("| reading an answer | {} s |", seconds(config::SEND_TIMEOUT)),
-        format!("| resuming | {} s |", seconds(config::RESUME_GRACE)),
-        format!("hears nothing for {} s", seconds(config::ANSWER_TIMEOUT)),
-        format!("headers up to {} MiB", config::OBSERVATION_HEADER_BYTES >> 20),
-        format!(
-            "| uploads kept, and their bytes | {}, {} GiB |",
-            config::UPLOADS,
-            config::SPOOL_BYTES >> 30
-        ),
-        format!("| one upload | {} GiB |", config::UPLOAD_BYTES >> 30),
-        format!("| silence within an upload | {} s |", seconds(config::UPLOAD_SILENCE)),
-        format!(
-            "| an upload that nobody goes on with | {} h |",
-            seconds(config::UPLOAD_AGE) / 3600
-        ),
-        format!("| pushes that wait or run | {} |", config::PUSHES),
-        format!("| files of a push | {} |", config::PUSH_FILES),
-        format!("| poses compared | {} |", config::GOLDEN_POSES),
-        format!("frames up to {} GiB", config::OBSERVATION_BYTES as f64 / f64::from(1 << 30)),
-    ] {
-        assert!(page.contains(&row), "{row}");
-    }
-    let pixels =
-        page.split("all images together | ").nth(1).and_then(|rest| rest.split(' ').next());
-    let pixels = pixels.map(|pixels| pixels.replace(',', ""));
-    assert_eq!(pixels, Some(config::ANSWER_PIXELS.to_string()));
 }
 
 fn page() -> String {

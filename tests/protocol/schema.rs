@@ -2,7 +2,7 @@
 
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema, schema_for};
-use wildcity::protocol::{http, message, observation};
+use wildcity_protocol::{http, message, observation};
 
 use super::check_json;
 

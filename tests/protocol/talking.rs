@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::time::timeout;
-use wildcity::client::{Client, ClientError};
-use wildcity::protocol::error::Code;
-use wildcity::protocol::message::{Open, Outcome, Pose, Request};
+use wildcity_client::{Client, ClientError};
+use wildcity_protocol::error::Code;
+use wildcity_protocol::message::{Open, Outcome, Pose, Request};
 
 use super::fake_server::{FakeServer, Reply, seq_of};
 use super::read;

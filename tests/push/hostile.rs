@@ -2,8 +2,8 @@
 
 use serde_json::json;
 
+use crate::http::{get, post, send};
 use crate::support::TestServer;
-use crate::{get, post, send};
 
 #[tokio::test]
 async fn hostile_bodies() {

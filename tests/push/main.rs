@@ -1,132 +1,16 @@
 //! Uploads and pushes over HTTP: what is pushed is what agents see, whole, when they ask for it; and
 //! whatever goes wrong on the way changes nothing.
 
+#[path = "../support/push.rs"]
+mod http;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/server.rs"]
 mod support;
 
-mod command_line;
 mod hostile;
-mod kills;
 mod metrics;
 mod pushes;
 mod roles;
 mod uploads;
 mod versions;
-
-use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
-
-use serde_json::Value;
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-use tokio::net::TcpStream;
-use wildcity::client::{Golden, HttpClient, NewPush, Push, PushFile};
-use wildcity::scene::Gaussians;
-
-use scene_files::{inria_columns, ply};
-use support::TestServer;
-
-/// An answer of HTTP: its status, its header lines, and its body as JSON where it is.
-#[derive(Debug)]
-struct Reply {
-    status: u16,
-    head: String,
-    body: Value,
-}
-
-impl Reply {
-    /// The value of a header, whose name is written in small letters.
-    fn header(&self, name: &str) -> Option<&str> {
-        self.head.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
-    }
-
-    /// Asserts a refusal.
-    fn refused(&self, status: u16, code: &str) {
-        assert_eq!((self.status, self.body["code"].as_str()), (status, Some(code)), "{self:?}");
-    }
-}
-
-/// Sends bytes as they are on a connection of their own, and reads until the server closes.
-async fn send(address: SocketAddr, head: &str, body: &[u8]) -> Reply {
-    let mut stream = TcpStream::connect(address).await.unwrap();
-    let head = format!("{}\r\nHost: localhost\r\nConnection: close\r\n\r\n", head.trim_end());
-    stream.write_all(head.as_bytes()).await.unwrap();
-    // A server that refuses need not read all of it.
-    let _ = stream.write_all(body).await;
-    let mut answer = Vec::new();
-    let read = stream.read_to_end(&mut answer);
-    let read = tokio::time::timeout(support::PATIENCE, read).await.expect("an answer in time");
-    read.unwrap();
-    let text = String::from_utf8(answer).unwrap();
-    let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
-    let status = head.split(' ').nth(1).expect("a status").parse().unwrap();
-    let body = serde_json::from_str(body).unwrap_or(Value::Null);
-    Reply { status, head: head.to_owned(), body }
-}
-
-/// Sends JSON.
-async fn post(server: &TestServer, path: &str, body: &Value) -> Reply {
-    let body = body.to_string();
-    let head = format!("POST {path} HTTP/1.1\r\nContent-Length: {}", body.len());
-    send(server.address(), &head, body.as_bytes()).await
-}
-
-async fn get(server: &TestServer, path: &str) -> Reply {
-    send(server.address(), &format!("GET {path} HTTP/1.1"), b"").await
-}
-
-fn client(server: &TestServer) -> HttpClient {
-    HttpClient::new(&format!("http://{}", server.address()), None).unwrap()
-}
-
-/// Writes Gaussians as a PLY file of INRIA's.
-fn write(dir: &Path, name: &str, gaussians: &Gaussians) -> PathBuf {
-    let path = dir.join(name);
-    let columns = inria_columns(gaussians.sh_degree, false);
-    std::fs::write(&path, ply(gaussians, &columns)).unwrap();
-    path
-}
-
-/// A push of some uploads, with every default.
-fn push_of(uploads: &[&str]) -> NewPush {
-    let file =
-        |id: &&str| PushFile { upload: (*id).to_owned(), axes: "identity".to_owned(), scale: 1.0 };
-    NewPush {
-        id: None,
-        files: uploads.iter().map(file).collect(),
-        base: None,
-        cells: None,
-        record: None,
-        levels: true,
-        profile: Vec::new(),
-        note: None,
-        golden: Golden::default(),
-    }
-}
-
-/// Uploads a scene, pushes it as `change` says, and waits for the end.
-async fn push(
-    server: &TestServer,
-    gaussians: &Gaussians,
-    change: impl FnOnce(&mut NewPush),
-) -> Push {
-    let dir = tempfile::tempdir().unwrap();
-    let path = write(dir.path(), "scene.ply", gaussians);
-    let client = client(server);
-    let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
-    let mut asked = push_of(&[&upload.id]);
-    change(&mut asked);
-    let begun = client.push("test", &asked).await.unwrap();
-    client.wait(begun, &mut |_| {}).await.unwrap()
-}
-
-/// Gaussians in one cell, about its centre.
-fn in_cell(cell: [i32; 2], count: usize, seed: u64) -> Gaussians {
-    let mut gaussians = scene_files::gaussians(count, 0, 8.0, seed);
-    for mean in &mut gaussians.means_m {
-        mean[0] += 64.0 * f64::from(cell[0]);
-        mean[1] += 64.0 * f64::from(cell[1]);
-    }
-    gaussians
-}

@@ -3,8 +3,8 @@
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
+use crate::http::{get, in_cell, push};
 use crate::support::TestServer;
-use crate::{get, in_cell, push};
 
 /// The text of `/metrics`, its header included.
 pub(crate) async fn scrape(server: &TestServer) -> String {

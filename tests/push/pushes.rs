@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use serde_json::json;
-use wildcity::client::{Cells, NewPush, Push, PushState};
-use wildcity::protocol::error::Code;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::store::Catalog;
+use wildcity_client::{Cells, NewPush, Push, PushState};
+use wildcity_protocol::error::Code;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_twin::store::Catalog;
 
+use crate::http::{client, get, in_cell, post, push, push_of, write};
 use crate::scene_files::gaussians;
 use crate::support::TestServer;
-use crate::{client, get, in_cell, post, push, push_of, write};
 
 #[tokio::test]
 async fn a_push_replaces_the_cells_that_it_touches() {
@@ -156,7 +156,7 @@ async fn what_others_changed_is_not_overwritten() {
     assert_eq!((refused.status, &refused.body["cells"]), (409, &json!([[1, 0]])));
     let whole = in_cell([2, 2], 7, 4);
     let all = push(&server, &whole, |push| {
-        push.cells = Some(Cells::All(wildcity::client::All::All));
+        push.cells = Some(Cells::All(wildcity_client::All::All));
         push.base = Some(3);
     });
     assert_eq!(all.await.version, Some(4));
@@ -216,7 +216,7 @@ async fn a_likeness_that_cannot_be_seen_is_refused() {
     let other = gaussians(40, 1, 8.0, 3);
     let pushed = push(&server, &other, |push| {
         alike(push);
-        push.cells = Some(Cells::All(wildcity::client::All::All));
+        push.cells = Some(Cells::All(wildcity_client::All::All));
     });
     refused(&pushed.await, "SH degree is 1, and 0");
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);

@@ -2,11 +2,11 @@
 
 use serde_json::json;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
-use wildcity::client::{Client, HttpClient};
-use wildcity::server::Tokens;
+use wildcity_client::{Client, HttpClient};
+use wildcity_server::Tokens;
 
+use crate::http::{Reply, push_of, send};
 use crate::support::TestServer;
-use crate::{Reply, push_of, send};
 
 const DRIVER: &str = "driver-driver-driver";
 const PUSHER: &str = "pusher-pusher-pusher";
@@ -130,7 +130,7 @@ async fn the_client_sends_its_token() {
     let server = guarded().await;
     let url = format!("http://127.0.0.1:{}", server.address().port());
     let dir = tempfile::tempdir().unwrap();
-    let path = crate::write(dir.path(), "a.ply", &crate::in_cell([0, 0], 40, 1));
+    let path = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
     let stranger = HttpClient::new(&url, None).unwrap();
     let refused = stranger.upload(&path, &mut |_, _| {}).await.unwrap_err();
     assert!(refused.to_string().contains("refused, 401"), "{refused}");
@@ -148,7 +148,7 @@ async fn the_client_sends_its_token() {
     assert!(refused.to_string().contains("401"), "{refused}");
     let mut driver = Client::connect_as(&url, "driver", Some(DRIVER.to_owned())).await.unwrap();
     assert!(!format!("{driver:?}").contains(DRIVER));
-    driver.open(wildcity::client::Open::twin("test")).await.unwrap();
+    driver.open(wildcity_client::Open::twin("test")).await.unwrap();
     assert_eq!(driver.switch_version(Some(2)).await.unwrap().version, 2);
     assert_eq!(driver.reset(0, None).await.unwrap().metadata().version, 2);
 }
@@ -160,5 +160,5 @@ async fn pages_from_elsewhere_may_not_push() {
     let request = "POST /v1/twins/test/rollback HTTP/1.1\r\nOrigin: https://example.org";
     let head = format!("{request}\r\nContent-Length: {}", body.len());
     send(server.address(), &head, body.as_bytes()).await.refused(403, "forbidden");
-    assert_eq!(crate::get(&server, "/v1/twins/test").await.body["version"], 1);
+    assert_eq!(crate::http::get(&server, "/v1/twins/test").await.body["version"], 1);
 }

@@ -5,10 +5,10 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
-use wildcity::server::{Limits, SpoolLimits};
+use wildcity_server::{Limits, SpoolLimits};
 
+use crate::http::{Reply, get, post, send};
 use crate::support::{PATIENCE, TestServer};
-use crate::{Reply, get, post, send};
 
 fn content(size: usize) -> Vec<u8> {
     (0..size).map(|i| (i * i % 251) as u8).collect()

@@ -6,17 +6,17 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::json;
-use wildcity::client::PushState;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::residency::Cache;
-use wildcity::session::{
+use wildcity_client::PushState;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_session::{
     Encoding, Engine, EngineSettings, Extent, Opening, Outputs, Recording, Session,
 };
-use wildcity::store::Catalog;
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
 
+use crate::http::{get, in_cell, push};
 use crate::metrics::scrape;
 use crate::support::{Agent, PATIENCE, Seen, TestServer, pose, refused};
-use crate::{get, in_cell, push};
 
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, Frame, RenderError, Target};
-use wildcity::scene::appearance::{Appearance, AppearanceError, Exposure, Overlay};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, Frame, RenderError, Target};
+use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure, Overlay};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::{Image, agree, cpu, max_difference, render_one};
 use crate::skies::{appearance, draw_seen, sky};

@@ -2,14 +2,14 @@
 //! pixel's own ray, and against the same scene row by row.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use wildcity::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::reference::Reference;
-use wildcity::render::unscented::Bent;
-use wildcity::render::{Backend, RenderError, Rolling, Target, View};
-use wildcity::report::points::centroid;
-use wildcity::report::stress::blobs::{Blob, scene};
-use wildcity::scene::{Rays, RenderProfile, Scene};
+use wildcity_render::compare::blobs::{Blob, scene};
+use wildcity_render::compare::points::centroid;
+use wildcity_render::reference::Reference;
+use wildcity_render::unscented::Bent;
+use wildcity_render::{Backend, RenderError, Rolling, Target, View};
+use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{agree, cpu, max_difference, psnr, render, render_one, try_render};
 use crate::lenses::{
@@ -342,7 +342,7 @@ fn exact_rays_are_for_the_reference_alone() {
     let mut rgb8 = vec![7; 3 * view.camera.pixels()];
     let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
     let frame =
-        wildcity::render::Frame { scene: &Scene::default(), profile: &exact(), views: &[view] };
+        wildcity_render::Frame { scene: &Scene::default(), profile: &exact(), views: &[view] };
     assert!(cpu().render(&frame, &mut [target], &|_, _| {}).is_err());
     assert!(rgb8.iter().all(|&b| b == 7), "nothing was written");
 }

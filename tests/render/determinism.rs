@@ -2,10 +2,9 @@
 
 use std::sync::Mutex;
 
-use wildcity::config;
-use wildcity::render::cpu::{Cpu, CpuError, Simd};
-use wildcity::render::{Backend, Frame, RenderError, Target};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::cpu::{Cpu, CpuError, Simd};
+use wildcity_render::{Backend, Frame, RenderError, Target};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::{cpu, render, render_one};
 use crate::scene_files::gaussians;
@@ -34,7 +33,7 @@ fn the_number_of_threads_does_not_show() {
 
 #[test]
 fn more_threads_than_any_machine_has_are_refused_before_they_start() {
-    let refused = Cpu::new(config::RENDER_THREADS + 1, Simd::Best).unwrap_err();
+    let refused = Cpu::new(wildcity_render::limits::RENDER_THREADS + 1, Simd::Best).unwrap_err();
     assert!(matches!(refused, CpuError::TooManyThreads { threads: 1025 }), "{refused}");
     assert_eq!(refused.to_string(), "1025 render threads; 0 to 1024 are accepted");
 }

@@ -1,16 +1,16 @@
 //! Camera models on their own: there and back, by formulas written another way, and what is refused.
 
 use glam::{DVec2, DVec3};
-use wildcity::geometry::camera::{
+use wildcity_render::compare::blobs::{Blob, scene};
+use wildcity_render::compare::points::centroid;
+use wildcity_render::reference;
+use wildcity_render::{Backend, View};
+use wildcity_scene::geometry::camera::{
     Bivariate, FTheta, Field, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
     WindshieldReference,
 };
-use wildcity::geometry::{Camera, CameraError, Pose};
-use wildcity::render::reference;
-use wildcity::render::{Backend, View};
-use wildcity::report::points::centroid;
-use wildcity::report::stress::blobs::{Blob, scene};
-use wildcity::scene::{Rays, RenderProfile, Rig};
+use wildcity_scene::geometry::{Camera, CameraError, Pose};
+use wildcity_scene::{Rays, RenderProfile, Rig};
 
 use crate::images::{cpu, psnr, render_one};
 use crate::lenses::{lenses, street_scene};

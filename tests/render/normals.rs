@@ -1,12 +1,12 @@
 //! Normals: of surfaces whose normal is known, through every lens, and where surfaces end.
 
 use glam::{DQuat, DVec3};
-use wildcity::geometry::Pose;
-use wildcity::geometry::camera::Rolls;
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, Frame, RenderError, Rolling, Target, View};
-use wildcity::report::stress::blobs::{Blob, ahead, scene};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::compare::blobs::{Blob, ahead, scene};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, Frame, RenderError, Rolling, Target, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::cpu;
 use crate::lenses::lenses;

@@ -1,8 +1,8 @@
 //! Against images that other renderers made of the same Gaussians.
 
-use wildcity::render::Backend;
-use wildcity::render::reference::Reference;
-use wildcity::scene::RenderProfile;
+use wildcity_render::Backend;
+use wildcity_render::reference::Reference;
+use wildcity_scene::RenderProfile;
 
 use crate::images::{cpu, max_difference, psnr, render_one};
 use crate::truths::{gsplat, skull_front};

@@ -1,11 +1,11 @@
 //! cpu against reference: f32 and tiles against f64 and none.
 
 use glam::DVec3;
-use wildcity::ingest;
-use wildcity::render::View;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::render::reference::Reference;
-use wildcity::scene::{Gaussians, RenderProfile, Scene};
+use wildcity_render::View;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::reference::Reference;
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_twin::ingest;
 
 use crate::data::real;
 use crate::images::{agree, cpu, look, render, render_one};

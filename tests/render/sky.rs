@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::render::reference::Reference;
-use wildcity::render::{Backend, Frame, RenderError, Target, View};
-use wildcity::scene::sky::{CubeMap, Drawn, Model, SKY_CUT, SkyError};
-use wildcity::scene::{RenderProfile, Scene, Sky};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::sky::{CubeMap, Drawn, Model, SKY_CUT, SkyError};
+use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::images::{agree, cpu, look, max_difference, render, render_one};
 use crate::scene_files::Random;
@@ -164,7 +164,7 @@ fn the_demo_sky_is_within_the_default_bound() {
 fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     let mut layers = network(true, 7, 0, false).layers().clone();
     layers[0].weight.iter_mut().for_each(|weight| *weight *= 40.0);
-    let sharp = wildcity::scene::sky::Network::new(layers, Vec::new()).unwrap();
+    let sharp = wildcity_scene::sky::Network::new(layers, Vec::new()).unwrap();
     let sky = Arc::new(Sky::new(Model::network(sharp), DMat3::IDENTITY));
     let error = sky.drawn(1e-4).unwrap_err();
     assert!(matches!(error, SkyError::Coarse { edge: 1025, .. }), "{error}");

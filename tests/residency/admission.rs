@@ -4,12 +4,11 @@ use std::sync::Arc;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use wildcity::config;
-use wildcity::residency::{Cache, Lens, Needed, ResidencyError};
-use wildcity::scene::Chunk;
+use wildcity_scene::Chunk;
+use wildcity_twin::residency::{Cache, Lens, Needed, ResidencyError};
 
 use crate::scene_files::{Random, gaussians};
-use crate::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
+use crate::streaming::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
 
 const LENS: Lens = Lens { focal_px: 70.0, radius_m: 1.7 };
 
@@ -43,7 +42,7 @@ fn another_version_takes_the_room_of_the_one_before() {
     commit(dir.path(), "street", &scene);
     scene.sh[0] += 0.5;
     commit(dir.path(), "street", &scene);
-    let catalog = wildcity::store::Catalog::open(dir.path()).unwrap();
+    let catalog = wildcity_twin::store::Catalog::open(dir.path()).unwrap();
     let all = Cache::new(catalog.clone()).open("street", None).unwrap();
     let limit_bytes = all.worst_bytes(LENS) * 3 / 2;
     assert!(limit_bytes < all.whole_bytes());
@@ -121,17 +120,17 @@ fn the_end_of_a_frame_makes_room_at_once() {
             std::thread::yield_now();
         }
         // Time to find that there is no room, and to fall asleep; a loader that is late finds room.
-        std::thread::sleep(config::ROOM_POLL / 4);
+        std::thread::sleep(wildcity_twin::limits::ROOM_POLL / 4);
         let dropped = Instant::now();
         drop(first);
         slowest = slowest.max(told.recv_timeout(PATIENCE).unwrap() - dropped);
         waiting.join().unwrap();
     }
-    assert!(slowest < config::ROOM_POLL / 4, "{slowest:?}");
+    assert!(slowest < wildcity_twin::limits::ROOM_POLL / 4, "{slowest:?}");
 }
 
 /// Threads that each draw forty frames in places of their own.
-fn race(resident: &Arc<wildcity::residency::Resident>, threads: u64, admitted: bool) {
+fn race(resident: &Arc<wildcity_twin::residency::Resident>, threads: u64, admitted: bool) {
     let (tell, told) = channel();
     for thread in 0..threads {
         let (resident, tell) = (resident.clone(), tell.clone());

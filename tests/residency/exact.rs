@@ -1,10 +1,10 @@
 //! The set that is drawn is a function of the pose: memory changes when, and never what.
 
-use wildcity::residency::{Cache, Index, Lens, Resident, demand};
-use wildcity::scene::RenderProfile;
+use wildcity_scene::RenderProfile;
+use wildcity_twin::residency::{Cache, Index, Lens, Resident, demand};
 
 use crate::scene_files::Random;
-use crate::{PROFILE, bytes, demo, eyes, need_bytes, pixels, unlimited, views};
+use crate::streaming::{PROFILE, bytes, demo, eyes, need_bytes, pixels, unlimited, views};
 
 /// A frame's pixels, and that nothing is held beyond the limit meanwhile.
 fn drawn(resident: &std::sync::Arc<Resident>, station_m: f64) -> Vec<Vec<u8>> {
@@ -78,16 +78,16 @@ fn the_index_finds_what_looking_at_every_block_finds() {
 
 /// The rule without an index.
 fn plain_walk(
-    manifest: &wildcity::scene::Manifest,
-    eyes: &[wildcity::residency::Eye],
+    manifest: &wildcity_scene::Manifest,
+    eyes: &[wildcity_twin::residency::Eye],
     profile: &RenderProfile,
-) -> Vec<wildcity::residency::Needed> {
+) -> Vec<wildcity_twin::residency::Needed> {
     let focal_px = eyes.iter().map(|eye| eye.focal_px).fold(0.0, f64::max);
     let mut needed = Vec::new();
     for (chunk, entry) in manifest.chunks.iter().enumerate() {
         for (section, full) in entry.sections.iter().enumerate().filter(|(_, s)| s.level == 0) {
             let bounds = entry.section_bounds(full);
-            let far = |eye: &wildcity::residency::Eye| bounds.distance_m(eye.position_m);
+            let far = |eye: &wildcity_twin::residency::Eye| bounds.distance_m(eye.position_m);
             let distance_m = eyes.iter().map(far).fold(f64::INFINITY, f64::min);
             if profile.reach_m.is_some_and(|reach_m| distance_m > reach_m) {
                 continue;
@@ -98,7 +98,7 @@ fn plain_walk(
                 .filter(|(_, s)| focal_px * f64::from(s.error_m) <= profile.tau_px * distance_m)
                 .last();
             let level = drawn.map_or(0, |(level, _)| level);
-            needed.push(wildcity::residency::Needed { chunk, section: section + level });
+            needed.push(wildcity_twin::residency::Needed { chunk, section: section + level });
         }
     }
     needed

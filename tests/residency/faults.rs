@@ -4,11 +4,10 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
-use wildcity::config;
-use wildcity::residency::{Cache, Needed, Pinned, ResidencyError, Resident, Stats, Ticket};
+use wildcity_twin::residency::{Cache, Needed, Pinned, ResidencyError, Resident, Stats, Ticket};
 
 use crate::source::{Fault, Faulty, Place};
-use crate::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
+use crate::streaming::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
 
 /// A cache whose source can be broken, and a section that a frame at 300 m needs and one at 0 m
 /// does not.
@@ -76,18 +75,18 @@ fn a_bad_section_is_named_tried_again_counted_and_forgotten() {
         match &error {
             ResidencyError::Load { twin, cell: c, block: b, level: l, attempts, cause: said } => {
                 assert_eq!((twin.as_str(), *c, *b, *l), ("demo", cell, block, level));
-                assert_eq!(*attempts, config::LOAD_ATTEMPTS);
+                assert_eq!(*attempts, wildcity_twin::limits::LOAD_ATTEMPTS);
                 assert!(said.contains(cause), "{said}");
             }
             other => panic!("{other}"),
         }
-        let attempts = u64::from(config::LOAD_ATTEMPTS);
+        let attempts = u64::from(wildcity_twin::limits::LOAD_ATTEMPTS);
         let stats = broken.cache.stats();
         assert_eq!((count(&stats), stats.retries), (attempts, attempts - 1), "{stats:?}");
         // Others drive on, and it is tried again by every frame that needs it.
         broken.assert_draws(0.0);
         assert!(broken.frame(300.0).is_err());
-        assert_eq!(broken.source.reads(broken.place), 2 * config::LOAD_ATTEMPTS);
+        assert_eq!(broken.source.reads(broken.place), 2 * wildcity_twin::limits::LOAD_ATTEMPTS);
         broken.source.heal();
         broken.assert_draws(300.0);
         let stats = broken.cache.stats();

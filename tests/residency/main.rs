@@ -1,113 +1,19 @@
 //! Streaming: whatever is in memory, a frame is the same; and nothing that fails, waits or races
 //! stops the others.
 
+#[path = "../support/city.rs"]
+mod city_twin;
 #[path = "../support/images.rs"]
 mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
+#[path = "../support/source.rs"]
+mod source;
+#[path = "../support/streaming.rs"]
+mod streaming;
 
 mod admission;
 mod city;
-mod driving;
 mod exact;
 mod faults;
 mod sharing;
-mod source;
-
-use std::path::Path;
-use std::sync::OnceLock;
-use std::time::Duration;
-
-use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::geometry::Pose;
-use wildcity::render::View;
-use wildcity::residency::{Cache, Eye, Needed, Resident};
-use wildcity::scene::manifest::Provenance;
-use wildcity::scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
-use wildcity::store::{Catalog, NewVersion, Version};
-
-use images::{cpu, look, render};
-
-/// How long a test waits for anything before it fails.
-const PATIENCE: Duration = Duration::from_secs(20);
-
-/// What a frame of the twin draws of it: within 120 m, so that a drive needs ever other parts.
-const PROFILE: RenderProfile = RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT };
-
-/// The demo street, sparser and longer: 600 m, all levels of detail.
-struct Demo {
-    dir: tempfile::TempDir,
-    trajectory: Trajectory,
-}
-
-fn demo() -> &'static Demo {
-    static DEMO: OnceLock<Demo> = OnceLock::new();
-    DEMO.get_or_init(|| {
-        let settings =
-            StreetSettings { length_m: 600.0, density: 0.2, ..StreetSettings::default() };
-        let street = generate::street(&settings).unwrap();
-        let dir = tempfile::tempdir().unwrap();
-        commit(dir.path(), "demo", &street.gaussians);
-        Demo { dir, trajectory: street.trajectory }
-    })
-}
-
-impl Demo {
-    fn catalog(&self) -> Catalog {
-        Catalog::open(self.dir.path()).unwrap()
-    }
-
-    /// The place of the car so many metres down the street.
-    fn at(&self, station_m: f64) -> Pose {
-        self.trajectory.at_station(station_m)
-    }
-}
-
-fn commit(dir: &Path, name: &str, gaussians: &Gaussians) -> Version {
-    let provenance = Provenance::of("test".into());
-    let new = NewVersion { profile: PROFILE, ..NewVersion::of(name, gaussians, provenance) };
-    Catalog::open(dir).unwrap().commit(new, &mut |_, _| {}).unwrap()
-}
-
-/// Two small cameras of a car: ahead and to its left.
-fn views(world_from_rig: Pose) -> [View; 2] {
-    let at = world_from_rig.position_m + DVec3::Z * 1.6;
-    let forward = world_from_rig.rotation * DVec3::X;
-    let left = world_from_rig.rotation * DVec3::Y;
-    [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
-}
-
-fn eyes(views: &[View]) -> Vec<Eye> {
-    let eye = |view: &View| Eye {
-        position_m: view.world_from_camera.position_m,
-        focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
-    };
-    views.iter().map(eye).collect()
-}
-
-/// The pixels of a scene as two cameras at a pose see it.
-fn pixels(scene: &Scene, world_from_rig: Pose) -> Vec<Vec<u8>> {
-    let views = views(world_from_rig);
-    render(&cpu(), scene, &PROFILE, &views).into_iter().map(|image| image.rgb8).collect()
-}
-
-/// Bytes of memory that sections take.
-fn bytes(resident: &Resident, needed: &[Needed]) -> u64 {
-    let manifest = &resident.version.manifest;
-    let of = |n: &Needed| {
-        let count = manifest.chunks[n.chunk].sections[n.section].count;
-        Chunk::bytes_of(manifest.sh_degree, count.into())
-    };
-    needed.iter().map(of).sum()
-}
-
-/// What a frame of the demo street needs at a pose, in bytes.
-fn need_bytes(resident: &Resident, world_from_rig: Pose) -> u64 {
-    bytes(resident, &resident.demand(&eyes(&views(world_from_rig)), &PROFILE))
-}
-
-/// A cache with all the room that it wants.
-fn unlimited() -> Cache {
-    Cache::new(demo().catalog())
-}

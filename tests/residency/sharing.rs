@@ -3,15 +3,15 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use wildcity::residency::{Cache, Eye, Lens, Resident};
-use wildcity::scene::{Chunk, RenderProfile};
+use wildcity_scene::{Chunk, RenderProfile};
+use wildcity_twin::residency::{Cache, Eye, Lens, Resident};
 
 use crate::scene_files::gaussians;
 use crate::source::Faulty;
-use crate::{PROFILE, commit, demo, eyes, need_bytes, unlimited, views};
+use crate::streaming::{PROFILE, commit, demo, eyes, need_bytes, unlimited, views};
 
 /// Everything in full detail.
-fn all_of(resident: &Arc<Resident>) -> wildcity::residency::Pinned {
+fn all_of(resident: &Arc<Resident>) -> wildcity_twin::residency::Pinned {
     let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
     let profile = RenderProfile { tau_px: 0.0, reach_m: None, ..PROFILE };
     resident.scene(&[eye], &profile).unwrap()
@@ -46,7 +46,7 @@ fn versions_share_the_memory_of_what_they_share() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = gaussians(20_000, 1, 300.0, 1);
     commit(dir.path(), "street", &scene);
-    let catalog = wildcity::store::Catalog::open(dir.path()).unwrap();
+    let catalog = wildcity_twin::store::Catalog::open(dir.path()).unwrap();
     let cache = Cache::new(catalog);
     let first = cache.open("street", None).unwrap();
     let old = all_of(&first);

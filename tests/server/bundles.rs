@@ -3,12 +3,12 @@
 use std::sync::atomic::Ordering;
 
 use serde_json::{Value, json};
-use wildcity::geometry::Pose;
-use wildcity::render::Backend;
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::residency::Cache;
-use wildcity::session::{Extent, Recording};
-use wildcity::store::Catalog;
+use wildcity_render::Backend;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::geometry::Pose;
+use wildcity_session::{Extent, Recording};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
 
 use crate::support::{Agent, Painter, Seen, TestServer, pose, refused, rig};
 

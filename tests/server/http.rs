@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use wildcity::scene::ProfileChanges;
-use wildcity::server::{self, Config, Limits, ServerError};
+use wildcity_scene::ProfileChanges;
+use wildcity_server::{Config, Limits, ServerError};
 
 use crate::support::{PATIENCE, TestServer};
 
@@ -114,8 +114,9 @@ async fn public_addresses_are_refused() {
         profile: ProfileChanges::default(),
         limits: Limits::default(),
     };
-    let refused = server::start(config.clone()).await.unwrap_err();
+    let refused = wildcity_server::start(config.clone()).await.unwrap_err();
     assert!(matches!(refused, ServerError::PublicAddress { .. }), "{refused}");
-    let taken = server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
+    let taken =
+        wildcity_server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
     assert!(matches!(taken, ServerError::Listen { .. }), "{taken}");
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use wildcity::store::{Catalog, Keep};
+use wildcity_twin::store::{Catalog, Keep};
 
 use crate::support::{PATIENCE, TestServer, commit_twin_of};
 

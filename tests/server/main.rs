@@ -1,14 +1,20 @@
 //! The server from outside: bytes on a socket in, bytes on a socket out.
 
+#[path = "../support/episodes.rs"]
+mod episodes;
 #[path = "../support/server.rs"]
 mod support;
 
+mod appearance;
 mod bundles;
+mod ego;
 mod http;
 mod leases;
-mod load;
 mod observation;
+mod page;
 mod profile;
+mod record;
 mod refused;
+mod replay;
 mod resume;
 mod shutdown;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde_json::json;
-use wildcity::geometry::Pose;
+use wildcity_scene::geometry::Pose;
 
 use crate::support::{Agent, Painter, Seen, TestServer, pose, rig};
 

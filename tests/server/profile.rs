@@ -6,14 +6,14 @@ use std::path::Path;
 use glam::DMat3;
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};
-use wildcity::ingest;
-use wildcity::scene::Gaussians;
-use wildcity::scene::manifest::Provenance;
-use wildcity::store::{Catalog, NewSky, NewVersion, SkyBytes};
+use wildcity_scene::Gaussians;
+use wildcity_scene::manifest::Provenance;
+use wildcity_twin::ingest;
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes};
 
 use crate::support::{TestServer, refused, rig};
 
-fn changes(json: Value) -> wildcity::scene::ProfileChanges {
+fn changes(json: Value) -> wildcity_scene::ProfileChanges {
     serde_json::from_value(json).unwrap()
 }
 

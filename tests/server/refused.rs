@@ -7,7 +7,7 @@ use futures_util::SinkExt;
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt;
 use tokio_tungstenite::tungstenite::Message;
-use wildcity::server::Limits;
+use wildcity_server::Limits;
 
 use crate::support::{self, Agent, Reply, TestServer, pose, refused};
 

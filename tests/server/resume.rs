@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use serde_json::json;
-use wildcity::server::Limits;
+use wildcity_server::Limits;
 
 use crate::support::{Agent, Reply, TestServer, pose, refused};
 

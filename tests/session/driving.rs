@@ -1,90 +1,235 @@
-//! Cars on slopes, through standstill and backwards.
+//! Sessions that drive: through the engine, with a small budget, and over what breaks.
 
-use glam::{DQuat, DVec2, DVec3};
-use wildcity::geometry::Pose;
-use wildcity::scene::Trajectory;
-use wildcity::scene::trajectory::Keyframe;
-use wildcity::sim::ego::{Action, Model, Path, SingleTrack, TimedPose, Told, Vehicle};
-use wildcity::sim::{Command, Dynamics, Ego, Ground};
+use std::sync::Arc;
+use std::time::Duration;
 
-const STEP_US: i64 = 100_000;
+use glam::{DQuat, DVec3};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_session::{
+    Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
+};
+use wildcity_twin::residency::{Cache, Needed, ResidencyError, Resident};
 
-/// Uphill along x by a tenth.
-fn uphill() -> Trajectory {
-    let keyframe = |i: i64| {
-        let x_m = 5.0 * i as f64;
-        let rotation = DQuat::from_rotation_y(-0.1_f64.atan());
-        let position_m = DVec3::new(x_m, 0.0, 8.0 + 0.1 * x_m);
-        Keyframe { time_us: i, world_from_rig: Pose { position_m, rotation } }
+use crate::source::{Fault, Faulty, Place};
+use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
+
+/// An engine with its own room for episodes.
+struct Bench {
+    engine: Arc<Engine>,
+    _episodes: tempfile::TempDir,
+}
+
+fn bench(cache: Cache) -> Bench {
+    let episodes = tempfile::tempdir().unwrap();
+    let engine = Engine::start(EngineSettings {
+        cache,
+        episodes: episodes.path().to_owned(),
+        backend: Arc::new(crate::images::cpu()),
+        step_timeout: wildcity_session::limits::STEP_TIMEOUT,
+    });
+    Bench { engine: engine.unwrap(), _episodes: episodes }
+}
+
+/// The two cameras of the other tests, as a rig.
+fn rig() -> Rig {
+    let cameras = views(Pose::IDENTITY).into_iter().zip(["front", "left"]);
+    let camera = |(view, name): (wildcity_render::View, &str)| {
+        RigCamera::new(name, view.camera, view.world_from_camera)
     };
-    Trajectory { name: "uphill".to_owned(), keyframes: (0..=10).map(keyframe).collect() }
+    Rig { name: "pair".to_owned(), cameras: cameras.map(camera).collect() }
 }
 
-#[test]
-fn a_car_is_lifted_and_pitched_by_the_ground() {
-    let drives = [uphill()];
-    let ground = Ground::of(&drives);
-    for model in [Model::Kinematic, Model::Dynamic] {
-        let dynamics = Dynamics::checked(model, 5.0, false).unwrap();
-        let start = dynamics.start(Pose::IDENTITY, &ground);
-        let mut ego = Ego::new(dynamics, start);
-        let turn = Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.03 });
-        for step in 0..60 {
-            ego = ego.stepped(&turn, STEP_US, &ground).unwrap();
-            let pose = ego.world_from_rig();
-            let DVec3 { x, z, .. } = pose.position_m;
-            assert!((z - (8.0 + 0.1 * x)).abs() < 1e-9, "{model:?}, step {step}: {pose:?}");
-            let up = pose.rotation * DVec3::Z;
-            let wanted = DVec3::new(-0.1, 0.0, 1.0).normalize();
-            assert!(up.distance(wanted) < 1e-9, "{model:?}, step {step}: {up}");
-            assert!(ego.velocity_m_s().dot(wanted).abs() < 1e-9, "it drives along the ground");
+impl Bench {
+    async fn session(
+        &self,
+        name: &str,
+        deadline: Option<Duration>,
+    ) -> Result<Session, SessionError> {
+        let opening = Opening {
+            start: Some(wildcity_session::Start::Pose(demo().at(0.0))),
+            rig: Some(RigChoice::Full(rig())),
+            deadline,
+            ..Opening::twin("demo", Outputs::colour(Encoding::Raw))
+        };
+        Session::open(self.engine.clone(), name.to_owned(), opening).await
+    }
+}
+
+/// Hashes of a frame's images.
+fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
+    frame.images.iter().map(|image| image.hash).collect()
+}
+
+/// A section that frames from 250 m on need, and earlier ones do not.
+fn later_section() -> Place {
+    let resident = unlimited().open("demo", None).unwrap();
+    let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
+    let early: Vec<Needed> = (0..25).flat_map(|k| at(10.0 * f64::from(k))).collect();
+    let only_late: Vec<_> = at(250.0).into_iter().filter(|n| !early.contains(n)).collect();
+    place(&resident, only_late[0])
+}
+
+fn place(resident: &Resident, Needed { chunk, section }: Needed) -> Place {
+    let chunk = &resident.version.manifest.chunks[chunk];
+    (chunk.cell, chunk.sections[section].block, chunk.sections[section].level)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn thirty_metres_a_second_wait_for_nothing_once_under_way() {
+    let all = unlimited().open("demo", None).unwrap();
+    let lens = wildcity_twin::residency::Lens { focal_px: 70.0, radius_m: 1.7 };
+    let limit_bytes = all.worst_bytes(lens) * 3 / 2;
+    assert!(limit_bytes < all.whole_bytes() / 2, "else all of it fits");
+    let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
+    let mut session = bench.session("a", None).await.unwrap();
+    let mut waited = Vec::new();
+    for step in 0..180 {
+        // What an agent thinks: a quarter of what it may, so that it drives at 120 m/s.
+        tokio::time::sleep(Duration::from_millis(25)).await;
+        let frame = session.step(demo().at(3.0 * f64::from(step)), false).await.unwrap();
+        assert!(frame.residency.held_bytes <= limit_bytes);
+        assert_eq!(frame.residency.limit_bytes, limit_bytes);
+        waited.push(frame.residency.waited_for);
+    }
+    assert!(waited[20..].iter().all(|&sections| sections == 0), "{waited:?}");
+    let stats = bench.engine.residency();
+    assert!(stats.evictions > 0, "{stats:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hint_is_loaded_before_it_is_driven() {
+    let source = Arc::new(Faulty::new(demo().catalog()));
+    let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
+    let mut session = bench.session("a", None).await.unwrap();
+    session.reset(0, None).await.unwrap();
+    let there = demo().at(400.0);
+    session.prefetch(vec![there]).unwrap();
+    let began = std::time::Instant::now();
+    let resident = session.resident().clone();
+    // Until all of it was asked for, and has come: then a jump there finds everything.
+    let needed = resident.demand(&eyes(&views(there)), &PROFILE);
+    let begun = || needed.iter().all(|&one| source.reads(place(&resident, one)) > 0);
+    while !begun() || resident.stats().loads < source.all_reads() {
+        assert!(began.elapsed() < crate::streaming::PATIENCE);
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let frame = session.step(there, false).await.unwrap();
+    assert_eq!(frame.residency.waited_for, 0);
+    let frame = session.step(demo().at(550.0), false).await.unwrap();
+    assert!(frame.residency.waited_for > 0 && !frame.residency.waited.is_zero());
+    let far = Pose { position_m: DVec3::ZERO, rotation: DQuat::IDENTITY };
+    for count in [0, wildcity_session::limits::PREFETCH_POSES + 1] {
+        let refused = session.prefetch(vec![far; count]).unwrap_err();
+        assert!(matches!(refused, SessionError::OutOfRange { field: "poses", .. }), "{refused}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on() {
+    let truth = bench(unlimited());
+    let mut healthy = truth.session("healthy", None).await.unwrap();
+    for fault in [Fault::Damaged, Fault::Hangs] {
+        let source = Arc::new(Faulty::new(demo().catalog()));
+        source.break_section(later_section(), fault);
+        let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
+        let deadline = Some(Duration::from_millis(600));
+        let mut driver = bench.session("driver", deadline).await.unwrap();
+        let mut other = bench.session("other", deadline).await.unwrap();
+        let mut stopped_at = None;
+        for step in 0..40_u32 {
+            let pose = demo().at(10.0 * f64::from(step));
+            match driver.step(pose, false).await {
+                Ok(frame) => {
+                    let wanted = healthy.observe(vec![pose]).await.unwrap();
+                    assert_eq!(hashes(&frame), hashes(&wanted), "step {step}");
+                }
+                Err(error) => {
+                    match (fault, error) {
+                        (Fault::Damaged, SessionError::Residency(error)) => {
+                            assert!(matches!(error, ResidencyError::Load { .. }), "{error}");
+                        }
+                        (_, SessionError::Residency(error)) => {
+                            assert!(matches!(error, ResidencyError::Late { .. }), "{error}");
+                        }
+                        (_, error) => panic!("{error}"),
+                    }
+                    stopped_at = Some(step);
+                    break;
+                }
+            }
         }
-        // 30 m of an arc of 33 m of radius, less what the slope takes of its plan.
-        let driven_m = ego.world_from_rig().position_m - start.position_m;
-        assert!(driven_m.x > 20.0 && driven_m.y > 10.0, "{model:?}: {driven_m}");
-    }
-}
-
-/// The law of a step is that of its parts, also where the car stops in between and goes back.
-#[test]
-fn a_step_through_standstill_is_its_parts() {
-    let car = Vehicle::DEFAULT;
-    for (speed_m_s, acceleration_m_s2) in [(1.0, -2.0), (-1.0, 2.0), (0.01, -3.0), (-0.3, 0.5)] {
-        let told = Told { acceleration_m_s2, steering_rad: 0.2 };
-        let begun = SingleTrack { speed_m_s, steering_rad: -0.1, ..SingleTrack::default() };
-        let bounds_m_s = [-5.0, 5.0];
-        let whole = begun.after(&car, told, 2.0, bounds_m_s);
-        let parts = (0..200).fold(begun, |now, _| now.after(&car, told, 0.01, bounds_m_s));
-        assert!(whole.speed_m_s * speed_m_s < 0.0, "it goes the other way: {whole:?}");
-        let off_m = whole.position_m.distance(parts.position_m);
-        let off_rad = (whole.yaw_rad - parts.yaw_rad).abs();
-        assert!(off_m < 1e-9 && off_rad < 1e-9, "{speed_m_s} m/s: {off_m} m, {off_rad} rad");
-        assert!(whole.position_m.distance(DVec2::ZERO) > 1e-3);
-    }
-}
-
-#[test]
-fn a_path_is_followed_backwards() {
-    // Back along an arc of 20 m of radius at 2 m/s.
-    let place = |seconds: f64| {
-        let angle_rad = -2.0 * seconds / 20.0;
-        let position_m = DVec3::new(20.0 * angle_rad.sin(), 20.0 * (1.0 - angle_rad.cos()), 0.0);
-        Pose { position_m, rotation: DQuat::from_rotation_z(angle_rad) }
-    };
-    for model in [Model::Kinematic, Model::Dynamic] {
-        let dynamics = Dynamics::checked(model, -2.0, true).unwrap();
-        let mut ego = Ego::new(dynamics, Pose::IDENTITY);
-        for step in 0..60 {
-            let now_s = 0.1 * f64::from(step);
-            let timed = |k: i64| TimedPose {
-                time_us: k * STEP_US,
-                start_from_rig: ego.world_from_rig().inverse() * place(now_s + 0.1 * k as f64),
-            };
-            let path = Path::checked((1..=20).map(timed).collect()).unwrap();
-            ego = ego.stepped(&Command::Path(path), STEP_US, &Ground::of(&[])).unwrap();
-            let off_m = ego.world_from_rig().position_m.distance(place(now_s + 0.1).position_m);
-            let allowed_m = if model == Model::Kinematic { 0.001 } else { 0.1 };
-            assert!(off_m < allowed_m, "{model:?}, step {step}: {off_m} m off");
+        // Nothing has happened to the session, and others drive.
+        let stopped_at = stopped_at.expect("the section was never needed");
+        assert_eq!(driver.episode().step(), u64::from(stopped_at));
+        other.step(demo().at(0.0), false).await.unwrap();
+        source.heal();
+        for step in stopped_at..40 {
+            let pose = demo().at(10.0 * f64::from(step));
+            let frame = driver.step(pose, false).await.unwrap();
+            let wanted = healthy.observe(vec![pose]).await.unwrap();
+            assert_eq!(hashes(&frame), hashes(&wanted), "step {step}");
         }
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frame_that_waits_for_a_disk_holds_up_nobody_elses() {
+    let source = Arc::new(Faulty::new(demo().catalog()));
+    let place = later_section();
+    source.break_section(place, Fault::Hangs);
+    let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
+    let mut waiting = bench.session("waiting", None).await.unwrap();
+    let mut other = bench.session("other", None).await.unwrap();
+    let stuck = tokio::spawn(async move { waiting.step(demo().at(250.0), false).await.map(drop) });
+    tokio::task::block_in_place(|| source.await_read(place));
+    for step in 0..5 {
+        other.step(demo().at(f64::from(step)), false).await.unwrap();
+    }
+    assert!(!stuck.is_finished());
+    source.heal();
+    stuck.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_made_ready_takes_nothing_from_a_session_that_drives() {
+    let all = unlimited().open("demo", None).unwrap();
+    let probe = bench(unlimited());
+    let limit_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
+    let source = Arc::new(Faulty::new(demo().catalog()));
+    let bench = bench(Cache::with_source(demo().catalog(), source.clone(), Some(limit_bytes)));
+    let mut driver = bench.session("driver", None).await.unwrap();
+    for station_m in [0.0, 3.0, 6.0] {
+        driver.step(demo().at(station_m), false).await.unwrap();
+    }
+    let far = (0..8).map(|k| eyes(&views(demo().at(250.0 + 40.0 * f64::from(k))))).collect();
+    assert!(crate::streaming::need_bytes(&all, demo().at(250.0)) > limit_bytes / 4);
+    bench.engine.prepare("demo", 1, far).await.unwrap();
+    let frame = driver.observe(vec![demo().at(6.0)]).await.unwrap();
+    assert_eq!(frame.residency.waited_for, 0);
+
+    // Nor does it stand in the way of frames while a section does not come.
+    source.break_section(later_section(), Fault::Hangs);
+    let engine = bench.engine.clone();
+    let far = vec![eyes(&views(demo().at(250.0)))];
+    let preparing = tokio::spawn(async move { engine.prepare("demo", 1, far).await });
+    for station_m in [9.0, 20.0, 40.0] {
+        driver.step(demo().at(station_m), false).await.unwrap();
+    }
+    source.heal();
+    preparing.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_that_does_not_fit_is_refused_and_one_that_closes_makes_room() {
+    let all = unlimited().open("demo", None).unwrap();
+    let probe = bench(unlimited());
+    let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
+    assert!(2 * reserved_bytes < all.whole_bytes());
+    let bench = bench(Cache::limited(demo().catalog(), Some(2 * reserved_bytes - 1)));
+    let first = bench.session("first", None).await.unwrap();
+    let refused = bench.session("second", None).await.unwrap_err();
+    assert!(refused.to_string().contains(&reserved_bytes.to_string()), "{refused}");
+    first.close(wildcity_session::Outcome::Completed).await;
+    bench.session("second", None).await.unwrap();
 }

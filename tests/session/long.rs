@@ -3,10 +3,10 @@
 use std::f64::consts::TAU;
 
 use glam::{DQuat, DVec3};
-use wildcity::geometry::Pose;
-use wildcity::session::Episode;
-use wildcity::sim::ego::{Action, Model};
-use wildcity::sim::{Command, Dynamics, Ego, Ground};
+use wildcity_scene::geometry::Pose;
+use wildcity_session::Episode;
+use wildcity_sim::ego::{Action, Model};
+use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEPS: u64 = 100_000;
 const STEP_US: i64 = 100_000;
@@ -49,7 +49,7 @@ fn a_thousand_laps_end_where_they_began() {
         assert_eq!((driven.step(), driven.time_us()), (STEPS, STEPS as i64 * STEP_US));
         eprintln!("{away_m} m from the origin: {worst_m:e} m of drift");
         assert!(worst_m < bound_m, "{away_m} m from the origin: {worst_m} m of drift");
-        let driven_m = driven.summary(wildcity::session::Outcome::Completed).distance_m;
+        let driven_m = driven.summary(wildcity_session::Outcome::Completed).distance_m;
         // The sum of chords, as long as two sines: 100,000 roundings of half an ulp of 1e5 m.
         let chords_m = STEPS as f64 * 100.0 / TAU * 2.0 * (TAU / 200.0).sin();
         assert!((driven_m - chords_m).abs() < 1e-6, "{driven_m} m, not {chords_m}");

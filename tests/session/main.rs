@@ -1,13 +1,12 @@
-//! Episodes on record, and rendered again; and what their egos do.
+//! Episodes: what sessions draw, foresee and keep.
 
-#[path = "../support/server.rs"]
-mod support;
+#[path = "../support/images.rs"]
+mod images;
+#[path = "../support/source.rs"]
+mod source;
+#[path = "../support/streaming.rs"]
+mod streaming;
 
-mod appearance;
 mod driving;
-mod ego;
-mod integrators;
 mod long;
-mod record;
-mod replay;
-mod study;
+mod trust;

@@ -2,14 +2,14 @@
 
 use std::collections::BTreeSet;
 
-use wildcity::scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
-use wildcity::store::{
+use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Change, Commit, Kind, NewVersion, Settings, Storage, StoreError,
     Version,
 };
 
 use crate::scene_files::gaussians;
-use crate::{commit, files, street, turn};
+use crate::support::{commit, files, street, turn};
 
 const EXACT: Storage = Storage { record: Record::F32, levels: false };
 

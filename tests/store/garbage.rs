@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use wildcity::store::{Catalog, Keep, StoreError, Sum};
+use wildcity_twin::store::{Catalog, Keep, StoreError, Sum};
 
 use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
-use crate::{turn, wildcity};
+use crate::support::turn;
 
 const NOW: Duration = Duration::ZERO;
 const DAY: Duration = Duration::from_secs(86_400);
@@ -219,39 +219,4 @@ fn fsck_names_what_the_log_lost() {
         assert_eq!(checked.verified.damaged.len(), 0);
         assert_eq!(checked.unreferenced.objects, 2 * OWN);
     });
-}
-
-#[test]
-fn commands_say_it() {
-    let dir = tempfile::tempdir().unwrap();
-    let place = Place::Directory(dir);
-    twin(&place, 3);
-    let run = |arguments: &[&str]| {
-        let mut command = wildcity();
-        command.arg("twin").args(arguments).arg("--twins").arg(place.twins());
-        let output = command.output().unwrap();
-        (output.status.code(), String::from_utf8(output.stdout).unwrap())
-    };
-    let gc = ["gc", "street", "--keep", "1", "--grace", "0s"];
-    let (code, said) = run(&gc);
-    assert_eq!(code, Some(0));
-    assert!(said.starts_with("kept versions 3\nremoved 0 objects"), "{said}");
-    let (_, said) = run(&[&gc[..], &["--dry-run"]].concat());
-    assert!(said.contains("would be removed 5 objects"), "{said}");
-    let (_, said) = run(&gc);
-    assert!(said.contains("removed 5 objects") && said.contains("noted 0 objects"), "{said}");
-    let (code, said) = run(&["fsck", "street", "--json"]);
-    let found: serde_json::Value = serde_json::from_str(&said).unwrap();
-    assert_eq!((code, &found["sound"]), (Some(0), &true.into()), "{said}");
-    assert_eq!(found["collected"], serde_json::json!([1, 2]));
-    let (_, said) = run(&["list"]);
-    assert!(said.starts_with("street ") && said.contains("version 3"), "{said}");
-    let (_, said) = run(&["log", "street", "--json"]);
-    assert_eq!(said.lines().count(), 3);
-    let (_, said) = run(&["log", "street"]);
-    assert!(said.contains("push of 2"), "{said}");
-    std::fs::remove_file(place.twins().join("street/log/0000000001")).unwrap();
-    let (code, said) = run(&["fsck", "street"]);
-    assert_eq!(code, Some(1));
-    assert!(said.contains("lost version 1: the log has later ones"), "{said}");
 }

@@ -1,13 +1,13 @@
 use glam::DVec3;
-use wildcity::geometry::Pose;
-use wildcity::residency::{Cache, Eye};
-use wildcity::scene::chunk::columns;
-use wildcity::scene::trajectory::Keyframe;
-use wildcity::scene::{Chunk, Scene, Trajectory};
-use wildcity::store::{Catalog, Listing, NewVersion, StoreError};
+use wildcity_scene::chunk::columns;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::trajectory::Keyframe;
+use wildcity_scene::{Chunk, Scene, Trajectory};
+use wildcity_twin::residency::{Cache, Eye};
+use wildcity_twin::store::{Catalog, Listing, NewVersion, StoreError};
 
 use crate::scene_files::gaussians;
-use crate::{commit, files, street};
+use crate::support::{commit, files, street};
 
 #[test]
 fn what_is_committed_comes_back_bit_by_bit() {

@@ -1,36 +1,19 @@
 //! The sky of a version: kept, shared, replaced, taken away, damaged, collected.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use glam::{DMat3, DVec3};
-use wildcity::ingest;
-use wildcity::residency::Cache;
-use wildcity::scene::RenderProfile;
-use wildcity::scene::sky::Model;
-use wildcity::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::sky::Model;
+use wildcity_twin::ingest;
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
 
 use crate::places::{cells_alone, everywhere};
-use crate::scene_files::{Tensor, gaussians, safetensors};
-use crate::{commit, street, wildcity};
-
-/// A small network of gentle weights; another one for every `seed`.
-fn tensors(seed: usize) -> Vec<Tensor> {
-    let tensor = |name: &'static str, shape: &[usize]| {
-        let count: usize = shape.iter().product();
-        let values = (0..count).map(|i| 0.1 * (((i + seed) * 7 % 11) as f64 - 5.0)).collect();
-        (name, shape.to_vec(), values)
-    };
-    vec![
-        tensor("sky_head.layers.0.weight", &[8, 9]),
-        tensor("sky_head.layers.0.bias", &[8]),
-        tensor("sky_head.layers.1.weight", &[8, 17]),
-        tensor("sky_head.layers.1.bias", &[8]),
-        tensor("sky_head.layers.2.weight", &[3, 8]),
-        tensor("sky_head.layers.2.bias", &[3]),
-    ]
-}
+use crate::scene_files::{gaussians, safetensors};
+use crate::sky_network::tensors;
+use crate::support::{commit, street};
 
 fn sky_bytes(seed: usize) -> SkyBytes {
     let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
@@ -81,7 +64,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         let direction = DVec3::new(0.6, 0.0, 0.8);
         let rgb = |seed| {
             let model = ingest::sky::decode(&sky_bytes(seed).bytes, None).unwrap();
-            wildcity::scene::Sky::new(model, DMat3::IDENTITY).rgb(direction)
+            wildcity_scene::Sky::new(model, DMat3::IDENTITY).rgb(direction)
         };
         assert_eq!(one.sky().unwrap().rgb(direction), rgb(1));
         assert_eq!(three.sky().unwrap().rgb(direction), rgb(2));
@@ -165,54 +148,9 @@ fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
         let new = NewVersion { sky: Some(NewSky::Put(sky)), ..street(&scene) };
         let error = commit(dir.path(), new).unwrap_err().to_string();
         assert!(error.contains(wanted), "{error}");
-        assert_eq!(crate::files(&dir.path().join("street")), Vec::<std::path::PathBuf>::new());
+        assert_eq!(
+            crate::support::files(&dir.path().join("street")),
+            Vec::<std::path::PathBuf>::new()
+        );
     }
-}
-
-#[test]
-fn on_the_command_line() {
-    let dir = tempfile::tempdir().unwrap();
-    let at = |name: &str| dir.path().join(name);
-    let run = |arguments: &[&str]| {
-        let output =
-            wildcity().args(arguments).args([Path::new("--twins"), &at("twins")]).output().unwrap();
-        let said = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-        (output.status.code(), said(output.stdout), said(output.stderr))
-    };
-    let scene = gaussians(300, 0, 10.0, 1);
-    let columns = crate::scene_files::inria_columns(0, false);
-    std::fs::write(at("scene.ply"), crate::scene_files::ply(&scene, &columns)).unwrap();
-    std::fs::write(at("sky.safetensors"), safetensors(&tensors(1), &[])).unwrap();
-    let (ply, sky) = (at("scene.ply"), at("sky.safetensors"));
-    let (ply, sky) = (ply.to_str().unwrap(), sky.to_str().unwrap());
-
-    let axes = ["--axes", "y-down-z-forward"];
-    let import = ["import", ply, "--twin", "street", "--sky", sky];
-    let (code, _, error) = run(&[&import[..], &axes].concat());
-    assert_eq!(code, Some(0), "{error}");
-    let catalog = Catalog::open(&at("twins")).unwrap();
-    let version = catalog.version("street", None).unwrap();
-    // A network has the axes of its scene: the world's z, up, is the file's -y.
-    let named = version.manifest.sky.clone().unwrap();
-    assert_eq!(named.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
-    let (_, said, _) = run(&["inspect", "street"]);
-    assert!(said.contains(&format!("sky         {}", &named.object[..16])), "{said}");
-
-    let (code, _, error) = run(&["twin", "sky", "street", "--remove"]);
-    assert_eq!(code, Some(0), "{error}");
-    let without = catalog.version("street", None).unwrap();
-    assert_eq!((without.number, &without.manifest.sky), (2, &None));
-    assert_eq!(without.manifest.chunks, version.manifest.chunks);
-    let (code, said, _) = run(&["twin", "sky", "street", "--sky", sky, "--sky-axes", "identity"]);
-    assert_eq!(code, Some(0));
-    assert!(said.starts_with("twin street version 3: a sky of"), "{said}");
-    let again = catalog.version("street", None).unwrap().manifest.sky.unwrap();
-    assert_eq!(again.object, named.object);
-    assert_eq!(again.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
-
-    let (code, _, error) = run(&["twin", "sky", "street"]);
-    assert_eq!(code, Some(2), "neither a sky nor --remove: {error}");
-    let (code, _, error) = run(&["twin", "sky", "street", "--sky", ply]);
-    assert_eq!(code, Some(1));
-    assert!(error.contains("scene.ply: sky header, start: it is no safetensors file"), "{error}");
 }

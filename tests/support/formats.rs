@@ -5,7 +5,7 @@
 
 use std::io::Write;
 
-use wildcity::scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, sh};
 
 /// `opacity = sigmoid(logit)`.
 pub(crate) fn opacity(logit: f32) -> f64 {

@@ -1,12 +1,14 @@
 //! A GPU for tests. Lavapipe counts as one, so every machine can have one and no test skips.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::ops::Deref;
 use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
-use wildcity::render::gpu::shaders::Shaders;
-use wildcity::render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
-use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity_render::gpu::shaders::Shaders;
+use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
+use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
 
 /// The best device of this machine.
 pub(crate) fn gpu() -> Watched {

@@ -2,11 +2,11 @@
 
 #![allow(dead_code, unused_imports, reason = "every test binary uses another part of it")]
 
-use wildcity::render::cpu::{Cpu, Simd};
-use wildcity::render::{Backend, View};
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::{Backend, View};
+use wildcity_scene::{RenderProfile, Scene};
 
-pub(crate) use wildcity::report::drawing::{
+pub(crate) use wildcity_render::compare::drawing::{
     Drawing as Image, agree, draw as try_render, look, max_difference,
 };
 

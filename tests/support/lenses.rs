@@ -1,16 +1,16 @@
 //! A camera of every model, and what each must show.
 
 use glam::{DQuat, DVec2, DVec3};
-use wildcity::geometry::camera::{
+use wildcity_render::compare::blobs::{Blob, scene};
+use wildcity_render::compare::points::centroid;
+use wildcity_render::reference;
+use wildcity_render::{Backend, Rolling, View};
+use wildcity_scene::geometry::camera::{
     Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Rolls, Windshield,
     WindshieldReference,
 };
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::reference;
-use wildcity::render::{Backend, Rolling, View};
-use wildcity::report::points::centroid;
-use wildcity::report::stress::blobs::{Blob, scene};
-use wildcity::scene::{Rays, RenderProfile, Scene};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{look, psnr, render_one};
 use crate::streets::street;

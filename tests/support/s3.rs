@@ -2,6 +2,8 @@
 //!
 //! The server is s3s-fs, which does not put atomically if absent: puts take turns here.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::{Arc, Mutex};
@@ -16,7 +18,7 @@ use object_store::aws::AmazonS3Builder;
 use object_store::{ObjectStore, RetryConfig};
 use s3s::auth::SimpleAuth;
 use s3s::service::{S3Service, S3ServiceBuilder};
-use wildcity::store::{CacheSettings, Catalog, Patience, StoreError};
+use wildcity_twin::store::{CacheSettings, Catalog, Patience, StoreError};
 
 const KEYS: [&str; 2] = ["test", "secret"];
 const BUCKET: &str = "bucket";

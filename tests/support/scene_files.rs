@@ -4,7 +4,7 @@
 
 use std::fmt::Write as _;
 
-use wildcity::scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, sh};
 
 /// Uniform numbers in [0, 1), the same for the same seed (splitmix64).
 pub(crate) struct Random(pub(crate) u64);

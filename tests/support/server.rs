@@ -16,16 +16,16 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Bytes, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
-use wildcity::geometry::camera::Pinhole;
-use wildcity::geometry::{Camera, Pose};
-use wildcity::render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
-use wildcity::scene::Gaussians;
-use wildcity::scene::ProfileChanges;
-use wildcity::scene::manifest::Provenance;
-use wildcity::scene::rig::{Rig, RigCamera};
-use wildcity::scene::trajectory::{Keyframe, Trajectory};
-use wildcity::server::{self, Config, Limits, Running};
-use wildcity::store::{Catalog, NewVersion};
+use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity_scene::Gaussians;
+use wildcity_scene::ProfileChanges;
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::trajectory::{Keyframe, Trajectory};
+use wildcity_server::{Config, Limits, Running};
+use wildcity_twin::store::{Catalog, NewVersion};
 
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -184,7 +184,7 @@ impl TestServer {
             limits: Limits::default(),
         };
         change(&mut config);
-        let running = server::start(config).await.expect("a server");
+        let running = wildcity_server::start(config).await.expect("a server");
         Self { running, painter, twins, episodes }
     }
 
@@ -257,7 +257,7 @@ pub(crate) struct Seen {
 
 /// Room for every observation.
 pub(crate) fn client_limits() -> Option<WebSocketConfig> {
-    let bytes = Some(wildcity::config::OBSERVATION_BYTES);
+    let bytes = Some(wildcity_protocol::limits::OBSERVATION_BYTES);
     Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
 }
 

@@ -2,15 +2,15 @@
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wildcity::ingest;
-use wildcity::render::{Backend, Frame, Target, View};
-use wildcity::scene::appearance::{Appearance, Exposure, Overlay};
-use wildcity::scene::sky::{Layer, Model, Network};
-use wildcity::scene::{RenderProfile, Scene, Sky};
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
+use wildcity_scene::sky::{Layer, Model, Network};
+use wildcity_scene::{RenderProfile, Scene, Sky};
+use wildcity_twin::ingest;
 
 use crate::images::Image;
 use crate::scene_files::Random;
@@ -24,7 +24,7 @@ pub(crate) const SKY_FROM_WORLD: DMat3 = DMat3::from_cols(
 
 /// The demo twin's sky.
 pub(crate) fn demo_sky() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("scenes/sky.safetensors")
+    root().join("scenes/sky.safetensors")
 }
 
 /// It, with the appearance of an image or of all.
@@ -105,4 +105,14 @@ pub(crate) fn draw_seen(
     let frame = Frame { scene, profile: &RenderProfile::DEFAULT, views: &[view] };
     backend.render(&frame, &mut [target], &|_, _| {}).unwrap();
     image
+}
+
+/// The repository.
+fn root() -> PathBuf {
+    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut above = package.ancestors();
+    above
+        .find(|dir| dir.join("Cargo.lock").is_file())
+        .expect("a package within the repository")
+        .to_owned()
 }

@@ -1,9 +1,11 @@
 //! Scenes with the shape of a street: flat things, thin things, near and far.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use glam::DVec3;
-use wildcity::generate::{self, StreetSettings};
-use wildcity::render::View;
-use wildcity::scene::{Gaussians, Rig, sh};
+use wildcity_generate::StreetSettings;
+use wildcity_render::View;
+use wildcity_scene::{Gaussians, Rig, sh};
 
 use crate::images::look;
 use crate::scene_files::Random;
@@ -60,7 +62,7 @@ pub(crate) fn street_views() -> [View; 3] {
 
 /// The demo street, and what two of its cameras see at an eighth of their size.
 pub(crate) fn demo_street() -> (Gaussians, [View; 2]) {
-    let street = generate::street(&StreetSettings::default()).unwrap();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let rig = Rig::preset("vehicle6").unwrap();
     let world_from_rig = street.trajectory.at_station(60.0);
     let view = |name: &str| {

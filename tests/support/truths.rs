@@ -4,11 +4,11 @@ use std::path::Path;
 
 use glam::DVec3;
 use safetensors::SafeTensors;
-use wildcity::geometry::Camera;
-use wildcity::geometry::camera::Pinhole;
-use wildcity::ingest;
-use wildcity::render::View;
-use wildcity::scene::{RenderProfile, Scene};
+use wildcity_render::View;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::Pinhole;
+use wildcity_scene::{RenderProfile, Scene};
+use wildcity_twin::ingest;
 
 use crate::data::real;
 use crate::images::look;

@@ -29,7 +29,7 @@ const PACKAGES: &[(&str, &[&str])] = &[
             "scene/chunk.rs",
             "scene/sky",
             "generate/city.rs",
-            "ingest/validate.rs",
+            "scene/validate.rs",
             "store/pack.rs",
         ],
     ),

@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release --example drive -- ws://127.0.0.1:8080/v1/session TWIN`
 
-use wildcity::client::Client;
-use wildcity::protocol::message::{Open, Pose};
+use wildcity_client::Client;
+use wildcity_protocol::message::{Open, Pose};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 
-use crate::cli::places::{TwinVersion, Twins};
+use crate::cli::directories::{TwinVersion, Twins};
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_twin::ingest;
 use wildcity_twin::store::{Catalog, Version};

@@ -7,7 +7,8 @@ use serde_json::json;
 use wildcity_render::{Backend, Frame, View};
 
 use super::timed::{Timed, time};
-use crate::cli::scene_source::{Renderer, SceneSource};
+use crate::cli::backend_options::RendererOptions;
+use crate::cli::scene_source::SceneSource;
 
 /// Time one step: all cameras of the list in one frame, to 8-bit colour.
 ///
@@ -21,7 +22,7 @@ pub(super) struct Step {
     source: SceneSource,
 
     #[command(flatten)]
-    renderer: Renderer,
+    renderer: RendererOptions,
 
     /// Frames to time.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -46,7 +47,7 @@ impl Step {
         if let Some(other) = ready.shots.iter().find(|shot| shot.profile != profile) {
             anyhow::bail!(
                 "camera {:?} has another near than {:?}; one step has one profile: give \
-                 --profile near=...",
+                 --set near=...",
                 other.name,
                 ready.shots[0].name
             );

@@ -8,7 +8,7 @@ use image::imageops::{self, FilterType};
 
 use wildcity_client::{ImageView, Observation};
 
-use super::output;
+use crate::cli::output;
 
 /// Cameras of the demo's rig from left to right, row by row.
 const ROWS: [[&str; 3]; 2] = [["front_left", "front", "front_right"], ["left", "rear", "right"]];

@@ -14,8 +14,8 @@ use wildcity_twin::ingest::cameras;
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
-use super::super::{output, progress};
 use super::Lod;
+use crate::cli::{output, progress};
 
 /// Pixels between two pictures.
 const GAP_PX: u32 = 8;
@@ -35,7 +35,7 @@ pub(super) fn draw(
         profile.check()?;
         profiles.push(profile);
     }
-    let backend = lod.engine.backend()?;
+    let backend = lod.backend.backend()?;
     let resident = Cache::new(catalog).open(&version.manifest.twin, Some(version.number))?;
     output::make_dir(out)?;
     let eyes = wildcity_session::eyes(&views);

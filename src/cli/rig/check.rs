@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::{rig_of, view_of};
-use crate::cli::scene_source::Engine;
+use crate::cli::backend_options::BackendOptions;
 use wildcity_render::compare::points::Points;
 
 /// Render points that each camera must show at known pixels, and find them there.
@@ -18,7 +18,7 @@ pub(super) struct Check {
     rig: String,
 
     #[command(flatten)]
-    engine: Engine,
+    backend: BackendOptions,
 }
 
 /// Farthest that a point may be from its pixel, in pixels.
@@ -27,7 +27,7 @@ const OFF_PX: f64 = 0.1;
 impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let rig = rig_of(&self.rig)?;
-        let backend = self.engine.backend()?;
+        let backend = self.backend.backend()?;
         let mut out = io::stdout().lock();
         let mut wrong = Vec::new();
         for camera in &rig.cameras {

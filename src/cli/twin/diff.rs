@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::places::Twins;
+use crate::cli::directories::Twins;
 use wildcity_twin::store::{CellDiff, CellSize, Diff as Differences};
 
 /// Show which cells differ between two versions of a twin: Gaussians and bytes, before and after.

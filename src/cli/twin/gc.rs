@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::time::Duration;
 
+use crate::cli::directories::Twins;
 use crate::cli::limits;
-use crate::cli::places::Twins;
 use wildcity_twin::store::Keep;
 
 /// Remove objects of a twin that no version to be kept names.

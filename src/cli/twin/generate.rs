@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 
-use crate::cli::places::Twins;
+use crate::cli::directories::Twins;
 use crate::cli::progress;
 use wildcity_generate::CitySettings;
 use wildcity_scene::manifest::Provenance;

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::places::Twins;
+use crate::cli::directories::Twins;
 
 /// List all twins with their latest versions.
 #[derive(Debug, clap::Args)]

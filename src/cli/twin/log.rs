@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::places::Twins;
+use crate::cli::directories::Twins;
 use crate::cli::time::utc;
 use wildcity_twin::store::LogEntry;
 

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::places::Twins;
+use crate::cli::directories::Twins;
 
 /// Make an old version of a twin the latest, under a new number.
 ///

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::places::{TwinVersion, Twins};
+use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::sky_source::SkySource;
 use wildcity_twin::store::{Change, Kind, NewSky, Storage};
 

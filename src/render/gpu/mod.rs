@@ -156,8 +156,10 @@ impl Gpu {
             let reason = format!("{threads} are too many; 0 to {limit} are allowed");
             return Err(GpuError::Threads { reason });
         }
-        let limits =
-            MemoryLimits { binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN), ..limits };
+        let limits = MemoryLimits {
+            binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
+            ..limits
+        };
         let device = Device::open(choice, &shaders, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);

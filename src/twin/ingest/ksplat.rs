@@ -14,7 +14,7 @@ use half::f16;
 use wildcity_scene::{Gaussians, sh};
 
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count, joined};
+use super::{IngestError, activated, check_count};
 
 const FORMAT: &str = ".ksplat";
 const HEADER_BYTES: usize = 4096;
@@ -52,7 +52,7 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
     let mut all = Gaussians::default();
     for section in &sections {
         let part = section.decode(&mut input, &header)?;
-        joined::append(&mut all, &part, 0..part.len());
+        all.append(&part);
     }
     validate::check(&all, &Field::plain_name)?;
     Ok(all)

@@ -12,7 +12,6 @@ pub mod cameras;
 mod file;
 mod gltf;
 mod hashing;
-mod joined;
 mod ksplat;
 mod nurec;
 mod parts;
@@ -24,7 +23,6 @@ mod splat;
 mod spz;
 mod told;
 mod unpacked;
-pub mod validate;
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
@@ -36,7 +34,7 @@ use wildcity_scene::sky::SkyError;
 
 pub use axes::Axes;
 pub use file::{FileError, read_whole};
-pub use validate::{BadGaussian, BadGaussians};
+pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use hashing::Hashing;
 use parts::Folder;
@@ -132,7 +130,7 @@ pub enum IngestError {
     },
     /// Gaussians that no renderer can draw.
     #[error("{0}")]
-    Values(BadGaussians),
+    Values(#[from] BadGaussians),
     /// A sky that cannot be drawn.
     #[error("sky: {0}")]
     Sky(#[from] SkyError),

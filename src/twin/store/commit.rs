@@ -2,10 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::ingest::validate::{self, Field};
+use crate::ingest::IngestError;
 use crate::limits;
 use wildcity_scene::manifest::{ChunkEntry, ObjectRef, Provenance};
 use wildcity_scene::record::Clamped;
+use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory};
 
 use super::catalog::check_name;
@@ -133,7 +134,7 @@ impl Commit {
         only: Option<&BTreeSet<[i32; 2]>>,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Stored, StoreError> {
-        validate::check(gaussians, &Field::twin_name)?;
+        validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let sh_degree = gaussians.sh_degree;
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
         let cells = Cells::new(gaussians, self.storage, only);

@@ -1,7 +1,8 @@
 //! A whole version in one call, for what is in memory anyway.
 
-use crate::ingest::validate::{self, Field};
+use crate::ingest::IngestError;
 use wildcity_scene::manifest::Provenance;
+use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
 
 use super::catalog::check_name;
@@ -60,7 +61,7 @@ impl Catalog {
         let NewVersion { name, gaussians, profile, rig, trajectories, sky, provenance, storage } =
             new;
         check_name(name)?;
-        validate::check(gaussians, &Field::twin_name)?;
+        validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let settings = Settings { profile, rig, trajectories, sky, provenance };
         settings.check()?;
         let mut commit = self.begin(name, Kind::Import, storage)?;

@@ -25,7 +25,7 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::parts::Parts;
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count, joined};
+use super::{IngestError, activated, check_count};
 use accessor::Column;
 use document::{Document, Primitive};
 
@@ -121,7 +121,7 @@ pub(super) fn read(
             let place = format!("node {}, primitive {index}", placed.node);
             let mut part = read_primitive(&document, &buffers, primitive, &place, parts)?;
             placed.apply(&mut part)?;
-            joined::append(&mut all, &part, 0..part.len());
+            all.append(&part);
             check_count(all.len() as u64)?;
         }
     }

@@ -18,7 +18,7 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::unpacked::{self, Budget};
 use super::validate::{self, Field};
-use super::{IngestError, check_count, joined};
+use super::{IngestError, check_count};
 use msgpack::Value;
 
 const FORMAT: &str = "NuRec";
@@ -46,7 +46,7 @@ pub(super) fn read(payload: &[u8], budget: &mut Budget) -> Result<Gaussians, Ing
     for name in layers {
         check_activations(data, name)?;
         let part = Layer { state, name }.read()?;
-        joined::append(&mut all, &part, 0..part.len());
+        all.append(&part);
         check_count(all.len() as u64)?;
     }
     validate::check(&all, &Field::plain_name)?;

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Deserialize;
 
 use crate::ingest::parts::Parts;
-use crate::ingest::{IngestError, check_count, joined};
+use crate::ingest::{IngestError, check_count};
 use crate::limits;
 use wildcity_scene::Gaussians;
 
@@ -70,12 +70,12 @@ pub(super) fn read(
                     format!("Gaussians to {end} of {:?}, which has {held}", meta.filenames[file]);
                 return Err(bad(NAME, reason));
             }
-            joined::append(&mut all, &block, offset as usize..end as usize);
+            all.append_range(&block, offset as usize..end as usize);
         }
     }
     if let Some(environment) = &meta.environment {
         let block = read_block(environment, folder, parts)?;
-        joined::append(&mut all, &block, 0..block.len());
+        all.append(&block);
     }
     Ok(all)
 }

@@ -1,0 +1,281 @@
+//! `wildcity bench drive`.
+
+mod report;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+
+use crate::cli::backend_options::{self, BackendOptions};
+use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::{output, progress};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::route::Route;
+use wildcity_scene::{Manifest, Rig};
+use wildcity_session::{Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use wildcity_twin::residency::{Cache, Stats};
+
+use report::{Report, Row};
+
+/// Time a drive along a twin's first trajectory, as a session does it, without a network.
+///
+/// Ten steps a second at a constant speed, however long they take; a step that is done early waits
+/// for its time, as an agent in real time would. Reports for every kilometre how long the steps took,
+/// how many waited for the disk and how long, and what was in memory.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Drive {
+    /// The twin, or NAME@NUMBER for an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    backend: BackendOptions,
+
+    /// Memory for the twin, in GiB [default: three quarters of the machine's]
+    #[arg(long, value_name = "N", value_parser = backend_options::gib)]
+    memory_gib: Option<f64>,
+
+    /// How fast, in m/s.
+    #[arg(long, value_name = "V", default_value_t = 30.0, value_parser = speed)]
+    speed_m_s: f64,
+
+    /// Where on the trajectory to begin, in metres.
+    #[arg(long, value_name = "M", default_value_t = 0.0, value_parser = distance)]
+    from_m: f64,
+
+    /// Steps, a tenth of a second each [default: to the end of the trajectory]
+    #[arg(long, value_name = "N")]
+    steps: Option<u32>,
+
+    /// Cut width and height of every camera to one in so many, around its middle: as much in memory
+    /// as for whole images, and less to draw.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+    crop: u32,
+
+    /// Take the next step as soon as one is done: faster than in real time, if the machine can.
+    #[arg(long)]
+    unpaced: bool,
+
+    /// After the drive, jump so many times to a random place of the trajectory.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    teleports: u32,
+
+    /// Write every step and jump to a CSV file.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity bench drive city --memory-gib 2 --crop 4 --teleports 200
+  wildcity bench drive city --from-m 9000 --steps 600 --json | jq .all";
+
+/// One pose, drawn.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    station_m: f64,
+    step: Duration,
+    waited: Duration,
+    /// Sections that were not there when the frame asked.
+    misses: u64,
+    loads: u64,
+    evictions: u64,
+    held_bytes: u64,
+    rss_bytes: u64,
+}
+
+impl Drive {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let version = catalog.version(&self.twin.name, self.twin.number)?;
+        let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
+        let scratch = Scratch::new()?;
+        let engine = wildcity_session::Engine::start(EngineSettings {
+            cache: Cache::limited(catalog, limit_bytes),
+            episodes: scratch.0.clone(),
+            backend: Arc::from(self.backend.backend()?),
+            step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
+        })?;
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        let report = runtime.block_on(self.drive(engine, &version.manifest))?;
+        if let Some(path) = &self.csv {
+            output::write(path, report.csv().as_bytes())?;
+        }
+        report.print(self.json)
+    }
+
+    async fn drive(
+        &self,
+        engine: Arc<wildcity_session::Engine>,
+        manifest: &Manifest,
+    ) -> anyhow::Result<Report> {
+        let trajectory = manifest.trajectories.first();
+        let trajectory =
+            trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+        let route = Route::new(trajectory)?;
+        let opened = Instant::now();
+        let session = Session::open(engine.clone(), "bench".into(), self.opening(manifest)).await?;
+        let open = opened.elapsed();
+        let start = Start::Pose(route.at(self.from_m).world_from_rig);
+        let mut driven = Driven { session, engine, last: Stats::default() };
+        let first = Instant::now();
+        driven.session.reset(0, Some(start)).await?;
+        let first = first.elapsed();
+        driven.last = driven.engine.residency();
+
+        let step_m = self.speed_m_s * wildcity_session::limits::DT_US as f64 * 1e-6;
+        let to_the_end = ((route.length_m() - self.from_m) / step_m).max(0.0) as u32;
+        let count = self.steps.unwrap_or(to_the_end).min(to_the_end);
+        let bar = progress::count("driving");
+        bar.set_length(u64::from(count) + u64::from(self.teleports));
+        let mut steps = Vec::with_capacity(count as usize);
+        let begun = tokio::time::Instant::now();
+        for number in 1..=count {
+            if !self.unpaced {
+                let due = Duration::from_micros(
+                    u64::from(number) * wildcity_session::limits::DT_US as u64,
+                );
+                tokio::time::sleep_until(begun + due).await;
+            }
+            let station_m = self.from_m + f64::from(number) * step_m;
+            let pose = route.at(station_m).world_from_rig;
+            steps.push(driven.step(station_m, pose).await?);
+            bar.inc(1);
+        }
+        let mut jumps = Vec::with_capacity(self.teleports as usize);
+        for number in 0..self.teleports {
+            let station_m = route.length_m() * scattered(number);
+            let pose = route.at(station_m).world_from_rig;
+            jumps.push(driven.step(station_m, pose).await?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        let (_, peak_rss_bytes) = rss_bytes()?;
+        Ok(Report {
+            twin: manifest.twin.clone(),
+            gaussians: manifest.gaussians(),
+            length_m: route.length_m(),
+            speed_m_s: self.speed_m_s,
+            backend: driven.engine.backend(),
+            cameras: Row::cameras(driven.session.cameras()),
+            reserved_bytes: driven.session.reserved_bytes(),
+            open,
+            first,
+            steps,
+            jumps,
+            peak_rss_bytes,
+            stats: driven.engine.residency(),
+        })
+    }
+
+    fn opening(&self, manifest: &Manifest) -> Opening {
+        let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
+        let rig = rig.map(|rig| cropped(rig, self.crop));
+        let outputs = Outputs::colour(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY));
+        Opening {
+            version: self.twin.number,
+            rig: rig.map(RigChoice::Full),
+            ..Opening::twin(&self.twin.name, outputs)
+        }
+    }
+}
+
+/// A session that is driven, and what its engine had counted before the next step.
+struct Driven {
+    session: Session,
+    engine: Arc<wildcity_session::Engine>,
+    last: Stats,
+}
+
+impl Driven {
+    async fn step(&mut self, station_m: f64, pose: Pose) -> anyhow::Result<Step> {
+        let begun = Instant::now();
+        let stepped = self.session.step(pose, false).await;
+        stepped.with_context(|| format!("at {station_m:.1} m of the trajectory"))?;
+        let step = begun.elapsed();
+        let (before, now) = (self.last, self.engine.residency());
+        self.last = now;
+        let (rss_bytes, _) = rss_bytes()?;
+        Ok(Step {
+            station_m,
+            step,
+            waited: now.wait_time.saturating_sub(before.wait_time),
+            misses: now.misses - before.misses,
+            loads: now.loads - before.loads,
+            evictions: now.evictions - before.evictions,
+            held_bytes: now.held_bytes,
+            rss_bytes,
+        })
+    }
+}
+
+/// The same cameras with the middle of their images alone.
+fn cropped(mut rig: Rig, crop: u32) -> Rig {
+    for camera in rig.cameras.iter_mut().map(|camera| &mut camera.camera) {
+        let [width_px, height_px] = [camera.width_px, camera.height_px];
+        camera.width_px = (width_px / crop).max(1);
+        camera.height_px = (height_px / crop).max(1);
+        camera.pinhole.cx -= 0.5 * f64::from(width_px - camera.width_px);
+        camera.pinhole.cy -= 0.5 * f64::from(height_px - camera.height_px);
+    }
+    rig
+}
+
+/// Numbers that fill [0, 1) evenly and come in no order: multiples of the golden ratio.
+fn scattered(number: u32) -> f64 {
+    (0.5 + 0.618_033_988_749_895 * f64::from(number)).fract()
+}
+
+/// What this process has in memory now and had at most, in bytes.
+fn rss_bytes() -> anyhow::Result<(u64, u64)> {
+    let text = fs::read_to_string("/proc/self/status").context("/proc/self/status")?;
+    let field = |name: &str| {
+        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
+    };
+    let both = field("VmRSS:").zip(field("VmHWM:"));
+    both.context("/proc/self/status does not say how much memory is used")
+}
+
+/// A directory for the episode, which nobody wants to keep.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new() -> anyhow::Result<Self> {
+        let dir = std::env::temp_dir().join(format!("wildcity-bench-{}", std::process::id()));
+        output::make_dir(&dir)?;
+        Ok(Self(dir))
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        // What cannot be removed is left to whoever cleans the directory for temporary files.
+        let _ = fs::remove_dir_all(Path::new(&self.0));
+    }
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(speed_m_s) if (0.1..=1000.0).contains(&speed_m_s) => Ok(speed_m_s),
+        _ => Err("expected 0.1 to 1000 m/s".to_owned()),
+    }
+}
+
+fn distance(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(distance_m) if (0.0..=1e7).contains(&distance_m) => Ok(distance_m),
+        _ => Err("expected 0 to 1e7 m".to_owned()),
+    }
+}

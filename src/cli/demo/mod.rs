@@ -1,0 +1,274 @@
+//! `wildcity demo`.
+
+mod mosaic;
+
+use std::io::{self, ErrorKind, Write};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use glam::DMat3;
+use serde_json::json;
+
+use wildcity_client::{Client, Observation, Open, Pose};
+use wildcity_generate::StreetSettings;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
+use wildcity_server::Limits;
+use wildcity_twin::ingest::sky;
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
+
+use super::backend_options::BackendOptions;
+use super::directories::Twins;
+use super::{output, progress};
+
+/// Drive through the demo twin and look at the pictures.
+///
+/// Builds a street on first use, serves it on a free loopback port, drives along its recorded
+/// trajectory through the WebSocket as any agent would, and writes what the six cameras saw: a
+/// mosaic of every tenth step, the recorded episode, and report.json with the time of every step.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Demo {
+    /// Steps to drive, a tenth of a second each.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    steps: u32,
+
+    /// Directory for the pictures and the report; made if it is missing.
+    #[arg(long, value_name = "DIR", default_value = "wildcity-demo")]
+    out: PathBuf,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    backend: BackendOptions,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity demo
+  wildcity demo --steps 20 --out /tmp/look
+  wildcity serve            (then the twin \"demo\" can be opened by any agent)";
+
+/// Name of the demo twin.
+pub(super) const TWIN: &str = "demo";
+/// The same, of `wildcity report`.
+const EXACT_TWIN: &str = "demo-f32";
+/// How the source of every revision of it begins.
+const STREET: &str = "street ";
+/// How fast the agent drives, in m/s; a step takes 0.1 s.
+const SPEED_M_PER_S: f64 = 8.0;
+/// Steps between two mosaics.
+const MOSAIC_STEPS: u64 = 10;
+
+impl Demo {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let twins = self.twins.dir()?;
+        let version = demo_twin(&twins, TWIN, Storage::default())?;
+        output::make_dir(&self.out)?;
+        let config = wildcity_server::Config {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            twins,
+            cache: self.twins.cache(),
+            episodes: self.out.join("episodes"),
+            uploads: self.out.join("uploads"),
+            tokens: None,
+            backend: Arc::from(self.backend.backend()?),
+            profile: ProfileChanges::default(),
+            limits: Limits::default(),
+        };
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        let drive = runtime.block_on(async {
+            let running = wildcity_server::start(config).await?;
+            let drive = self.drive(&running.url(), &version).await;
+            running.stop().await;
+            drive
+        })?;
+        self.report(&version, &drive)
+    }
+
+    /// The agent: follows the recorded trajectory at a constant speed.
+    async fn drive(&self, url: &str, version: &Version) -> anyhow::Result<Drive> {
+        let route = &version.manifest.trajectories[0];
+        let mut client = Client::connect(url, "wildcity demo").await?;
+        let opened = client.open(Open::twin(TWIN)).await?;
+        let dt_s = opened.dt_us as f64 * 1e-6;
+        let mut drive = Drive { backend: opened.backend, steps: Vec::new(), mosaics: Vec::new() };
+        let first = client.reset(0, None).await?;
+        drive.keep(&first, &self.out)?;
+        let bar = progress::count("driving");
+        bar.set_length(self.steps.into());
+        for step in 1..=self.steps {
+            let pose = pose_at(route, f64::from(step) * dt_s * SPEED_M_PER_S);
+            let start = Instant::now();
+            let seen = client.step(pose).await?;
+            let step_ms = start.elapsed().as_secs_f64() * 1e3;
+            seen.verify()?;
+            drive.steps.push(report_step(&seen, step_ms));
+            drive.keep(&seen, &self.out)?;
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        client.close().await?;
+        Ok(drive)
+    }
+
+    fn report(&self, version: &Version, drive: &Drive) -> anyhow::Result<()> {
+        let step_ms = |step: &serde_json::Value| step["step_ms"].as_f64().unwrap_or(f64::NAN);
+        let mut times: Vec<f64> = drive.steps.iter().map(step_ms).collect();
+        times.sort_by(f64::total_cmp);
+        let at = |share: f64| times[((times.len() - 1) as f64 * share).round() as usize];
+        let report = json!({
+            "twin": version.manifest.twin,
+            "version": version.number,
+            "version_hash": version.hash,
+            "gaussians": version.manifest.gaussians(),
+            "backend": drive.backend,
+            "step_ms": { "median": at(0.5), "p95": at(0.95), "max": at(1.0) },
+            "steps": drive.steps,
+            "mosaics": drive.mosaics,
+        });
+        let path = self.out.join("report.json");
+        output::write(&path, format!("{report:#}\n").as_bytes())?;
+        let mut out = io::stdout().lock();
+        writeln!(
+            out,
+            "drove {} steps of six cameras: median {:.0} ms a step, 95 % within {:.0} ms",
+            self.steps,
+            at(0.5),
+            at(0.95)
+        )?;
+        if let Some(last) = drive.mosaics.last() {
+            writeln!(out, "look at   {}", self.out.join(last).display())?;
+        }
+        writeln!(out, "report    {}", path.display())?;
+        writeln!(out, "episode   {}", self.out.join("episodes").display())?;
+        Ok(())
+    }
+}
+
+/// What is kept of a drive.
+struct Drive {
+    backend: String,
+    steps: Vec<serde_json::Value>,
+    mosaics: Vec<String>,
+}
+
+impl Drive {
+    /// Writes a mosaic of every tenth step.
+    fn keep(&mut self, seen: &Observation, out: &Path) -> anyhow::Result<()> {
+        let step = seen.metadata().step;
+        if step.is_multiple_of(MOSAIC_STEPS) {
+            let name = format!("step_{step:04}.png");
+            mosaic::write(seen, &out.join(&name))?;
+            self.mosaics.push(name);
+        }
+        Ok(())
+    }
+}
+
+fn report_step(seen: &Observation, step_ms: f64) -> serde_json::Value {
+    let metadata = seen.metadata();
+    json!({
+        "step": metadata.step,
+        "time_us": metadata.time_us,
+        "frame_hash": metadata.frame_hash,
+        "step_ms": step_ms,
+        "answer_bytes": seen.frame().len(),
+        "timings": metadata.timings,
+    })
+}
+
+fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
+    let pose = route.at_station(station_m);
+    Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
+}
+
+/// The demo street in the record that leaves nothing out, under a name of its own.
+pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
+    demo_twin(twins, EXACT_TWIN, Storage { record: Record::F32, ..Storage::default() })
+}
+
+/// The demo twin in the user's store: built on first use, and again after the generator changed or
+/// the disk lost some of it.
+fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Version> {
+    let catalog = Catalog::open(twins)?;
+    let settings = StreetSettings::default();
+    let revision = wildcity_generate::REVISION;
+    let settings_json = serde_json::to_string(&settings)?;
+    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
+    let why = match built(&catalog, name, &provenance)? {
+        Ok(version) => return Ok(version),
+        Err(why) => why,
+    };
+    writeln!(io::stderr(), "building the demo twin in {} ({why})", twins.display())?;
+    let street = wildcity_generate::street(&settings)?;
+    let sky = sky::read_bytes(wildcity_generate::SKY, None)?;
+    let bar = progress::count("writing");
+    let version = catalog.commit(
+        NewVersion {
+            rig: Rig::preset("vehicle6"),
+            trajectories: vec![street.trajectory],
+            sky: Some(NewSky::Put(SkyBytes {
+                bytes: sky.bytes.into(),
+                image: None,
+                sky_from_world: DMat3::IDENTITY,
+            })),
+            storage,
+            ..NewVersion::of(name, &street.gaussians, provenance)
+        },
+        &mut progress::show(&bar),
+    )?;
+    bar.finish_and_clear();
+    Ok(version)
+}
+
+/// The demo twin as it was built, or why it must be built.
+///
+/// # Errors
+/// The name belongs to a twin that somebody imported: it is not ours to add a version to.
+fn built(
+    catalog: &Catalog,
+    name: &str,
+    provenance: &Provenance,
+) -> anyhow::Result<Result<Version, &'static str>> {
+    const DAMAGED: &str = "again, since it is damaged";
+    let version = match catalog.version(name, None) {
+        Ok(version) => version,
+        Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
+        Err(StoreError::Damaged { .. }) => return Ok(Err(DAMAGED)),
+        Err(StoreError::Format { .. }) => return Ok(Err("anew, in this build's format")),
+        Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
+            return Ok(Err(DAMAGED));
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let found = &version.manifest.provenance;
+    anyhow::ensure!(
+        found.source.starts_with(STREET),
+        "twin {name:?} in {} is not the demo street (its source is {:?}): give --twins another \
+         directory, or import yours under another name",
+        catalog.dir().display(),
+        found.source,
+    );
+    if found != provenance {
+        return Ok(Err("anew, as the generator changed"));
+    }
+    Ok(if is_sound(catalog, name, &version)? { Ok(version) } else { Err(DAMAGED) })
+}
+
+/// Whether every chunk of a version is what was committed; older versions may be as they like.
+fn is_sound(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<bool> {
+    let bar = progress::bytes("checking");
+    let verified = catalog.verify(name, &mut progress::show(&bar))?;
+    bar.finish_and_clear();
+    let chunks = &version.manifest.chunks;
+    let mut damaged = verified.damaged.iter().map(|damage| &damage.object);
+    let sky = version.manifest.sky.as_ref();
+    Ok(!damaged.any(|object| {
+        chunks.iter().any(|chunk| chunk.object == *object)
+            || sky.is_some_and(|sky| sky.object == *object)
+    }))
+}

@@ -1,0 +1,54 @@
+//! `wildcity bench drive` along a city.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::city_twin::city;
+
+#[test]
+fn a_timed_drive_tells_of_every_kilometre_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let report = bench_drive(
+        dir.path(),
+        &["--crop", "16", "--memory-gib", "0.2", "--unpaced", "--from-m", "900", "--steps", "60"],
+    );
+    let count = |of: &str, field: &str| report[of][field].as_u64().unwrap();
+    assert_eq!(count("all", "steps"), 60);
+    // 900 to 1,080 m: 33 steps of 3 m, the one that ends on 1,000 m being on the other side.
+    let kilometres = report["kilometres"].as_array().unwrap();
+    let steps: Vec<_> = kilometres.iter().map(|row| row["steps"].as_u64().unwrap()).collect();
+    assert_eq!(steps, [33, 27]);
+    assert_eq!(count("teleports", "steps"), 5);
+    assert!(count("teleports", "loads") > 0);
+    let limit_bytes = report["limit_bytes"].as_u64().unwrap();
+    assert_eq!(limit_bytes, (0.2 * f64::from(1 << 30)) as u64);
+    let held_bytes = count("all", "held_bytes_max");
+    assert!(held_bytes > 0 && held_bytes <= limit_bytes, "{held_bytes} of {limit_bytes}");
+    assert!(report["peak_rss_bytes"].as_u64().unwrap() > held_bytes);
+
+    let csv = fs::read_to_string(dir.path().join("steps.csv")).unwrap();
+    assert_eq!(csv.lines().count(), 1 + 60 + 5);
+    assert_eq!(csv.lines().filter(|line| line.starts_with("teleport,")).count(), 5);
+    // The episode that a session writes is gone.
+    let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(left, ["steps.csv"]);
+}
+
+/// What `wildcity bench drive` says, with 5 teleports and a CSV file.
+fn bench_drive(dir: &Path, arguments: &[&str]) -> Value {
+    let output = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["bench", "drive", "city", "--backend", "cpu", "--json", "--teleports", "5"])
+        .args(arguments)
+        .arg("--twins")
+        .arg(city().dir.path())
+        .arg("--csv")
+        .arg(dir.join("steps.csv"))
+        .env("TMPDIR", dir)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}

@@ -1,0 +1,59 @@
+//! The demo twin is built once, healed when it is damaged, and never put over somebody's own.
+
+use std::fs;
+use std::path::Path;
+use std::process::Output;
+
+use wildcity_twin::store::Catalog;
+
+use crate::scene_files::gaussians;
+use crate::support::{commit, street};
+use crate::wildcity;
+
+fn demo(dir: &Path) -> Output {
+    let mut command = wildcity();
+    command.args(["demo", "--steps", "1", "--twins"]).arg(dir.join("twins"));
+    command.arg("--out").arg(dir.join("out")).output().unwrap()
+}
+
+#[test]
+fn a_twin_of_the_same_name_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = dir.path().join("twins");
+    let scene = gaussians(100, 0, 10.0, 1);
+    let mine = commit(&twins, wildcity_twin::store::NewVersion { name: "demo", ..street(&scene) });
+    let output = demo(dir.path());
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        said.contains("twin \"demo\" in ") && said.contains("is not the demo street"),
+        "{said}"
+    );
+    assert!(said.contains("give --twins another directory"), "{said}");
+    assert_eq!(Catalog::open(&twins).unwrap().version("demo", None).unwrap(), mine.unwrap());
+}
+
+#[test]
+fn a_damaged_demo_twin_is_built_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let drive = || {
+        let output = demo(dir.path());
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
+    assert!(drive().contains("building the demo twin in "));
+    assert!(!drive().contains("building"), "built once");
+    let version = catalog.version("demo", None).unwrap();
+    let object = |hash: &str| dir.path().join("twins/demo/objects").join(&hash[..2]).join(hash);
+    for hash in [&version.manifest.chunks[3].object, &version.hash] {
+        let mut bytes = fs::read(object(hash)).unwrap();
+        bytes[40] ^= 1;
+        fs::write(object(hash), bytes).unwrap();
+        assert!(drive().contains("(again, since it is damaged)"));
+        fs::remove_file(object(hash)).unwrap();
+        assert!(drive().contains("(again, since it is damaged)"));
+        assert_eq!(catalog.version("demo", None).unwrap(), version);
+        assert_eq!(catalog.verify("demo", &mut |_, _| {}).unwrap().damaged.len(), 0);
+    }
+}

@@ -1,0 +1,47 @@
+//! `wildcity twin generate`.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use wildcity_twin::store::Catalog;
+
+#[test]
+fn memory_does_not_grow_with_the_route() {
+    let dir = tempfile::tempdir().unwrap();
+    let [one, five] = ["1", "5"].map(|km| peak_bytes(km, dir.path()));
+    // A longer route has fuller places; but the Gaussians of 4 km more, 104 bytes each, would take 420
+    // MB.
+    assert!(five < one + (100 << 20), "{one} bytes at 1 km, {five} at 5 km");
+
+    let version = Catalog::open(dir.path()).unwrap().version("km5", None).unwrap();
+    assert!(version.manifest.gaussians() > 4_500_000, "{}", version.manifest.gaussians());
+    assert!((version.manifest.trajectories[0].length_m() - 4_984.0).abs() < 10.0);
+}
+
+/// Most memory that making a city of so many km takes, in bytes.
+fn peak_bytes(km: &str, twins: &Path) -> u64 {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["twin", "generate", "--twin", &format!("km{km}"), "--length-km", km])
+        .args(["--density", "1", "--twins"])
+        .arg(twins)
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    // The kernel's high-water mark: it is enough to read it once near the end.
+    let mut peak = 0;
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        let status = fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kib = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+        peak = peak.max(kib.unwrap_or(0) << 10);
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    assert!(status.success(), "{status}");
+    assert!(peak > 0);
+    peak
+}

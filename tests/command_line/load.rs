@@ -1,0 +1,290 @@
+//! Many clients, slow clients, and what they leave behind.
+
+use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+use tokio::net::TcpSocket;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use wildcity_server::Limits;
+
+use crate::support::{self, Agent, Reply, TestServer, pose, refused};
+
+/// `wildcity serve` as a process of its own, whose memory can be measured.
+struct Served {
+    child: Child,
+    address: SocketAddr,
+    _twins: tempfile::TempDir,
+    _episodes: tempfile::TempDir,
+}
+
+impl Served {
+    fn start() -> Self {
+        let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
+        let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+            .args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"])
+            .arg("--twins")
+            .arg(twins.path())
+            .arg("--episodes")
+            .arg(episodes.path())
+            .arg("--uploads")
+            .arg(twins.path().join(".uploads"))
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let address = line
+            .strip_prefix("listening on ws://")
+            .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
+        let address = address.expect(&line).parse().unwrap();
+        Self { child, address, _twins: twins, _episodes: episodes }
+    }
+
+    /// Resident memory, in bytes.
+    fn rss(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+    }
+
+    async fn whole_session(&self, steps: u32) {
+        let mut agent = Agent::connect(self.address).await;
+        agent.hello().await;
+        agent.open(json!({})).await;
+        for step in 0..steps {
+            agent.step(f64::from(step)).await;
+        }
+        agent.ask(json!({ "type": "close" })).await;
+    }
+
+    fn signal_and_wait(mut self) -> Option<i32> {
+        let kill = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
+        assert!(kill.success());
+        let deadline = Instant::now() + Duration::from_secs(20);
+        loop {
+            match self.child.try_wait().unwrap() {
+                Some(status) => return status.code(),
+                None if Instant::now() > deadline => return None,
+                None => std::thread::sleep(Duration::from_millis(10)),
+            }
+        }
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        // It may have ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[tokio::test]
+async fn a_thousand_sessions_leave_nothing_behind() {
+    let served = Served::start();
+    for _ in 0..200 {
+        served.whole_session(2).await;
+    }
+    let before = served.rss();
+    for _ in 0..1000 {
+        served.whole_session(2).await;
+    }
+    let after = served.rss();
+    // A leaked session would keep its JPEGs, its history and its cameras: 10 kB at least.
+    assert!(after < before + (4 << 20), "{before} bytes grew to {after}");
+    assert_eq!(served.signal_and_wait(), Some(0));
+}
+
+#[tokio::test]
+async fn memory_is_flat_over_ten_thousand_steps() {
+    let served = Served::start();
+    let mut agent = Agent::connect(served.address).await;
+    agent.hello().await;
+    agent.open(json!({})).await;
+    for step in 0..1000 {
+        agent.step(f64::from(step)).await;
+    }
+    let before = served.rss();
+    for step in 1000..10_000 {
+        agent.step(f64::from(step)).await;
+    }
+    let after = served.rss();
+    assert!(after < before + (4 << 20), "{before} bytes grew to {after}");
+}
+
+/// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as in the
+/// first, the same bytes seen, and a clock that is exact.
+async fn two_laps(steps: u64) {
+    let served = Served::start();
+    let mut agent = Agent::connect(served.address).await;
+    agent.hello().await;
+    let dynamics = json!({ "model": "dynamic", "speed": 5.0 });
+    agent.open(json!({ "dynamics": dynamics, "outputs": { "encoding": "raw" } })).await;
+    let (mut laps, mut early_bytes) = (Vec::new(), None);
+    for _ in 0..2 {
+        agent.look(json!({ "type": "reset" })).await;
+        let mut lap = blake3::Hasher::new();
+        for step in 1..=steps {
+            let phase = step as f64;
+            let (acceleration, curvature) =
+                (2.0 * (phase / 7.0).sin(), 0.03 * (phase / 11.0).sin());
+            let action = json!({ "acceleration": acceleration, "curvature": curvature });
+            let seen = agent.look(json!({ "type": "step", "action": action })).await;
+            assert_eq!(seen.meta["time_us"], 100_000 * step);
+            lap.update(seen.frame_hash().as_bytes());
+            lap.update(seen.meta["ego"].to_string().as_bytes());
+            if step == steps / 2 {
+                early_bytes.get_or_insert_with(|| served.rss());
+            }
+        }
+        laps.push(lap.finalize());
+    }
+    assert_eq!(laps[0], laps[1], "what is driven twice is the same");
+    let (early, late) = (early_bytes.unwrap(), served.rss());
+    eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
+    // Of 10,000 steps and more, 70 B each would be seen.
+    assert!(late < early + (1 << 20), "{early} bytes grew to {late}");
+}
+
+#[tokio::test]
+async fn a_lap_driven_twice_is_the_same_in_the_same_memory() {
+    two_laps(10_000).await;
+}
+
+#[tokio::test]
+#[ignore = "takes minutes"]
+async fn a_lap_of_50_000_steps_driven_twice_is_the_same_in_the_same_memory() {
+    two_laps(50_000).await;
+}
+
+#[tokio::test]
+async fn a_thousand_connections_at_once() {
+    let served = Served::start();
+    let mut agents = Vec::new();
+    for _ in 0..1000 {
+        let mut agent = Agent::connect(served.address).await;
+        assert_eq!(agent.hello().await["type"], "welcome");
+        agents.push(agent);
+    }
+    // All of them are served; as many as allowed get a session.
+    let mut opened = 0;
+    for agent in &mut agents[..300] {
+        let answer = agent.try_open(json!({})).await;
+        if answer["type"] == "opened" {
+            opened += 1;
+        } else {
+            refused(&answer, "busy");
+        }
+    }
+    assert_eq!(opened, wildcity_session::limits::SESSIONS);
+    assert_eq!(agents[0].step(1.0).await.meta["step"], 1);
+    let rss = served.rss();
+    assert!(rss < 300 << 20, "{rss} bytes for 1,000 connections");
+}
+
+#[tokio::test]
+async fn connections_above_the_limit_are_turned_away() {
+    let server = TestServer::with(Limits { connections: 2, ..Limits::default() }).await;
+    let first = server.agent().await;
+    let mut second = server.agent().await;
+    let request = format!("ws://{}/v1/session", server.address());
+    let mut request = request.into_client_request().unwrap();
+    request.headers_mut().insert("Sec-WebSocket-Protocol", "wildcity.v1".parse().unwrap());
+    match tokio_tungstenite::connect_async(request).await {
+        Err(tokio_tungstenite::tungstenite::Error::Http(answer)) => {
+            assert_eq!(answer.status(), 503);
+            let body = String::from_utf8(answer.into_body().unwrap()).unwrap();
+            assert!(body.contains("\"busy\""), "{body}");
+        }
+        other => panic!("{other:?}"),
+    }
+    drop(first);
+    let seated = async {
+        while server.running.connections() == 2 {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(support::PATIENCE, seated).await.expect("a free place");
+    server.still_serves().await;
+    second.open(json!({})).await;
+}
+
+/// A client with a small receive buffer that never reads: its megabytes do not fit anywhere.
+async fn one_that_does_not_read(server: &TestServer, name: &str) -> Agent {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(4096).unwrap();
+    let stream = socket.connect(server.address()).await.unwrap();
+    let mut request =
+        format!("ws://{}/v1/session", server.address()).into_client_request().unwrap();
+    request.headers_mut().insert("Sec-WebSocket-Protocol", "wildcity.v1".parse().unwrap());
+    let stream = tokio_tungstenite::MaybeTlsStream::Plain(stream);
+    let limits = support::client_limits();
+    let connected = tokio_tungstenite::client_async_with_config(request, stream, limits).await;
+    let (socket, _) = connected.unwrap();
+    let mut agent = Agent { socket, seq: 0 };
+    agent.hello().await;
+    let camera = json!({
+        "name": "c", "width": 4000, "height": 3000,
+        "fx": 8.0, "fy": 8.0, "cx": 4.0, "cy": 4.0, "camera_to_rig": pose(0.0),
+    });
+    let rig = json!({ "name": "r", "cameras": [camera] });
+    agent.open(json!({ "session": name, "rig": rig, "outputs": { "encoding": "raw" } })).await;
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    agent
+}
+
+#[tokio::test]
+async fn a_client_that_does_not_read_harms_only_itself() {
+    let (send, resume_grace) = (Duration::from_millis(500), Duration::from_millis(200));
+    let server = TestServer::with(Limits { send, resume_grace, ..Limits::default() }).await;
+    let stuck = one_that_does_not_read(&server, "stuck").await;
+    let mut other = server.driver("other").await;
+    for step in 0..50 {
+        other.step(f64::from(step)).await;
+    }
+    // It loses its connection, and as it does not come back, its session.
+    server.sessions_become(1).await;
+    drop(stuck);
+    assert_eq!(other.step(50.0).await.meta["step"], 51);
+}
+
+#[tokio::test]
+async fn many_sessions_take_turns() {
+    let server = TestServer::start().await;
+    server.painter.slow_ms.store(20, Ordering::SeqCst);
+    let mut agents = Vec::new();
+    for k in 0..5 {
+        agents.push(server.driver(&format!("a{k}")).await);
+    }
+    let server = &server;
+    let drive = |mut agent: Agent| async move {
+        for step in 0..10 {
+            agent.step(f64::from(step)).await;
+        }
+        server.painter.begun.load(Ordering::SeqCst)
+    };
+    let frames_at_end = futures_util::future::join_all(agents.into_iter().map(drive)).await;
+    // In turns, all are in their last rounds when the first is done: 46 of 50 frames are drawn.
+    // Served one session after the other, it would be done after 10.
+    let first = frames_at_end.iter().min().unwrap();
+    assert!(*first >= 40, "the first was done after {first} of 50 frames");
+}
+
+#[tokio::test]
+async fn reading_half_an_answer_is_no_problem_for_others() {
+    let server = TestServer::start().await;
+    let mut agents = Vec::new();
+    for k in 0..8 {
+        agents.push(one_that_does_not_read(&server, &format!("slow{k}")).await);
+    }
+    server.still_serves().await;
+    // They only were slow: once they read, they get everything.
+    for agent in &mut agents {
+        let Reply::Binary(bytes) = agent.receive().await else { panic!("no observation") };
+        assert!(bytes.len() > 36_000_000);
+    }
+}

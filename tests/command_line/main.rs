@@ -1,0 +1,69 @@
+//! The `wildcity` command, as users run it: files in, files, text and exit codes out.
+
+#[path = "../support/city.rs"]
+mod city_twin;
+#[path = "../support/data.rs"]
+mod data;
+#[path = "../support/drives.rs"]
+mod drives;
+#[path = "../support/episodes.rs"]
+mod episodes;
+#[path = "../support/formats.rs"]
+mod format_files;
+#[path = "../support/gpu.rs"]
+mod gpu;
+#[path = "../support/push.rs"]
+mod http;
+#[path = "../support/images.rs"]
+mod images;
+#[path = "../support/places.rs"]
+mod places;
+#[path = "../support/reported.rs"]
+mod reported;
+#[path = "../support/s3.rs"]
+mod s3;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+#[path = "../support/server.rs"]
+mod server;
+#[path = "../support/sky_network.rs"]
+mod sky_network;
+#[path = "../support/store.rs"]
+mod store;
+#[path = "../support/streets.rs"]
+mod streets;
+
+mod bench_drive;
+mod bench_gpu;
+mod bisect;
+mod bombs;
+mod crash;
+mod demo;
+mod devices;
+mod garbage;
+mod generate;
+mod import;
+mod kills;
+mod load;
+mod memory;
+mod push;
+mod remote;
+mod replay;
+mod report;
+mod rig;
+mod route;
+mod sky;
+mod twin;
+
+/// The support files name each other so in every test binary.
+mod support {
+    pub(crate) use crate::server::*;
+    pub(crate) use crate::store::*;
+}
+
+use std::process::Command;
+
+/// The command that users run.
+fn wildcity() -> Command {
+    Command::new(env!("CARGO_BIN_EXE_wildcity"))
+}

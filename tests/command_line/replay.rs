@@ -1,0 +1,86 @@
+//! `wildcity replay`.
+
+use std::path::Path;
+use std::process::{Command, Output};
+use std::sync::Arc;
+
+use serde_json::json;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::ProfileChanges;
+use wildcity_server::{Config, Limits};
+
+use crate::episodes::{drive, lines, tamper};
+use crate::support::{self, Agent};
+
+fn wildcity(arguments: &[&str], episode: &Path, twins: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    command.arg("replay").arg(episode).arg("--twins").arg(twins).args(arguments);
+    command.output().unwrap()
+}
+
+#[tokio::test]
+async fn the_command_verifies_what_the_cpu_backend_served() {
+    let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
+    let config = Config {
+        listen: "127.0.0.1:0".parse().unwrap(),
+        twins: twins.path().to_owned(),
+        cache: None,
+        episodes: episodes.path().to_owned(),
+        uploads: twins.path().join(".uploads"),
+        tokens: None,
+        backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
+        profile: ProfileChanges::default(),
+        limits: Limits::default(),
+    };
+    let running = wildcity_server::start(config).await.unwrap();
+    let mut agent = Agent::connect(running.address()).await;
+    agent.hello().await;
+    // With a profile of its own: what was recorded is drawn, not what the twin says.
+    let own =
+        json!({ "session": "a", "profile": { "blur": 4.0 }, "outputs": { "encoding": "raw" } });
+    agent.open(own).await;
+    drive(&mut agent).await;
+    let path = episodes.path().join("a-1.jsonl");
+
+    let shown = wildcity(&[], &path, twins.path());
+    let text = String::from_utf8(shown.stdout).unwrap();
+    assert!(text.contains("test version 1") && text.contains("10 steps"), "{text}");
+    let verified = wildcity(&["--verify", "--threads", "1"], &path, twins.path());
+    let text = String::from_utf8(verified.stdout).unwrap();
+    assert!(verified.status.success() && text.contains("24 images"), "{text}");
+    let out = episodes.path().join("pictures");
+    let drawn = wildcity(&["--out", out.to_str().unwrap()], &path, twins.path());
+    assert!(drawn.status.success());
+    assert_eq!(std::fs::read_dir(&out).unwrap().count(), 24);
+    let front = image::open(out.join("000003_step_front.png")).unwrap().into_rgb8();
+    let recorded = lines(&path);
+    assert_eq!(recorded[4]["images"][0], blake3::hash(&front).to_hex().as_str());
+
+    let whole = std::fs::read_to_string(&path).unwrap();
+    let lines: Vec<&str> = whole.lines().collect();
+    for (kept, wanted) in [(1, "it has no frames"), (lines.len() - 1, "it has no end")] {
+        std::fs::write(&path, lines[..kept].join("\n") + "\n").unwrap();
+        let partial = wildcity(&["--verify"], &path, twins.path());
+        assert_eq!(partial.status.code(), Some(1));
+        let error = String::from_utf8(partial.stderr).unwrap();
+        assert!(error.contains("the recording is incomplete") && error.contains(wanted), "{error}");
+        assert!(wildcity(&[], &path, twins.path()).status.success(), "it can still be looked at");
+    }
+    std::fs::write(&path, whole).unwrap();
+
+    // Another backend differs, and its pictures are wanted all the same.
+    let others = episodes.path().join("others");
+    let arguments = ["--backend", "reference", "--out", others.to_str().unwrap()];
+    tamper(&path, 2, 0);
+    tamper(&path, 5, 1);
+    let drawn = wildcity(&arguments, &path, twins.path());
+    let text = String::from_utf8(drawn.stdout).unwrap();
+    assert!(drawn.status.success() && text.contains("differs     step"), "{text}");
+    assert_eq!(std::fs::read_dir(&others).unwrap().count(), 24);
+
+    let failed = wildcity(&["--verify"], &path, twins.path());
+    assert_eq!(failed.status.code(), Some(1));
+    let error = String::from_utf8(failed.stderr).unwrap();
+    assert!(error.contains("step 2") && error.contains("\"front\""), "{error}");
+    running.stop().await;
+}

@@ -1,0 +1,98 @@
+//! `wildcity rig`: every preset is shown, drawn, and true to its lenses.
+
+use std::process::{Command, Output};
+
+use wildcity_render::compare::points::Points;
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, View};
+use wildcity_scene::Rig;
+use wildcity_scene::geometry::Pose;
+
+use crate::images::cpu;
+
+fn wildcity(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_wildcity")).arg("rig").args(arguments).output().unwrap()
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&[&output.stdout[..], &output.stderr].concat()).into_owned()
+}
+
+#[test]
+fn presets_are_shown_checked_and_drawn() {
+    let dir = tempfile::tempdir().unwrap();
+    let names = said(&wildcity(&["show"]));
+    for name in Rig::preset_names() {
+        assert!(names.lines().any(|line| line == name), "{names}");
+        let cameras = Rig::preset(name).unwrap().cameras;
+        let shown = said(&wildcity(&["show", name]));
+        assert_eq!(shown.lines().count(), cameras.len() + 2, "{shown}");
+        let checked = wildcity(&["check", name, "--backend", "cpu"]);
+        assert!(checked.status.success(), "{}", said(&checked));
+        assert_eq!(said(&checked).lines().count(), cameras.len());
+        let picture = dir.path().join("rig.svg");
+        let drawn = wildcity(&["draw", name, "--out", picture.to_str().unwrap()]);
+        assert!(drawn.status.success(), "{}", said(&drawn));
+        let svg = std::fs::read_to_string(&picture).unwrap();
+        assert!(svg.starts_with("<svg"), "{svg}");
+        for camera in cameras {
+            assert!(svg.contains(&camera.name), "{} is not in the picture", camera.name);
+        }
+    }
+}
+
+#[test]
+fn the_surround_rig_looks_all_around() {
+    let shown = said(&wildcity(&["show", "surround6"]));
+    let yaw_of = |name: &str| {
+        let line = shown.lines().find(|line| line.split_whitespace().nth(1) == Some(name));
+        line.unwrap().split_whitespace().rev().nth(1).unwrap().parse::<f64>().unwrap()
+    };
+    for (name, yaw_deg) in [("front", 0.0), ("front_left", 55.0), ("back_right", -110.0)] {
+        assert!((yaw_of(name) - yaw_deg).abs() < 0.06, "{name}: {shown}");
+    }
+}
+
+#[test]
+fn what_is_no_rig_is_refused() {
+    let unknown = wildcity(&["check", "vehicle7"]);
+    assert_eq!(unknown.status.code(), Some(1));
+    let text = said(&unknown);
+    assert!(text.contains("neither a file nor a preset") && text.contains("vehicle6"), "{text}");
+}
+
+/// The f-theta cameras of a real car, at full size and at that which a model reads.
+#[test]
+fn a_real_cars_points_land_where_its_lenses_say() {
+    let cpu = cpu();
+    for mounted in Rig::preset("alpamayo2").unwrap().cameras {
+        let full = mounted.camera;
+        let small = full.scaled(576, 320).unwrap();
+        for (backend, camera) in [(&cpu as &dyn Backend, full), (&cpu, small), (&Reference, small)]
+        {
+            let view = View::new(camera, Pose::IDENTITY);
+            let Points { count, worst_px } = Points::of(backend, &view).unwrap();
+            let (name, width, drawn_by) = (&mounted.name, camera.width_px, backend.name());
+            eprintln!("{name}, {width} px wide, {drawn_by}: {worst_px:.3} px");
+            assert!(count > 20 && worst_px < 0.1, "{name}: {count} points, {worst_px} px");
+        }
+    }
+}
+
+#[test]
+fn a_camera_that_does_not_show_what_it_says_fails_the_check() {
+    // All around on 48 x 32 px: a point is as wide as its circle is round, and lands beside its middle.
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("rig.json");
+    let place = r#""camera_to_rig": {"xyz": [0, 0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}"#;
+    let coarse = r#""width": 48, "height": 32, "fx": 8, "fy": 8, "cx": 24, "cy": 16,
+        "lens": {"model": "fisheye", "k": [0, 0, 0, 0], "max_angle": 2.8}"#;
+    let fine = r#""width": 160, "height": 100, "fx": 90, "fy": 90, "cx": 80, "cy": 50"#;
+    let cameras = [("fine", fine), ("coarse", coarse)]
+        .map(|(name, camera)| format!(r#"{{"name": "{name}", {camera}, {place}}}"#));
+    let rig = format!(r#"{{"name": "car", "cameras": [{}]}}"#, cameras.join(", "));
+    std::fs::write(&path, rig).unwrap();
+    let checked = wildcity(&["check", path.to_str().unwrap(), "--backend", "cpu"]);
+    assert_eq!(checked.status.code(), Some(1), "{}", said(&checked));
+    assert!(said(&checked).contains("not where the lens says: coarse"), "{}", said(&checked));
+}

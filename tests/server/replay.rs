@@ -1,0 +1,99 @@
+//! Recorded episodes, rendered again.
+
+use std::path::{Path, PathBuf};
+
+use wildcity_render::Backend;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_session::{Extent, FrameRequest, Recording, ReplayError, Report};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
+
+use crate::episodes::{drive, tamper};
+use crate::support::{Painter, TestServer};
+
+async fn recorded() -> (TestServer, PathBuf) {
+    let server = TestServer::start().await;
+    drive(&mut server.driver("a").await).await;
+    let path = server.recorded().remove(0);
+    (server, path)
+}
+
+pub(crate) fn replay(
+    server: &TestServer,
+    path: &Path,
+    backend: &dyn Backend,
+) -> Result<Report, ReplayError> {
+    let recording = Recording::read(path)?;
+    let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
+    let mut open = |version| cache.open(&recording.header.twin, Some(version));
+    recording.replay(&mut open, backend, Extent::FirstDifference, &mut |_| Ok(()))
+}
+
+#[tokio::test]
+async fn what_was_recorded_is_rendered_again() {
+    let (server, path) = recorded().await;
+    let report = replay(&server, &path, &Painter::default()).unwrap();
+    assert_eq!(report, Report { images: 24, changes: vec![], strayed: None, difference: None });
+}
+
+#[tokio::test]
+async fn the_first_differing_image_is_named() {
+    let (server, path) = recorded().await;
+    tamper(&path, 8, 0);
+    tamper(&path, 4, 1);
+    let report = replay(&server, &path, &Painter::default()).unwrap();
+    let found = report.difference.unwrap();
+    assert_eq!((found.line, found.step, &*found.camera), (5, 4, "rear"));
+    assert_eq!(report.images, 8);
+
+    let (server, path) = recorded().await;
+    tamper(&path, 11, 2);
+    let found = replay(&server, &path, &Painter::default()).unwrap().difference.unwrap();
+    assert_eq!((found.request, found.pose, &*found.camera), (FrameRequest::Observe, 1, "front"));
+}
+
+#[tokio::test]
+async fn another_backend_is_noticed() {
+    let (server, path) = recorded().await;
+    let report = replay(&server, &path, &Cpu::new(1, Simd::Best).unwrap()).unwrap();
+    assert_eq!(report.changes.len(), 2);
+    let detail = &report.changes[1];
+    assert_eq!((detail.what, &*detail.recorded), ("backend detail", ""));
+    assert!(
+        ["Avx512", "Avx2", "Sse4_2", "Neon", "Fallback"].contains(&&*detail.now),
+        "{}",
+        detail.now
+    );
+    let change = &report.changes[0];
+    assert_eq!((change.what, &*change.recorded, &*change.now), ("backend", "painter", "cpu"));
+    assert_eq!(report.difference.unwrap().step, 1);
+}
+
+#[tokio::test]
+async fn damaged_files_are_named_by_line() {
+    let (server, path) = recorded().await;
+    let whole = std::fs::read_to_string(&path).unwrap();
+    let lines: Vec<&str> = whole.lines().collect();
+    let damaged = |text: &str| {
+        std::fs::write(&path, text).unwrap();
+        match Recording::read(&path) {
+            Err(ReplayError::Line { line, reason, .. }) => (line, reason),
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(damaged("").0, 1);
+    assert_eq!(damaged(lines[0]).0, 1, "no end of line");
+    assert_eq!(damaged(&whole[..whole.len() - 30]).0, lines.len());
+    assert_eq!(damaged(&whole.replace("\"step\":3", "\"step\":x")).0, 4);
+    assert_eq!(damaged(&lines[1..].join("\n")).0, 1);
+    assert_eq!(damaged(&format!("{whole}{}\n", lines[1])).0, lines.len() + 1);
+    assert_eq!(damaged(&format!("{}\n{}\n", lines[0], lines[0])).0, 2);
+    let (line, reason) = damaged(&whole.replace("\"format\":0", "\"format\":7"));
+    assert!(line == 1 && reason.contains('7'), "{reason}");
+    let (line, reason) = damaged(&format!("{}\n\"{}\"\n", lines[0], "x".repeat(2 << 20)));
+    assert!(line == 2 && reason.contains("longer"), "{reason}");
+    assert!(matches!(Recording::read(Path::new("/nowhere.jsonl")), Err(ReplayError::Read { .. })));
+    // Without its last line, the episode of a killed server can still be replayed.
+    std::fs::write(&path, lines[..lines.len() - 1].join("\n") + "\n").unwrap();
+    assert_eq!(replay(&server, &path, &Painter::default()).unwrap().difference, None);
+}

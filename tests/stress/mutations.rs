@@ -1,0 +1,469 @@
+//! The stress table on the cpu backend and on the definition, and that its bounds can be missed.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use glam::{DQuat, DVec3};
+use wildcity_render::compare::blobs::{Blob, ahead, scene};
+use wildcity_render::compare::drawing::{crop, cut, draw};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
+use wildcity_scene::chunk::{ActiveRecord, column, columns};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::Lens;
+use wildcity_scene::record::recorded;
+use wildcity_scene::{Chunk, Record, RenderProfile, Scene};
+use wildcity_stress::table::{self, Candidate};
+use wildcity_stress::{CASES, Case, Check, Verdict};
+
+use crate::images::{agree, cpu, render_one};
+
+fn case(number: &str) -> &'static Case {
+    CASES.iter().find(|case| case.number == number).unwrap()
+}
+
+/// Makes sure that every case holds, but for those that take gigabytes.
+fn all_hold(backend: &dyn Backend) {
+    let outcomes = CASES.iter().map(|case| case.run(backend, false));
+    let wrong = outcomes.filter(|outcome| match outcome.verdict {
+        Verdict::Held => outcome.checks == 0 || outcome.strain > 1.0,
+        Verdict::NotRun => !NOT_RUN.contains(&outcome.case),
+        Verdict::Missed | Verdict::Refused => true,
+    });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+/// What takes gigabytes.
+const NOT_RUN: &[&str] = &["T21"];
+
+#[test]
+fn the_table_holds_on_the_cpu_backend() {
+    all_hold(&cpu());
+}
+
+#[test]
+fn the_table_holds_on_the_definition() {
+    all_hold(&Reference);
+}
+
+#[test]
+fn cases_are_numbered_in_order() {
+    for (index, case) in CASES.iter().enumerate() {
+        assert_eq!(case.number, format!("T{}", index + 1));
+    }
+}
+
+#[test]
+#[ignore = "gigabytes of memory and a minute: cargo test --release --test render t21 -- --ignored"]
+fn t21_seventy_million_sort_keys() {
+    let outcome = case("T21").run(&cpu(), true);
+    assert_eq!(outcome.verdict, Verdict::Held, "{outcome:?}");
+}
+
+/// A backend, and what goes wrong with it.
+struct Faulty<'a> {
+    inner: &'a dyn Backend,
+    fault: Fault,
+    /// Drawings so far.
+    count: AtomicU32,
+}
+
+/// Faults of the kinds that renderers had.
+#[derive(Clone, Copy, Debug)]
+enum Fault {
+    /// Everything is culled.
+    Culled,
+    /// Thin things are a little wider.
+    Blur,
+    /// What is nearer than near is drawn.
+    Near,
+    /// What is behind is drawn as if it were ahead.
+    Mirror,
+    /// What is beyond a lens' fold is drawn where its polynomial puts it.
+    Folded,
+    /// Of equal depths the higher id is in front.
+    Reversed,
+    /// Drawings differ by an ulp or two in one value.
+    Restless,
+    /// Every other drawing is darker by a hundredth.
+    Flicker,
+    /// Everything is paler by a twentieth.
+    Pale,
+    /// Another cap, and another stop.
+    Rules,
+    /// Centres are off by what 20 bits of a cell tell, so that neighbours change places in depth.
+    Places,
+    /// The pose is taken in f32.
+    PoseF32,
+    /// The slope clamp is that of an image twice as wide.
+    Clamp,
+    /// The principal point is taken to be in the middle.
+    Centred,
+    /// The last pixel of the image is never written.
+    Unwritten,
+    /// The background is another.
+    Background,
+    /// One byte of the background is another.
+    Byte,
+    /// What a lens does not see is drawn.
+    Unmasked,
+    /// All rows are exposed at once.
+    Global,
+    /// A lens is taken for its pinhole.
+    Straight,
+    /// One tile lists a Gaussian twice.
+    Twice,
+}
+
+impl Backend for Faulty<'_> {
+    /// The name of what is faulty: the definition's is compared with nothing.
+    fn name(&self) -> &'static str {
+        self.inner.name()
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        let count = self.count.fetch_add(1, Relaxed);
+        let (mut scene, mut profile) = (frame.scene.clone(), *frame.profile);
+        let mut views = frame.views.to_vec();
+        match self.fault {
+            Fault::Culled => scene = Scene::default(),
+            Fault::Blur => profile.blur *= 1.2,
+            Fault::Near => profile.near *= 0.5,
+            Fault::Rules => (profile.alpha_cap, profile.stop) = (0.995, 2.0 * profile.stop),
+            Fault::Places => scene = recorded(&scene, Record::Q24).scene,
+            Fault::Mirror => views.iter_mut().for_each(|view| {
+                let turned = DQuat::from_rotation_y(std::f64::consts::PI);
+                view.world_from_camera.rotation *= turned;
+            }),
+            Fault::Folded => {
+                scene = views.iter_mut().fold(scene, |scene, view| folded(&scene, view))
+            }
+            Fault::Reversed => scene = remade(&scene, &mut |_, rows| rows.reverse()),
+            Fault::Centred => views.iter_mut().for_each(|view| {
+                let camera = &mut view.camera;
+                camera.pinhole.cx = 0.5 * f64::from(camera.width_px);
+                camera.pinhole.cy = 0.5 * f64::from(camera.height_px);
+            }),
+            Fault::PoseF32 => views.iter_mut().for_each(|view| {
+                let position_m = &mut view.world_from_camera.position_m;
+                *position_m = position_m.as_vec3().as_dvec3();
+            }),
+            Fault::Straight => views.iter_mut().for_each(|view| view.camera.lens = Lens::Pinhole),
+            Fault::Global => views.iter_mut().for_each(|view| view.rolling = None),
+            _ => {}
+        }
+        if let Fault::Clamp = self.fault {
+            let [view] = views[..] else { panic!("one view") };
+            let [width, height] = [view.camera.width_px, view.camera.height_px];
+            let wide = crop(view, [-(width as i32), 0], [3 * width, height]);
+            let drawing = draw(self.inner, &scene, &profile, &[wide])?.remove(0);
+            let rgba = cut(&drawing, 3 * width, [width, 0], [width, height]);
+            self.inner.render(frame, targets, finished)?;
+            targets[0].rgba.as_mut().unwrap().copy_from_slice(&rgba);
+            return Ok(FrameStats::default());
+        }
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let mut stats = self.inner.render(&frame, targets, finished)?;
+        stats.instances += u64::from(matches!(self.fault, Fault::Twice));
+        for target in targets {
+            let Target { rgba: Some(rgba), rgb8: Some(rgb8), opacity: Some(opacity), .. } = target
+            else {
+                continue;
+            };
+            let middle = rgba.len() / 2;
+            let darken =
+                |values: &mut [f32], share: f32| values.iter_mut().for_each(|v| *v *= share);
+            match self.fault {
+                Fault::Restless => rgba[middle] += f32::EPSILON * (count % 3) as f32,
+                Fault::Flicker if count % 2 == 1 => {
+                    darken(opacity, 0.99);
+                    rgba.iter_mut().for_each(|v| *v = 0.99 * *v - 1e-3);
+                }
+                Fault::Pale => {
+                    darken(rgba, 0.95);
+                    darken(opacity, 0.95);
+                }
+                Fault::Background => rgba[middle] += 2e-3,
+                Fault::Byte => rgb8[0] ^= 1,
+                Fault::Unmasked => opacity.iter_mut().for_each(|o| *o = o.max(0.01)),
+                Fault::Unwritten => {
+                    *rgba.last_mut().unwrap() = f32::NAN;
+                    *opacity.last_mut().unwrap() = f32::NAN;
+                }
+                _ => {}
+            }
+        }
+        Ok(stats)
+    }
+}
+
+/// The same Gaussians, after `edit` of each chunk's origin in metres and its rows of columns.
+fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Scene {
+    let again = scene.chunks.iter().map(|chunk| {
+        let width = columns(chunk.sh_degree());
+        let row = |i| (0..width).map(|c| chunk.value(i, c)).collect::<Vec<f32>>();
+        let mut rows: Vec<_> = (0..chunk.len()).map(row).collect();
+        edit(chunk.origin_m(), &mut rows);
+        let (cell, origin_m) = (chunk.cell(), chunk.origin_m());
+        let mut again = Chunk::new(cell, origin_m, chunk.sh_degree(), rows.len());
+        for row in &rows {
+            again.push_active(&ActiveRecord {
+                mean_m: row[column::MEAN..][..3].try_into().unwrap(),
+                scale_m: row[column::SCALE..][..3].try_into().unwrap(),
+                quat_wxyz: row[column::QUAT..][..4].try_into().unwrap(),
+                log2_opacity: row[column::LOG2_OPACITY],
+                sh: &row[column::SH..],
+            });
+        }
+        Arc::new(again)
+    });
+    Scene { chunks: again.collect(), sky: scene.sky.clone() }
+}
+
+/// What an OpenCV lens makes of a scene if its polynomial is trusted everywhere, for its pinhole: of a camera
+/// at the origin that looks along +z.
+fn folded(scene: &Scene, view: &mut View) -> Scene {
+    let Lens::OpenCv(lens) = view.camera.lens else { return scene.clone() };
+    view.camera.lens = Lens::Pinhole;
+    let [k1, k2, k3, ..] = lens.k();
+    remade(scene, &mut |origin_m, rows| {
+        for mean_m in rows.iter_mut().map(|row| &mut row[column::MEAN..][..3]) {
+            let at_m = origin_m + DVec3::new(mean_m[0].into(), mean_m[1].into(), mean_m[2].into());
+            let r2 = (at_m.truncate() / at_m.z).length_squared();
+            let factor = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+            let moved_m = (factor * at_m.truncate()).extend(at_m.z) - origin_m;
+            mean_m.copy_from_slice(&moved_m.as_vec3().to_array());
+        }
+    })
+}
+
+use Fault::{
+    Background, Blur, Byte, Centred, Clamp, Culled, Flicker, Folded, Global, Mirror, Near, Pale,
+    Places, PoseF32, Restless, Reversed, Rules, Straight, Twice, Unmasked, Unwritten,
+};
+
+/// Faults of each case, and the checks that must miss each, by a part of what they look at.
+const PLANTED: &[(&str, Fault, &[&str])] = &[
+    ("T1", Culled, &[": seen"]),
+    ("T1", Blur, &["opacity off by"]),
+    ("T1", Unmasked, &["the cut off by"]),
+    ("T2", Clamp, &["as f64"]),
+    ("T2", Culled, &["some reach into the image"]),
+    ("T3", Culled, &["opacity from 0.9"]),
+    ("T3", Flicker, &["as f64"]),
+    ("T3", Twice, &["in the list of each tile"]),
+    ("T4", Near, &["drawn as near says", "as f64"]),
+    ("T5", Mirror, &["behind: opacity", "as f64"]),
+    ("T5", Culled, &["inside: seen"]),
+    ("T6", Reversed, &["the first of each pair is in front", "as f64"]),
+    ("T6", Restless, &["100 drawings"]),
+    ("T7", Places, &["the nearer one is in front", "as f64"]),
+    ("T8", Culled, &["it pops"]),
+    ("T8", Pale, &["apart", "as f64"]),
+    ("T9", Culled, &["something is seen"]),
+    ("T9", PoseF32, &["off by"]),
+    ("T10", Flicker, &["drawn: dB"]),
+    ("T11", Rules, &["off the cap by"]),
+    ("T11", Unmasked, &[": opacity", "off 0 and 1/255 by"]),
+    ("T11", Culled, &["above the logit of 1/255: seen"]),
+    ("T11", Pale, &["as f64"]),
+    ("T11", Flicker, &["monotone"]),
+    ("T12", Culled, &["it is seen"]),
+    ("T12", Flicker, &["neighbours off by", "as f64"]),
+    ("T13", Blur, &["as f64"]),
+    ("T13", Pale, &["centre's opacity from 0.9"]),
+    ("T14", Restless, &["20 drawings"]),
+    ("T14", Pale, &["as f64"]),
+    ("T15", Restless, &["the small frame after it", "and so has the large one"]),
+    ("T15", Pale, &["as f64"]),
+    ("T16", Background, &["every value is 0", "off the background by"]),
+    ("T16", Byte, &["every byte is the background's"]),
+    ("T16", Unmasked, &["no opacity and no depth"]),
+    ("T16", Culled, &["one: seen"]),
+    ("T16", Unwritten, &["as f64", "is finite"]),
+    ("T17", Culled, &["something is seen"]),
+    ("T17", Unwritten, &["off by"]),
+    ("T18", Culled, &[": seen"]),
+    ("T18", Centred, &["off the whole by", "as f64"]),
+    ("T19", Rules, &["layers of 0.9", "layers of 1,", "as f64"]),
+    ("T19", Pale, &["thin layers"]),
+    ("T20", Places, &["as f64"]),
+    ("T22", Straight, &["centre off by", "spread along x off", "spread along y off", "as f64"]),
+    ("T22", Straight, &["spread along xy off"]),
+    ("T23", Mirror, &["nothing of what is behind"]),
+    ("T23", Unmasked, &["pixels wrong about the lens' field"]),
+    ("T23", Straight, &["seen at 100°", "as f64"]),
+    ("T23", Folded, &["opacity of what is mirrored"]),
+    ("T23", Culled, &["within the fold: seen"]),
+    ("T24", Global, &["row by row: dB", "as f64"]),
+    ("T25", Culled, &["seen"]),
+    ("T25", Flicker, &["off by", "as f64"]),
+    ("T26", Culled, &[": seen", "as f64"]),
+    ("T27", Places, &["as f64"]),
+    ("T27", Culled, &["it is covered"]),
+    ("T28", Pale, &["the fog lets through", "as f64"]),
+];
+
+/// What no fault of a backend reaches: the record's own bound, which a coarser record misses in the unit
+/// tests of `report/stress/places.rs`.
+const OUT_OF_REACH: (&str, &str) = ("T10", "centres off by m");
+
+/// Plants every fault in a backend, and makes sure that each check that it must miss is missed, and that
+/// nothing that the backend is held to is left without a fault.
+fn every_check_can_be_missed(backend: &dyn Backend) {
+    let sound: Vec<(&str, Vec<Check>)> = CASES
+        .iter()
+        .filter(|case| !NOT_RUN.contains(&case.number))
+        .map(|case| (case.number, case.checks(backend).unwrap()))
+        .collect();
+    let mut wrong = Vec::new();
+    for &(number, fault, wanted) in PLANTED {
+        let (_, sound) = sound.iter().find(|(case, _)| *case == number).unwrap();
+        // The definition is not held to itself.
+        let looked_at = |part: &str| sound.iter().any(|check| check.what.contains(part));
+        let (wanted, stale): (Vec<&str>, Vec<&str>) =
+            wanted.iter().partition(|part| looked_at(part));
+        if backend.name() != Reference.name() {
+            wrong.extend(
+                stale.iter().map(|part| format!("{number} looks at nothing like {part:?}")),
+            );
+        }
+        if wanted.is_empty() {
+            continue;
+        }
+        let faulty = Faulty { inner: backend, fault, count: AtomicU32::new(0) };
+        let checks = case(number).checks(&faulty).unwrap();
+        for part in wanted {
+            let missed = checks.iter().any(|check| check.what.contains(part) && !check.holds());
+            if !missed {
+                let own = checks.iter().filter(|check| check.what.contains(part));
+                let own: Vec<String> = own.take(4).map(Check::to_string).collect();
+                wrong.push(format!("{number}: {fault:?} goes unnoticed by {part:?}: {own:?}"));
+            }
+        }
+    }
+    for (number, checks) in &sound {
+        let parts: Vec<&str> = PLANTED
+            .iter()
+            .filter(|(case, ..)| case == number)
+            .flat_map(|(_, _, wanted)| wanted.iter().copied())
+            .collect();
+        for check in checks {
+            // One line of code for all cases, of which T16 has the fault.
+            let is_planted = parts.iter().any(|part| check.what.contains(part))
+                || check.what.ends_with("every value is finite")
+                || (*number == OUT_OF_REACH.0 && check.what == OUT_OF_REACH.1);
+            if !is_planted {
+                wrong.push(format!("{number}: no fault for {:?}", check.what));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+/// A bound that cannot be missed proves nothing.
+#[test]
+fn every_bound_can_be_missed() {
+    every_check_can_be_missed(&cpu());
+}
+
+/// Nor do the numbers that alone hold the definition.
+#[test]
+fn every_bound_of_the_definition_can_be_missed() {
+    every_check_can_be_missed(&Reference);
+}
+
+/// A backend of some name that refuses everything.
+struct Refusing(&'static str, RenderError);
+
+impl Backend for Refusing {
+    fn name(&self) -> &'static str {
+        self.0
+    }
+
+    fn render(
+        &self,
+        _: &Frame<'_>,
+        _: &mut [Target<'_>],
+        _: Finished<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        Err(self.1.clone())
+    }
+}
+
+const TOO_MANY: RenderError = RenderError::TooMany { what: "splats", limit: 65_535 };
+
+#[test]
+fn a_refusal_is_a_limit_of_devices_alone_and_where_a_case_names_it() {
+    let verdict = |number: &str, name, error| case(number).run(&Refusing(name, error), false);
+    let refused = verdict("T28", "gpu", TOO_MANY);
+    assert_eq!(refused.verdict, Verdict::Refused);
+    assert!(refused.told.contains("65535"), "{}", refused.told);
+    assert_eq!(verdict("T28", "cpu", TOO_MANY).verdict, Verdict::Missed);
+    assert_eq!(verdict("T3", "gpu", TOO_MANY).verdict, Verdict::Missed);
+    let lost = RenderError::Device { device: "a card".to_owned(), reason: "lost".to_owned() };
+    assert_eq!(verdict("T28", "gpu", lost).verdict, Verdict::Missed);
+}
+
+#[test]
+#[ignore = "gigabytes of memory: cargo test --release --test render t21 -- --ignored"]
+fn t21_may_be_refused_by_a_device() {
+    let run = |name| case("T21").run(&Refusing(name, TOO_MANY), true).verdict;
+    assert_eq!(run("gpu"), Verdict::Refused);
+    assert_eq!(run("cpu"), Verdict::Missed);
+}
+
+#[test]
+fn the_table_says_what_was_refused_and_what_was_drawn_instead() {
+    let backends: [Candidate; 2] =
+        [Ok(Box::new(Reference)), Ok(Box::new(Refusing("gpu", TOO_MANY)))];
+    let table = table::run(&[case("T17"), case("T28")], &backends, false, &mut |_, _| {});
+    let text = table.to_string();
+    let line = |number: &str| text.lines().find(|line| line.starts_with(number)).unwrap();
+    assert!(line("T17").starts_with("T17  held (1921 x 1081 px)  MISSED    "), "{text}");
+    assert!(line("T28").starts_with("T28  held                   refused   "), "{text}");
+    assert!(text.contains(&format!("gpu: {TOO_MANY}")), "{text}");
+    assert!(text.ends_with("2 held, 1 refused, 1 missed, 0 not run\n"), "{text}");
+}
+
+#[test]
+fn too_much_is_refused_and_the_next_frame_is_right() {
+    // 400,000 tiles of an 10,240 px square times 340 walls are beyond 2^27 pairs.
+    let wall = || Blob { sigma_m: DVec3::splat(1e3), opacity: 0.01, ..Blob::default() };
+    let walls: Vec<Blob> = (0..340).map(|_| wall()).collect();
+    let (backend, profile) = (cpu(), RenderProfile::default());
+    let view = ahead([10_240, 10_240], 300.0);
+    let small = ahead([64, 48], 50.0);
+    let walls = scene(&walls);
+    let fresh = render_one(&backend, &walls, &profile, small);
+    let mut opacity = vec![7.0; view.camera.pixels()];
+    let target = Target { opacity: Some(&mut opacity), ..Target::default() };
+    let frame = Frame { scene: &walls, profile: &profile, views: &[view] };
+    let refused = backend.render(&frame, &mut [target], &|_, _| {}).unwrap_err();
+    assert!(matches!(refused, RenderError::TooMany { .. }), "{refused}");
+    assert!(opacity.iter().all(|&o| o == 7.0), "nothing was written");
+    assert!(render_one(&backend, &walls, &profile, small) == fresh);
+}
+
+#[test]
+fn a_pose_turns_and_moves_the_image() {
+    // A blob ahead of a camera that looks along +x lies in the middle of its image.
+    let east = Pose {
+        position_m: DVec3::new(3.0, 0.0, 0.0),
+        rotation: DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2),
+    };
+    let view = View { world_from_camera: east, ..ahead([65, 65], 100.0) };
+    let blob = scene(&[Blob { mean_m: DVec3::new(8.0, 0.0, 0.0), ..Blob::default() }]);
+    let profile = RenderProfile::default();
+    let image = render_one(&cpu(), &blob, &profile, view);
+    agree(&image, &render_one(&Reference, &blob, &profile, view)).unwrap();
+    let brightest = image.opacity.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1)).unwrap().0;
+    assert_eq!(brightest, 32 * 65 + 32);
+    assert!((image.depth_m[brightest] - 5.0).abs() < 1e-4);
+}

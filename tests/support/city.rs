@@ -1,0 +1,40 @@
+//! Two thin kilometres of a procedural city, with all levels of detail.
+
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
+use std::sync::OnceLock;
+
+use wildcity_generate::CitySettings;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{RenderProfile, Rig, Trajectory};
+use wildcity_twin::store::{Catalog, Kind, Settings, Storage};
+
+pub(crate) struct City {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) drive: Trajectory,
+}
+
+/// Two thin kilometres, all levels of detail.
+pub(crate) fn city() -> &'static City {
+    static CITY: OnceLock<City> = OnceLock::new();
+    CITY.get_or_init(|| {
+        let settings =
+            CitySettings { seed: 3, length_m: 2_000.0, millions_per_km: 1.0, speed_m_s: 30.0 };
+        let dir = tempfile::tempdir().unwrap();
+        let catalog = Catalog::open(dir.path()).unwrap();
+        let mut commit = catalog.begin("city", Kind::Import, Storage::default()).unwrap();
+        for cell in wildcity_generate::city(&settings).unwrap() {
+            commit.put(&cell.gaussians, None, &mut |_, _| {}).unwrap();
+        }
+        let drive = wildcity_generate::city_drive(&settings).unwrap();
+        let settings = Settings {
+            profile: RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT },
+            rig: Rig::preset("vehicle6"),
+            trajectories: vec![drive.clone()],
+            sky: None,
+            provenance: Provenance::of("test".into()),
+        };
+        commit.replace(None, settings).unwrap();
+        City { dir, drive }
+    })
+}

@@ -1,0 +1,43 @@
+//! Versions of a small twin, and what lies on disk of it.
+
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
+use std::path::{Path, PathBuf};
+
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{Gaussians, Record};
+use wildcity_twin::store::{Catalog, NewVersion, Storage, StoreError, Version};
+
+/// A version of twin "street" with nothing but Gaussians.
+pub(crate) fn street(gaussians: &Gaussians) -> NewVersion<'_> {
+    let storage = Storage { record: Record::F32, levels: false };
+    let provenance = Provenance::of("test".into());
+    NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
+}
+
+pub(crate) fn commit(dir: &Path, new: NewVersion<'_>) -> Result<Version, StoreError> {
+    Catalog::open(dir)?.commit(new, &mut |_, _| {})
+}
+
+/// All files below a directory, sorted.
+pub(crate) fn files(dir: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(dir).into_iter().flatten() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path));
+        } else {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The turn to publish versions of twin "street" in a directory, until it is dropped.
+pub(crate) fn turn(dir: &Path) -> std::fs::File {
+    let turn =
+        std::fs::File::options().append(true).open(dir.join(".staging/street.lock")).unwrap();
+    turn.lock().unwrap();
+    turn
+}
