@@ -105,14 +105,12 @@ impl Bin {
         self.tile_offsets.reserve(device, 4 * u64::from(sizes.tiles));
         self.ranges.reserve(device, 8 * u64::from(sizes.tiles));
         self.instances.reserve(device, 4 * sizes.instances);
-        let touches =
-            [&mut self.touch_macro_tiles, &mut self.touch_splats, &mut self.touch_masks];
+        let touches = [&mut self.touch_macro_tiles, &mut self.touch_splats, &mut self.touch_masks];
         for buffer in touches.into_iter().flatten() {
             buffer.reserve(device, 4 * sizes.touches);
         }
-        let capacity = |words: &GrowableBuffer| {
-            (words.buffer().size() / 4).min(Self::limit(device)) as u32
-        };
+        let capacity =
+            |words: &GrowableBuffer| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
         BinCapacity {
             touches: capacity(&self.touch_macro_tiles[0]),
             instances: capacity(&self.instances),

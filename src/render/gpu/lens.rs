@@ -44,7 +44,8 @@ impl Lenses {
             }
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
-        let buffer = self.buffer.get_or_insert_with(|| GrowableBuffer::new(device, "lenses", usage));
+        let buffer =
+            self.buffer.get_or_insert_with(|| GrowableBuffer::new(device, "lenses", usage));
         buffer.fill(device, bytemuck::cast_slice(&lenses));
     }
 
@@ -119,7 +120,8 @@ impl Lens {
         self.end = end as f32;
         self.end_value = polynomial.at(end) as f32;
         self.end_slope = polynomial.slope(end) as f32;
-        let scaled = polynomial.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
+        let scaled =
+            polynomial.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
         for (to, c) in self.coefficients.as_flattened_mut().iter_mut().zip(scaled.skip(1)) {
             *to = c as f32;
         }

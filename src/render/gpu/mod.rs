@@ -15,6 +15,7 @@
 //! which waits for it.
 
 mod background;
+mod bandwidth;
 mod bin;
 mod chain;
 mod device;
@@ -33,7 +34,6 @@ mod roofline;
 mod scan;
 pub mod shaders;
 mod sort;
-mod bandwidth;
 mod tickets;
 
 use std::time::Instant;
@@ -43,9 +43,9 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
+pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
-pub use bandwidth::FrameCounts;
 
 use self::chain::Chain;
 use self::device::Device;

@@ -54,7 +54,11 @@ impl Plan {
             splats: kernel("splats"),
             touches: kernel("touches"),
             instances: kernel("instances"),
-            frame: GrowableBuffer::new(device, "frame", BufferUsages::UNIFORM | BufferUsages::COPY_DST),
+            frame: GrowableBuffer::new(
+                device,
+                "frame",
+                BufferUsages::UNIFORM | BufferUsages::COPY_DST,
+            ),
             jobs: GrowableBuffer::new(device, "jobs", storage | BufferUsages::INDIRECT),
             counters: GrowableBuffer::new(device, "counters", storage | BufferUsages::COPY_SRC),
         };

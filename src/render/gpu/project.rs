@@ -166,9 +166,7 @@ fn visible(
         let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
         may_see(min_m, max_m, sigma_m)
     });
-    visible
-        .map(|(place, _)| ClusterPlace { page: place.page, line: place.lines.start })
-        .collect()
+    visible.map(|(place, _)| ClusterPlace { page: place.page, line: place.lines.start }).collect()
 }
 
 /// The splats of a region, and the keys by which they are sorted.
@@ -290,10 +288,10 @@ impl Project {
         let degree = usize::from(work.sh_degree.min(3));
         let needs = |projection| work.dispatches.iter().any(|d| d.projection == projection);
         let compile = |module: &ShaderModule| Kernels::new(device, module, degree);
-        let pinhole = needs(Projection::Pinhole)
-            .then(|| self.pinhole.variant(device, degree, compile));
-        let unscented = needs(Projection::Unscented)
-            .then(|| self.unscented.variant(device, degree, compile));
+        let pinhole =
+            needs(Projection::Pinhole).then(|| self.pinhole.variant(device, degree, compile));
+        let unscented =
+            needs(Projection::Unscented).then(|| self.unscented.variant(device, degree, compile));
 
         // The kernels and the input of each dispatch.
         let mut dispatches = Vec::with_capacity(work.dispatches.len());

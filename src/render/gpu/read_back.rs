@@ -1,7 +1,7 @@
 //! Reading a frame back: buffers in memory that the host can read, reused by later frames.
 
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use parking_lot::Mutex;

@@ -38,11 +38,7 @@ const fn choice(placeholder: &'static str, file: &'static str) -> Choice {
     Choice { placeholder, file }
 }
 
-const fn variant(
-    name: &'static str,
-    file: &'static str,
-    choices: &'static [Choice],
-) -> Variant {
+const fn variant(name: &'static str, file: &'static str, choices: &'static [Choice]) -> Variant {
     Variant { name, file, choices }
 }
 
@@ -146,12 +142,7 @@ impl Shaders {
 
 /// Appends a file with its imports, each file once. An import without a file is kept as it is, so that
 /// the shader compiler reports it.
-fn append(
-    name: &str,
-    choices: &[Choice],
-    appended: &mut Vec<&'static str>,
-    source: &mut String,
-) {
+fn append(name: &str, choices: &[Choice], appended: &mut Vec<&'static str>, source: &mut String) {
     let Some((name, text)) = FILES.iter().find(|(file, _)| *file == name) else {
         source.push_str(&format!("#import {name}\n"));
         return;

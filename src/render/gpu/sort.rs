@@ -88,11 +88,7 @@ impl Sort {
             &self.passes[..bits.div_ceil(DIGIT_BITS) as usize]
         {
             let to = 1 - from;
-            let counts = [
-                (0, jobs.keys.bind()),
-                (1, self.offsets.bind()),
-                (2, keys[from].bind()),
-            ];
+            let counts = [(0, jobs.keys.bind()), (1, self.offsets.bind()), (2, keys[from].bind())];
             histogram.run(device, pass, Groups::Job(jobs.keys), &counts);
             scan.run(device, pass, jobs.counters, self.offsets.buffer());
             let moved = [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];

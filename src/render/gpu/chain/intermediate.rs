@@ -214,11 +214,7 @@ fn counts(outputs: &StageOutputs) -> Counts {
     // No device has room for 2^32 or more, so the largest number is refused like them.
     let count = |length: usize| u32::try_from(length).unwrap_or(u32::MAX);
     let instances = outputs.tiles.as_ref().map_or(0, |tiles| tiles.instances.len());
-    Counts {
-        cluster_views: 0,
-        splats: count(outputs.splats.len()),
-        instances: count(instances),
-    }
+    Counts { cluster_views: 0, splats: count(outputs.splats.len()), instances: count(instances) }
 }
 
 fn shape(splat: &Splat) -> SplatShape {

@@ -240,11 +240,7 @@ impl Chain {
     }
 
     /// Uploads what the whole frame shares, and makes room for its pixels.
-    fn begin(
-        &mut self,
-        frame: &Frame<'_>,
-        outputs: &Outputs,
-    ) -> Result<CurrentFrame, RenderError> {
+    fn begin(&mut self, frame: &Frame<'_>, outputs: &Outputs) -> Result<CurrentFrame, RenderError> {
         let planes = outputs.planes;
         self.lenses.upload(&self.device, frame);
         self.rasterize.upload_background(&self.device, frame, &outputs.appearances)?;

@@ -67,7 +67,10 @@ mod tests {
                     assert_eq!(range.len(), wanted as usize);
                     let apart =
                         |other: &Range<u32>| range.end <= other.start || other.end <= range.start;
-                    assert!(range.end <= 1_000 && allocated.iter().all(apart), "{range:?} {allocated:?}");
+                    assert!(
+                        range.end <= 1_000 && allocated.iter().all(apart),
+                        "{range:?} {allocated:?}"
+                    );
                     allocated.push(range);
                 }
             } else if !allocated.is_empty() {
