@@ -4,7 +4,7 @@ use std::env;
 use std::path::PathBuf;
 
 use crate::cli::limits;
-use wildcity_twin::store::{CacheSettings, Catalog};
+use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
 /// `--twins`, for every command that has it.
 #[derive(Debug, clap::Args)]
@@ -32,11 +32,11 @@ impl Twins {
     }
 
     /// Where parts of remote twins are kept: nowhere without a home.
-    pub(super) fn cache(&self) -> Option<CacheSettings> {
+    pub(super) fn cache(&self) -> Option<DiskCacheSettings> {
         let limit_bytes = u64::from(self.cache_gib) << 30;
         let own = || Some(user_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
         let dir = self.cache_dir.clone().or_else(own)?;
-        (limit_bytes > 0).then_some(CacheSettings { dir, limit_bytes })
+        (limit_bytes > 0).then_some(DiskCacheSettings { dir, limit_bytes })
     }
 
     /// The place given, or the user's own directory.

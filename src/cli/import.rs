@@ -11,7 +11,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Record, RenderProfile, Rig, Trajectory};
 use wildcity_twin::ingest::{self, Axes};
-use wildcity_twin::store::{NewSky, NewVersion, Storage, StoreError};
+use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
 use super::profile_options::ProfileOptions;
@@ -150,7 +150,7 @@ impl Import {
             trajectories,
             sky: sky.map(NewSky::Put),
             provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
-            storage: Storage { record: self.record, levels: !self.no_lod },
+            storage: StorageOptions { record: self.record, levels: !self.no_lod },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
         // The file was sound, so what cannot be used now was made by the options.
@@ -193,7 +193,7 @@ fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
     for path in paths {
         let trajectory = read_trajectory(path)?;
         if read.iter().any(|before| before.name == trajectory.name) {
-            return Err(StoreError::TrajectoryName { name: trajectory.name })
+            return Err(StoreError::DuplicateTrajectory { name: trajectory.name })
                 .with_context(|| format!("{}", path.display()));
         }
         read.push(trajectory);

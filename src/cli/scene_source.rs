@@ -11,7 +11,7 @@ use wildcity_render::View;
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::ingest;
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
-use wildcity_twin::residency::{Cache, Pinned, Resident};
+use wildcity_twin::residency::{Cache, PinnedScene, Resident};
 
 use super::directories::{TwinVersion, Twins};
 use super::profile_options::{LoadedProfile, ProfileOptions};
@@ -64,7 +64,7 @@ pub(super) enum FrameScene<'a> {
     /// All of a file.
     Whole(Cow<'a, Scene>),
     /// The sections of a twin that the cameras need.
-    Needed(Pinned),
+    Needed(PinnedScene),
 }
 
 impl Deref for FrameScene<'_> {

@@ -20,7 +20,7 @@ use wildcity_render::{Backend, RenderError, View};
 use wildcity_scene::record::recorded;
 use wildcity_scene::sky::Drawn;
 use wildcity_scene::{Rays, RenderProfile, Scene};
-use wildcity_twin::residency::{Pinned, Resident};
+use wildcity_twin::residency::{PinnedScene, Resident};
 
 /// What is measured, and on what.
 pub struct Benchmark<'a> {
@@ -222,7 +222,7 @@ impl Benchmark<'_> {
         self.resident.version.manifest.profile
     }
 
-    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
+    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<PinnedScene, ReportError> {
         Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
     }
 

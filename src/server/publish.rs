@@ -13,7 +13,10 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, RenderProfile};
 use wildcity_session::{Changed, Engine, HeldLatest};
 use wildcity_twin::ingest::{self, IngestError};
-use wildcity_twin::store::{Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version};
+use wildcity_twin::store::{
+    Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
+    VersionSettings,
+};
 
 use super::Server;
 use super::fault::Fault;
@@ -339,8 +342,8 @@ fn commit(
 ) -> Result<Version, Fault> {
     let was = base.map(|base| &base.manifest);
     let record = ask.record.or(was.map(|was| was.record)).unwrap_or_default();
-    let storage = Storage { record, levels: ask.levels };
-    let mut commit = catalog.begin(&ask.twin, Kind::Push, storage)?;
+    let storage = StorageOptions { record, levels: ask.levels };
+    let mut commit = catalog.begin(&ask.twin, CommitKind::Push, storage)?;
     let only = match &ask.cells {
         AskedCells::These(cells) => Some(cells),
         AskedCells::Touched | AskedCells::All => None,
@@ -351,11 +354,12 @@ fn commit(
     Ok(match base {
         Some(base) if ask.cells != AskedCells::All => {
             let profile = (!ask.profile.is_empty()).then_some(new_profile);
-            let change = Change { profile, rig: None, trajectories: None, sky: None, provenance };
+            let change =
+                VersionChange { profile, rig: None, trajectories: None, sky: None, provenance };
             commit.change(base.number, change)?
         }
         _ => {
-            let settings = Settings {
+            let settings = VersionSettings {
                 profile: new_profile,
                 rig: was.and_then(|was| was.rig.clone()),
                 trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),

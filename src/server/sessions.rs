@@ -9,7 +9,7 @@ use tokio::time::{Instant, timeout};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{Frame, Outcome, Session};
-use wildcity_twin::residency::Eye;
+use wildcity_twin::residency::Viewpoint;
 
 use super::fault::Fault;
 
@@ -40,7 +40,7 @@ pub(super) struct About {
     pub(super) step: u64,
     pub(super) world_from_rig: Pose,
     /// What its next frame needs, if it stays where it is.
-    pub(super) eyes: Vec<Eye>,
+    pub(super) eyes: Vec<Viewpoint>,
 }
 
 /// A session with what a lost connection must not lose.

@@ -14,7 +14,7 @@ use crate::limits;
 use wildcity_render::Backend;
 use wildcity_scene::RenderProfile;
 use wildcity_twin::residency::{
-    Cache, Expectation, Eye, Lens, Reservation, ResidencyError, Resident, Stats, Urgency,
+    Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
 };
 use wildcity_twin::store::Catalog;
 
@@ -178,18 +178,18 @@ impl Engine {
         self: &Arc<Self>,
         twin: &str,
         number: u64,
-        frames: Vec<Vec<Eye>>,
+        frames: Vec<Vec<Viewpoint>>,
     ) -> Result<(), SessionError> {
         let resident = self.resident(twin.to_owned(), Some(number)).await?;
         let deadline = Instant::now() + limits::PREFETCH_TIMEOUT;
-        let expectation = Arc::new(Expectation::new(resident));
-        let expected = expectation.clone();
+        let prefetcher = Arc::new(Prefetcher::new(resident));
+        let expected = prefetcher.clone();
         let expect = move || {
             let places: Vec<_> = frames.into_iter().map(|eyes| (Urgency::Imminent, eyes)).collect();
             expected.prefetch(&places, &expected.resident().version.manifest.profile);
         };
         tokio::task::spawn_blocking(expect).await.map_err(|_| SessionError::Crashed)?;
-        while expectation.coming() > 0 && Instant::now() < deadline {
+        while prefetcher.pending() > 0 && Instant::now() < deadline {
             sleep(limits::PREPARE_POLL).await;
         }
         Ok(())
@@ -240,7 +240,7 @@ impl Engine {
     /// Sets aside the memory for the frames of a rig, if there is enough.
     pub(super) async fn reserve(
         resident: Arc<Resident>,
-        lens: Lens,
+        lens: RigExtent,
         profile: RenderProfile,
     ) -> Result<Reservation, SessionError> {
         let reserved = tokio::task::spawn_blocking(move || resident.reserve_with(lens, &profile));
@@ -248,12 +248,13 @@ impl Engine {
     }
 
     /// The most that a frame of a rig anywhere in the twin needs, in bytes.
-    pub(super) async fn worst_bytes(
+    pub(super) async fn worst_case_bytes(
         resident: Arc<Resident>,
-        lens: Lens,
+        lens: RigExtent,
         profile: RenderProfile,
     ) -> Result<u64, SessionError> {
-        let sought = tokio::task::spawn_blocking(move || resident.worst_bytes_with(lens, &profile));
+        let sought =
+            tokio::task::spawn_blocking(move || resident.worst_case_bytes_with(lens, &profile));
         sought.await.map_err(|_| SessionError::Crashed)
     }
 

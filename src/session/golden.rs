@@ -12,7 +12,7 @@ use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Chunk, Gaussians, Manifest, RenderProfile, Rig, Scene};
-use wildcity_twin::residency::{Needed, demand};
+use wildcity_twin::residency::{SectionRef, demand};
 use wildcity_twin::store::{Catalog, Version};
 
 use super::{Engine, SessionError, observation};
@@ -135,7 +135,9 @@ fn scene(
 ) -> Result<Scene, SessionError> {
     let chunks = &version.manifest.chunks;
     let mut scene = Scene::default();
-    for Needed { chunk, section } in demand(&version.manifest, &observation::eyes(views), profile) {
+    for SectionRef { chunk, section } in
+        demand(&version.manifest, &observation::eyes(views), profile)
+    {
         let entry = &chunks[chunk];
         if without.contains(&entry.cell) {
             continue;

@@ -37,7 +37,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{RigCamera, overlay_bytes};
 use wildcity_scene::{ProfileChanges, RenderProfile};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
-use wildcity_twin::residency::{Eye, Lens, Pinned, Reservation, Resident, Urgency};
+use wildcity_twin::residency::{PinnedScene, Reservation, Resident, RigExtent, Urgency, Viewpoint};
 
 pub use buffer::Buffer;
 pub use encode::Encoding;
@@ -283,7 +283,7 @@ impl Session {
         let lens = lens(self.layout.cameras());
         let profile = self.changes.apply(resident.version.manifest.profile)?;
         Engine::bake(resident.clone(), profile).await?;
-        let bytes = Engine::worst_bytes(resident.clone(), lens, profile).await?;
+        let bytes = Engine::worst_case_bytes(resident.clone(), lens, profile).await?;
         let trained = match &self.trained {
             Some(_) => Some(trained(&resident).await?),
             None => None,
@@ -316,7 +316,7 @@ impl Session {
     }
 
     /// What its next frame needs, if it stays where it is.
-    pub fn eyes(&self) -> Vec<Eye> {
+    pub fn eyes(&self) -> Vec<Viewpoint> {
         eyes(&View::of_rig(self.layout.cameras(), self.episode.world_from_rig()))
     }
 
@@ -471,17 +471,21 @@ impl Session {
 
     /// Has what is seen from some places loaded by others.
     fn expect(&self, places: Vec<(Urgency, Pose)>) {
-        let (expectation, layout) = (self.reservation.expectation().clone(), self.layout.clone());
+        let (prefetcher, layout) = (self.reservation.prefetcher().clone(), self.layout.clone());
         let profile = self.profile;
         self.lookout.look(move || {
             let eyes_at = |(urgency, pose)| (urgency, eyes(&View::of_rig(layout.cameras(), pose)));
             let places: Vec<_> = places.into_iter().map(eyes_at).collect();
-            expectation.prefetch(&places, &profile);
+            prefetcher.prefetch(&places, &profile);
         });
     }
 
     /// Waits until everything that a frame needs is in memory, all at once.
-    async fn pin(&self, deadline: Instant, eyes: Vec<Eye>) -> Result<Pinned, SessionError> {
+    async fn pin(
+        &self,
+        deadline: Instant,
+        eyes: Vec<Viewpoint>,
+    ) -> Result<PinnedScene, SessionError> {
         let (reply, answer) = oneshot::channel();
         let (resident, profile) = (self.resident().clone(), self.profile);
         let ask = move || {
@@ -489,22 +493,22 @@ impl Session {
                 // Nobody waits any more: the deadline has passed.
                 let _ = reply.send(pinned);
             });
-            resident.ask(&eyes, &profile, done)
+            resident.request(&eyes, &profile, done)
         };
-        let ticket =
+        let request =
             tokio::task::spawn_blocking(ask).await.map_err(|_| SessionError::Crashed)??;
         match timeout_at(deadline, answer).await {
             Ok(Ok(pinned)) => Ok(pinned?),
             Ok(Err(_)) => Err(SessionError::Crashed),
-            Err(_) => Err(ticket.late().into()),
+            Err(_) => Err(request.timeout_error().into()),
         }
     }
 }
 
 /// What of a rig decides how much memory its frames need.
-fn lens(cameras: &[RigCamera]) -> Lens {
+fn lens(cameras: &[RigCamera]) -> RigExtent {
     let eyes = eyes(&View::of_rig(cameras, Pose::IDENTITY));
-    Lens {
+    RigExtent {
         focal_px: eyes.iter().fold(0.0, |most, eye| eye.focal_px.max(most)),
         radius_m: eyes.iter().fold(0.0, |most, eye| eye.position_m.length().max(most)),
     }

@@ -20,7 +20,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::Field;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{RenderProfile, Scene};
-use wildcity_twin::residency::Eye;
+use wildcity_twin::residency::Viewpoint;
 
 use super::album::{Album, Shown};
 use super::buffer::Buffer;
@@ -505,9 +505,9 @@ impl Layout {
 }
 
 /// What decides how much detail the views need.
-pub fn eyes(views: &[View]) -> Vec<Eye> {
+pub fn eyes(views: &[View]) -> Vec<Viewpoint> {
     // Of a rolling shutter the end of its way: detail is chosen by distance alone, in every direction.
-    let eye = |view: &View| Eye {
+    let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };

@@ -26,7 +26,7 @@ use wildcity_session::{
     Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
 };
 use wildcity_twin::residency::{Cache, Resident};
-use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
 
 use crate::reported::{commit, commit_reaching, drive, rig};
 use crate::skies::demo_sky;
@@ -410,7 +410,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -452,7 +452,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: Record::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

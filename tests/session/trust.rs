@@ -12,7 +12,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Record, RenderProfile, Rig, Scene};
 use wildcity_session::{Trained, Trust};
-use wildcity_twin::store::{Catalog, NewVersion, Storage};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
 use crate::images::{Image, cpu, render};
 
@@ -120,7 +120,7 @@ fn pair() -> Pair {
     let dir = tempfile::tempdir().unwrap();
     let new = NewVersion {
         trajectories: vec![street.trajectory.clone()],
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();

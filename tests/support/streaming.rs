@@ -12,7 +12,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
-use wildcity_twin::residency::{Cache, Eye, Needed, Resident};
+use wildcity_twin::residency::{Cache, Resident, SectionRef, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, Version};
 
 use crate::images::{cpu, look, render};
@@ -67,8 +67,8 @@ pub(crate) fn views(world_from_rig: Pose) -> [View; 2] {
     [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
 }
 
-pub(crate) fn eyes(views: &[View]) -> Vec<Eye> {
-    let eye = |view: &View| Eye {
+pub(crate) fn eyes(views: &[View]) -> Vec<Viewpoint> {
+    let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };
@@ -82,9 +82,9 @@ pub(crate) fn pixels(scene: &Scene, world_from_rig: Pose) -> Vec<Vec<u8>> {
 }
 
 /// Bytes of memory that sections take.
-pub(crate) fn bytes(resident: &Resident, needed: &[Needed]) -> u64 {
+pub(crate) fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     let manifest = &resident.version.manifest;
-    let of = |n: &Needed| {
+    let of = |n: &SectionRef| {
         let count = manifest.chunks[n.chunk].sections[n.section].count;
         Chunk::bytes_of(manifest.sh_degree, count.into())
     };

@@ -121,7 +121,7 @@ impl Load {
 /// Reads all chunks of a version, one after the other, and looks at nothing.
 fn bare(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
     for chunk in &version.manifest.chunks {
-        catalog.skim(version, chunk)?;
+        catalog.read_and_discard(version, chunk)?;
     }
     Ok(())
 }

@@ -11,7 +11,9 @@ use wildcity_protocol::http::Refusal;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
+use wildcity_protocol::observation::{
+    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+};
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -253,7 +255,12 @@ fn past_tensor(session: &Session, past: &PastImage) -> String {
     format!("camera/{}/history/{}/rgb", session.cameras()[past.camera].name, past.back)
 }
 
-fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> Observation {
+fn metadata(
+    seq: u64,
+    session: &Session,
+    frame: &Frame,
+    image_names: &[String],
+) -> ObservationMetadata {
     let (episode, version) = (session.episode(), &session.resident().version);
     let time_us = episode.time_us();
     let (encoding, _) = encoding(session.encoding());
@@ -304,7 +311,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    Observation {
+    ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
@@ -350,9 +357,9 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::Model::Teleport,
-        Model::Kinematic => message::Model::Kinematic,
-        Model::Dynamic => message::Model::Dynamic,
+        Model::Teleport => message::DynamicsModel::Teleport,
+        Model::Kinematic => message::DynamicsModel::Kinematic,
+        Model::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

@@ -274,9 +274,9 @@ fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
         }
     };
     let model = match model {
-        message::Model::Teleport => Model::Teleport,
-        message::Model::Kinematic => Model::Kinematic,
-        message::Model::Dynamic => Model::Dynamic,
+        message::DynamicsModel::Teleport => Model::Teleport,
+        message::DynamicsModel::Kinematic => Model::Kinematic,
+        message::DynamicsModel::Dynamic => Model::Dynamic,
     };
     Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }

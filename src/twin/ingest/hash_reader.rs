@@ -3,12 +3,12 @@
 use std::io::{self, Read};
 
 /// A reader that hashes what passes through it.
-pub(super) struct Hashing<R> {
+pub(super) struct HashReader<R> {
     inner: R,
     hasher: blake3::Hasher,
 }
 
-impl<R> Hashing<R> {
+impl<R> HashReader<R> {
     /// Nothing read yet.
     pub(super) fn new(inner: R) -> Self {
         Self { inner, hasher: blake3::Hasher::new() }
@@ -20,7 +20,7 @@ impl<R> Hashing<R> {
     }
 }
 
-impl<R: Read> Read for Hashing<R> {
+impl<R: Read> Read for HashReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(buffer)?;
         self.hasher.update(&buffer[..read]);

@@ -6,12 +6,12 @@ use super::IngestError;
 
 /// What a scene has unpacked so far of how much.
 #[derive(Debug, Default)]
-pub(super) struct Budget {
+pub(super) struct UnpackBudget {
     packed: u64,
     unpacked: u128,
 }
 
-impl Budget {
+impl UnpackBudget {
     /// So many more compressed bytes were read.
     pub(super) fn read(&mut self, packed: u64) {
         self.packed = self.packed.saturating_add(packed);
@@ -42,7 +42,12 @@ pub(super) fn check(
     unpacked: u128,
 ) -> Result<(), IngestError> {
     if unpacked > u128::from(limit_bytes(packed)) {
-        return Err(IngestError::Bomb { format, place: place.into(), packed, unpacked });
+        return Err(IngestError::DecompressionBomb {
+            format,
+            place: place.into(),
+            packed,
+            unpacked,
+        });
     }
     Ok(())
 }

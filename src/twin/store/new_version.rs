@@ -7,7 +7,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
 
 use super::catalog::check_name;
 use super::sky::NewSky;
-use super::{Catalog, Kind, Settings, Storage, StoreError, Version};
+use super::{Catalog, CommitKind, StorageOptions, StoreError, Version, VersionSettings};
 
 /// What a new version of a twin consists of.
 #[derive(Clone, Debug)]
@@ -27,7 +27,7 @@ pub struct NewVersion<'a> {
     /// Where they come from.
     pub provenance: Provenance,
     /// How they are stored.
-    pub storage: Storage,
+    pub storage: StorageOptions,
 }
 
 impl<'a> NewVersion<'a> {
@@ -41,7 +41,7 @@ impl<'a> NewVersion<'a> {
             trajectories: Vec::new(),
             sky: None,
             provenance,
-            storage: Storage::default(),
+            storage: StorageOptions::default(),
         }
     }
 }
@@ -62,9 +62,9 @@ impl Catalog {
             new;
         check_name(name)?;
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
-        let settings = Settings { profile, rig, trajectories, sky, provenance };
+        let settings = VersionSettings { profile, rig, trajectories, sky, provenance };
         settings.check()?;
-        let mut commit = self.begin(name, Kind::Import, storage)?;
+        let mut commit = self.begin(name, CommitKind::Import, storage)?;
         commit.put(gaussians, None, progress)?;
         commit.replace(None, settings)
     }

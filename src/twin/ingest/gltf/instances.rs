@@ -9,7 +9,7 @@ use super::bad;
 use super::document::{Document, Mesh, Node};
 
 /// A mesh of a node.
-pub(super) struct Placed<'a> {
+pub(super) struct MeshInstance<'a> {
     pub(super) node: usize,
     /// Which mesh of the document, and the mesh.
     pub(super) index: usize,
@@ -18,7 +18,7 @@ pub(super) struct Placed<'a> {
 }
 
 /// All meshes of the scene, in the order of its tree.
-pub(super) fn meshes(document: &Document) -> Result<Vec<Placed<'_>>, IngestError> {
+pub(super) fn mesh_instances(document: &Document) -> Result<Vec<MeshInstance<'_>>, IngestError> {
     let scene = document.scenes.get(document.scene.unwrap_or(0));
     // Without scenes everything that is no child of another is shown.
     let roots = scene.map_or_else(|| roots(document), |scene| scene.nodes.clone());
@@ -36,7 +36,7 @@ pub(super) fn meshes(document: &Document) -> Result<Vec<Placed<'_>>, IngestError
         if let Some(own) = node.mesh {
             let mesh = document.meshes.get(own);
             let mesh = mesh.ok_or_else(|| bad(&place, "its mesh is not there".into()))?;
-            placed.push(Placed { node: index, index: own, mesh, scene_from_mesh });
+            placed.push(MeshInstance { node: index, index: own, mesh, scene_from_mesh });
         }
     }
     Ok(placed)
@@ -63,7 +63,7 @@ fn parent_from_node(node: &Node) -> DMat4 {
     )
 }
 
-impl Placed<'_> {
+impl MeshInstance<'_> {
     /// Puts Gaussians of the mesh there. The identity changes no bit.
     pub(super) fn apply(&self, gaussians: &mut Gaussians) -> Result<(), IngestError> {
         if self.scene_from_mesh == DMat4::IDENTITY {

@@ -5,7 +5,7 @@ use std::io::{self, BufRead, Read};
 use super::Progress;
 
 /// A reader that reports how far it is each time so many bytes have passed.
-pub(super) struct Told<'a, R> {
+pub(super) struct ProgressReader<'a, R> {
     inner: R,
     done: u64,
     told: u64,
@@ -16,7 +16,7 @@ pub(super) struct Told<'a, R> {
 /// Bytes between two reports.
 const REPORT_EVERY_BYTES: u64 = 1 << 20;
 
-impl<'a, R> Told<'a, R> {
+impl<'a, R> ProgressReader<'a, R> {
     /// Of a file of a known size.
     pub(super) fn new(inner: R, file_bytes: u64, progress: Progress<'a>) -> Self {
         Self { inner, done: 0, told: 0, file_bytes, progress }
@@ -31,7 +31,7 @@ impl<'a, R> Told<'a, R> {
     }
 }
 
-impl<R: Read> Read for Told<'_, R> {
+impl<R: Read> Read for ProgressReader<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(buffer)?;
         self.add(read);
@@ -39,7 +39,7 @@ impl<R: Read> Read for Told<'_, R> {
     }
 }
 
-impl<R: BufRead> BufRead for Told<'_, R> {
+impl<R: BufRead> BufRead for ProgressReader<'_, R> {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
         self.inner.fill_buf()
     }

@@ -119,7 +119,8 @@ async fn a_new_session_can_follow_one_that_is_gone() {
 #[tokio::test]
 async fn another_client_can_take_a_session_over() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed"), SEEN]]).await;
-    let (mut client, resumed) = Client::resume(&server.url, "test", "run-17", 4).await.unwrap();
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let resumed = client.resume("run-17", 4).await.unwrap();
     assert_eq!((resumed.last_seq, client.next_seq()), (4, 5));
     assert_eq!(client.step(HERE).await.unwrap().metadata().seq, 5);
 }
@@ -127,7 +128,8 @@ async fn another_client_can_take_a_session_over() {
 #[tokio::test]
 async fn numbers_have_an_end() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
-    let result = Client::resume(&server.url, "test", "run-17", u64::MAX).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let result = client.resume("run-17", u64::MAX).await;
     assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
 }
 
@@ -149,7 +151,8 @@ async fn a_refused_resume_says_why() {
 #[tokio::test]
 async fn a_session_that_is_elsewhere_is_not_taken_over() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
-    let result = Client::resume(&server.url, "test", "run-17", 2).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let result = client.resume("run-17", 2).await;
     assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
 }
 

@@ -7,7 +7,7 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use super::message::{Dynamics, DynamicsChoice, Model, Pose, Rig, RigChoice, Start};
+use super::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
 
 /// The first field of a request that was sent and not understood, as `rig.cameras[2].widht`.
 ///
@@ -94,7 +94,7 @@ impl<'de> Deserialize<'de> for DynamicsChoice {
             }
 
             fn visit_str<E: Error>(self, name: &str) -> Result<DynamicsChoice, E> {
-                Model::deserialize(name.into_deserializer()).map(DynamicsChoice::Model)
+                DynamicsModel::deserialize(name.into_deserializer()).map(DynamicsChoice::Model)
             }
 
             fn visit_map<A: MapAccess<'de>>(self, all: A) -> Result<DynamicsChoice, A::Error> {

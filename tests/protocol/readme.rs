@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::http;
 use wildcity_protocol::message::{Answer, Request};
-use wildcity_protocol::observation::Observation;
+use wildcity_protocol::observation::ObservationMetadata;
 
 use super::read;
 
@@ -16,7 +16,7 @@ fn every_json_example_is_a_message() {
     let kinds: [Kind; 3] = [
         ("request", parses::<Request>),
         ("answer", parses::<Answer>),
-        ("observation", parses::<Observation>),
+        ("observation", parses::<ObservationMetadata>),
     ];
     // Each request but the two of `open` once, each answer once.
     assert_eq!(counted(page, kinds), [12, 7, 1]);

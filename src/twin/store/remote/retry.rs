@@ -14,7 +14,7 @@ use super::to_io;
 
 /// How long a store is waited for.
 #[derive(Clone, Copy, Debug)]
-pub struct Patience {
+pub struct RetryPolicy {
     /// How long one request may take, its bytes included.
     pub timeout: Duration,
     /// How often a request is made, at most.
@@ -27,14 +27,14 @@ pub struct Patience {
     pub section_tries: u32,
 }
 
-impl Patience {
+impl RetryPolicy {
     /// With what a step waits for, and with what tells how large something is.
-    pub(super) fn of_sections(self) -> Self {
+    pub(super) fn for_sections(self) -> Self {
         Self { timeout: self.section_timeout, tries: self.section_tries, ..self }
     }
 }
 
-impl Default for Patience {
+impl Default for RetryPolicy {
     fn default() -> Self {
         Self {
             timeout: limits::REMOTE_TIMEOUT,
@@ -63,7 +63,7 @@ pub struct Traffic {
 
 /// What is counted.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Counted {
+pub(super) enum RequestCounter {
     Request,
     Retry,
     Failure,
@@ -71,32 +71,32 @@ pub(super) enum Counted {
 
 /// Threads that requests run on, so that any thread may wait for one, even one of another runtime.
 #[derive(Debug)]
-pub(super) struct Runner {
+pub(super) struct RequestRunner {
     /// Taken when it is dropped.
     runtime: Option<Runtime>,
-    patience: Patience,
+    retry: RetryPolicy,
     counts: Arc<[AtomicU64; 3]>,
 }
 
 /// A request that runs.
 #[derive(Debug)]
-pub(super) struct Running<T>(Receiver<io::Result<T>>);
+pub(super) struct PendingRequest<T>(Receiver<io::Result<T>>);
 
-impl Runner {
-    pub(super) fn new(patience: Patience) -> io::Result<Self> {
+impl RequestRunner {
+    pub(super) fn new(retry: RetryPolicy) -> io::Result<Self> {
         let runtime = Builder::new_multi_thread()
             .worker_threads(limits::REMOTE_THREADS)
             .thread_name("store")
             .enable_all()
             .build()?;
-        Ok(Self { runtime: Some(runtime), patience, counts: Arc::default() })
+        Ok(Self { runtime: Some(runtime), retry, counts: Arc::default() })
     }
 
-    pub(super) fn patience(&self) -> Patience {
-        self.patience
+    pub(super) fn retry(&self) -> RetryPolicy {
+        self.retry
     }
 
-    pub(super) fn count(&self, what: Counted) {
+    pub(super) fn count(&self, what: RequestCounter) {
         add(&self.counts, what);
     }
 
@@ -113,35 +113,35 @@ impl Runner {
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send,
     {
-        self.start(self.patience, request).wait()
+        self.start(self.retry, request).wait()
     }
 
-    /// As [`Runner::run`], with a patience of its own and without waiting for it.
+    /// As [`RequestRunner::run`], with a retry of its own and without waiting for it.
     pub(super) fn start<T, F>(
         &self,
-        patience: Patience,
+        retry: RetryPolicy,
         request: impl Fn() -> F + Send + 'static,
-    ) -> Running<T>
+    ) -> PendingRequest<T>
     where
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send,
     {
         let counts = self.counts.clone();
         self.spawn(async move {
-            let (mut tries, mut backoff) = (1, patience.backoff);
+            let (mut tries, mut backoff) = (1, retry.backoff);
             loop {
-                let error = match once(patience, &counts, request()).await {
+                let error = match once(retry, &counts, request()).await {
                     Ok(done) => return Ok(done),
                     Err(error) => error,
                 };
                 let passes = matches!(error.kind(), ErrorKind::Other | ErrorKind::TimedOut);
-                if !passes || tries >= patience.tries {
+                if !passes || tries >= retry.tries {
                     if error.kind() != ErrorKind::NotFound {
-                        add(&counts, Counted::Failure);
+                        add(&counts, RequestCounter::Failure);
                     }
                     return Err(error);
                 }
-                add(&counts, Counted::Retry);
+                add(&counts, RequestCounter::Retry);
                 tokio::time::sleep(backoff).await;
                 (tries, backoff) = (tries + 1, backoff.saturating_mul(2));
             }
@@ -154,14 +154,14 @@ impl Runner {
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send + 'static,
     {
-        let (patience, counts) = (self.patience, self.counts.clone());
-        self.spawn(async move { once(patience, &counts, request).await }).wait()
+        let (retry, counts) = (self.retry, self.counts.clone());
+        self.spawn(async move { once(retry, &counts, request).await }).wait()
     }
 
     fn spawn<T: Send + 'static>(
         &self,
         request: impl Future<Output = io::Result<T>> + Send + 'static,
-    ) -> Running<T> {
+    ) -> PendingRequest<T> {
         let (send, receive) = mpsc::sync_channel(1);
         if let Some(runtime) = &self.runtime {
             runtime.spawn(async move {
@@ -169,18 +169,18 @@ impl Runner {
                 let _ = send.send(request.await);
             });
         }
-        Running(receive)
+        PendingRequest(receive)
     }
 }
 
-impl<T> Running<T> {
+impl<T> PendingRequest<T> {
     /// Waits for its end. A plain channel, and not `block_on`, which panics on threads of a runtime.
     pub(super) fn wait(self) -> io::Result<T> {
         self.0.recv().unwrap_or_else(|_| Err(io::Error::other("the store's threads are gone")))
     }
 }
 
-impl Drop for Runner {
+impl Drop for RequestRunner {
     /// Without waiting, which would panic on threads of a runtime.
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
@@ -190,20 +190,20 @@ impl Drop for Runner {
 }
 
 async fn once<T>(
-    patience: Patience,
+    retry: RetryPolicy,
     counts: &[AtomicU64; 3],
     request: impl Future<Output = object_store::Result<T>>,
 ) -> io::Result<T> {
-    add(counts, Counted::Request);
-    match tokio::time::timeout(patience.timeout, request).await {
+    add(counts, RequestCounter::Request);
+    match tokio::time::timeout(retry.timeout, request).await {
         Ok(done) => done.map_err(|error| to_io(&error)),
         Err(_) => {
-            let said = format!("no answer within {} s", patience.timeout.as_secs_f32());
+            let said = format!("no answer within {} s", retry.timeout.as_secs_f32());
             Err(io::Error::new(ErrorKind::TimedOut, said))
         }
     }
 }
 
-fn add(counts: &[AtomicU64; 3], what: Counted) {
+fn add(counts: &[AtomicU64; 3], what: RequestCounter) {
     counts[what as usize].fetch_add(1, Ordering::Relaxed);
 }
