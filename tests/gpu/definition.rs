@@ -110,8 +110,8 @@ pub(crate) fn bin(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> Vec<Vec
             for left in (0..width_px).step_by(TILE_PX as usize) {
                 let rows = top..height_px.min(top + TILE_PX);
                 let columns = left..width_px.min(left + TILE_PX);
-                let touches = |index: &&u32| {
-                    let splat = &splats[**index as usize];
+                let touches = |splat_index: &&u32| {
+                    let splat = &splats[**splat_index as usize];
                     let reaches =
                         |row| columns.clone().any(|column| splat.log2_alpha(column, row) >= cut);
                     splat.view == index && rows.clone().any(reaches)
