@@ -82,9 +82,9 @@ impl Source {
     fn scene(&self, shots: &[Shot]) -> anyhow::Result<FrameScene<'_>> {
         let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
         Ok(match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => {
-                FrameScene::Needed(resident.scene(&wildcity_session::eyes(&views), &first.profile)?)
-            }
+            (Self::Twin(resident), [first, ..]) => FrameScene::Needed(
+                resident.scene(&wildcity_session::viewpoints(&views), &first.profile)?,
+            ),
             (Self::Twin(_), []) => FrameScene::Whole(Cow::default()),
             (Self::File(scene), _) => FrameScene::Whole(Cow::Borrowed(scene)),
         })

@@ -9,7 +9,7 @@ use super::sample_points::{OFFSETS_M, SamplePoint};
 use super::settings::scaled;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::CameraError;
-use wildcity_session::{Trained, Trust};
+use wildcity_session::{TrainingCoverage, Trust};
 use wildcity_twin::residency::Resident;
 
 /// Trust at one distance from the recorded drive: of all cameras at all stations.
@@ -59,7 +59,9 @@ pub fn confidence_by_offset(
     backend: &dyn Backend,
     places: &[SamplePoint],
 ) -> Result<Vec<Confidence>, ReportError> {
-    let Some(trained) = Trained::new(&resident.version.manifest) else { return Ok(Vec::new()) };
+    let Some(trained) = TrainingCoverage::new(&resident.version.manifest) else {
+        return Ok(Vec::new());
+    };
     let mut all = Vec::new();
     for offset_m in OFFSETS_M {
         let here: Vec<&SamplePoint> =
@@ -89,7 +91,7 @@ impl Seen {
         resident: &Arc<Resident>,
         backend: &dyn Backend,
         place: &SamplePoint,
-        trained: &Trained,
+        trained: &TrainingCoverage,
     ) -> Result<Self, ReportError> {
         let world_from_rig = place.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
         let widest_px = place.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
@@ -97,7 +99,7 @@ impl Seen {
         let views = place.views.iter().map(|view| scaled(*view, share));
         let views = views.collect::<Result<Vec<View>, CameraError>>()?;
         let profile = &resident.version.manifest.profile;
-        let scene = resident.scene(&wildcity_session::eyes(&views), profile)?;
+        let scene = resident.scene(&wildcity_session::viewpoints(&views), profile)?;
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut rgb8: Vec<Vec<u8>> = pixels().map(|count| vec![0; 3 * count]).collect();
         let mut opacity: Vec<Vec<f32>> = pixels().map(|count| vec![0.0; count]).collect();
@@ -112,7 +114,7 @@ impl Seen {
         let frame = Frame { scene: &scene, profile, views: &views };
         backend.render(&frame, &mut targets, &|_, _| {})?;
         let trust =
-            |(view, opacity): (&View, &Vec<f32>)| trained.of(&world_from_rig, view, opacity);
+            |(view, opacity): (&View, &Vec<f32>)| trained.trust(&world_from_rig, view, opacity);
         let trusts = views.iter().zip(&opacity).map(trust).collect();
         Ok(Self { trusts, first: views[0], rgb8: rgb8.swap_remove(0) })
     }

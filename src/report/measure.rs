@@ -11,9 +11,9 @@ use super::sample_points::{OFFSETS_M, SamplePoint};
 use super::settings::{Family, Setting};
 use super::timing::{Step, Timed, file};
 use super::{ErrorImages, ReportError, error_images};
-use wildcity_render::compare::drawing::{Drawing, draw};
-use wildcity_render::compare::errors::{Errors, Gathered, Image};
-use wildcity_render::compare::numbers::{number, numbers};
+use wildcity_render::compare::errors::{ErrorAccumulator, Image, ImageErrors};
+use wildcity_render::compare::images::{RenderedImage, render_images};
+use wildcity_render::compare::json_numbers::{serialize_number, serialize_numbers};
 use wildcity_render::gpu::Gpu;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, RenderError, View};
@@ -46,9 +46,9 @@ pub struct Measurement {
     #[serde(flatten)]
     pub setting: Setting,
     /// Errors at all places.
-    pub errors: Errors,
+    pub errors: ImageErrors,
     /// PSNR by [`OFFSETS_M`], in dB; one where there is no drive.
-    #[serde(serialize_with = "numbers")]
+    #[serde(serialize_with = "serialize_numbers")]
     pub psnr_db_by_offset: Vec<f64>,
     /// The same place by place.
     pub by_place: Vec<SampleResult>,
@@ -67,10 +67,10 @@ pub struct SampleResult {
     /// Whether a setting may be chosen by it.
     pub chooses: bool,
     /// PSNR of all its windows together, in dB.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
     /// PSNR of the window that has the least, in dB: what a setting is judged by.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub least_db: f64,
     /// The 95th percentile of its steps, in milliseconds, which is the longest of fewer than twenty; none
     /// beside the drive, where no step is timed.
@@ -119,7 +119,7 @@ impl Benchmark<'_> {
             progress(done);
             let scene = self.scene(&place.views, &profile)?;
             let start = Instant::now();
-            let drawings = draw(&Reference, &scene, &profile, &place.windows)?;
+            let drawings = render_images(&Reference, &scene, &profile, &place.windows)?;
             let pixels = |views: &[View]| views.iter().map(|v| v.camera.pixels()).sum::<usize>();
             let share = pixels(&place.views) as f64 / pixels(&place.windows) as f64;
             step_ms += start.elapsed().as_secs_f64() * 1e3 * share / self.places.len() as f64;
@@ -139,7 +139,7 @@ impl Benchmark<'_> {
     ) -> Result<Measurement, ReportError> {
         let profile = setting.apply(self.profile())?;
         let backend = &*self.backends[setting.backend];
-        let mut by_offset = vec![Gathered::default(); OFFSETS_M.len()];
+        let mut by_offset = vec![ErrorAccumulator::default(); OFFSETS_M.len()];
         let mut by_place = Vec::new();
         let (mut steps_ms, mut served_ms, mut cost) = (Vec::new(), Vec::new(), Cost::NOTHING);
         let device = if backend.name() == GPU { (self.device)() } else { None };
@@ -151,8 +151,8 @@ impl Benchmark<'_> {
             let scene: &Scene = stored.as_ref().unwrap_or(&needed);
             let offset = OFFSETS_M.iter().position(|o| *o == place.offset_m).unwrap_or(0);
 
-            let drawings = draw(backend, scene, &profile, &own.windows)?;
-            let (mut here, mut windows_db) = (Gathered::default(), Vec::new());
+            let drawings = render_images(backend, scene, &profile, &own.windows)?;
+            let (mut here, mut windows_db) = (ErrorAccumulator::default(), Vec::new());
             for ((view, drawing), truth) in own.windows.iter().zip(&drawings).zip(truths) {
                 let image = arrived(setting, view, drawing, truth.size_px)?;
                 let db = here.add(&image, truth);
@@ -185,10 +185,10 @@ impl Benchmark<'_> {
             let least_db = least(windows_db);
             by_place.push(SampleResult { chooses: place.chooses, psnr_db, least_db, p95_ms });
         }
-        let mut all = Gathered::default();
+        let mut all = ErrorAccumulator::default();
         by_offset.iter().for_each(|gathered| all.merge(gathered));
         cost.step_ms = quantile(&steps_ms, 0.5);
-        let db = |gathered: &Gathered| gathered.errors().map(|errors| errors.psnr_db);
+        let db = |gathered: &ErrorAccumulator| gathered.errors().map(|errors| errors.psnr_db);
         let worst = worst.1.map(|(place, image, truth)| error_images::of(place, &image, &truth));
         Ok(Measurement {
             setting: setting.clone(),
@@ -223,7 +223,7 @@ impl Benchmark<'_> {
     }
 
     fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<PinnedScene, ReportError> {
-        Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
+        Ok(self.resident.scene(&wildcity_session::viewpoints(views), profile)?)
     }
 
     /// The scene in the setting's record, if it is another one, and bytes of a Gaussian in it.
@@ -288,7 +288,7 @@ impl Cost {
 fn arrived(
     setting: &Setting,
     view: &View,
-    drawing: &Drawing,
+    drawing: &RenderedImage,
     size_px: [u32; 2],
 ) -> Result<Image, ReportError> {
     let mut image = shown(view, drawing);
@@ -313,7 +313,7 @@ fn decoded(file: &[u8]) -> Result<Vec<u8>, ReportError> {
 }
 
 /// A drawing as it is shown.
-fn shown(view: &View, drawing: &Drawing) -> Image {
+fn shown(view: &View, drawing: &RenderedImage) -> Image {
     let rgba = drawing.rgba.chunks_exact(4);
     Image {
         size_px: [view.camera.width_px, view.camera.height_px],

@@ -252,7 +252,7 @@ fn stress(page: &mut String, report: &Report) {
                 Verdict::Missed => "text miss",
                 Verdict::Refused | Verdict::NotRun => "text off",
             };
-            let (word, told) = (outcome.word(), text(&outcome.told));
+            let (word, told) = (outcome.word(), text(&outcome.detail));
             let _ = write!(page, "<td class=\"{class}\"><b>{word}</b><br>{told}</td>");
         }
         page.push_str("</tr>");

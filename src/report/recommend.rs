@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::ReportError;
 use super::measure::{Measurement, SampleResult, least};
 use super::settings::{Family, Sent};
-use wildcity_render::compare::numbers::number;
+use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileChanges, RenderProfile};
 
@@ -52,7 +52,7 @@ pub struct EncodingCost {
     /// Whether sessions get their images so unless they ask for another encoding.
     pub by_default: bool,
     /// Least PSNR of a window at any place, in dB, of what arrives.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub least_db: f64,
     /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
     /// chance can make it less than 0.

@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3};
 
 use super::settings::scaled;
 use wildcity_render::View;
-use wildcity_render::compare::drawing::{crop, look};
+use wildcity_render::compare::images::{crop_view, view_along};
 use wildcity_scene::geometry::{Bounds, CameraError, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Trajectory};
@@ -109,7 +109,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
         let share = f64::from(station) / f64::from(AROUND * sampling.stations);
         let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
         let toward = DVec3::new(cos, sin, 20.0_f64.to_radians().tan()).normalize();
-        let view = look([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
+        let view = view_along([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
         let place = SamplePoint {
             name: format!("{:.1}° around", 360.0 * share),
             offset_m: 0.0,
@@ -136,7 +136,7 @@ impl SamplePoint {
                 let share = 0.5 + within * (at[axis] - 0.5);
                 (share * f64::from(size_px[axis] - own_px[axis])) as i32
             });
-            crop(*view, at, own_px)
+            crop_view(*view, at, own_px)
         };
         self.windows = self.views.iter().enumerate().map(window).collect();
         self

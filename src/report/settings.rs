@@ -289,7 +289,7 @@ impl TwinFeatures {
                 Some(Model::Network(..)) => BackgroundKind::Network,
                 Some(Model::Cube(_)) => BackgroundKind::Images,
             },
-            bent: views.iter().any(|view| !view.is_ideal()),
+            bent: views.iter().any(|view| !view.is_static_pinhole()),
         }
     }
 }

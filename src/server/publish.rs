@@ -11,7 +11,7 @@ use crate::limits;
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, RenderProfile};
-use wildcity_session::{Changed, Engine, HeldLatest};
+use wildcity_session::{Engine, LatestPin, ProposedChange};
 use wildcity_twin::ingest::{self, IngestError};
 use wildcity_twin::store::{
     Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
@@ -78,7 +78,7 @@ async fn publish(
     let (engine, told, asked) = (server.engine.clone(), push.clone(), ask.clone());
     let (held, version) = blocking(move || {
         // Until it is ready, who opens the latest gets what is the latest now: comparing took its time.
-        let held = hold_latest(&engine, &asked.twin)?;
+        let held = pin_latest(&engine, &asked.twin)?;
         let version = commit(engine.catalog(), &told, &asked, &scene, base.as_deref())?;
         Ok((held, version))
     })
@@ -190,13 +190,13 @@ fn find_base(catalog: &Catalog, ask: &Ask) -> Result<Option<Version>, Fault> {
 }
 
 /// Keeps what is the latest version; none if the twin is new.
-fn hold_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<HeldLatest>, Fault> {
+fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, Fault> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
         Err(StoreError::NoTwin { .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
-    Ok(versions.last().map(|latest| engine.hold_latest(twin, latest.number)))
+    Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
 /// Looks at what would change, and at how it looks.
@@ -212,7 +212,8 @@ async fn validate(
         blocking(move || changes(&told, &asked, scene, before.as_ref())).await?;
     if let Some(changed) = changed {
         let progress = |done, total| push.progress(done, total);
-        scene.report.golden = server.engine.compare(changed, ask.poses.clone(), &progress).await?;
+        scene.report.golden =
+            server.engine.preview_psnr(changed, ask.poses.clone(), &progress).await?;
         push.tell(scene.report.clone());
     }
     looks_alike(ask, &scene, base.as_deref())?;
@@ -225,7 +226,7 @@ fn changes(
     ask: &Ask,
     scene: Scene,
     base: Option<&Arc<Version>>,
-) -> Result<(Scene, Option<Changed>), Fault> {
+) -> Result<(Scene, Option<ProposedChange>), Fault> {
     let Scene { mut gaussians, sources, options, mut report } = scene;
     // What is stored of a twin has one SH degree; a lower one gets zeros.
     if let Some(base) = base
@@ -254,7 +255,7 @@ fn changes(
     let changed = match base {
         Some(base) => {
             let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
-            Some(Changed {
+            Some(ProposedChange {
                 before: base.clone(),
                 gaussians: inside(&gaussians, &changed, left_out),
                 cells: changed,

@@ -4,13 +4,13 @@
 
 use std::sync::LazyLock;
 
-use wildcity_render::compare::psnr::RIGHT_DB;
+use wildcity_render::compare::psnr::MIN_PSNR_DB;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::hybrid::{HybridBackend, bisect};
 use wildcity_render::layout::Cutoffs;
-use wildcity_render::relay::{Relay, bisect};
-use wildcity_render::stage::{Between, Stage};
+use wildcity_render::stage::{Stage, StageOutputs};
 use wildcity_render::{Backend, Frame, RenderError, View};
 use wildcity_scene::{RenderProfile, Scene};
 
@@ -27,7 +27,7 @@ struct Truth {
     profile: RenderProfile,
     views: Vec<View>,
     /// The outputs of the cpu's stages project, sort, and bin.
-    cpu: [Between; 3],
+    cpu: [StageOutputs; 3],
     images: Vec<Image>,
     /// The definition's splats, in f64.
     splats: Vec<Splat>,
@@ -50,7 +50,7 @@ impl Truth {
         let scene = Scene::from_gaussians(&misty_street(gaussians));
         let profile = RenderProfile::default();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        let stages = Stage::ALL.map(|stage| cpu.through(&frame, stage).unwrap().0);
+        let stages = Stage::ALL.map(|stage| cpu.run_through(&frame, stage).unwrap().0);
         let of_cpu = definition::splats(&stages[0]);
         let order = definition::sort(&of_cpu);
         Self {
@@ -73,7 +73,7 @@ impl Truth {
     /// The names of a gpu's wrong stages, with their differences from the twins on the cpu and in f64.
     fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Differences)> {
         let [project, sort, bin] = &self.cpu;
-        let compare = |done, last, differences: &dyn Fn(&Between) -> Differences| {
+        let compare = |done, last, differences: &dyn Fn(&StageOutputs) -> Differences| {
             match gpu.run_through(&self.frame(), done, last) {
                 Ok(found) => differences(&found),
                 // A stage that counts wrong may need more than there is room for.
@@ -93,11 +93,11 @@ impl Truth {
     }
 
     /// The images that a gpu draws from the outputs of a stage.
-    fn drawn(&self, gpu: &Gpu, between: &Between) -> Vec<Image> {
+    fn drawn(&self, gpu: &Gpu, between: &StageOutputs) -> Vec<Image> {
         render(&ResumedGpu { gpu, between }, &self.scene, &self.profile, &self.views)
     }
 
-    fn compare_project(&self, found: &Between) -> Differences {
+    fn compare_project(&self, found: &StageOutputs) -> Differences {
         let splats = definition::splats(found);
         let cpu = definition::splats(&self.cpu[0]);
         [&cpu, &self.splats].map(|truths| {
@@ -118,7 +118,7 @@ impl Truth {
                 Some((index, splat)) => {
                     close(splat, truth, view).map_err(|e| format!("splat {index}: {e}"))?;
                     let is_exact = splat.depth_m == f64::from(truth.depth_m as f32);
-                    exact += usize::from(is_exact || view.rolling.is_some());
+                    exact += usize::from(is_exact || view.rolling_shutter.is_some());
                     next.next();
                 }
                 None if inside_px > 0.01 => {
@@ -138,7 +138,7 @@ impl Truth {
         }
     }
 
-    fn compare_sort(&self, found: &Between) -> Differences {
+    fn compare_sort(&self, found: &StageOutputs) -> Differences {
         [self.cpu[1].order.as_ref(), Some(&self.order)].map(|order| {
             let kept = found.keys == self.cpu[0].keys && found.splats == self.cpu[0].splats;
             let is_equal = found.order.as_ref() == order;
@@ -149,7 +149,7 @@ impl Truth {
 
     /// The lists must equal the cpu's except for a few roundings. They must contain all splats that f64
     /// finds, and at most 1 % more.
-    fn compare_bin(&self, found: &Between) -> Differences {
+    fn compare_bin(&self, found: &StageOutputs) -> Differences {
         let found = found.tiles.as_ref().unwrap();
         let cpu = self.cpu[2].tiles.as_ref().unwrap();
         let mut ranks = vec![None; self.order.len()];
@@ -202,7 +202,7 @@ impl Truth {
 /// The first difference from the cpu and from f64, if any.
 type Differences = [Option<String>; 2];
 
-fn check_keys(found: &Between, cutoffs: &Cutoffs) -> Result<(), String> {
+fn check_keys(found: &StageOutputs, cutoffs: &Cutoffs) -> Result<(), String> {
     let splats = definition::splats(found);
     for (splat, (&key, of)) in splats.iter().zip(found.keys.iter().zip(&found.splats)) {
         let truth = cutoffs.sort_key(splat.view, of.depth_m);
@@ -216,7 +216,7 @@ fn check_keys(found: &Between, cutoffs: &Cutoffs) -> Result<(), String> {
 /// A backend that draws the rest of a frame from the outputs of a stage.
 struct ResumedGpu<'a> {
     gpu: &'a Gpu,
-    between: &'a Between,
+    between: &'a StageOutputs,
 }
 
 impl Backend for ResumedGpu<'_> {
@@ -228,7 +228,7 @@ impl Backend for ResumedGpu<'_> {
         &self,
         frame: &Frame<'_>,
         targets: &mut [wildcity_render::Target<'_>],
-        finished: wildcity_render::Finished<'_>,
+        finished: wildcity_render::OnViewDone<'_>,
     ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
         self.gpu.resume(self.between, frame, targets, finished)
     }
@@ -243,7 +243,7 @@ fn slope_bound(truth: &Splat) -> f64 {
 /// Largest error of a depth: one step of f32. With a rolling shutter the camera moves 0.9 m here, and the row
 /// that sees a point is known to a millionth of that.
 fn depth_bound_m(truth: &Splat, view: &View) -> f64 {
-    1.2e-7 * truth.depth_m + if view.rolling.is_some() { 1e-6 } else { 0.0 }
+    1.2e-7 * truth.depth_m + if view.rolling_shutter.is_some() { 1e-6 } else { 0.0 }
 }
 
 /// Whether two splats are so close that they must be of the same Gaussian.
@@ -261,7 +261,7 @@ fn close(found: &Splat, truth: &Splat, view: &View) -> Result<(), String> {
     let step = slope_bound(truth);
     let mean = |k: usize| 2e-3 + step * (truth.mean_px[k].abs() + 200.0);
     // Large Gaussians around the camera have sigma points all over the image of a lens.
-    let wide = if view.is_ideal() { 1e-5 } else { 1e-4 };
+    let wide = if view.is_static_pinhole() { 1e-5 } else { 1e-4 };
     let reach = |k: usize| 1e-3 + (wide + 2.0 * step) * truth.reach_px[k];
     let factor = |of: f64| (1e-4 + 2.0 * step) * of;
     let numbers = [
@@ -352,14 +352,14 @@ fn a_correct_gpu_is_right_from_every_stage_on() {
         let frame = Frame { scene: &scene, profile: &profile, views };
         let bisection = bisect(&cpu(), &gpu(), &frame).unwrap();
         assert_eq!(bisection.psnr_db.len(), 4);
-        assert!(bisection.psnr_db.iter().all(|(_, db)| *db >= RIGHT_DB), "{bisection:?}");
+        assert!(bisection.psnr_db.iter().all(|(_, db)| *db >= MIN_PSNR_DB), "{bisection:?}");
         assert_eq!(bisection.wrong(), None);
     }
 }
 
 /// With all outputs, with buffers that grow, and after another frame, of which nothing may remain.
 #[test]
-fn a_relay_draws_what_the_cpu_draws() {
+fn a_hybrid_draws_what_the_cpu_draws() {
     let scene = Scene::from_gaussians(&street(100_000, 1, 43));
     let (profile, views) = (RenderProfile::default(), street_views());
     let truths = render(&cpu(), &scene, &profile, &views);
@@ -367,13 +367,13 @@ fn a_relay_draws_what_the_cpu_draws() {
     // It also watches the log for errors of the other devices.
     let _watched = gpu();
     for stage in Stage::ALL {
-        let relay = Relay::new(cpu(), Gpu::new(&AdapterChoice::Best, 0).unwrap(), stage);
-        render(&relay, &other, &profile, &views[..2]);
-        let images = render(&relay, &scene, &profile, &views);
+        let hybrid = HybridBackend::new(cpu(), Gpu::new(&AdapterChoice::Best, 0).unwrap(), stage);
+        render(&hybrid, &other, &profile, &views[..2]);
+        let images = render(&hybrid, &scene, &profile, &views);
         for (view, (image, truth)) in images.iter().zip(&truths).enumerate() {
             agree(image, truth).unwrap_or_else(|e| panic!("{stage:?}, view {view}: {e}"));
         }
-        render(&relay, &Scene::default(), &profile, &views);
+        render(&hybrid, &Scene::default(), &profile, &views);
     }
 }
 
@@ -384,7 +384,7 @@ fn a_gpu_that_resumes_from_its_own_outputs_draws_the_same() {
     let images = render(&gpu, &truth.scene, &truth.profile, &truth.views);
     for stage in Stage::ALL {
         let between = gpu.run_through(&truth.frame(), None, stage).unwrap();
-        assert_eq!(between.through(), stage);
+        assert_eq!(between.last_stage(), stage);
         assert!(truth.drawn(&gpu, &between) == images, "{stage:?}");
     }
 }

@@ -7,7 +7,8 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
+    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Session, SessionError,
+    SessionOptions,
 };
 use wildcity_twin::residency::{Cache, ResidencyError, Resident, SectionRef};
 
@@ -46,18 +47,18 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let opening = Opening {
+        let opening = SessionOptions {
             start: Some(wildcity_session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
             deadline,
-            ..Opening::twin("demo", Outputs::colour(Encoding::Raw))
+            ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
         };
         Session::open(self.engine.clone(), name.to_owned(), opening).await
     }
 }
 
 /// Hashes of a frame's images.
-fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
+fn hashes(frame: &Observation) -> Vec<blake3::Hash> {
     frame.images.iter().map(|image| image.hash).collect()
 }
 

@@ -15,7 +15,7 @@ use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
 use wildcity_twin::residency::{Cache, Resident, SectionRef, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, Version};
 
-use crate::images::{cpu, look, render};
+use crate::images::{cpu, render, view_along};
 
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -64,7 +64,10 @@ pub(crate) fn views(world_from_rig: Pose) -> [View; 2] {
     let at = world_from_rig.position_m + DVec3::Z * 1.6;
     let forward = world_from_rig.rotation * DVec3::X;
     let left = world_from_rig.rotation * DVec3::Y;
-    [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
+    [
+        view_along([96, 64], 70.0, at, forward, -DVec3::Z),
+        view_along([64, 64], 40.0, at, left, -DVec3::Z),
+    ]
 }
 
 pub(crate) fn eyes(views: &[View]) -> Vec<Viewpoint> {

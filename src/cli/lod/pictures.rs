@@ -7,7 +7,7 @@ use anyhow::Context;
 use image::RgbImage;
 use image::imageops;
 
-use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Rig, Scene};
 use wildcity_twin::ingest::cameras;
@@ -38,7 +38,7 @@ pub(super) fn draw(
     let backend = lod.backend.backend()?;
     let resident = Cache::new(catalog).open(&version.manifest.twin, Some(version.number))?;
     output::make_dir(out)?;
-    let eyes = wildcity_session::eyes(&views);
+    let eyes = wildcity_session::viewpoints(&views);
     let bar = progress::count("rendering");
     bar.set_length(profiles.len() as u64);
     let mut drawn: Vec<Vec<RgbImage>> = Vec::new();
@@ -49,7 +49,7 @@ pub(super) fn draw(
         let share = 100.0 * scene.gaussians() as f64 / version.manifest.gaussians() as f64;
         let (full, now) = (&drawn[0], &drawn[drawn.len() - 1]);
         let pairs = full.iter().zip(now).flat_map(|(full, now)| full.iter().zip(now.iter()));
-        let decibels = match psnr_db_of_bytes(pairs) {
+        let decibels = match psnr_db_u8(pairs) {
             f64::INFINITY => "the same image".to_owned(),
             db => format!("{db:.1} dB"),
         };

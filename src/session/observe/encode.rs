@@ -6,7 +6,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
-use super::Trust;
+use super::trust::Trust;
 
 /// How colour images travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,25 +21,25 @@ pub enum Encoding {
 }
 
 /// One image as the worker thread left it.
-pub(super) struct Drawn {
+pub(crate) struct EncodedImage {
     /// BLAKE3 of its pixels.
-    pub(super) hash: blake3::Hash,
+    pub(crate) hash: blake3::Hash,
     /// The file, unless the pixels are in the buffer already.
-    pub(super) file: Vec<u8>,
+    pub(crate) file: Vec<u8>,
     /// How far it may be believed, if that was asked for.
-    pub(super) trust: Option<Trust>,
+    pub(crate) trust: Option<Trust>,
     /// CPU time that this took.
-    pub(super) took: Duration,
+    pub(crate) took: Duration,
 }
 
 /// Hashes the pixels of an image, and encodes them. Runs on a render thread, while other images
 /// are still drawn.
-pub(super) fn encode(
+pub(crate) fn encode(
     rgb8: &[u8],
     width: u32,
     height: u32,
     encoding: Encoding,
-) -> Result<Drawn, String> {
+) -> Result<EncodedImage, String> {
     let started = Instant::now();
     let hash = blake3::hash(rgb8);
     let file = match encoding {
@@ -47,7 +47,7 @@ pub(super) fn encode(
         Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
         Encoding::Png => png(rgb8, width, height)?,
     };
-    Ok(Drawn { hash, file, trust: None, took: started.elapsed() })
+    Ok(EncodedImage { hash, file, trust: None, took: started.elapsed() })
 }
 
 /// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.

@@ -1,18 +1,19 @@
 //! What a session writes to its episodes' files.
 
-use super::episode::{Episode, Outcome};
-use super::observation::Drawing;
-use super::opening::Maps;
-use super::record::{
-    self, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOutputs, RecordedVersion,
+use super::Session;
+use crate::episode::{Episode, Outcome};
+use crate::error::SessionError;
+use crate::observe::builder::RenderedObservation;
+use crate::options::PixelMaps;
+use crate::record::format::{
+    BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOutputs, RecordedVersion,
     Recorder,
 };
-use super::{Session, SessionError};
 use wildcity_scene::Rig;
 
 impl Session {
     /// Writes what was rendered to the episode's file, which begins with its first frame.
-    pub(super) async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
+    pub(crate) async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
         let line = Line::Frame(frame);
         match self.recorder.clone() {
             Some(recorder) => {
@@ -29,13 +30,13 @@ impl Session {
     }
 
     /// Says what was rendered.
-    pub(super) fn frame_line(
+    pub(crate) fn frame_line(
         &self,
         request: FrameRequest,
         episode: &Episode,
-        drawing: &Drawing,
+        drawing: &RenderedObservation,
     ) -> FrameRecord {
-        let Drawing { frame, shots, hashes, .. } = drawing;
+        let RenderedObservation { frame, shots, hashes, .. } = drawing;
         let all = self.layout.cameras().len();
         let mut cameras: Vec<_> = shots.iter().map(|shot| shot.cameras.clone()).collect();
         if cameras.iter().all(|of_pose| of_pose.len() == all) {
@@ -67,17 +68,17 @@ impl Session {
     }
 
     /// Begins the file of an episode that has not moved yet, with its first frame.
-    pub(super) async fn begin_recording(
+    pub(crate) async fn begin_recording(
         &self,
         episode: &Episode,
         first_frame: Line,
     ) -> Result<(Recorder, u64), SessionError> {
         let version = &self.resident().version;
-        let Maps { depth, opacity, normals } = self.layout.maps();
+        let PixelMaps { depth, opacity, normals } = self.layout.maps();
         let cameras = self.layout.cameras().to_vec();
         let header = EpisodeHeader {
             format: EpisodeHeader::FORMAT,
-            build: record::BUILD.to_owned(),
+            build: BUILD.to_owned(),
             session: self.name.clone(),
             twin: version.manifest.twin.clone(),
             version: version.number,
@@ -104,7 +105,7 @@ impl Session {
     }
 
     /// Writes the last line. The episode is over either way: a failure is only logged.
-    pub(super) async fn finish(&mut self, outcome: Outcome) {
+    pub(crate) async fn finish(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
         if let Err(error) = append(recorder, vec![Line::End(self.episode.summary(outcome))]).await {
             tracing::warn!(session = self.name, "the episode's summary is missing: {error}");

@@ -22,13 +22,18 @@ use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::residency::Viewpoint;
 
-use super::album::{Album, Shown};
-use super::buffer::Buffer;
-use super::encode::{Drawn, Encoding, encode};
-use super::engine::{Answers, Scratch};
-use super::frame::{DType, Frame, Image, PastImage, Residency, Tensor, TensorKind, Timings};
+use super::buffer::ObservationBuffer;
+use super::encode::{EncodedImage, Encoding, encode};
+use super::frame_history::{FrameHistory, PastFrame};
+use super::observation::{
+    DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
+};
 use super::schedule::Schedule;
-use super::{Episode, History, Maps, SessionError, Trained, Trust};
+use super::trust::{TrainingCoverage, Trust};
+use crate::engine::{AnswerBudget, Scratch};
+use crate::episode::{EgoHistory, Episode};
+use crate::error::SessionError;
+use crate::options::PixelMaps;
 
 /// The length of the header, little-endian, stands before it.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -54,70 +59,70 @@ const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 
 /// What every observation of a session looks like.
 #[derive(Debug)]
-pub(super) struct Layout {
+pub(crate) struct ObservationLayout {
     cameras: Vec<RigCamera>,
     /// The share of each image that its lens sees, where that is not all.
     seen: Vec<Option<f64>>,
     encoding: Encoding,
-    maps: Maps,
+    maps: PixelMaps,
     schedule: Schedule,
 }
 
 /// What is drawn at once: cameras at one place.
 #[derive(Clone, Debug)]
-pub(super) struct Shot {
+pub(crate) struct RigCapture {
     /// Where the rig stands.
-    pub(super) world_from_rig: Pose,
+    pub(crate) world_from_rig: Pose,
     /// When, in microseconds since the episode's start.
-    pub(super) time_us: i64,
+    pub(crate) time_us: i64,
     /// Indices of the cameras; there may be none.
-    pub(super) cameras: Vec<usize>,
+    pub(crate) cameras: Vec<usize>,
     /// Whether its images are the observation's; else they are only kept for a bundle.
-    pub(super) shown: bool,
+    pub(crate) shown: bool,
 }
 
 /// A finished observation, and what it leaves for later ones.
-pub(super) struct Drawing {
-    pub(super) frame: Frame,
-    pub(super) album: Album,
+pub(crate) struct RenderedObservation {
+    pub(crate) frame: Observation,
+    pub(crate) album: FrameHistory,
     /// What was drawn, in order, the hashes of its images, and how far they may be believed.
-    pub(super) shots: Vec<Shot>,
-    pub(super) hashes: Vec<blake3::Hash>,
+    pub(crate) shots: Vec<RigCapture>,
+    pub(crate) hashes: Vec<blake3::Hash>,
     trusts: Vec<Option<Trust>>,
 }
 
-impl Drawing {
+impl RenderedObservation {
     /// How far each of its images may be believed, those for later observations included, as far as that
     /// was asked for.
-    pub(super) fn trusts(&self) -> impl Iterator<Item = f64> {
+    pub(crate) fn trusts(&self) -> impl Iterator<Item = f64> {
         self.trusts.iter().flatten().map(|trust| trust.value)
     }
 }
 
 /// A frame in the making.
-pub(super) struct Assembly {
-    layout: Arc<Layout>,
-    answers: Answers,
-    buffer: Buffer,
+pub(crate) struct ObservationBuilder {
+    layout: Arc<ObservationLayout>,
+    answers: AnswerBudget,
+    buffer: ObservationBuffer,
     history_count: usize,
     /// Where the next shown image's floats and raw pixels go, from the buffer's start.
     floats_at: usize,
     raw_at: usize,
-    trained: Option<Arc<Trained>>,
-    shots: Vec<Shot>,
+    trained: Option<Arc<TrainingCoverage>>,
+    shots: Vec<RigCapture>,
     /// Of all shots so far, camera by camera.
-    drawn: Vec<Drawn>,
+    drawn: Vec<EncodedImage>,
     timings: Timings,
-    residency: Residency,
+    residency: ResidencyStats,
 }
 
-impl Layout {
+impl ObservationLayout {
     /// # Errors
     /// The quality is not one, or the images of one observation are too large.
-    pub(super) fn new(
+    pub(crate) fn new(
         cameras: Vec<RigCamera>,
         encoding: Encoding,
-        maps: Maps,
+        maps: PixelMaps,
         schedule: Schedule,
     ) -> Result<Self, SessionError> {
         if let Encoding::Jpeg(quality) = encoding
@@ -135,30 +140,30 @@ impl Layout {
         Ok(layout)
     }
 
-    pub(super) fn cameras(&self) -> &[RigCamera] {
+    pub(crate) fn cameras(&self) -> &[RigCamera] {
         &self.cameras
     }
 
     /// The share of a camera's image that its lens sees, where that is not all.
-    pub(super) fn seen(&self, camera: usize) -> Option<f64> {
+    pub(crate) fn visible_share(&self, camera: usize) -> Option<f64> {
         self.seen[camera]
     }
 
-    pub(super) fn encoding(&self) -> Encoding {
+    pub(crate) fn encoding(&self) -> Encoding {
         self.encoding
     }
 
-    pub(super) fn maps(&self) -> Maps {
+    pub(crate) fn maps(&self) -> PixelMaps {
         self.maps
     }
 
-    pub(super) fn schedule(&self) -> &Schedule {
+    pub(crate) fn schedule(&self) -> &Schedule {
         &self.schedule
     }
 
     /// What is drawn for an observation at the end of an episode, beside what an album has: the frames
     /// that it shows or a later one will, those of one time together, the last those of now.
-    pub(super) fn shots(&self, episode: &Episode, album: &Album) -> Vec<Shot> {
+    pub(crate) fn shots(&self, episode: &Episode, album: &FrameHistory) -> Vec<RigCapture> {
         let now_us = episode.time_us();
         let mut times = BTreeMap::from([(now_us, Vec::new())]);
         for camera in 0..self.cameras.len() {
@@ -168,7 +173,7 @@ impl Layout {
                 }
             }
         }
-        let shot = |(time_us, cameras)| Shot {
+        let shot = |(time_us, cameras)| RigCapture {
             world_from_rig: episode.at(time_us),
             time_us,
             cameras,
@@ -178,9 +183,9 @@ impl Layout {
     }
 
     /// All cameras from poses that the ego need not be at.
-    pub(super) fn looks(&self, episode: &Episode, poses: Vec<Pose>) -> Vec<Shot> {
+    pub(crate) fn looks(&self, episode: &Episode, poses: Vec<Pose>) -> Vec<RigCapture> {
         let cameras: Vec<usize> = (0..self.cameras.len()).collect();
-        let shot = |world_from_rig| Shot {
+        let shot = |world_from_rig| RigCapture {
             world_from_rig,
             time_us: episode.time_us(),
             cameras: cameras.clone(),
@@ -190,7 +195,7 @@ impl Layout {
     }
 
     /// The views of a shot. Those of a warm-up are as of a vehicle that stood while they were exposed.
-    pub(super) fn views(&self, episode: &Episode, shot: &Shot) -> Vec<View> {
+    pub(crate) fn views(&self, episode: &Episode, shot: &RigCapture) -> Vec<View> {
         let moves = shot.time_us == episode.time_us();
         episode.views((&self.cameras, &shot.cameras), shot.world_from_rig, moves)
     }
@@ -208,7 +213,7 @@ impl Layout {
     }
 
     /// Bytes of the floats of a shot's images, and of their pixels where they are in the buffer.
-    fn bytes_of(&self, shot: &Shot) -> (usize, usize) {
+    fn bytes_of(&self, shot: &RigCapture) -> (usize, usize) {
         if !shot.shown {
             return (0, 0);
         }
@@ -221,13 +226,13 @@ impl Layout {
     }
 }
 
-impl Assembly {
+impl ObservationBuilder {
     /// Reserves the buffer of an observation and writes the ego history into it.
-    pub(super) fn new(
-        layout: Arc<Layout>,
-        answers: &Answers,
+    pub(crate) fn new(
+        layout: Arc<ObservationLayout>,
+        answers: &AnswerBudget,
         episode: &Episode,
-        shots: &[Shot],
+        shots: &[RigCapture],
     ) -> Result<Self, SessionError> {
         layout.check_size(shots.iter().filter(|shot| shot.shown).count())?;
         let images = shots.iter().map(|shot| shot.cameras.len()).sum::<usize>();
@@ -236,11 +241,11 @@ impl Assembly {
         let header = HEADER_BASE_BYTES + named * HEADER_IMAGE_BYTES;
         let bytes = shots.iter().map(|shot| layout.bytes_of(shot));
         let (floats, raw) = bytes.fold((0, 0), |sum, shot| (sum.0 + shot.0, sum.1 + shot.1));
-        let History { xyz_m, rotation, count } = episode.history();
+        let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let history = history.concat();
         let floats_at = header + history.len();
-        let mut buffer = Buffer::zeroed(answers, floats_at + floats + raw, header)?;
+        let mut buffer = ObservationBuffer::zeroed(answers, floats_at + floats + raw, header)?;
         buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
         Ok(Self {
             layout,
@@ -253,17 +258,17 @@ impl Assembly {
             shots: Vec::with_capacity(shots.len()),
             drawn: Vec::with_capacity(images),
             timings: Timings::default(),
-            residency: Residency::default(),
+            residency: ResidencyStats::default(),
         })
     }
 
     /// Renders a shot that has cameras; shots come in order.
-    pub(super) fn draw(
+    pub(crate) fn draw(
         &mut self,
         scene: &Scene,
         profile: &RenderProfile,
         backend: &dyn Backend,
-        (shot, views): (&Shot, &[View]),
+        (shot, views): (&RigCapture, &[View]),
         scratch: &mut Scratch,
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
@@ -271,7 +276,7 @@ impl Assembly {
 
         let trained = self.trained.clone();
         // Seen by nobody else: coverage is a part of trust, and normals are computed of depth.
-        let Maps { depth, opacity, normals } = layout.maps;
+        let PixelMaps { depth, opacity, normals } = layout.maps;
         let wanted =
             [trained.is_some() && !(opacity && shot.shown), normals && !depth && shot.shown];
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
@@ -288,7 +293,7 @@ impl Assembly {
         for (target, depth_m) in targets.iter_mut().zip(&mut depths_m) {
             target.depth_m = Some(depth_m);
         }
-        let slots: Vec<OnceLock<Result<Drawn, String>>> =
+        let slots: Vec<OnceLock<Result<EncodedImage, String>>> =
             views.iter().map(|_| OnceLock::new()).collect();
         let finished = |view: usize, target: &Target<'_>| {
             let index = shot.cameras[view];
@@ -303,7 +308,7 @@ impl Assembly {
             }
             if let (Ok(drawn), Some(trained)) = (&mut drawn, &trained) {
                 let opacity = target.opacity.as_deref().unwrap_or_default();
-                drawn.trust = Some(trained.of(&shot.world_from_rig, &views[view], opacity));
+                drawn.trust = Some(trained.trust(&shot.world_from_rig, &views[view], opacity));
             }
             // A backend calls this once per view.
             let _ = slots[view].set(drawn);
@@ -331,7 +336,7 @@ impl Assembly {
     }
 
     /// Where the renderer puts a shot's images.
-    fn targets<'a>(&'a mut self, shot: &Shot, scratch: &'a mut Scratch) -> Vec<Target<'a>> {
+    fn targets<'a>(&'a mut self, shot: &RigCapture, scratch: &'a mut Scratch) -> Vec<Target<'a>> {
         let layout = &self.layout;
         let (floats, raw) = layout.bytes_of(shot);
         let (floats_at, raw_at) = (self.floats_at, self.raw_at);
@@ -346,7 +351,7 @@ impl Assembly {
                 let bytes = 4 * pixels * values;
                 (wanted && shot.shown).then(|| floats_of(take(&mut float_part, bytes)))
             };
-            let Maps { depth, opacity, normals } = layout.maps;
+            let PixelMaps { depth, opacity, normals } = layout.maps;
             let (depth_m, opacity) = (floats(depth, 1), floats(opacity, 1));
             let normals = floats(normals, 3);
             let rgb8 = if layout.encoding == Encoding::Raw && shot.shown {
@@ -366,31 +371,31 @@ impl Assembly {
     }
 
     /// Says of the images how far they may be believed.
-    pub(super) fn judge(&mut self, trained: Option<Arc<Trained>>) {
+    pub(crate) fn judge(&mut self, trained: Option<Arc<TrainingCoverage>>) {
         self.trained = trained;
     }
 
-    pub(super) fn add_shot(&mut self, shot: Shot) {
+    pub(crate) fn add_shot(&mut self, shot: RigCapture) {
         self.shots.push(shot);
     }
 
-    pub(super) fn add_queue_time(&mut self, queued: Duration) {
+    pub(crate) fn add_queue_time(&mut self, queued: Duration) {
         self.timings.queue += queued;
     }
 
-    pub(super) fn add_waiting(&mut self, waited_for: usize, waited: Duration) {
+    pub(crate) fn add_waiting(&mut self, waited_for: usize, waited: Duration) {
         self.residency.waited_for += waited_for;
         self.residency.waited += waited;
     }
 
     /// Appends what was encoded, and what an album still has of a bundle, and names every tensor. The
     /// album is that of all frames before; a look without one is `None` of it, and shows no bundle.
-    pub(super) fn finish(
+    pub(crate) fn finish(
         mut self,
-        album: Option<Album>,
+        album: Option<FrameHistory>,
         held_bytes: u64,
         limit_bytes: u64,
-    ) -> Result<Drawing, SessionError> {
+    ) -> Result<RenderedObservation, SessionError> {
         let layout = self.layout;
         let mut drawn = self.drawn;
         let (mut taken, mut images, mut shown_files) = (Vec::new(), Vec::new(), Vec::new());
@@ -399,8 +404,8 @@ impl Assembly {
             for &camera in &shot.cameras {
                 let (index, time_us) = (taken.len(), shot.time_us);
                 if shot.shown {
-                    let Drawn { hash, trust, .. } = drawn[index];
-                    images.push(Image { camera, pose, time_us, hash, trust });
+                    let EncodedImage { hash, trust, .. } = drawn[index];
+                    images.push(ImageInfo { camera, pose, time_us, hash, trust });
                     shown_files.push(index);
                 }
                 taken.push((shot, camera));
@@ -441,7 +446,7 @@ impl Assembly {
         if bundled && let Some(now_us) = self.shots.last().map(|shot| shot.time_us) {
             for (index, &(shot, camera)) in taken.iter().enumerate() {
                 if layout.outlives(shot, camera) {
-                    let Drawn { hash, trust, file, .. } = &mut drawn[index];
+                    let EncodedImage { hash, trust, file, .. } = &mut drawn[index];
                     let (known, file) = ((*hash, *trust), mem::take(file));
                     album.add(&self.answers, (camera, shot.time_us), known, file)?;
                 }
@@ -451,11 +456,11 @@ impl Assembly {
                 let parts: Vec<&[u8]> = earlier.iter().map(|(_, shown)| &shown.bytes[..]).collect();
                 self.buffer.append(&self.answers, &parts)?;
                 for (index, (back, shown)) in earlier.iter().enumerate() {
-                    let Shown { camera, time_us, hash, trust, bytes, .. } = &***shown;
+                    let PastFrame { camera, time_us, hash, trust, bytes, .. } = &***shown;
                     let (camera, time_us, hash, trust) = (*camera, *time_us, *hash, *trust);
                     let shape = layout.shape(camera, bytes.len());
                     tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
-                    history.push(PastImage { camera, back: *back, time_us, hash, trust });
+                    history.push(PastImageInfo { camera, back: *back, time_us, hash, trust });
                 }
             }
             album.forget(&layout.schedule, now_us);
@@ -463,7 +468,7 @@ impl Assembly {
         let hashes = drawn.iter().map(|drawn| drawn.hash).collect();
         let trusts = drawn.iter().map(|drawn| drawn.trust).collect();
         let frame_hash = frame_hash(images.iter().map(|image| image.hash));
-        let frame = Frame {
+        let frame = Observation {
             buffer: self.buffer,
             tensors: tensors.list,
             images,
@@ -471,21 +476,25 @@ impl Assembly {
             frame_hash,
             history_count: self.history_count,
             timings: self.timings,
-            residency: Residency { held_bytes, limit_bytes, ..self.residency },
+            residency: ResidencyStats { held_bytes, limit_bytes, ..self.residency },
         };
-        Ok(Drawing { frame, album, shots: self.shots, hashes, trusts })
+        Ok(RenderedObservation { frame, album, shots: self.shots, hashes, trusts })
     }
 }
 
-impl Layout {
+impl ObservationLayout {
     /// Whether a frame is looked at once more, or for the first time, beside the images of its shot.
-    fn outlives(&self, shot: &Shot, camera: usize) -> bool {
+    fn outlives(&self, shot: &RigCapture, camera: usize) -> bool {
         !shot.shown || self.schedule.kept(camera, shot.time_us, shot.time_us)
     }
 
     /// The frames of an album that a decision looks at beside those of its own time, camera by camera,
     /// the newest first, and how many frames ago each is.
-    fn earlier<'a>(&self, album: &'a Album, now_us: i64) -> Vec<(usize, &'a Arc<Shown>)> {
+    fn earlier<'a>(
+        &self,
+        album: &'a FrameHistory,
+        now_us: i64,
+    ) -> Vec<(usize, &'a Arc<PastFrame>)> {
         let of_camera = |camera| {
             let seen = self.schedule.seen(camera, now_us).filter(|&time_us| time_us < now_us);
             let there = seen.filter_map(move |time_us| album.find(camera, time_us));
@@ -505,7 +514,7 @@ impl Layout {
 }
 
 /// What decides how much detail the views need.
-pub fn eyes(views: &[View]) -> Vec<Viewpoint> {
+pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
     // Of a rolling shutter the end of its way: detail is chosen by distance alone, in every direction.
     let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
@@ -515,7 +524,7 @@ pub fn eyes(views: &[View]) -> Vec<Viewpoint> {
 }
 
 /// The hash of a frame: of its images' hashes, in order.
-pub(super) fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
+pub(crate) fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
     let mut hasher = blake3::Hasher::new();
     for hash in images {
         hasher.update(hash.as_bytes());

@@ -1,5 +1,8 @@
 //! What all sessions share: the twins in memory, the backend, and one queue for the renderer.
 
+mod leases;
+pub(crate) mod twin_summaries;
+
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -18,9 +21,9 @@ use wildcity_twin::residency::{
 };
 use wildcity_twin::store::Catalog;
 
-use super::SessionError;
-use super::leases::Leases;
-use super::listing::{Listings, TwinSummary};
+use self::leases::Leases;
+use self::twin_summaries::{SummaryCache, TwinSummary};
+use crate::error::SessionError;
 
 /// What an engine is made of.
 pub struct EngineSettings {
@@ -41,37 +44,37 @@ pub struct EngineSettings {
 /// before is encoded. Frames are begun in the order in which they were asked for, and a session asks
 /// for one at a time, so that sessions take turns.
 pub struct Engine {
-    listings: Arc<Listings>,
+    listings: Arc<SummaryCache>,
     cache: Cache,
     leases: Arc<Leases>,
     episodes: PathBuf,
     backend: Arc<dyn Backend>,
     step_timeout: Duration,
     jobs: mpsc::Sender<Job>,
-    answers: Answers,
+    answers: AnswerBudget,
     /// By twin: the version that counts as its latest, while a newer one is made ready.
     held: Mutex<BTreeMap<String, u64>>,
 }
 
 /// Keeps what is the latest version of a twin, until dropped.
-pub struct HeldLatest {
+pub struct LatestPin {
     engine: Arc<Engine>,
     twin: String,
 }
 
 /// RGB images that are encoded and forgotten: kept between frames, so that no step allocates them.
-pub(super) type Scratch = Vec<Vec<u8>>;
+pub(crate) type Scratch = Vec<Vec<u8>>;
 
 type Job = Box<dyn FnOnce(&mut Scratch) + Send>;
 
 /// The budget of bytes for answers that are made, sent or kept.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Answers(Arc<AtomicU64>);
+pub(crate) struct AnswerBudget(Arc<AtomicU64>);
 
 /// A part of the budget, given back when dropped.
 #[derive(Debug)]
-pub(super) struct Hold {
-    answers: Answers,
+pub(crate) struct BudgetShare {
+    answers: AnswerBudget,
     bytes: u64,
 }
 
@@ -85,14 +88,14 @@ impl Engine {
         let EngineSettings { cache, episodes, backend, step_timeout } = settings;
         let (jobs, queue) = mpsc::channel::<Job>(limits::QUEUED_FRAMES);
         let queue = Arc::new(Mutex::new(queue));
-        for number in 0..backend.frames_at_once().max(1) {
+        for number in 0..backend.frames_in_flight().max(1) {
             let queue = queue.clone();
             std::thread::Builder::new()
                 .name(format!("render-{number}"))
                 .spawn(move || draw_all(&queue))
                 .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         }
-        let listings = Arc::new(Listings::new(cache.catalog().clone()));
+        let listings = Arc::new(SummaryCache::new(cache.catalog().clone()));
         Ok(Arc::new(Self {
             listings,
             leases: Arc::new(Leases::new(cache.catalog().clone())),
@@ -101,7 +104,7 @@ impl Engine {
             backend,
             step_timeout,
             jobs,
-            answers: Answers::default(),
+            answers: AnswerBudget::default(),
             held: Mutex::default(),
         }))
     }
@@ -114,7 +117,7 @@ impl Engine {
     pub async fn twins(self: &Arc<Self>) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
         let engine = self.clone();
         let listed = tokio::task::spawn_blocking(move || {
-            engine.listings.read(&|twin| engine.held_latest(twin))
+            engine.listings.read(&|twin| engine.pinned_latest(twin))
         });
         Ok(listed.await.map_err(|_| SessionError::Crashed)??)
     }
@@ -146,23 +149,23 @@ impl Engine {
     }
 
     /// Frames that wait for the renderer.
-    pub fn queued(&self) -> usize {
+    pub fn queued_frames(&self) -> usize {
         self.jobs.max_capacity() - self.jobs.capacity()
     }
 
     /// Lets a version be the latest of its twin for whoever opens it, whatever is committed meanwhile.
-    pub fn hold_latest(self: &Arc<Self>, twin: &str, number: u64) -> HeldLatest {
+    pub fn pin_latest(self: &Arc<Self>, twin: &str, number: u64) -> LatestPin {
         lock(&self.held).insert(twin.to_owned(), number);
-        HeldLatest { engine: self.clone(), twin: twin.to_owned() }
+        LatestPin { engine: self.clone(), twin: twin.to_owned() }
     }
 
     /// The version that is held, where one is.
-    pub fn held_latest(&self, twin: &str) -> Option<u64> {
+    pub fn pinned_latest(&self, twin: &str) -> Option<u64> {
         lock(&self.held).get(twin).copied()
     }
 
     /// Where a version is held, holds another in its place: one that was made the latest on purpose.
-    pub fn hold_instead(&self, twin: &str, number: u64) {
+    pub fn move_latest_pin(&self, twin: &str, number: u64) {
         if let Some(held) = lock(&self.held).get_mut(twin) {
             *held = number;
         }
@@ -201,7 +204,7 @@ impl Engine {
     }
 
     /// What else of the backend pixels depend on.
-    pub(super) fn backend_detail(&self) -> String {
+    pub(crate) fn backend_detail(&self) -> String {
         self.backend.detail()
     }
 
@@ -211,13 +214,13 @@ impl Engine {
     }
 
     /// A version of a twin, or its latest. None of its Gaussians need be in memory.
-    pub(super) async fn resident(
+    pub(crate) async fn resident(
         self: &Arc<Self>,
         twin: String,
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
-        let version = version.or_else(|| self.held_latest(&twin));
+        let version = version.or_else(|| self.pinned_latest(&twin));
         let opened = tokio::task::spawn_blocking(move || {
             let resident = engine.cache.open(&twin, version)?;
             engine.leases.hold(&resident);
@@ -227,7 +230,7 @@ impl Engine {
     }
 
     /// Makes the map of the twin's sky that a profile's frames look up, so that none of them waits for it.
-    pub(super) async fn bake(
+    pub(crate) async fn bake(
         resident: Arc<Resident>,
         profile: RenderProfile,
     ) -> Result<(), SessionError> {
@@ -238,7 +241,7 @@ impl Engine {
     }
 
     /// Sets aside the memory for the frames of a rig, if there is enough.
-    pub(super) async fn reserve(
+    pub(crate) async fn reserve(
         resident: Arc<Resident>,
         lens: RigExtent,
         profile: RenderProfile,
@@ -248,7 +251,7 @@ impl Engine {
     }
 
     /// The most that a frame of a rig anywhere in the twin needs, in bytes.
-    pub(super) async fn worst_case_bytes(
+    pub(crate) async fn worst_case_bytes(
         resident: Arc<Resident>,
         lens: RigExtent,
         profile: RenderProfile,
@@ -264,7 +267,7 @@ impl Engine {
     /// [`SessionError::Busy`] if too much is queued, [`SessionError::DeadlineExceeded`] if the
     /// result is not there in time: work that has not begun by then is dropped, work that has is
     /// finished and its result dropped.
-    pub(super) async fn run<T: Send + 'static>(
+    pub(crate) async fn run<T: Send + 'static>(
         &self,
         deadline: Instant,
         work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
@@ -293,20 +296,20 @@ impl Engine {
         }
     }
 
-    pub(super) fn answers(&self) -> &Answers {
+    pub(crate) fn answers(&self) -> &AnswerBudget {
         &self.answers
     }
 
-    pub(super) fn episodes(&self) -> &Path {
+    pub(crate) fn episodes(&self) -> &Path {
         &self.episodes
     }
 
-    pub(super) fn step_timeout(&self) -> Duration {
+    pub(crate) fn step_timeout(&self) -> Duration {
         self.step_timeout
     }
 }
 
-impl Drop for HeldLatest {
+impl Drop for LatestPin {
     fn drop(&mut self) {
         lock(&self.engine.held).remove(&self.twin);
     }
@@ -339,29 +342,29 @@ fn shrink(scratch: &mut Scratch) {
     scratch.retain(|image| image.capacity() <= limits::SCRATCH_IMAGE_BYTES);
 }
 
-impl Answers {
-    /// Takes a part of the budget.
+impl AnswerBudget {
+    /// InstantBackend a part of the budget.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if it is used up.
-    pub(super) fn hold(&self, bytes: u64) -> Result<Hold, SessionError> {
+    pub(crate) fn hold(&self, bytes: u64) -> Result<BudgetShare, SessionError> {
         let limit = limits::ANSWERS_BYTES;
         let fits = |held: u64| held.checked_add(bytes).filter(|&sum| sum <= limit);
         self.0
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits)
-            .map(|_| Hold { answers: self.clone(), bytes })
+            .map(|_| BudgetShare { answers: self.clone(), bytes })
             .map_err(|_| SessionError::Busy { what: "too many answers are kept" })
     }
 }
 
-impl Hold {
-    /// Takes over another part of the same budget.
-    pub(super) fn join(&mut self, mut other: Self) {
+impl BudgetShare {
+    /// InstantBackend over another part of the same budget.
+    pub(crate) fn join(&mut self, mut other: Self) {
         self.bytes += std::mem::take(&mut other.bytes);
     }
 }
 
-impl Drop for Hold {
+impl Drop for BudgetShare {
     fn drop(&mut self) {
         self.answers.0.fetch_sub(self.bytes, Ordering::Relaxed);
     }
@@ -378,14 +381,14 @@ mod tests {
         assert_eq!(scratch, [vec![0; 1000]]);
     }
 
-    struct Takes(usize);
+    struct InstantBackend(usize);
 
-    impl Backend for Takes {
+    impl Backend for InstantBackend {
         fn name(&self) -> &'static str {
             "takes"
         }
 
-        fn frames_at_once(&self) -> usize {
+        fn frames_in_flight(&self) -> usize {
             self.0
         }
 
@@ -393,7 +396,7 @@ mod tests {
             &self,
             _: &wildcity_render::Frame<'_>,
             _: &mut [wildcity_render::Target<'_>],
-            _: wildcity_render::Finished<'_>,
+            _: wildcity_render::OnViewDone<'_>,
         ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
             Ok(wildcity_render::FrameStats::default())
         }
@@ -406,7 +409,7 @@ mod tests {
             let engine = Engine::start(EngineSettings {
                 cache: Cache::new(Catalog::open(dir.path()).unwrap()),
                 episodes: dir.path().to_owned(),
-                backend: Arc::new(Takes(at_once)),
+                backend: Arc::new(InstantBackend(at_once)),
                 step_timeout: limits::STEP_TIMEOUT,
             });
             let engine = engine.unwrap();
@@ -439,7 +442,7 @@ mod tests {
 
     #[test]
     fn the_budget_for_answers_comes_back() {
-        let answers = Answers::default();
+        let answers = AnswerBudget::default();
         for _ in 0..3 {
             let mut half = answers.hold(limits::ANSWERS_BYTES / 2).unwrap();
             half.join(answers.hold(limits::ANSWERS_BYTES / 2).unwrap());

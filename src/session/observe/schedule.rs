@@ -8,11 +8,11 @@ use std::collections::BTreeMap;
 use crate::limits;
 use wildcity_scene::rig::RigCamera;
 
-use super::SessionError;
+use crate::error::SessionError;
 
 /// When the cameras take frames, and when the agent looks at them; times since the episode's start.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Schedule {
+pub(crate) struct Schedule {
     /// Last frames of each camera that a decision looks at.
     frames: usize,
     /// Time between two frames of each camera, in microseconds.
@@ -28,7 +28,7 @@ impl Schedule {
     /// # Errors
     /// Names the first value that is out of range or no multiple of a step, or the first camera that
     /// there is not.
-    pub(super) fn new(
+    pub(crate) fn new(
         cameras: &[RigCamera],
         dt_us: i64,
         frames: Option<u64>,
@@ -57,27 +57,27 @@ impl Schedule {
     }
 
     /// Last frames of each camera that a decision looks at.
-    pub(super) fn frames(&self) -> usize {
+    pub(crate) fn frames(&self) -> usize {
         self.frames
     }
 
     /// Time between two frames of a camera, in microseconds.
-    pub(super) fn period_us(&self, camera: usize) -> i64 {
+    pub(crate) fn period_us(&self, camera: usize) -> i64 {
         self.periods_us[camera]
     }
 
     /// Time between two decisions, in microseconds.
-    pub(super) fn decision_us(&self) -> i64 {
+    pub(crate) fn decision_us(&self) -> i64 {
         self.decision_us
     }
 
     /// Whether the agent decides at a time, in microseconds.
-    pub(super) fn decides(&self, time_us: i64) -> bool {
+    pub(crate) fn decides(&self, time_us: i64) -> bool {
         time_us.rem_euclid(self.decision_us) == 0
     }
 
     /// When the frames of a camera were taken that are looked at in a decision, newest first.
-    pub(super) fn seen(&self, camera: usize, decision_us: i64) -> impl Iterator<Item = i64> {
+    pub(crate) fn seen(&self, camera: usize, decision_us: i64) -> impl Iterator<Item = i64> {
         let period_us = self.periods_us[camera];
         let newest = decision_us.div_euclid(period_us);
         (0..self.frames as i64).map(move |back| (newest - back) * period_us)
@@ -85,13 +85,13 @@ impl Schedule {
 
     /// When the frames of a camera are taken that the next decision looks at, the one at this very
     /// time if there is one; those of later times left out, newest first.
-    pub(super) fn wanted(&self, camera: usize, time_us: i64) -> impl Iterator<Item = i64> {
+    pub(crate) fn wanted(&self, camera: usize, time_us: i64) -> impl Iterator<Item = i64> {
         let next_us = time_us + (-time_us).rem_euclid(self.decision_us);
         self.seen(camera, next_us).filter(move |&taken_us| taken_us <= time_us)
     }
 
     /// Whether a frame is looked at by a decision later than a time.
-    pub(super) fn kept(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {
+    pub(crate) fn kept(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {
         let next_us = (time_us.div_euclid(self.decision_us) + 1) * self.decision_us;
         self.seen(camera, next_us).any(|seen_us| seen_us == taken_us)
     }

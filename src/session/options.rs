@@ -12,11 +12,12 @@ use wildcity_scene::route::Route;
 use wildcity_sim::Dynamics;
 use wildcity_twin::residency::Resident;
 
-use super::{Encoding, SessionError};
+use crate::error::SessionError;
+use crate::observe::encode::Encoding;
 
 /// What opens a session. What is `None` is chosen by the twin or by `config`.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Opening {
+pub struct SessionOptions {
     /// Name of the twin.
     pub twin: String,
     /// Its version; the latest if absent.
@@ -44,7 +45,7 @@ pub struct Opening {
     pub deadline: Option<Duration>,
 }
 
-impl Opening {
+impl SessionOptions {
     /// The latest version of a twin, and every default.
     pub fn twin(twin: impl Into<String>, outputs: Outputs) -> Self {
         Self {
@@ -97,7 +98,7 @@ pub struct Outputs {
     /// How colour images travel.
     pub encoding: Encoding,
     /// What else of every image.
-    pub maps: Maps,
+    pub maps: PixelMaps,
     /// How many last frames of each camera; 1 if absent.
     pub frames: Option<u64>,
     /// Whether to say how far each image may be believed.
@@ -113,7 +114,7 @@ impl Outputs {
             cameras: None,
             images: BTreeMap::new(),
             encoding,
-            maps: Maps::default(),
+            maps: PixelMaps::default(),
             frames: None,
             trust: false,
             periods_us: BTreeMap::new(),
@@ -123,7 +124,7 @@ impl Outputs {
 
 /// What an observation holds of an image beside its colours, all f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Maps {
+pub struct PixelMaps {
     /// Expected depth in metres, `[height, width]`.
     pub depth: bool,
     /// Accumulated opacity, `[height, width]`.
@@ -132,9 +133,9 @@ pub struct Maps {
     pub normals: bool,
 }
 
-impl Maps {
+impl PixelMaps {
     /// Values per pixel.
-    pub(super) fn values(self) -> usize {
+    pub(crate) fn values(self) -> usize {
         usize::from(self.depth) + usize::from(self.opacity) + 3 * usize::from(self.normals)
     }
 }
@@ -149,7 +150,7 @@ pub struct ImagePart {
 }
 
 /// The rig's name and the wanted cameras in the wanted order, as they are to be drawn.
-pub(super) fn choose_cameras(
+pub(crate) fn choose_cameras(
     resident: &Resident,
     choice: Option<RigChoice>,
     outputs: &Outputs,
@@ -223,11 +224,11 @@ fn whole_cameras(
 }
 
 /// Where the rig was (`world_from_rig`) by time in microseconds, rising to an episode's start at 0.
-pub(super) type Track = Vec<(i64, Pose)>;
+pub(crate) type Track = Vec<(i64, Pose)>;
 
 /// How an episode gets to its start: the start alone, or `warm_up_us` of the recorded drive before it.
 /// Without a start, it is at the first drive's begin, or where that has driven for `warm_up_us`.
-pub(super) fn resolve_start(
+pub(crate) fn resolve_start(
     resident: &Resident,
     start: Option<&Start>,
     warm_up_us: i64,

@@ -37,13 +37,13 @@ pub struct TrajectorySummary {
 /// Summaries of the twins of a catalog. A manifest can have megabytes and never changes, so each is
 /// read once.
 #[derive(Debug)]
-pub(super) struct Listings {
+pub(crate) struct SummaryCache {
     catalog: Catalog,
     known: Mutex<BTreeMap<String, Arc<TwinSummary>>>,
 }
 
-impl Listings {
-    pub(super) fn new(catalog: Catalog) -> Self {
+impl SummaryCache {
+    pub(crate) fn new(catalog: Catalog) -> Self {
         Self { catalog, known: Mutex::default() }
     }
 
@@ -52,7 +52,7 @@ impl Listings {
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub(super) fn read(
+    pub(crate) fn read(
         &self,
         held: &dyn Fn(&str) -> Option<u64>,
     ) -> Result<Vec<Arc<TwinSummary>>, StoreError> {
@@ -88,7 +88,7 @@ impl Listings {
     ///
     /// # Errors
     /// It cannot.
-    pub(super) fn check(&self) -> Result<(), StoreError> {
+    pub(crate) fn check(&self) -> Result<(), StoreError> {
         self.catalog.twins().map(|_| ())
     }
 }

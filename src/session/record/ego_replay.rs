@@ -4,12 +4,13 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::ego::Path;
 use wildcity_sim::{Command, Ego, Ground};
 
-use super::record::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
-use super::{Episode, SessionError};
+use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
+use crate::episode::Episode;
+use crate::error::SessionError;
 
 /// A step whose command leads elsewhere than it did.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct StrayedStep {
+pub struct DivergedStep {
     /// Line of the episode's file, from 1.
     pub line: usize,
     /// The step.
@@ -21,18 +22,18 @@ pub struct StrayedStep {
 }
 
 /// An episode that is driven again.
-pub(super) struct Retrace {
+pub(crate) struct EgoReplay {
     episode: Episode,
 }
 
-impl Retrace {
-    pub(super) fn new(header: &EpisodeHeader) -> Self {
+impl EgoReplay {
+    pub(crate) fn new(header: &EpisodeHeader) -> Self {
         let EpisodeHeader { seed, dynamics, start, dt_us, .. } = *header;
         Self { episode: Episode::new(seed, Ego::new(dynamics, start), dt_us) }
     }
 
     /// How far it is.
-    pub(super) fn episode(&self) -> &Episode {
+    pub(crate) fn episode(&self) -> &Episode {
         &self.episode
     }
 
@@ -40,12 +41,12 @@ impl Retrace {
     ///
     /// # Errors
     /// The recorded command is none for this ego.
-    pub(super) fn follow(
+    pub(crate) fn follow(
         &mut self,
         frame: &FrameRecord,
         line: usize,
         ground: &Ground<'_>,
-    ) -> Result<Option<StrayedStep>, SessionError> {
+    ) -> Result<Option<DivergedStep>, SessionError> {
         // Others before it are of frames that a later observation shows.
         let (FrameRequest::Step, Some(recorded)) = (frame.request, frame.poses.last()) else {
             return Ok(None);
@@ -59,11 +60,11 @@ impl Retrace {
         };
         self.episode = self.episode.stepped(&command, ground, false)?;
         let (now, recorded) = (self.episode.world_from_rig(), *recorded);
-        Ok((now != recorded).then_some(StrayedStep { line, step: frame.step, recorded, now }))
+        Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))
     }
 }
 
-impl std::fmt::Display for StrayedStep {
+impl std::fmt::Display for DivergedStep {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { line, step, recorded, now } = self;
         let off_m = recorded.position_m.distance(now.position_m);

@@ -61,14 +61,14 @@ pub struct Trust {
 
 /// Where a twin was recorded and trained.
 #[derive(Debug)]
-pub struct Trained {
+pub struct TrainingCoverage {
     keyframes: Vec<Pose>,
     boxes: Boxes,
     /// Lowest and highest content of every 16 m block of the map, in metres.
     columns: HashMap<[i64; 2], [f64; 2]>,
 }
 
-impl Trained {
+impl TrainingCoverage {
     /// Of a version of a twin; `None` without a recorded drive.
     pub fn new(manifest: &Manifest) -> Option<Self> {
         let logs = manifest.trajectories.iter();
@@ -93,7 +93,7 @@ impl Trained {
     }
 
     /// How far one image of a rig may be believed; `opacity` is the image's, row by row.
-    pub fn of(&self, world_from_rig: &Pose, view: &View, opacity: &[f32]) -> Trust {
+    pub fn trust(&self, world_from_rig: &Pose, view: &View, opacity: &[f32]) -> Trust {
         let (distance_m, angle_rad) = self.nearest(world_from_rig);
         let (low_coverage, outside) = self.seen(view, opacity);
         let recorded = (-distance_m / FADES_M - angle_rad / FADES_RAD).exp();

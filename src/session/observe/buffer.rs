@@ -1,21 +1,21 @@
 //! The bytes of an observation.
 
-use super::SessionError;
-use super::engine::{Answers, Hold};
+use crate::engine::{AnswerBudget, BudgetShare};
+use crate::error::SessionError;
 
 /// Bytes at an address that is a multiple of 8, counted against the budget for answers.
 #[derive(Debug)]
-pub struct Buffer {
+pub struct ObservationBuffer {
     words: Vec<u64>,
     len: usize,
     header: usize,
-    hold: Hold,
+    hold: BudgetShare,
 }
 
-impl Buffer {
+impl ObservationBuffer {
     /// `len` zeros, the first `header` of which are the header's.
-    pub(super) fn zeroed(
-        answers: &Answers,
+    pub(crate) fn zeroed(
+        answers: &AnswerBudget,
         len: usize,
         header: usize,
     ) -> Result<Self, SessionError> {
@@ -34,14 +34,14 @@ impl Buffer {
         &mut self.bytes_mut()[..header]
     }
 
-    pub(super) fn bytes_mut(&mut self) -> &mut [u8] {
+    pub(crate) fn bytes_mut(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.words)[..self.len]
     }
 
     /// Makes room behind and copies parts there, one after the other.
-    pub(super) fn append(
+    pub(crate) fn append(
         &mut self,
-        answers: &Answers,
+        answers: &AnswerBudget,
         parts: &[&[u8]],
     ) -> Result<(), SessionError> {
         let mut start = self.len;
@@ -66,8 +66,8 @@ mod tests {
 
     #[test]
     fn memory_is_what_the_budget_knows_of() {
-        let answers = Answers::default();
-        let mut buffer = Buffer::zeroed(&answers, 80_000, 16).unwrap();
+        let answers = AnswerBudget::default();
+        let mut buffer = ObservationBuffer::zeroed(&answers, 80_000, 16).unwrap();
         buffer.append(&answers, &[&[1; 5], &[2; 11]]).unwrap();
         assert_eq!(buffer.bytes().len(), 80_016);
         assert_eq!(buffer.words.capacity() * 8, 80_016);

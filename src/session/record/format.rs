@@ -24,10 +24,11 @@ use wildcity_scene::{RenderProfile, Rig};
 use wildcity_sim::ego::{Action, TimedPose};
 use wildcity_sim::{Command, Dynamics};
 
-use super::{Encoding, Summary};
+use crate::episode::EpisodeSummary;
+use crate::observe::encode::Encoding;
 
 /// What built this program, as it stands in records.
-pub(super) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
+pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
 
 /// The first line: everything that the images are a function of, but the poses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -151,7 +152,7 @@ pub enum FrameRequest {
 /// A line of an episode's file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
-pub(super) enum Line {
+pub(crate) enum Line {
     /// The first.
     Episode(Box<EpisodeHeader>),
     /// One per answer with images.
@@ -159,7 +160,7 @@ pub(super) enum Line {
     /// Between two frames.
     Version(RecordedVersion),
     /// The last.
-    End(Summary),
+    End(EpisodeSummary),
 }
 
 /// Why an episode could not be recorded.
@@ -174,14 +175,14 @@ pub struct RecordError {
 
 /// An episode's file, open for appending.
 #[derive(Clone, Debug)]
-pub(super) struct Recorder {
+pub(crate) struct Recorder {
     file: Arc<File>,
     path: Arc<Path>,
 }
 
 impl RecordedCommand {
     /// What of a command goes on record.
-    pub(super) fn of(command: &Command) -> Option<Self> {
+    pub(crate) fn of(command: &Command) -> Option<Self> {
         match command {
             Command::Pose(_) => None,
             Command::Path(path) => Some(Self::Trajectory(path.poses().to_vec())),
@@ -198,7 +199,7 @@ impl EpisodeHeader {
 impl Recorder {
     /// Creates the file of the first free number from `first_number` on and writes its first
     /// lines; tells the number. No file is left behind if that fails.
-    pub(super) fn create(
+    pub(crate) fn create(
         dir: &Path,
         session: &str,
         first_number: u64,
@@ -228,7 +229,7 @@ impl Recorder {
     }
 
     /// Appends whole lines, or nothing.
-    pub(super) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
+    pub(crate) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
         let mut text = Vec::with_capacity(2048);
         let written = lines
             .iter()
@@ -250,7 +251,7 @@ impl Recorder {
 }
 
 /// BLAKE3 of a profile's JSON.
-pub(super) fn profile_hash(profile: &RenderProfile) -> blake3::Hash {
+pub(crate) fn profile_hash(profile: &RenderProfile) -> blake3::Hash {
     // Writing seven numbers to memory cannot fail, and an empty text would only change the hash.
     blake3::hash(&serde_json::to_vec(profile).unwrap_or_default())
 }
@@ -262,7 +263,7 @@ mod tests {
 
     fn end(steps: u64) -> Line {
         let (outcome, least_trust) = (Outcome::Completed, None);
-        Line::End(Summary { outcome, steps, time_us: 0, distance_m: 0.0, least_trust })
+        Line::End(EpisodeSummary { outcome, steps, time_us: 0, distance_m: 0.0, least_trust })
     }
 
     #[test]

@@ -13,11 +13,13 @@ use wildcity_scene::rig::{RigCamera, RigError};
 use wildcity_sim::Ground;
 use wildcity_twin::residency::{ResidencyError, Resident};
 
-use super::record::{
+use super::ego_replay::{DivergedStep, EgoReplay};
+use super::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedVersion, profile_hash,
 };
-use super::retrace::{Retrace, StrayedStep};
-use super::{SessionError, Summary, observation};
+use crate::episode::EpisodeSummary;
+use crate::error::SessionError;
+use crate::observe::builder::viewpoints;
 
 // In base64 and with a thousandth for what PNG adds; a rig and a profile are below 1 MiB.
 const _: () =
@@ -25,7 +27,7 @@ const _: () =
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Recording {
+pub struct RecordedEpisode {
     /// What it was rendered from, and how.
     pub header: EpisodeHeader,
     /// Everything rendered, in order; the first stands in line 2 of the file.
@@ -33,34 +35,34 @@ pub struct Recording {
     /// Versions that the session switched to, and how many frames were rendered before.
     pub versions: Vec<(usize, RecordedVersion)>,
     /// How it went; absent if the server was killed or is still running.
-    pub end: Option<Summary>,
+    pub end: Option<EpisodeSummary>,
 }
 
 /// How a replay went.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Report {
+pub struct ReplayReport {
     /// Images rendered again.
     pub images: u64,
     /// What is not as it was when the episode was recorded.
-    pub changes: Vec<Change>,
+    pub changes: Vec<ProvenanceChange>,
     /// The first step whose command does not lead where it did.
-    pub strayed: Option<StrayedStep>,
+    pub diverged: Option<DivergedStep>,
     /// The first image that differs.
-    pub difference: Option<Difference>,
+    pub difference: Option<ImageDifference>,
 }
 
 /// How far to render.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Extent {
+pub enum ReplayUntil {
     /// To the end, whatever differs.
-    Whole,
+    End,
     /// To the first image that differs, or the first step that strays.
     FirstDifference,
 }
 
 /// Something that is not as it was.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Change {
+pub struct ProvenanceChange {
     /// `build`, `backend`, `backend detail`, `version hash` or `profile hash`.
     pub what: &'static str,
     /// As recorded.
@@ -71,7 +73,7 @@ pub struct Change {
 
 /// An image that differs from the recorded one.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Difference {
+pub struct ImageDifference {
     /// Line of the episode's file, from 1.
     pub line: usize,
     /// What was asked.
@@ -90,7 +92,7 @@ pub struct Difference {
 
 /// An image that was rendered again.
 #[derive(Clone, Copy, Debug)]
-pub struct Redrawn<'a> {
+pub struct ReplayedImage<'a> {
     /// The answer that it belongs to, counted from 0.
     pub frame: usize,
     /// What was asked.
@@ -168,7 +170,7 @@ pub enum ReplayError {
     },
 }
 
-impl Recording {
+impl RecordedEpisode {
     /// Reads an episode's file.
     ///
     /// # Errors
@@ -230,14 +232,14 @@ impl Recording {
         &self,
         open: &mut dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError>,
         backend: &dyn Backend,
-        extent: Extent,
-        visit: &mut dyn FnMut(&Redrawn<'_>) -> Result<(), String>,
-    ) -> Result<Report, ReplayError> {
+        extent: ReplayUntil,
+        visit: &mut dyn FnMut(&ReplayedImage<'_>) -> Result<(), String>,
+    ) -> Result<ReplayReport, ReplayError> {
         let mut resident = open(self.header.version)?;
         let mut profile = &self.header.profile;
         let changes = self.changes(&resident, backend);
-        let mut report = Report { images: 0, changes, strayed: None, difference: None };
-        let mut retrace = Retrace::new(&self.header);
+        let mut report = ReplayReport { images: 0, changes, diverged: None, difference: None };
+        let mut retrace = EgoReplay::new(&self.header);
         let mut switches = self.versions.iter().peekable();
         let mut lines_before = 2;
         let all = &self.header.rig.cameras;
@@ -252,12 +254,12 @@ impl Recording {
                 report.changes.extend(scene_changes(recorded, &resident, profile));
             }
             let ground = Ground::of(&resident.version.manifest.trajectories);
-            let strayed = retrace
+            let diverged = retrace
                 .follow(frame, index + lines_before, &ground)
                 .map_err(|cause| ReplayError::Ego { step: frame.step, cause: Box::new(cause) })?;
-            if report.strayed.is_none() && strayed.is_some() {
-                report.strayed = strayed;
-                if extent == Extent::FirstDifference {
+            if report.diverged.is_none() && diverged.is_some() {
+                report.diverged = diverged;
+                if extent == ReplayUntil::FirstDifference {
                     return Ok(report);
                 }
             }
@@ -271,7 +273,7 @@ impl Recording {
                 // What is drawn before the last pose of a step is of a warm-up.
                 let moves = frame.request == FrameRequest::Observe || pose + 1 == frame.poses.len();
                 let views = retrace.episode().views((all, &cameras), *world_from_rig, moves);
-                let scene = resident.scene(&observation::eyes(&views), profile);
+                let scene = resident.scene(&viewpoints(&views), profile);
                 let scene = scene.map_err(|cause| ReplayError::Residency { step, cause })?;
                 let to_draw = RenderFrame { scene: &scene, profile, views: &views };
                 redraw(backend, &to_draw, (all, &cameras), &mut pixels)
@@ -279,16 +281,15 @@ impl Recording {
                 for (&camera, recorded) in cameras.iter().zip(&mut recorded) {
                     let (camera, rgb8) = (&all[camera], &*pixels[camera]);
                     let FrameRecord { request, step, .. } = *frame;
-                    visit(&Redrawn { frame: index, request, step, pose, camera, rgb8 }).map_err(
-                        |reason| {
+                    visit(&ReplayedImage { frame: index, request, step, pose, camera, rgb8 })
+                        .map_err(|reason| {
                             let camera = camera.name.clone();
                             ReplayError::Visit { step, camera, reason }
-                        },
-                    )?;
+                        })?;
                     report.images += 1;
                     let now = blake3::hash(rgb8).to_hex().to_string();
                     if now != *recorded && report.difference.is_none() {
-                        report.difference = Some(Difference {
+                        report.difference = Some(ImageDifference {
                             line: index + lines_before,
                             request,
                             step,
@@ -297,7 +298,7 @@ impl Recording {
                             recorded: recorded.clone(),
                             now,
                         });
-                        if extent == Extent::FirstDifference {
+                        if extent == ReplayUntil::FirstDifference {
                             return Ok(report);
                         }
                     }
@@ -307,7 +308,7 @@ impl Recording {
         Ok(report)
     }
 
-    fn changes(&self, resident: &Resident, backend: &dyn Backend) -> Vec<Change> {
+    fn changes(&self, resident: &Resident, backend: &dyn Backend) -> Vec<ProvenanceChange> {
         let header = &self.header;
         let of_build = [
             ("build", &*header.build, BUILD),
@@ -327,7 +328,7 @@ fn scene_changes(
     (version, profile_then): (&str, &str),
     resident: &Resident,
     profile: &RenderProfile,
-) -> Vec<Change> {
+) -> Vec<ProvenanceChange> {
     let now = profile_hash(profile).to_hex();
     differing([
         ("version hash", version, &*resident.version.hash),
@@ -335,11 +336,11 @@ fn scene_changes(
     ])
 }
 
-fn differing<const N: usize>(compared: [(&'static str, &str, &str); N]) -> Vec<Change> {
+fn differing<const N: usize>(compared: [(&'static str, &str, &str); N]) -> Vec<ProvenanceChange> {
     compared
         .into_iter()
         .filter(|(_, recorded, now)| recorded != now)
-        .map(|(what, recorded, now)| Change {
+        .map(|(what, recorded, now)| ProvenanceChange {
             what,
             recorded: recorded.to_owned(),
             now: now.to_owned(),
@@ -347,7 +348,7 @@ fn differing<const N: usize>(compared: [(&'static str, &str, &str); N]) -> Vec<C
         .collect()
 }
 
-impl std::fmt::Display for Difference {
+impl std::fmt::Display for ImageDifference {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { line, step, pose, camera, recorded, now, request } = self;
         write!(f, "step {step}, camera {camera:?}")?;

@@ -3,17 +3,17 @@
 use std::fmt;
 
 use super::{Case, Outcome, Verdict};
-use wildcity_render::compare::drawing::{AGREED_DB, Drawing, agree, draw};
+use wildcity_render::compare::images::{AGREEMENT_DB, RenderedImage, agree, render_images};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 
 /// One case on one backend.
-pub struct Trial<'a> {
+pub struct CaseRun<'a> {
     backend: &'a dyn Backend,
     checks: Vec<Check>,
     refused: Option<RenderError>,
-    only: Option<String>,
+    reduced_to: Option<String>,
 }
 
 /// A measured value and its bound.
@@ -35,9 +35,9 @@ enum Bound {
     So,
 }
 
-impl<'a> Trial<'a> {
+impl<'a> CaseRun<'a> {
     pub(super) fn new(backend: &'a dyn Backend) -> Self {
-        Self { backend, checks: Vec::new(), refused: None, only: None }
+        Self { backend, checks: Vec::new(), refused: None, reduced_to: None }
     }
 
     /// Everything that was looked at.
@@ -47,23 +47,33 @@ impl<'a> Trial<'a> {
 
     /// How it went, in the end.
     pub(super) fn outcome(self, case: &Case, ended: Result<(), RenderError>) -> Outcome {
-        let (verdict, told, strain) = match (self.verdict(), &self.refused, ended) {
+        let (verdict, detail, bound_usage) = match (self.verdict(), &self.refused, ended) {
             (_, _, Err(error)) => (Verdict::Missed, error.to_string(), f64::INFINITY),
             (Some(check), _, _) if !check.holds() => {
-                (Verdict::Missed, check.to_string(), check.strain())
+                (Verdict::Missed, check.to_string(), check.bound_usage())
             }
             (_, Some(limit), _) => (Verdict::Refused, limit.to_string(), 0.0),
-            (Some(check), None, _) => (Verdict::Held, check.to_string(), check.strain()),
+            (Some(check), None, _) => (Verdict::Held, check.to_string(), check.bound_usage()),
             (None, None, _) => (Verdict::Missed, "nothing was compared".to_owned(), f64::INFINITY),
         };
         let (case, backend, checks) = (case.number, self.backend.name(), self.checks.len());
-        Outcome { case, backend, verdict, only: self.only, told, strain, checks, seconds: 0.0 }
+        Outcome {
+            case,
+            backend,
+            verdict,
+            reduced_to: self.reduced_to,
+            detail,
+            bound_usage,
+            checks,
+            seconds: 0.0,
+        }
     }
 
     /// The first bound that does not hold, else the one that is closest to not holding.
     pub(super) fn verdict(&self) -> Option<&Check> {
         let missed = self.checks.iter().find(|check| !check.holds());
-        let closest = || self.checks.iter().max_by(|a, b| a.strain().total_cmp(&b.strain()));
+        let closest =
+            || self.checks.iter().max_by(|a, b| a.bound_usage().total_cmp(&b.bound_usage()));
         missed.or_else(closest)
     }
 
@@ -94,8 +104,8 @@ impl<'a> Trial<'a> {
     }
 
     /// Says what is drawn, where that is less than what the case says.
-    pub(super) fn draws_only(&mut self, what: impl Into<String>) {
-        self.only = Some(what.into());
+    pub(super) fn reduce_to(&mut self, what: impl Into<String>) {
+        self.reduced_to = Some(what.into());
     }
 
     /// Whether this is the definition itself.
@@ -109,8 +119,8 @@ impl<'a> Trial<'a> {
         scene: &Scene,
         profile: &RenderProfile,
         view: View,
-    ) -> Result<Drawing, RenderError> {
-        Ok(draw(self.backend, scene, profile, &[view])?.remove(0))
+    ) -> Result<RenderedImage, RenderError> {
+        Ok(render_images(self.backend, scene, profile, &[view])?.remove(0))
     }
 
     /// What a frame of a view costs.
@@ -132,8 +142,8 @@ impl<'a> Trial<'a> {
         scene: &Scene,
         profile: &RenderProfile,
         views: &[View],
-    ) -> Result<Vec<Drawing>, RenderError> {
-        draw(self.backend, scene, profile, views)
+    ) -> Result<Vec<RenderedImage>, RenderError> {
+        render_images(self.backend, scene, profile, views)
     }
 
     /// The definition's drawing.
@@ -142,8 +152,8 @@ impl<'a> Trial<'a> {
         scene: &Scene,
         profile: &RenderProfile,
         view: View,
-    ) -> Result<Drawing, RenderError> {
-        Ok(draw(&Reference, scene, profile, &[view])?.remove(0))
+    ) -> Result<RenderedImage, RenderError> {
+        Ok(render_images(&Reference, scene, profile, &[view])?.remove(0))
     }
 
     /// The backend's drawing, after it was looked at whether it is finite, and whether the definition's is
@@ -154,9 +164,9 @@ impl<'a> Trial<'a> {
         scene: &Scene,
         profile: &RenderProfile,
         view: View,
-    ) -> Result<Drawing, RenderError> {
+    ) -> Result<RenderedImage, RenderError> {
         let (what, drawing) = (what.into(), self.draw(scene, profile, view)?);
-        let Drawing { rgba, depth_m, opacity, .. } = &drawing;
+        let RenderedImage { rgba, depth_m, opacity, .. } = &drawing;
         let mut values = rgba.iter().chain(depth_m).chain(opacity);
         self.holds(format!("{what}: every value is finite"), values.all(|v| v.is_finite()));
         if !self.is_reference() {
@@ -167,9 +177,14 @@ impl<'a> Trial<'a> {
     }
 
     /// Looks at whether two drawings are of one thing.
-    pub(super) fn compare(&mut self, what: impl Into<String>, drawing: &Drawing, truth: &Drawing) {
+    pub(super) fn compare(
+        &mut self,
+        what: impl Into<String>,
+        drawing: &RenderedImage,
+        truth: &RenderedImage,
+    ) {
         match agree(drawing, truth) {
-            Ok(db) => self.at_least_db(format!("{}: as f64, dB", what.into()), db, AGREED_DB),
+            Ok(db) => self.at_least_db(format!("{}: as f64, dB", what.into()), db, AGREEMENT_DB),
             Err(off) => self.holds(format!("{}: as f64, {off}", what.into()), false),
         }
     }
@@ -187,7 +202,7 @@ impl Check {
 
     /// How much of its bound the value takes: 1 is all of it. Of decibels it is the error that counts, a tenth
     /// for every 20 dB.
-    pub fn strain(&self) -> f64 {
+    pub fn bound_usage(&self) -> f64 {
         match self.bound {
             Bound::Most(0.0) => self.measured,
             Bound::Most(most) => self.measured / most,
@@ -224,22 +239,22 @@ impl fmt::Display for Check {
 mod tests {
     use super::*;
 
-    fn strain(measured: f64, bound: Bound) -> f64 {
-        Check { what: String::new(), measured, bound }.strain()
+    fn bound_usage(measured: f64, bound: Bound) -> f64 {
+        Check { what: String::new(), measured, bound }.bound_usage()
     }
 
     #[test]
-    fn strain_is_the_share_of_the_bound() {
-        assert_eq!(strain(0.5, Bound::Most(2.0)), 0.25);
-        assert_eq!(strain(70.0, Bound::LeastDb(70.0)), 1.0);
-        assert!((strain(110.0, Bound::LeastDb(70.0)) - 0.01).abs() < 1e-15);
-        assert!((strain(50.0, Bound::LeastDb(70.0)) - 10.0).abs() < 1e-12);
-        assert_eq!(strain(f64::INFINITY, Bound::LeastDb(70.0)), 0.0);
+    fn bound_usage_is_the_share_of_the_bound() {
+        assert_eq!(bound_usage(0.5, Bound::Most(2.0)), 0.25);
+        assert_eq!(bound_usage(70.0, Bound::LeastDb(70.0)), 1.0);
+        assert!((bound_usage(110.0, Bound::LeastDb(70.0)) - 0.01).abs() < 1e-15);
+        assert!((bound_usage(50.0, Bound::LeastDb(70.0)) - 10.0).abs() < 1e-12);
+        assert_eq!(bound_usage(f64::INFINITY, Bound::LeastDb(70.0)), 0.0);
     }
 
     #[test]
-    fn what_is_told_is_what_is_closest_to_its_bound() {
-        let mut trial = Trial::new(&Reference);
+    fn the_detail_is_the_check_that_is_closest_to_its_bound() {
+        let mut trial = CaseRun::new(&Reference);
         trial.at_least_db("far from its bound, dB", 145.0, 70.0);
         trial.at_most("close to it", 3e-4, 5e-4);
         trial.at_least_db("closer, dB", 71.0, 70.0);

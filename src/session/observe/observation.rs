@@ -3,20 +3,20 @@
 use std::ops::Range;
 use std::time::Duration;
 
-use super::Trust;
-use super::buffer::Buffer;
+use super::buffer::ObservationBuffer;
+use super::trust::Trust;
 
 /// A finished observation.
 #[derive(Debug)]
-pub struct Frame {
+pub struct Observation {
     /// The bytes of all tensors, behind the reserved header.
-    pub buffer: Buffer,
+    pub buffer: ObservationBuffer,
     /// What is where in the buffer, in order and without gaps.
     pub tensors: Vec<Tensor>,
     /// The images, pose by pose, camera by camera.
-    pub images: Vec<Image>,
+    pub images: Vec<ImageInfo>,
     /// Earlier frames of the same cameras, camera by camera, the newest first.
-    pub history: Vec<PastImage>,
+    pub history: Vec<PastImageInfo>,
     /// BLAKE3 of the images' hashes, 32 bytes each, in order.
     pub frame_hash: blake3::Hash,
     /// How many poses of the ego history were driven.
@@ -24,12 +24,12 @@ pub struct Frame {
     /// What it cost.
     pub timings: Timings,
     /// What of it had to be loaded.
-    pub residency: Residency,
+    pub residency: ResidencyStats,
 }
 
 /// Memory behind an observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Residency {
+pub struct ResidencyStats {
     /// Bytes of Gaussians in memory, of all twins.
     pub held_bytes: u64,
     /// Bytes that there may be.
@@ -40,10 +40,10 @@ pub struct Residency {
     pub waited: Duration,
 }
 
-/// One image of a [`Frame`].
+/// One image of a [`Observation`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Image {
-    /// Index of the camera among [`super::Session::cameras`].
+pub struct ImageInfo {
+    /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
     /// Which of the request's poses.
     pub pose: usize,
@@ -55,10 +55,10 @@ pub struct Image {
     pub trust: Option<Trust>,
 }
 
-/// One image of a [`Frame`] that was taken before it.
+/// One image of a [`Observation`] that was taken before it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PastImage {
-    /// Index of the camera among [`super::Session::cameras`].
+pub struct PastImageInfo {
+    /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
     /// How many frames of this camera ago, from 1.
     pub back: usize,
@@ -70,7 +70,7 @@ pub struct PastImage {
     pub trust: Option<Trust>,
 }
 
-/// One tensor of a [`Frame`].
+/// One tensor of a [`Observation`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
     /// What it holds.
@@ -83,7 +83,7 @@ pub struct Tensor {
     pub bytes: Range<usize>,
 }
 
-/// What a tensor holds; images by their index in [`Frame::images`].
+/// What a tensor holds; images by their index in [`Observation::images`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TensorKind {
     /// Positions of the ego history, in metres: `[16, 3]`.
@@ -98,7 +98,7 @@ pub enum TensorKind {
     Normals(usize),
     /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
     Rgb(usize),
-    /// Colour of an earlier frame, by its index in [`Frame::history`]: the same.
+    /// Colour of an earlier frame, by its index in [`Observation::history`]: the same.
     PastRgb(usize),
 }
 
@@ -126,7 +126,7 @@ pub struct Timings {
 
 impl DType {
     /// Bytes of one.
-    pub(super) fn bytes(self) -> usize {
+    pub(crate) fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
             Self::U8 => 1,

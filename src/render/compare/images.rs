@@ -10,7 +10,7 @@ use wildcity_scene::{RenderProfile, Scene};
 
 /// What a backend says of one view, row by row from the top; the shapes are those of [`Target`].
 #[derive(Clone, Debug, PartialEq)]
-pub struct Drawing {
+pub struct RenderedImage {
     /// `[height, width, 4]`: linear premultiplied colour on black, and opacity.
     pub rgba: Vec<f32>,
     /// `[height, width, 3]`: the colour in 8 bit.
@@ -25,30 +25,31 @@ pub struct Drawing {
 ///
 /// # Errors
 /// As [`Backend::render`].
-pub fn draw(
+pub fn render_images(
     backend: &dyn Backend,
     scene: &Scene,
     profile: &RenderProfile,
     views: &[View],
-) -> Result<Vec<Drawing>, RenderError> {
+) -> Result<Vec<RenderedImage>, RenderError> {
     // Garbage, so that a pixel that nobody wrote is seen.
     let empty = |view: &View| {
         let pixels = view.camera.pixels();
-        Drawing {
+        RenderedImage {
             rgba: vec![f32::NAN; 4 * pixels],
             rgb8: vec![77; 3 * pixels],
             depth_m: vec![f32::NAN; pixels],
             opacity: vec![f32::NAN; pixels],
         }
     };
-    let mut drawings: Vec<Drawing> = views.iter().map(empty).collect();
-    let targets = drawings.iter_mut().map(|Drawing { rgba, rgb8, depth_m, opacity }| Target {
-        rgba: Some(rgba),
-        rgb8: Some(rgb8),
-        depth_m: Some(depth_m),
-        opacity: Some(opacity),
-        ..Target::default()
-    });
+    let mut drawings: Vec<RenderedImage> = views.iter().map(empty).collect();
+    let targets =
+        drawings.iter_mut().map(|RenderedImage { rgba, rgb8, depth_m, opacity }| Target {
+            rgba: Some(rgba),
+            rgb8: Some(rgb8),
+            depth_m: Some(depth_m),
+            opacity: Some(opacity),
+            ..Target::default()
+        });
     let mut targets: Vec<Target<'_>> = targets.collect();
     backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;
     Ok(drawings)
@@ -56,7 +57,7 @@ pub fn draw(
 
 /// A camera with a centred principal point and square pixels, at `position_m`, that looks along
 /// `forward` with `down` on the image's lower side.
-pub fn look(
+pub fn view_along(
     size_px: [u32; 2],
     focal_px: f64,
     position_m: DVec3,
@@ -78,7 +79,7 @@ pub fn look(
 }
 
 /// A part of a view's image, as a view of its own. It may begin before the image, and reach beyond.
-pub fn crop(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32; 2]) -> View {
+pub fn crop_view(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32; 2]) -> View {
     let mut camera = Camera { width_px, height_px, ..whole.camera };
     camera.pinhole.cx -= f64::from(left);
     camera.pinhole.cy -= f64::from(top);
@@ -89,8 +90,8 @@ pub fn crop(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32; 2])
 ///
 /// # Panics
 /// If the part is not within the drawing.
-pub fn cut(
-    drawing: &Drawing,
+pub fn crop_rgba(
+    drawing: &RenderedImage,
     width_px: u32,
     [left, top]: [u32; 2],
     [columns, rows]: [u32; 2],
@@ -121,19 +122,19 @@ pub fn max_difference(a: &[f32], b: &[f32]) -> f32 {
 }
 
 /// Least PSNR at which two drawings agree, in dB.
-pub const AGREED_DB: f64 = 70.0;
+pub const AGREEMENT_DB: f64 = 70.0;
 
-/// Whether two backends drew the same thing: at least [`AGREED_DB`], no value off by more than 2/255,
+/// Whether two backends drew the same thing: at least [`AGREEMENT_DB`], no value off by more than 2/255,
 /// and depths within a hundredth, on average 1e-4, where at least half the pixel is covered. Gives the
 /// PSNR in dB.
 ///
 /// # Errors
 /// Says what is off, and by how much.
-pub fn agree(drawing: &Drawing, truth: &Drawing) -> Result<f64, String> {
+pub fn agree(drawing: &RenderedImage, truth: &RenderedImage) -> Result<f64, String> {
     let pairs = drawing.rgba.iter().zip(&truth.rgba);
     let db = psnr_db(pairs.map(|(a, b)| f64::from(a - b)));
     let off = max_difference(&drawing.rgba, &truth.rgba);
-    let close = db >= AGREED_DB && off <= 2.0 / 255.0;
+    let close = db >= AGREEMENT_DB && off <= 2.0 / 255.0;
     if !close {
         return Err(format!("{db:.1} dB, off by {off:.5}"));
     }

@@ -14,20 +14,20 @@ const POINT_PX: f64 = 2.0;
 
 /// Points that a camera should show.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Points {
+pub struct ReprojectionErrors {
     /// How many there were.
     pub count: usize,
     /// How far the worst was from its pixel; infinite if one was not seen.
     pub worst_px: f64,
 }
 
-impl Points {
+impl ReprojectionErrors {
     /// Draws a grid of small Gaussians before a camera, where its lens says that known places of the image
     /// look, and finds them by their centroids.
     ///
     /// # Errors
     /// The backend cannot draw them.
-    pub fn of(backend: &dyn Backend, view: &View) -> Result<Self, RenderError> {
+    pub fn measure(backend: &dyn Backend, view: &View) -> Result<Self, RenderError> {
         let size_px = view.camera.size_px();
         let mut gaussians = Gaussians::with_capacity(0, 0);
         let mut wanted = Vec::new();

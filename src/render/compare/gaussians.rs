@@ -3,12 +3,12 @@
 use glam::{DQuat, DVec3};
 
 use crate::View;
-use crate::compare::drawing::look;
+use crate::compare::images::view_along;
 use wildcity_scene::{Gaussians, Scene, sh};
 
 /// One Gaussian, by default an orange ball of 10 cm, 5 m ahead of [`ahead`].
 #[derive(Clone, Copy, Debug)]
-pub struct Blob {
+pub struct GaussianSpec {
     /// Centre, in metres.
     pub mean_m: DVec3,
     /// Rotation of its own axes.
@@ -21,7 +21,7 @@ pub struct Blob {
     pub rgb: [f64; 3],
 }
 
-impl Default for Blob {
+impl Default for GaussianSpec {
     fn default() -> Self {
         Self {
             mean_m: DVec3::new(0.0, 0.0, 5.0),
@@ -34,14 +34,14 @@ impl Default for Blob {
 }
 
 /// The scene that they make.
-pub fn scene(blobs: &[Blob]) -> Scene {
-    Scene::from_gaussians(&raw(blobs))
+pub fn scene_of(blobs: &[GaussianSpec]) -> Scene {
+    Scene::from_gaussians(&gaussians_of(blobs))
 }
 
 /// Raw columns of SH degree 0.
-pub fn raw(blobs: &[Blob]) -> Gaussians {
+pub fn gaussians_of(blobs: &[GaussianSpec]) -> Gaussians {
     let mut g = Gaussians::with_capacity(0, blobs.len());
-    for Blob { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
+    for GaussianSpec { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
         g.means_m.push(mean_m.to_array());
         g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
         g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
@@ -52,6 +52,6 @@ pub fn raw(blobs: &[Blob]) -> Gaussians {
 }
 
 /// A camera at the origin that looks along +z, y down.
-pub fn ahead(size_px: [u32; 2], focal_px: f64) -> View {
-    look(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
+pub fn forward_view(size_px: [u32; 2], focal_px: f64) -> View {
+    view_along(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
 }

@@ -11,7 +11,7 @@ use wildcity_twin::residency::Urgency;
 
 /// A recorded drive that the ego may follow.
 #[derive(Debug)]
-pub(super) struct Route {
+pub(crate) struct RecordedDrive {
     poses: Vec<Pose>,
     /// Distance of each pose along the drive, in metres.
     stations_m: Vec<f64>,
@@ -21,28 +21,28 @@ pub(super) struct Route {
 
 /// What is known of where the ego goes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ahead<'a> {
+pub(crate) struct EgoForecast<'a> {
     /// `world_from_rig` now.
-    pub(super) now: Pose,
+    pub(crate) now: Pose,
     /// The way of the last step, in metres along world axes; zero at the start.
-    pub(super) last_step_m: DVec3,
+    pub(crate) last_step_m: DVec3,
     /// Steps to look ahead.
-    pub(super) steps: usize,
+    pub(crate) steps: usize,
     /// The drive that it may follow.
-    pub(super) route: Option<&'a Route>,
+    pub(crate) route: Option<&'a RecordedDrive>,
     /// Where the agent says that it may go next, in order.
-    pub(super) hint: &'a [Pose],
+    pub(crate) hint: &'a [Pose],
 }
 
-impl Ahead<'_> {
+impl EgoForecast<'_> {
     /// Poses (`world_from_rig`), the soonest first: the next steps' own places, then some metres apart
     /// as far as the steps reach, then along the hint.
     ///
     /// Near the drive and not against it, the ego is taken to follow it, as far beside it and as turned
     /// as it is now; else it is taken to go straight on.
-    pub(super) fn places(&self) -> Vec<(Urgency, Pose)> {
+    pub(crate) fn places(&self) -> Vec<(Urgency, Pose)> {
         let step_m = self.last_step_m.length();
-        let moves = step_m > limits::STANDING_M;
+        let moves = step_m > limits::STANDSTILL_STEP_M;
         let mut places = Vec::new();
         let followed = self.followed();
         let after = |way_m: f64| match followed {
@@ -65,7 +65,7 @@ impl Ahead<'_> {
         let far_m = match (moves, followed) {
             (true, _) => step_m * self.steps as f64,
             // It stands where a drive goes on.
-            (false, Some(_)) => limits::STANDING_AHEAD_M,
+            (false, Some(_)) => limits::STANDSTILL_AHEAD_M,
             (false, None) => 0.0,
         };
         while way_m < far_m && places.len() < limits::PREFETCH_PLACES {
@@ -77,7 +77,7 @@ impl Ahead<'_> {
     }
 
     /// The drive, and where along it the ego is, if it follows it.
-    fn followed(&self) -> Option<(&Route, f64)> {
+    fn followed(&self) -> Option<(&RecordedDrive, f64)> {
         let route = self.route?;
         let (station_m, distance_m) = route.nearest(self.now.position_m)?;
         let on = route.at(station_m + 1.0).position_m - route.at(station_m).position_m;
@@ -89,7 +89,7 @@ impl Ahead<'_> {
 /// What is left of a hint for an ego that has come so far: what lies behind the last pose that it is
 /// near is done. A pose that is much farther along the hint than from its front to the ego is still to
 /// come, however near: a hint may lead back to its start.
-pub(super) fn rest(hint: &[Pose], now: Pose) -> &[Pose] {
+pub(crate) fn rest(hint: &[Pose], now: Pose) -> &[Pose] {
     let near_m = 2.0 * limits::PREFETCH_SPACING_M;
     let Some(front) = hint.first() else { return hint };
     let most_m = 2.0 * front.position_m.distance(now.position_m) + near_m;
@@ -121,9 +121,9 @@ fn along(corners: &[Pose]) -> Vec<Pose> {
     poses
 }
 
-impl Route {
+impl RecordedDrive {
     /// Of a trajectory.
-    pub(super) fn new(log: &Trajectory) -> Self {
+    pub(crate) fn new(log: &Trajectory) -> Self {
         let poses: Vec<Pose> = log.keyframes.iter().map(|frame| frame.world_from_rig).collect();
         let mut stations_m = Vec::with_capacity(poses.len());
         let mut way_m = 0.0;
@@ -182,7 +182,7 @@ mod tests {
     use wildcity_scene::trajectory::Keyframe;
 
     /// 100 m east, then 100 m north.
-    fn route() -> Route {
+    fn route() -> RecordedDrive {
         let pose = |i: i64| {
             let way_m = i as f64;
             let (position_m, yaw) = if way_m <= 100.0 {
@@ -193,7 +193,10 @@ mod tests {
             Pose { position_m, rotation: DQuat::from_rotation_z(yaw) }
         };
         let keyframe = |i| Keyframe { time_us: i, world_from_rig: pose(i) };
-        Route::new(&Trajectory { name: "log".into(), keyframes: (0..=200).map(keyframe).collect() })
+        RecordedDrive::new(&Trajectory {
+            name: "log".into(),
+            keyframes: (0..=200).map(keyframe).collect(),
+        })
     }
 
     fn at(x_m: f64, y_m: f64) -> Pose {
@@ -203,10 +206,10 @@ mod tests {
     fn ahead<'a>(
         now: Pose,
         step_m: DVec3,
-        route: Option<&'a Route>,
+        route: Option<&'a RecordedDrive>,
         hint: &'a [Pose],
     ) -> Vec<Pose> {
-        let ahead = Ahead { now, last_step_m: step_m, steps: 20, route, hint };
+        let ahead = EgoForecast { now, last_step_m: step_m, steps: 20, route, hint };
         ahead.places().into_iter().map(|(_, pose)| pose).collect()
     }
 

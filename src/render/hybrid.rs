@@ -1,27 +1,27 @@
 //! The cpu backend up to a stage, and the gpu backend from there: to find which stage is wrong.
 
-use super::compare::psnr::{RIGHT_DB, psnr_db, psnr_db_of_bytes};
+use super::compare::psnr::{MIN_PSNR_DB, psnr_db, psnr_db_u8};
 use super::cpu::Cpu;
 use super::gpu::Gpu;
 use super::stage::Stage;
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
+use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 
 /// One frame by two backends.
 #[derive(Debug)]
-pub struct Relay {
+pub struct HybridBackend {
     cpu: Cpu,
     gpu: Gpu,
     through: Stage,
 }
 
-impl Relay {
+impl HybridBackend {
     /// The cpu backend runs the stages up to and including `through`.
     pub fn new(cpu: Cpu, gpu: Gpu, through: Stage) -> Self {
         Self { cpu, gpu, through }
     }
 }
 
-impl Backend for Relay {
+impl Backend for HybridBackend {
     fn name(&self) -> &'static str {
         "cpu+gpu"
     }
@@ -39,7 +39,7 @@ impl Backend for Relay {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         render_through(&self.cpu, &self.gpu, self.through, frame, targets, finished)
     }
@@ -51,10 +51,10 @@ fn render_through(
     through: Stage,
     frame: &Frame<'_>,
     targets: &mut [Target<'_>],
-    finished: Finished<'_>,
+    finished: OnViewDone<'_>,
 ) -> Result<FrameStats, RenderError> {
     frame.check(targets)?;
-    let (between, before) = cpu.through(frame, through)?;
+    let (between, before) = cpu.run_through(frame, through)?;
     let mut stats = gpu.resume(&between, frame, targets, finished)?;
     stats.stages_ms.splice(0..0, before.stages_ms);
     Ok(stats)
@@ -101,7 +101,7 @@ impl Bisection {
     /// The gpu's stage that is wrong, by name: the first one that the gpu runs where the image is
     /// still wrong for the last time. `None` if every image is right.
     pub fn wrong(&self) -> Option<&'static str> {
-        let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= RIGHT_DB;
+        let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
         let right = self.psnr_db.iter().rev().take_while(is_right).count();
         let names = ["rasterize", "bin", "sort", "project"];
         names.get(right).copied()
@@ -134,7 +134,7 @@ impl Images {
         let rgba = self.rgba.iter().flatten().zip(truth.rgba.iter().flatten());
         let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
         let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
-        let written = psnr_db_of_bytes(rgb8);
+        let written = psnr_db_u8(rgb8);
         // A NaN is not right, whatever the other is.
         if linear < written || linear.is_nan() { linear } else { written }
     }
