@@ -21,8 +21,7 @@ use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
 use wildcity_scene::geometry::camera::{
-    self, FTheta, Reference, Fisheye, Rising, OpenCv, Windshield,
-    WindshieldReference,
+    self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
 };
 
 /// The lenses of a frame's views on the device.

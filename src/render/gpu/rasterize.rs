@@ -94,8 +94,7 @@ impl Rasterize {
     ) -> Result<(), RenderError> {
         let background = match frame.background()? {
             None if !appearances.is_empty() => {
-                let black =
-                    self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
+                let black = self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
                 Some((Drawn::Map(black.clone()), DMat3::IDENTITY))
             }
             background => background,
