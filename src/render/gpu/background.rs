@@ -15,7 +15,7 @@ use super::growable_buffer::GrowableBuffer;
 use super::layout;
 use crate::{Frame, MAX_VIEWS, RenderError, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
-use wildcity_scene::sky::{Drawn, Folded};
+use wildcity_scene::sky::{DrawableSky, InferenceNetwork};
 
 /// Background and appearances of the current frame.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ pub(super) struct Background {
     /// Pixels of all overlays, one after the other.
     overlay_pixels: GrowableBuffer,
     /// The sky in `sky_values`.
-    sky: Option<Drawn>,
+    sky: Option<DrawableSky>,
     /// The overlays in `overlay_pixels`.
     overlays: Vec<Arc<Overlay>>,
     /// Whether a view of the frame has a lens or a rolling shutter.
@@ -73,7 +73,7 @@ impl Background {
         &mut self,
         device: &Device,
         frame: &Frame<'_>,
-        sky: Drawn,
+        sky: DrawableSky,
         sky_from_world: DMat3,
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
@@ -86,13 +86,13 @@ impl Background {
             *slot = rows.map(|[a, b, c]| [a, b, c, 0.0]);
         }
         match &sky {
-            Drawn::Map(map) => {
-                let [scale, offset] = map.look_up();
+            DrawableSky::CubeMap(map) => {
+                let [scale, offset] = map.lookup_scale_offset();
                 parameters.scale = scale as f32;
                 parameters.offset = offset as f32;
                 parameters.edge = map.edge() as u32;
             }
-            Drawn::Exact(network) => set_network(&mut parameters, network),
+            DrawableSky::Network(network) => set_network(&mut parameters, network),
         }
         let limit = device.binding_bytes();
         if sky.bytes() as u64 > limit {
@@ -100,12 +100,12 @@ impl Background {
             return Err(RenderError::TooMany { what, limit });
         }
         self.has_lenses = !frame.views.iter().all(View::is_static_pinhole);
-        if !self.sky.as_ref().is_some_and(|held| held.is(&sky)) {
+        if !self.sky.as_ref().is_some_and(|held| held.ptr_eq(&sky)) {
             match &sky {
-                Drawn::Map(map) => {
+                DrawableSky::CubeMap(map) => {
                     self.sky_values.fill(device, bytemuck::cast_slice(map.texels()));
                 }
-                Drawn::Exact(network) => {
+                DrawableSky::Network(network) => {
                     self.sky_values.fill(device, bytemuck::cast_slice(&network.weights()));
                 }
             }
@@ -188,7 +188,7 @@ impl Background {
     pub(super) fn iterations(&self) -> u64 {
         let rays = if self.has_lenses { 4 * (1 + 40 + 26) } else { 0 };
         let sky = match &self.sky {
-            Some(Drawn::Exact(network)) => {
+            Some(DrawableSky::Network(network)) => {
                 let width = network.width() as u64;
                 let encoded = network.encoded() as u64;
                 let outputs_per_thread = width.div_ceil(64);
@@ -202,11 +202,11 @@ impl Background {
     }
 
     fn has_network(&self) -> bool {
-        matches!(self.sky, Some(Drawn::Exact(_)))
+        matches!(self.sky, Some(DrawableSky::Network(_)))
     }
 }
 
-fn set_network(parameters: &mut layout::Background, network: &Folded) {
+fn set_network(parameters: &mut layout::Background, network: &InferenceNetwork) {
     parameters.width = network.width() as u32;
     parameters.octaves = network.octaves() as u32;
     parameters.encoded = network.encoded() as u32;

@@ -20,7 +20,7 @@ use super::project::SplatBuffers;
 use super::resolve::Planes;
 use crate::{Frame, RenderError};
 use wildcity_scene::appearance::Appearance;
-use wildcity_scene::sky::{CubeMap, Drawn};
+use wildcity_scene::sky::{CubeMap, DrawableSky};
 
 /// The stage with one kind of background; one kernel for each combination of planes.
 type Shader = LazyShader<Kernel, { Planes::VARIANTS }>;
@@ -94,8 +94,9 @@ impl Rasterize {
     ) -> Result<(), RenderError> {
         let background = match frame.background()? {
             None if !appearances.is_empty() => {
-                let black = self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
-                Some((Drawn::Map(black.clone()), DMat3::IDENTITY))
+                let black =
+                    self.black.get_or_insert_with(|| Arc::new(CubeMap::uniform(DVec3::ZERO)));
+                Some((DrawableSky::CubeMap(black.clone()), DMat3::IDENTITY))
             }
             background => background,
         };

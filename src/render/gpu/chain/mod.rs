@@ -109,7 +109,7 @@ struct CurrentFrame {
 #[derive(Debug)]
 enum RegionOutcome {
     /// It was drawn, and needed this much.
-    Drawn(Capacity),
+    DrawableSky(Capacity),
     /// It does not fit the device. These regions must be drawn instead.
     Split(Vec<Region>),
 }
@@ -174,7 +174,7 @@ impl Chain {
         let mut drawn = Vec::with_capacity(remaining.len());
         while let Some(region) = remaining.pop() {
             match self.draw_or_split(frame, &rows, &region, cull, &mut current)? {
-                RegionOutcome::Drawn(needs) => {
+                RegionOutcome::DrawableSky(needs) => {
                     drawn.push((region, needs));
                     if !remaining.is_empty() {
                         current.read_back.unmap();
@@ -232,7 +232,7 @@ impl Chain {
         let needs = self.draw_region(Source::Gaussians(&work), tiles, current)?;
         let count = needs.min_regions(self.limit());
         if count <= 1 {
-            return Ok(RegionOutcome::Drawn(needs));
+            return Ok(RegionOutcome::DrawableSky(needs));
         }
         let regions = rows.split(region, count).ok_or_else(|| self.too_many(needs))?;
         current.read_back.unmap();
