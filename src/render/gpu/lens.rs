@@ -149,11 +149,11 @@ impl Lens {
     }
 
     fn set_shutter_motion(&mut self, motion: &ShutterMotion) {
-        let [a, b, c] = motion.share.map(|value| value as f32);
+        let [a, b, c] = motion.remaining.map(|value| value as f32);
         self.remaining_exposure = [a, b, c, 0.0];
-        self.moved_world_m = motion.moved_world_m.as_vec3().to_array();
-        self.moved_m = motion.moved_m.as_vec3().to_array();
-        self.axis_angle = motion.axis.extend(motion.turned_rad).as_vec4().to_array();
+        self.moved_world_m = motion.translation_world_m.as_vec3().to_array();
+        self.moved_m = motion.translation_m.as_vec3().to_array();
+        self.axis_angle = motion.axis.extend(motion.rotation_rad).as_vec4().to_array();
     }
 }
 
