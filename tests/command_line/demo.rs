@@ -50,9 +50,9 @@ fn a_damaged_demo_twin_is_built_again() {
         let mut bytes = fs::read(object(hash)).unwrap();
         bytes[40] ^= 1;
         fs::write(object(hash), bytes).unwrap();
-        assert!(drive().contains("(again, since it is damaged)"));
+        assert!(drive().contains("(its files are damaged)"));
         fs::remove_file(object(hash)).unwrap();
-        assert!(drive().contains("(again, since it is damaged)"));
+        assert!(drive().contains("(its files are damaged)"));
         assert_eq!(catalog.version("demo", None).unwrap(), version);
         assert_eq!(catalog.verify("demo", &mut |_, _| {}).unwrap().damaged.len(), 0);
     }

@@ -53,10 +53,10 @@ fn report_of(dir: &Path, more: &[&str]) -> Output {
 fn wishes_that_cannot_be_meant_are_refused_at_once() {
     let nowhere = tempfile::tempdir().unwrap();
     for (given, fix) in [
-        ("--at-least-db=-inf", "expected 0 to 1000 dB, as 40"),
-        ("--at-least-db=NaN", "expected 0 to 1000 dB, as 40"),
-        ("--at-most-ms=-5", "expected milliseconds, more than 0, as 20"),
-        ("--at-most-ms=inf", "expected milliseconds, more than 0, as 20"),
+        ("--at-least-db=-inf", "expected 0 to 1000 dB, for example 40"),
+        ("--at-least-db=NaN", "expected 0 to 1000 dB, for example 40"),
+        ("--at-most-ms=-5", "expected milliseconds above 0, for example 20"),
+        ("--at-most-ms=inf", "expected milliseconds above 0, for example 20"),
         ("--backend=reference", "[possible values: cpu, gpu]"),
         ("--backend=cpu,cpu", "name each once"),
     ] {

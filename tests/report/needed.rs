@@ -1,4 +1,4 @@
-//! Only what is needed: the matrix of features on a device, and a base that pays for none of them.
+//! What each feature of a scene costs on a device, and that the base scene pays for none of them.
 
 use std::cell::Cell;
 
@@ -38,12 +38,17 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     let places = sample_points(manifest, &[], Sampling { stations: 2, window_px: [32, 32] });
     let open = || Gpu::new(&AdapterChoice::Best, 0).ok();
     let backends: [Box<dyn Backend>; 2] = [Box::new(cpu()), Box::new(open().unwrap())];
-    let twin = TwinFeatures::of(manifest, None, &places[0].views);
+    let twin = TwinFeatures::new(manifest, None, &places[0].views);
     let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu", "gpu"]);
     let held_bytes = |name: &str, device: &dyn Fn() -> Option<Gpu>| {
-        let (backends, places) = (&backends[..], &places[..]);
-        let bench = Benchmark { resident: &resident, backends, places, repeat: 1, device };
-        let truth = bench.truth(Rays::Splats, &mut |_| {}).unwrap();
+                let bench = Benchmark {
+            resident: &resident,
+            backends: &backends,
+            sample_points: &places,
+            repeat: 1,
+            open_device: device,
+        };
+        let truth = bench.render_reference(Rays::Splats, &mut |_| {}).unwrap();
         let setting = settings.iter().find(|setting| setting.name == name).unwrap();
         bench.measure(setting, &truth).unwrap().cost.device_bytes
     };
@@ -73,10 +78,10 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         Gpu::new(&AdapterChoice::Best, 0).ok()
     };
     let rows = feature_costs::count_features(&cpu(), &open).unwrap();
-    rows.iter().for_each(|row| eprintln!("| {} | {} |", row.with, row.counts.texts().join(" | ")));
+    rows.iter().for_each(|row| eprintln!("| {} | {} |", row.feature, row.counts.cells().join(" | ")));
     // Each on a device that drew nothing else.
     assert_eq!(opened.get(), rows.len());
-    let of = |with: &str| rows.iter().find(|row| row.with == with).unwrap().counts.device;
+    let of = |with: &str| rows.iter().find(|row| row.feature == with).unwrap().counts.device;
     let base = counted(of("nothing else"));
     assert_eq!([base[0], base[2]], BASE);
     let beyond = |with: &str| {
@@ -112,7 +117,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }
-    let bytes = |with: &str| of(with).unwrap().gaussian_bytes;
+    let bytes = |with: &str| of(with).unwrap().bytes_per_gaussian;
     // Colours of SH are halves: 9 values, and 45.
     let colours = ["SH degree 1", "SH degree 3"].map(|with| bytes(with) - bytes("nothing else"));
     assert!(
@@ -124,7 +129,7 @@ fn features_pay_for_themselves_and_the_base_for_none() {
 /// Pipelines, buffers, dispatches, and bytes of a pixel that go back.
 fn counted(counts: Option<DeviceCounts>) -> [u64; 4] {
     let counts = counts.unwrap();
-    [counts.pipelines, counts.buffers, counts.dispatches, counts.pixel_bytes]
+    [counts.pipelines, counts.buffers, counts.dispatches, counts.read_back_bytes_per_pixel]
 }
 
 /// What others had on the same device before is not the base's either.

@@ -31,8 +31,8 @@ use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
 use crate::reported::{commit, commit_reaching, drive, rig};
 use crate::skies::demo_sky;
 
-/// Settings of the ladder on the cpu backend, at three stations, or at twelve places around; and what is
-/// left out.
+/// Measures the settings that `keep` accepts, on the cpu backend at three stations, or at twelve sample
+/// points around a capture. Also returns the settings that were skipped.
 fn measured(
     resident: &Arc<Resident>,
     rig: &Rig,
@@ -43,30 +43,30 @@ fn measured(
     let places = sample_points(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
     let bench =
-        Benchmark { resident, backends: &backends, places: &places, repeat: 1, device: &|| None };
-    let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+        Benchmark { resident, backends: &backends, sample_points: &places, repeat: 1, open_device: &|| None };
+    let twin = TwinFeatures::new(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let SettingList { settings, skipped: left_out } = settings_to_compare(&twin, &["cpu"]);
     let truths = [Rays::Splats, Rays::Exact].map(|rays| {
-        let wanted = settings.iter().any(|s| keep(s) && s.against == rays);
-        wanted.then(|| bench.truth(rays, &mut |_| {}).unwrap())
+        let wanted = settings.iter().any(|s| keep(s) && s.reference_rays == rays);
+        wanted.then(|| bench.render_reference(rays, &mut |_| {}).unwrap())
     });
     let measure = |setting: &Setting| {
-        let truth = truths[usize::from(setting.against == Rays::Exact)].as_ref().unwrap();
+        let truth = truths[usize::from(setting.reference_rays == Rays::Exact)].as_ref().unwrap();
         assert!(truth.step_ms > 0.0);
         bench.measure(setting, truth).unwrap()
     };
     (settings.iter().filter(|setting| keep(setting)).map(measure).collect(), left_out)
 }
 
-/// One setting of the ladder on the cpu backend at some places.
+/// Measures one setting on the cpu backend at some sample points.
 fn one(resident: &Arc<Resident>, places: &[SamplePoint], name: &str) -> Measurement {
     let manifest = &resident.version.manifest;
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Benchmark { resident, backends: &backends, places, repeat: 1, device: &|| None };
-    let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
+    let bench = Benchmark { resident, backends: &backends, sample_points: places, repeat: 1, open_device: &|| None };
+    let twin = TwinFeatures::new(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu"]);
     let setting = settings.iter().find(|setting| setting.name == name).unwrap();
-    bench.measure(setting, &bench.truth(Rays::Splats, &mut |_| {}).unwrap()).unwrap()
+    bench.measure(setting, &bench.render_reference(Rays::Splats, &mut |_| {}).unwrap()).unwrap()
 }
 
 #[test]
@@ -100,17 +100,17 @@ fn errors_and_costs_go_the_way_they_must() {
     assert_eq!(of("8 bits").cost.sent_bytes, 2 * 3 * 120 * 80);
     assert_eq!(of("scale 0.5").cost.sent_bytes, 2 * 3 * 60 * 40);
     assert_eq!(
-        [of("as served"), of("record q32")].map(|m| m.cost.stored_bytes_each),
+        [of("as served"), of("record q32")].map(|m| m.cost.stored_bytes_per_gaussian),
         [92.0, 31.875]
     );
     for m in &all {
         let errors = &m.errors;
         assert_eq!(m.psnr_db_by_offset.len(), OFFSETS_M.len(), "{}", m.setting.name);
         assert!(errors.p99_9 <= errors.max && errors.ssim <= 1.0, "{errors:?}");
-        assert!(m.least_db() <= errors.psnr_db, "{}: {errors:?}", m.setting.name);
-        assert!(m.by_place.iter().all(|place| m.least_db() <= place.least_db));
-        assert_eq!(m.by_place.len(), 12);
-        assert_eq!(m.by_place.iter().filter(|place| place.p95_ms.is_some()).count(), 3);
+        assert!(m.min_db() <= errors.psnr_db, "{}: {errors:?}", m.setting.name);
+        assert!(m.by_sample_point.iter().all(|place| m.min_db() <= place.min_db));
+        assert_eq!(m.by_sample_point.len(), 12);
+        assert_eq!(m.by_sample_point.iter().filter(|place| place.p95_ms.is_some()).count(), 3);
         let files = &m.worst.files;
         assert!(files.iter().all(|file| file.starts_with(b"\x89PNG")), "{}", m.setting.name);
         assert!(m.cost.step_ms > 0.0);
@@ -121,24 +121,25 @@ fn errors_and_costs_go_the_way_they_must() {
     let best = recommend(Goal::AtLeastDb(35.0), &all, &names).unwrap();
     // Beside it, what the encodings that it is not of lose and take.
     let encoded: Vec<(&str, bool)> =
-        best.encoded.iter().map(|e| (e.sent.as_str(), e.by_default)).collect();
+        best.encodings.iter().map(|e| (e.encoding.as_str(), e.is_default)).collect();
     let sent = ["8 bits", "jpeg 50", "jpeg 75", "jpeg 90", "jpeg 98"];
     assert_eq!(encoded, sent.map(|name| (name, name == "jpeg 90")));
-    for encoded in &best.encoded {
-        let m = of(&encoded.sent);
-        assert_eq!(encoded.least_db, m.least_db());
-        assert_eq!(encoded.more_ms, m.cost.step_ms - m.served_ms);
-        assert!(best.of_what().contains(&format!("{:.1} dB", encoded.least_db)), "{best:?}");
+    for encoded in &best.encodings {
+        let m = of(&encoded.encoding);
+        assert_eq!(encoded.min_db, m.min_db());
+        assert_eq!(encoded.extra_ms, m.cost.step_ms - m.baseline_ms);
+        assert!(best.explanation().contains(&format!("{:.1} dB", encoded.min_db)), "{best:?}");
     }
     let chosen = of(&best.setting);
-    assert!(best.verified >= 35.0 && best.chosen_by >= 35.0 + best.margin, "{best:?}");
-    assert_eq!((least_db(chosen, true), least_db(chosen, false)), (best.chosen_by, best.verified));
+    assert!(best.verification_worst >= 35.0 && best.selection_worst >= 35.0 + best.margin, "{best:?}");
+    assert_eq!(least_db(chosen, true), best.selection_worst);
+    assert_eq!(least_db(chosen, false), best.verification_worst);
     assert!(chosen.setting.can_be_served() && chosen.setting.scale == 1.0);
     let too_much = recommend(Goal::AtLeastDb(500.0), &all, &names).unwrap_err();
     assert!(matches!(too_much, ReportError::GoalNotReached { .. }), "{too_much}");
     let too_fast = recommend(Goal::AtMostMs(1e-6), &all, &names).unwrap_err();
     assert!(matches!(too_fast, ReportError::GoalNotReached { .. }), "{too_fast}");
-    let slowest = all.iter().flat_map(|m| &m.by_place).filter_map(|place| place.p95_ms);
+    let slowest = all.iter().flat_map(|m| &m.by_sample_point).filter_map(|place| place.p95_ms);
     let slowest = slowest.fold(0.0, f64::max);
     let exact = recommend(Goal::AtMostMs(10.0 * slowest), &all, &names).unwrap();
     let servable = all.iter().filter(|m| m.setting.can_be_served());
@@ -146,24 +147,25 @@ fn errors_and_costs_go_the_way_they_must() {
     assert_eq!(least_db(of(&exact.setting), true), best_db, "{exact:?}");
 }
 
-/// Least PSNR of the places that choose, or of those that verify.
+/// Least PSNR of the sample points for selection, or of those for verification.
 fn least_db(m: &Measurement, chooses: bool) -> f64 {
-    let places = m.by_place.iter().filter(|place| place.chooses == chooses);
-    places.map(|place| place.least_db).fold(f64::INFINITY, f64::min)
+    let places = m.by_sample_point.iter().filter(|place| place.for_selection == chooses);
+    places.map(|place| place.min_db).fold(f64::INFINITY, f64::min)
 }
 
-/// A slow and good setting and a fast one, at places that give so many dB: of each two the first chooses.
+/// A slow, good setting and a fast one, with the given dB at six sample points: of each two, the first is
+/// for selection.
 fn two(like: &[Measurement], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measurement> {
     let mut all = like.to_vec();
     for (m, (db, ms)) in all.iter_mut().zip([(slow_db, 20.0), (fast_db, 10.0)]) {
         m.cost.step_ms = ms;
         let place = |(index, psnr_db): (usize, f64)| SampleResult {
-            chooses: index % 2 == 0,
+            for_selection: index % 2 == 0,
             psnr_db,
-            least_db: psnr_db,
+            min_db: psnr_db,
             p95_ms: Some(ms),
         };
-        m.by_place = db.into_iter().enumerate().map(place).collect();
+        m.by_sample_point = db.into_iter().enumerate().map(place).collect();
     }
     all
 }
@@ -193,9 +195,9 @@ fn the_margin_is_what_places_differ_by() {
     assert!(matches!(refused, ReportError::NotVerified { verified: 34.9, .. }), "{refused}");
     // The first was measured while the machine was twice as fast as with the second.
     let mut uneven = two(&like, [60.0; 6], [40.0; 6]);
-    (uneven[0].served_ms, uneven[1].served_ms) = (15.0, 30.0);
+    (uneven[0].baseline_ms, uneven[1].baseline_ms) = (15.0, 30.0);
     normalize_machine_speed(&mut uneven);
-    let times = [0, 1].map(|i| (uneven[i].cost.step_ms, uneven[i].by_place[0].p95_ms));
+    let times = [0, 1].map(|i| (uneven[i].cost.step_ms, uneven[i].by_sample_point[0].p95_ms));
     assert_eq!(times, [(40.0, Some(40.0)), (10.0, Some(10.0))]);
     // Times have a margin, too: 10 ms and a tenth.
     let all = two(&like, [60.0; 6], [40.0; 6]);
@@ -217,8 +219,8 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
     // As exact as each other where it is asked, and each faster than the one before.
     for (m, ms) in all.iter_mut().zip([30.0, 20.0, 10.0]) {
         m.cost.step_ms = ms;
-        for place in &mut m.by_place {
-            (place.least_db, place.p95_ms) = (f64::INFINITY, Some(ms));
+        for place in &mut m.by_sample_point {
+            (place.min_db, place.p95_ms) = (f64::INFINITY, Some(ms));
         }
     }
     let within = |all: &[Measurement], ms| recommend(Goal::AtMostMs(ms), all, &names).unwrap();
@@ -227,7 +229,7 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
     let mut idle = all[0].clone();
     (idle.setting.name, idle.setting.family) = ("tau_px=4".to_owned(), Family::Detail);
     idle.cost.step_ms = 1.0;
-    idle.by_place.iter_mut().for_each(|place| place.p95_ms = Some(1.0));
+    idle.by_sample_point.iter_mut().for_each(|place| place.p95_ms = Some(1.0));
     let at_least = |all: &[Measurement]| recommend(Goal::AtLeastDb(60.0), all, &names).unwrap();
     for first in [true, false] {
         let mut all = all.clone();
@@ -273,7 +275,7 @@ fn a_place_is_as_good_as_its_worst_camera() {
         };
         let places: Vec<SamplePoint> = both.iter().map(only).collect();
         let m = one(&resident, &places, "alpha_cut=0.032");
-        m.by_place.iter().map(|place| (place.least_db, place.psnr_db)).collect::<Vec<_>>()
+        m.by_sample_point.iter().map(|place| (place.min_db, place.psnr_db)).collect::<Vec<_>>()
     };
     let [together, first, second] = [None, Some(0), Some(1)].map(at_least_db);
     for (i, (least_db, psnr_db)) in together.into_iter().enumerate() {
@@ -292,11 +294,11 @@ fn a_place_is_as_good_as_its_worst_camera() {
     let chosen = |all: &[Measurement]| recommend(Goal::AtLeastDb(35.0), all, &names);
     assert_eq!(chosen(&all).unwrap().setting, "stop=0.016");
     for least_db in [32.2, f64::NAN] {
-        all[1].by_place[2].least_db = least_db;
+        all[1].by_sample_point[2].min_db = least_db;
         assert_eq!(chosen(&all).unwrap().setting, "as served", "{least_db}");
     }
-    all[1].by_place[2].least_db = 40.0;
-    all[1].by_place[3].least_db = f64::NAN;
+    all[1].by_sample_point[2].min_db = 40.0;
+    all[1].by_sample_point[3].min_db = f64::NAN;
     let refused = chosen(&all).unwrap_err();
     assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
 }
@@ -428,7 +430,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
         }
         match recommend(Goal::AtLeastDb(35.0), &all, &names) {
             Ok(best) if best.setting == fastest => met.push(fastest),
-            Ok(best) => assert!(best.verified >= 35.0, "{best:?}"),
+            Ok(best) => assert!(best.verification_worst >= 35.0, "{best:?}"),
             Err(refused) => panic!("{fastest}: {refused}"),
         }
     }
@@ -526,7 +528,7 @@ fn without_a_drive_a_twin_is_looked_at_from_around() {
         let at = view.camera.pinhole.project(seen);
         assert!(seen.z > 0.0 && (at.x - 320.0).abs() < 1e-6 && (at.y - 240.0).abs() < 1e-6, "{at}");
     }
-    assert_eq!(places.iter().filter(|place| place.chooses).count(), 8);
+    assert_eq!(places.iter().filter(|place| place.for_selection).count(), 8);
 }
 
 #[test]
@@ -540,13 +542,13 @@ fn images_are_believed_less_beside_the_drive() {
     assert_eq!(all.iter().map(|b| b.offset_m).collect::<Vec<_>>(), OFFSETS_M);
     assert!(all[0].mean > 0.9 && all[3].mean < 0.45, "{all:?}");
     for (pair, [near_m, far_m]) in all.windows(2).zip([[0.0, 1.0], [1.0, 3.0], [3.0, 5.0]]) {
-        assert!(pair[1].mean < pair[0].mean && pair[1].most < pair[0].most);
+        assert!(pair[1].mean < pair[0].mean && pair[1].max < pair[0].max);
         assert!((pair[0].distance_m - near_m).abs() < 0.3, "{:?}", pair[0]);
         assert!((pair[1].distance_m - far_m).abs() < 0.3, "{:?}", pair[1]);
     }
     for b in &all {
-        assert!(b.least <= b.mean && b.mean <= b.most && b.picture.file.starts_with(b"\xff\xd8"));
-        assert!(b.offset_m == 0.0 || b.picture.place.contains(&format!("{} m", b.offset_m)));
+        assert!(b.min <= b.mean && b.mean <= b.max && b.image.jpeg.starts_with(b"\xff\xd8"));
+        assert!(b.offset_m == 0.0 || b.image.sample_point.contains(&format!("{} m", b.offset_m)));
     }
     let nowhere = commit(tempfile::tempdir().unwrap().path(), Vec::new());
     assert!(confidence_by_offset(&nowhere, &cpu, &places).unwrap().is_empty());
@@ -556,30 +558,30 @@ fn images_are_believed_less_beside_the_drive() {
 fn the_base_pays_for_no_feature_of_others() {
     let cpu = Cpu::new(2, Simd::Best).unwrap();
     let rows = feature_costs::count_features(&cpu, &|| None).unwrap();
-    let of = |with: &str| rows.iter().find(|row| row.with == with).unwrap().counts;
+    let of = |with: &str| rows.iter().find(|row| row.feature == with).unwrap().counts;
     let base = of("nothing else");
     // 14 columns of 4 B, and no more than 1 % of ends of blocks and clusters.
-    assert!((56.0..58.0).contains(&base.host_bytes), "{base:?}");
-    assert_eq!((base.beside_bytes, base.host_pixel_bytes), (0, 3));
+    assert!((56.0..58.0).contains(&base.host_bytes_per_gaussian), "{base:?}");
+    assert_eq!((base.other_host_bytes, base.host_bytes_per_pixel), (0, 3));
     for row in &rows {
         let own = row.counts;
         let more = |is_more: bool, features: &[&str], what: &str| {
-            assert_eq!(is_more, features.contains(&row.with), "{what} of {}: {own:?}", row.with);
+            assert_eq!(is_more, features.contains(&row.feature), "{what} of {}: {own:?}", row.feature);
         };
-        let bytes = own.host_bytes;
-        more(bytes > base.host_bytes + 1.0, &["SH degree 1", "SH degree 3"], "bytes");
+        let bytes = own.host_bytes_per_gaussian;
+        more(bytes > base.host_bytes_per_gaussian + 1.0, &["SH degree 1", "SH degree 3"], "bytes");
         let beside = ["sky of images", "sky, baked", "hood"];
-        more(own.beside_bytes > 0, &beside, "bytes beside");
+        more(own.other_host_bytes > 0, &beside, "bytes beside");
         let planes = ["depth", "depth and opacity", "normals", "trust"];
-        more(own.host_pixel_bytes > 3, &planes, "bytes of a pixel");
+        more(own.host_bytes_per_pixel > 3, &planes, "bytes of a pixel");
         // What a Gaussian is, or where it lands, is evaluated otherwise; all else is not.
         let shapes =
             ["levels of detail, 1 m", "antialiasing", "fisheye", "windshield", "rolling shutter"];
         more(own.evaluations != base.evaluations, &shapes, "evaluations");
         assert!(own.device.is_none());
     }
-    assert!((92.0..95.0).contains(&of("SH degree 1").host_bytes));
-    assert!((236.0..242.0).contains(&of("SH degree 3").host_bytes));
+    assert!((92.0..95.0).contains(&of("SH degree 1").host_bytes_per_gaussian));
+    assert!((236.0..242.0).contains(&of("SH degree 3").host_bytes_per_gaussian));
     let coarse = of("levels of detail, 1 m");
     assert!(coarse.gaussians < base.gaussians && coarse.evaluations < base.evaluations);
 }
