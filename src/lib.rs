@@ -1,17 +1,40 @@
-//! A closed-loop driving simulator server for city twins made of 3D Gaussians.
+//! `wildcity`: a closed-loop driving simulator server for city twins made of 3D Gaussians.
+//!
+//! This package is the command line. The work is done by the packages of the workspace, each of which names
+//! only those below it; Cargo holds them to this table, and `tests/tidy` holds the table to the manifests.
+//!
+//! | package | what it is | depends on |
+//! |---|---|---|
+//! | [`wildcity_protocol`] | the wire: messages, schemas, binary observations | nothing of ours |
+//! | [`wildcity_client`] | the Rust client of the protocol | protocol |
+//! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
+//! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
+//! | [`wildcity_generate`] | procedural streets and cities | scene |
+//! | [`wildcity_sim`] | what moves: the dynamics of the ego vehicle | scene |
+//! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
+//! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
+//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | render, scene, sim, twin |
+//! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
+//! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
+//! | [`wildcity_server`] | WebSocket and HTTP | protocol, push, render, scene, session, sim, twin |
+//!
+//! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
+//! session, sim. Nothing below calls what is above it.
+//!
+//! # Invariants
+//!
+//! 1. The wire is known to `protocol`, `client` and `server::convert` only.
+//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum.
+//! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
+//! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
+//! 5. An image is a function of scene version, render profile, poses and cameras. Caches change
+//!    latency, never pixels.
+//! 6. Every observation names the scene version and the render profile that it was made with. A new version
+//!    becomes visible only between two steps, and only to a session that asked for it.
+//! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative f32.
+//! 8. Every queue, message, buffer and count has a maximum, in the `limits` module of its package.
+//! 9. A scene pays only for what it has: without a sky, spherical harmonics or lenses there is no buffer,
+//!    pass, pipeline or library for them.
+//! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 
 pub mod cli;
-
-pub use wildcity_client as client;
-pub use wildcity_generate as generate;
-pub use wildcity_protocol as protocol;
-pub use wildcity_render as render;
-pub use wildcity_report as report;
-pub use wildcity_scene as scene;
-pub use wildcity_scene::geometry;
-pub use wildcity_server as server;
-pub use wildcity_session as session;
-pub use wildcity_sim as sim;
-pub use wildcity_stress as stress;
-pub use wildcity_twin as twin;
-pub use wildcity_twin::{ingest, residency, store};

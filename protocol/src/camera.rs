@@ -1,10 +1,10 @@
 //! What a camera is beyond a pinhole.
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How a lens maps rays to pixels, where it is no pinhole.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "model", rename_all = "lowercase")]
 pub enum Lens {
     /// OpenCV's radial, tangential and thin prism distortion.
@@ -29,7 +29,7 @@ pub enum Lens {
     /// NVIDIA's f-theta, which has its focal lengths from its polynomial.
     Ftheta {
         /// Which way the polynomial goes.
-        reference: Reference,
+        reference: FthetaReference,
         /// Coefficients of powers 0 to 5, in radians and pixels.
         polynomial: [f64; 6],
         /// `[c, d, e]` of `[[c, d], [e, 1]]`, from round to real pixels.
@@ -40,9 +40,11 @@ pub enum Lens {
 }
 
 /// Which way an f-theta polynomial goes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Reference {
+#[cfg_attr(feature = "schema", schemars(rename = "Reference"))]
+pub enum FthetaReference {
     /// From radians off the axis to pixels from the principal point.
     AngleToPixel,
     /// From pixels to radians.
@@ -51,7 +53,8 @@ pub enum Reference {
 
 /// What a camera makes of colours: `matrix * rgb + offset`, linear red, green, blue from 0 to 1. The matrix,
 /// or a gain per channel; answers have the matrix.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Exposure {
     /// Row by row.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -65,7 +68,8 @@ pub struct Exposure {
 }
 
 /// A windshield before the lens.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Windshield {
     /// Which way the polynomials go.
     pub reference: WindshieldReference,
@@ -76,7 +80,8 @@ pub struct Windshield {
 }
 
 /// Which way a windshield's polynomials go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum WindshieldReference {
     /// From the world's rays to the lens'.
@@ -86,18 +91,21 @@ pub enum WindshieldReference {
 }
 
 /// A shutter that exposes rows, or columns, one after the other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Shutter {
     /// Which row or column comes first.
-    pub direction: Rolls,
+    pub direction: ShutterDirection,
     /// From the first row's exposure to the last's, in microseconds.
     pub duration_us: i64,
 }
 
 /// The way a shutter rolls.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Rolls {
+#[cfg_attr(feature = "schema", schemars(rename = "Rolls"))]
+pub enum ShutterDirection {
     /// The top row first.
     TopToBottom,
     /// The bottom row first.

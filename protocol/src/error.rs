@@ -1,10 +1,10 @@
 //! The closed list of error codes.
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// What went wrong. The list is closed: a new code is a new protocol version.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Code {
     /// The text frame is not JSON, or is nested too deeply.

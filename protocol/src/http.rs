@@ -2,14 +2,14 @@
 //!
 //! As on the WebSocket, answers may gain fields and unknown fields of requests are mistakes.
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::error::Code;
 use super::message::Pose;
 
 /// `POST /v1/uploads`: announces a file.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewUpload {
     /// What the file is called, for reports.
@@ -21,7 +21,8 @@ pub struct NewUpload {
 }
 
 /// An upload: what `POST`, `GET` and `PATCH` of uploads answer.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Upload {
     /// Its id, made of the digest: the same content, the same upload.
     pub id: String,
@@ -36,7 +37,8 @@ pub struct Upload {
 }
 
 /// `POST /v1/twins/{twin}/pushes`: makes a new version of uploaded files.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewPush {
     /// Name for the push, so that it can be sent again; made of its content if absent.
@@ -49,7 +51,7 @@ pub struct NewPush {
     pub base: Option<u64>,
     /// The 64 m cells that it replaces; those that its Gaussians touch, if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub cells: Option<Cells>,
+    pub cells: Option<CellSelection>,
     /// In how many bits Gaussians are stored: `f32`, `h52`, `q32` or `q24`; the base's if absent,
     /// and `q32` in a new twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -64,12 +66,13 @@ pub struct NewPush {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
     /// Where to compare before and after.
-    #[serde(default)]
-    pub golden: Golden,
+    #[serde(default, rename = "golden")]
+    pub preview: PreviewRequest,
 }
 
 /// One scene of a push.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PushFile {
     /// Id of its upload.
@@ -83,27 +86,33 @@ pub struct PushFile {
 }
 
 /// Which cells a push replaces.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(untagged)]
-pub enum Cells {
+#[cfg_attr(feature = "schema", schemars(rename = "Cells"))]
+pub enum CellSelection {
     /// `"all"`: the whole twin.
-    All(All),
+    All(AllCells),
     /// These, as (x, y); cell (i, j) is centred on (64 i, 64 j) m. Gaussians elsewhere are left out.
-    These(Vec<[i32; 2]>),
+    Listed(Vec<[i32; 2]>),
 }
 
 /// The word `all`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum All {
+#[cfg_attr(feature = "schema", schemars(rename = "All"))]
+pub enum AllCells {
     /// The whole twin.
     All,
 }
 
 /// Where a push is compared with what was there.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
-pub struct Golden {
+#[cfg_attr(feature = "schema", schemars(rename = "Golden"))]
+pub struct PreviewRequest {
     /// `world_from_rig` each; if absent, a few along the twin's first trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poses: Option<Vec<Pose>>,
@@ -113,7 +122,8 @@ pub struct Golden {
 }
 
 /// A push: what `POST` and `GET` of pushes answer.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Push {
     /// Its id.
     pub id: String,
@@ -138,7 +148,8 @@ pub struct Push {
 }
 
 /// How far a push is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum PushState {
     /// It waits for pushes before it.
@@ -160,7 +171,8 @@ pub enum PushState {
 }
 
 /// A part of a whole.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Progress {
     /// How much is done.
     pub done: u64,
@@ -169,7 +181,8 @@ pub struct Progress {
 }
 
 /// Why a push was refused, or failed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct PushError {
     /// What went wrong.
     pub code: Code,
@@ -181,7 +194,8 @@ pub struct PushError {
 }
 
 /// What was found in the files of a push.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct PushReport {
     /// The files, in order.
     pub files: Vec<FileReport>,
@@ -197,11 +211,13 @@ pub struct PushReport {
     /// The cells that are replaced.
     pub cells: Vec<CellReport>,
     /// How single poses look before and after.
-    pub golden: Vec<GoldenReport>,
+    #[serde(rename = "golden")]
+    pub previews: Vec<PsnrPreview>,
 }
 
 /// One file of a push.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FileReport {
     /// Its name.
     pub name: String,
@@ -214,7 +230,8 @@ pub struct FileReport {
 }
 
 /// A Gaussian that cannot be used.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct BadGaussian {
     /// Which one of its file, from 0.
     pub index: u64,
@@ -227,7 +244,8 @@ pub struct BadGaussian {
 }
 
 /// Smallest and largest values.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ranges {
     /// Centres, smallest and largest (x, y, z), in metres.
     pub mean_m: [[f64; 3]; 2],
@@ -240,7 +258,8 @@ pub struct Ranges {
 }
 
 /// A cell that a push replaces.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct CellReport {
     /// The cell (x, y).
     pub cell: [i32; 2],
@@ -251,8 +270,10 @@ pub struct CellReport {
 }
 
 /// One pose, before and after.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct GoldenReport {
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "GoldenReport"))]
+pub struct PsnrPreview {
     /// `world_from_rig`.
     pub pose: Pose,
     /// How alike all images of the pose are, in dB; absent where they are equal.
@@ -261,7 +282,8 @@ pub struct GoldenReport {
 }
 
 /// A version of a twin: an entry of `GET /v1/twins/{twin}/versions`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct VersionInfo {
     /// Its number.
     pub version: u64,
@@ -280,7 +302,8 @@ pub struct VersionInfo {
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again, as a new one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Rollback {
     /// The old version.
@@ -288,7 +311,8 @@ pub struct Rollback {
 }
 
 /// A session: an entry of `GET /v1/sessions`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct SessionInfo {
     /// Its name.
     pub session: String,
@@ -305,7 +329,8 @@ pub struct SessionInfo {
 }
 
 /// The body of every refusal.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Refusal {
     /// What went wrong.
     pub code: Code,

@@ -5,14 +5,14 @@
 //! beside it are generated from these types. What HTTP carries beside sessions is in [`http`].
 
 pub mod camera;
+mod deserialize;
 pub mod error;
 pub mod http;
 pub mod limits;
 pub mod message;
 pub mod observation;
-mod strict;
 
-pub use strict::unknown_field;
+pub use deserialize::unknown_field;
 
 /// The WebSocket subprotocol, and the only protocol version there is so far.
 pub const PROTOCOL: &str = "wildcity.v1";

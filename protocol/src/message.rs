@@ -9,14 +9,14 @@
 
 use std::collections::BTreeMap;
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::camera::{Exposure, Lens, Shutter, Windshield};
 use super::error::Code;
 
 /// A rigid transform: position in metres, unit quaternion (w, x, y, z).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Pose {
     /// Position, in metres.
     pub xyz: [f64; 3],
@@ -29,7 +29,8 @@ pub struct Pose {
 /// `seq` counts the requests of a connection from 0 without gaps; after `resume` it goes on from the
 /// session's. A request that was carried out is never carried out again: its number brings the same
 /// answer again. One that was refused can be sent again under its number, or under the next.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// First of a connection. Answer: `welcome`.
@@ -113,7 +114,8 @@ pub enum Request {
 }
 
 /// A pose of a trajectory that an agent wants to drive.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TimedPose {
     /// Time since the step's start, in microseconds; above that of the pose before, and above 0.
@@ -123,7 +125,8 @@ pub struct TimedPose {
 }
 
 /// Acceleration and curvature for one step.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Action {
     /// Along the car, in m/s², -9.8 to 9.8.
@@ -133,10 +136,11 @@ pub struct Action {
 }
 
 /// How the ego moves.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Dynamics {
     /// The model.
-    pub model: Model,
+    pub model: DynamicsModel,
     /// Speed at the start of an episode, in m/s.
     #[serde(default)]
     pub speed: f64,
@@ -146,9 +150,11 @@ pub struct Dynamics {
 }
 
 /// A model of the ego.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Model {
+#[cfg_attr(feature = "schema", schemars(rename = "Model"))]
+pub enum DynamicsModel {
     /// Goes to the pose that it is told.
     Teleport,
     /// Rolls without slipping, and has acceleration and curvature at once.
@@ -158,7 +164,8 @@ pub enum Model {
 }
 
 /// Who is calling.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ClientInfo {
     /// Program or library.
@@ -168,7 +175,8 @@ pub struct ClientInfo {
 }
 
 /// Opens a session on a twin.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Open {
     /// Number of this request.
@@ -239,7 +247,8 @@ impl Open {
 }
 
 /// Where an episode starts.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(untagged)]
 pub enum Start {
     /// At a pose.
@@ -258,7 +267,8 @@ pub enum Start {
 }
 
 /// Which cameras.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(untagged)]
 pub enum RigChoice {
     /// A preset, by name.
@@ -268,17 +278,19 @@ pub enum RigChoice {
 }
 
 /// How the ego moves.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(untagged)]
 pub enum DynamicsChoice {
     /// A model, from standstill.
-    Model(Model),
+    Model(DynamicsModel),
     /// All of it, written out.
     Full(Dynamics),
 }
 
 /// The cameras of a vehicle.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Rig {
     /// Name.
@@ -288,7 +300,8 @@ pub struct Rig {
 }
 
 /// A camera on the vehicle, a pinhole unless it has a lens; all intrinsics in pixels.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RigCamera {
     /// Name.
     pub name: String,
@@ -327,7 +340,8 @@ pub struct RigCamera {
 }
 
 /// What each observation holds.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default)]
 pub struct Outputs {
     /// Names of the cameras to render, in the order wanted; all if absent.
@@ -379,7 +393,8 @@ impl Default for Outputs {
 }
 
 /// What is sent of a camera's image.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default)]
 pub struct ImagePart {
     /// First column and row, width and height of the part, in the rig's pixels; all of it if absent.
@@ -391,7 +406,8 @@ pub struct ImagePart {
 }
 
 /// How colour images travel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Encoding {
     /// A JPEG file, u8 `[n]`.
@@ -403,7 +419,8 @@ pub enum Encoding {
 }
 
 /// What the server sends as text.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Answer {
     /// To `hello`.
@@ -480,7 +497,8 @@ pub enum Answer {
 }
 
 /// Name, version and build of the server.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ServerInfo {
     /// `wildcity`.
     pub name: String,
@@ -489,7 +507,8 @@ pub struct ServerInfo {
 }
 
 /// What the server accepts.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Limits {
     /// Largest message to the server, in bytes.
     pub message_bytes: u64,
@@ -508,7 +527,8 @@ pub struct Limits {
 }
 
 /// A twin that can be opened.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct TwinInfo {
     /// Name.
     pub name: String,
@@ -525,7 +545,8 @@ pub struct TwinInfo {
 }
 
 /// A recorded trajectory.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct TrajectoryInfo {
     /// Name.
     pub name: String,
@@ -536,7 +557,8 @@ pub struct TrajectoryInfo {
 }
 
 /// An open session.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Opened {
     /// Number of the request.
     pub seq: u64,
@@ -579,7 +601,8 @@ pub struct Opened {
 }
 
 /// How an episode went.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Summary {
     /// Why it ended.
     pub outcome: Outcome,
@@ -595,7 +618,8 @@ pub struct Summary {
 }
 
 /// Why an episode ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The agent closed it, or ended it with `terminate`.

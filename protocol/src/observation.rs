@@ -1,7 +1,7 @@
 //! The observation: one binary frame in safetensors layout.
 //!
 //! 8 bytes little-endian header length, a JSON header (space-padded), raw tensor bytes. The
-//! header's `__metadata__` is `{"observation": "<JSON of Observation>"}`: safetensors allows only
+//! header's `__metadata__` is `{"observation": "<JSON of ObservationMetadata>"}`: safetensors allows only
 //! strings there.
 //!
 //! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
@@ -11,15 +11,16 @@
 //! image names start with `pose/<k>/`. Last come earlier frames, where asked for:
 //! `camera/<name>/history/<back>/rgb` u8.
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::camera::{Lens, Windshield};
 use super::message::{Encoding, Pose};
 
 /// What an observation says beside its tensors.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct Observation {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "Observation"))]
+pub struct ObservationMetadata {
     /// Number of the request.
     pub seq: u64,
     /// Steps done in the episode; 0 after `reset`.
@@ -59,7 +60,8 @@ pub struct Observation {
 }
 
 /// The ego vehicle at one time.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ego {
     /// `world_from_rig`.
     pub pose: Pose,
@@ -79,7 +81,8 @@ pub struct Ego {
 }
 
 /// One image.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Image {
     /// Name of the camera.
     pub camera: String,
@@ -130,7 +133,8 @@ pub struct Image {
 }
 
 /// How far an image may be believed, and why.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Trust {
     /// 1 where and as it was recorded, 0 where nothing is known.
     pub value: f64,
@@ -149,7 +153,8 @@ fn is_now(back: &u64) -> bool {
 }
 
 /// What an observation cost, in milliseconds of wall time.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Timings {
     /// Waiting for other sessions' frames.
     pub queue_ms: f64,
@@ -162,7 +167,8 @@ pub struct Timings {
 }
 
 /// Memory of the server behind an observation. What is in memory never changes what is drawn.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Residency {
     /// Bytes of Gaussians in memory, of all twins.
     pub held_bytes: u64,
@@ -175,7 +181,8 @@ pub struct Residency {
 }
 
 /// Wall time of a render stage.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Stage {
     /// Name of the stage.
     pub name: String,

@@ -5,11 +5,11 @@ use std::io::{self, Write};
 use clap::ValueEnum;
 
 use wildcity_render::Backend;
-use wildcity_render::automatic::{Automatic, automatic};
+use wildcity_render::automatic::{self, Selection};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gpu::{AdapterChoice, Gpu, MemoryLimits};
+use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
-use wildcity_render::relay::Relay;
 use wildcity_render::stage::Stage;
 
 /// `--backend` and `--cpu-through`, for commands that examine the renderer.
@@ -126,7 +126,7 @@ impl BackendOptions {
         match (self.backend, device) {
             (BackendName::Auto, None) => {
                 let limits = self.hardware.memory_limits();
-                let Automatic { backend, reason } = automatic(*threads, (*simd).into(), limits)?;
+                let Selection { backend, reason } = automatic::select(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
@@ -176,7 +176,7 @@ impl RendererOptions {
         match (self.cpu_through, backend) {
             (None, _) => self.backend.backend(),
             (Some(stage), BackendName::Auto | BackendName::Gpu) => {
-                Ok(Box::new(Relay::new(hardware.cpu()?, hardware.gpu()?, stage.into())))
+                Ok(Box::new(HybridBackend::new(hardware.cpu()?, hardware.gpu()?, stage.into())))
             }
             (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
                 "--cpu-through leaves the later stages to the GPU: leave --backend away, or give \

@@ -2,8 +2,8 @@
 
 use std::io::{self, Write};
 
-use wildcity_render::compare::psnr::RIGHT_DB;
-use wildcity_render::relay::bisect;
+use wildcity_render::compare::psnr::MIN_PSNR_DB;
+use wildcity_render::hybrid::bisect;
 use wildcity_render::{Backend, Frame};
 
 use super::backend_options::HardwareOptions;
@@ -63,7 +63,7 @@ impl Bisect {
         match wrong {
             None => Ok(()),
             Some((camera, stage)) => anyhow::bail!(
-                "camera {camera:?} is below {RIGHT_DB} dB while the GPU runs stage {stage}"
+                "camera {camera:?} is below {MIN_PSNR_DB} dB while the GPU runs stage {stage}"
             ),
         }
     }

@@ -4,7 +4,7 @@ use std::env;
 use std::path::PathBuf;
 
 use crate::cli::limits;
-use wildcity_twin::store::{CacheSettings, Catalog};
+use wildcity_twin::store::{DiskCacheSettings, Catalog};
 
 /// `--twins` and the disk cache, for every command that reads twins.
 #[derive(Debug, clap::Args)]
@@ -32,11 +32,11 @@ impl Twins {
     }
 
     /// The cache for twins from an object store. None with size 0, and without a home directory.
-    pub(super) fn cache(&self) -> Option<CacheSettings> {
+    pub(super) fn cache(&self) -> Option<DiskCacheSettings> {
         let limit_bytes = u64::from(self.cache_gib) << 30;
         let default_dir = || Some(xdg_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
         let dir = self.cache_dir.clone().or_else(default_dir)?;
-        (limit_bytes > 0).then_some(CacheSettings { dir, limit_bytes })
+        (limit_bytes > 0).then_some(DiskCacheSettings { dir, limit_bytes })
     }
 
     /// The directory or URL of `--twins`, or the user's own directory.

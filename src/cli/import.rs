@@ -9,7 +9,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Record, RenderProfile};
 use wildcity_twin::ingest::{self, Axes};
-use wildcity_twin::store::{NewSky, NewVersion, Storage, StoreError};
+use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
 use super::input_files::{read_rig, read_trajectories};
@@ -151,7 +151,7 @@ impl Import {
             trajectories,
             sky: sky.map(NewSky::Put),
             provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
-            storage: Storage { record: self.record, levels: !self.no_lod },
+            storage: StorageOptions { record: self.record, levels: !self.no_lod },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.

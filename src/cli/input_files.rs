@@ -23,7 +23,7 @@ pub(super) fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Traject
     for path in paths {
         let trajectory = read_trajectory(path)?;
         if read.iter().any(|before| before.name == trajectory.name) {
-            return Err(StoreError::TrajectoryName { name: trajectory.name })
+            return Err(StoreError::DuplicateTrajectory { name: trajectory.name })
                 .with_context(|| format!("{}", path.display()));
         }
         read.push(trajectory);

@@ -7,7 +7,8 @@ use anyhow::Context as _;
 
 use crate::cli::limits;
 use wildcity_client::{
-    All, Cells, Golden, HttpClient, NewPush, Push as Pushed, PushFile, PushReport, PushState,
+    AllCells, CellSelection, ConnectOptions, HttpClient, NewPush, PreviewRequest, Push as Pushed,
+    PushFile, PushReport, PushState,
 };
 use wildcity_twin::ingest;
 
@@ -93,8 +94,10 @@ impl Push {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let cells = match &self.cells[..] {
             [] => None,
-            [all] if all == "all" => Some(Cells::All(All::All)),
-            cells => Some(Cells::These(cells.iter().map(|c| cell(c)).collect::<Result<_, _>>()?)),
+            [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
+            cells => Some(CellSelection::Listed(
+                cells.iter().map(|c| cell(c)).collect::<Result<_, _>>()?,
+            )),
         };
         let client = self.server.client()?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
@@ -116,7 +119,11 @@ impl Push {
         }
     }
 
-    async fn push(&self, client: &HttpClient, cells: Option<Cells>) -> anyhow::Result<Pushed> {
+    async fn push(
+        &self,
+        client: &HttpClient,
+        cells: Option<CellSelection>,
+    ) -> anyhow::Result<Pushed> {
         let mut files = Vec::with_capacity(self.files.len());
         for path in &self.files {
             let bar = progress::bytes("uploading");
@@ -136,7 +143,7 @@ impl Push {
             levels: !self.no_lod,
             profile: self.settings.clone(),
             note: self.note.clone(),
-            golden: Golden { poses: None, min_psnr_db: self.min_psnr_db },
+            preview: PreviewRequest { poses: None, min_psnr_db: self.min_psnr_db },
         };
         let begun = client.push(&self.twin, &asked).await?;
         let bar = progress::state();
@@ -145,7 +152,7 @@ impl Push {
             bar.set_length(push.progress.total);
             bar.set_position(push.progress.done);
         };
-        let ended = client.wait(begun, seen).await?;
+        let ended = client.wait_for_push(begun, seen).await?;
         bar.finish_and_clear();
         Ok(ended)
     }
@@ -158,7 +165,7 @@ impl Server {
             Some(path) => Some(read_token(path)?),
             None => std::env::var("WILDCITY_TOKEN").ok().filter(|token| !token.is_empty()),
         };
-        Ok(HttpClient::new(&self.server, token)?)
+        Ok(HttpClient::new(&self.server, &ConnectOptions::with_token(token))?)
     }
 }
 
@@ -205,9 +212,9 @@ fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
     if report.left_out > 0 {
         writeln!(out, "left out    {} Gaussians in other cells", report.left_out)?;
     }
-    for golden in &report.golden {
-        let [x, y, z] = golden.pose.xyz;
-        let alike = golden.psnr_db.map_or("equal".to_owned(), |db| format!("{db:.1} dB"));
+    for preview in &report.previews {
+        let [x, y, z] = preview.pose.xyz;
+        let alike = preview.psnr_db.map_or("equal".to_owned(), |db| format!("{db:.1} dB"));
         writeln!(out, "view        from ({x:.1}, {y:.1}, {z:.1}): {alike}")?;
     }
     Ok(())

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
-use wildcity_session::{Extent, FrameRequest, Recording, Redrawn};
+use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, ReplayedImage};
 use wildcity_twin::residency::Cache;
 
 use super::backend_options::BackendOptions;
@@ -47,7 +47,7 @@ Examples:
 
 impl Replay {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let recording = Recording::read(&self.episode)?;
+        let recording = RecordedEpisode::read(&self.episode)?;
         let mut out = io::stdout().lock();
         summary(&mut out, &recording)?;
         if !self.verify && self.out.is_none() {
@@ -63,7 +63,8 @@ impl Replay {
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
         // With --out all images are rendered. Without it, the first difference decides the result.
-        let extent = if self.out.is_some() { Extent::Whole } else { Extent::FirstDifference };
+        let extent =
+            if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
         let mut open = |version| cache.open(&header.twin, Some(version));
         let report = recording.replay(&mut open, &*backend, extent, &mut |image| {
             bar.inc(1);
@@ -77,10 +78,10 @@ impl Replay {
         for change in &report.changes {
             writeln!(out, "changed     {}: {} -> {}", change.what, change.recorded, change.now)?;
         }
-        match &report.strayed {
+        match &report.diverged {
             None => {}
-            Some(strayed) if self.verify => anyhow::bail!("strays at {strayed}"),
-            Some(strayed) => writeln!(out, "strays      {strayed}")?,
+            Some(diverged) if self.verify => anyhow::bail!("diverges at {diverged}"),
+            Some(diverged) => writeln!(out, "diverges    {diverged}")?,
         }
         match &report.difference {
             None => {
@@ -102,8 +103,8 @@ impl Replay {
     }
 }
 
-fn summary(out: &mut impl Write, recording: &Recording) -> io::Result<()> {
-    let Recording { header, frames, versions, end } = recording;
+fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {
+    let RecordedEpisode { header, frames, versions, end } = recording;
     let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
@@ -128,8 +129,8 @@ fn summary(out: &mut impl Write, recording: &Recording) -> io::Result<()> {
     }
 }
 
-fn write_png(dir: &Path, image: &Redrawn<'_>) -> anyhow::Result<()> {
-    let Redrawn { frame, request, pose, camera, rgb8, .. } = image;
+fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {
+    let ReplayedImage { frame, request, pose, camera, rgb8, .. } = image;
     let request = match request {
         FrameRequest::Reset => "reset".to_owned(),
         FrameRequest::Step => "step".to_owned(),

@@ -11,7 +11,7 @@ use wildcity_render::View;
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::ingest;
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
-use wildcity_twin::residency::{Cache, Pinned, Resident};
+use wildcity_twin::residency::{Cache, PinnedScene, Resident};
 
 use super::directories::{TwinVersion, Twins};
 use super::profile_options::{LoadedProfile, ProfileOptions};
@@ -64,7 +64,7 @@ pub(super) enum FrameScene<'a> {
     /// All of a file.
     Whole(Cow<'a, Scene>),
     /// The sections of a twin that the cameras need.
-    Needed(Pinned),
+    Needed(PinnedScene),
 }
 
 impl Deref for FrameScene<'_> {
@@ -82,9 +82,9 @@ impl Source {
     fn scene(&self, shots: &[Shot]) -> anyhow::Result<FrameScene<'_>> {
         let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
         Ok(match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => {
-                FrameScene::Needed(resident.scene(&wildcity_session::eyes(&views), &first.profile)?)
-            }
+            (Self::Twin(resident), [first, ..]) => FrameScene::Needed(
+                resident.scene(&wildcity_session::viewpoints(&views), &first.profile)?,
+            ),
             (Self::Twin(_), []) => FrameScene::Whole(Cow::default()),
             (Self::File(scene), _) => FrameScene::Whole(Cow::Borrowed(scene)),
         })

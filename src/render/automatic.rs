@@ -7,13 +7,13 @@ use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
-use super::compare::psnr::{RIGHT_DB, psnr_db};
+use super::compare::psnr::{MIN_PSNR_DB, psnr_db};
 use super::cpu::{Cpu, CpuError, Simd};
 use super::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
 use super::{Backend, Frame, RenderError, Target, View};
 
 /// A backend, and why it and no other.
-pub struct Automatic {
+pub struct Selection {
     /// What renders.
     pub backend: Box<dyn Backend>,
     /// One line for whoever started the program.
@@ -25,31 +25,31 @@ pub struct Automatic {
 ///
 /// # Errors
 /// As [`Cpu::new`].
-pub fn automatic(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Automatic, CpuError> {
+pub fn select(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Selection, CpuError> {
     let cpu = Cpu::new(threads, simd)?;
     let reason = match Gpu::with_limits(&AdapterChoice::Hardware, threads, limits) {
-        Ok(gpu) => match trial(&gpu, &cpu) {
+        Ok(gpu) => match self_test(&gpu, &cpu) {
             Ok(db) => {
                 let reason = format!("gpu: {}, {db:.1} dB against the cpu backend", gpu.detail());
-                return Ok(Automatic { backend: Box::new(gpu), reason });
+                return Ok(Selection { backend: Box::new(gpu), reason });
             }
             Err(doubt) => format!("cpu: {} is not trusted, {doubt}", gpu.detail()),
         },
         Err(GpuError::NoAdapter) => "cpu: there is no GPU".to_owned(),
         Err(error) => format!("cpu: {error}"),
     };
-    Ok(Automatic { backend: Box::new(cpu), reason })
+    Ok(Selection { backend: Box::new(cpu), reason })
 }
 
 /// Why a backend is not taken.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum Doubt {
+pub enum SelfTestError {
     /// It cannot draw at all.
     #[error(transparent)]
     Render(#[from] RenderError),
     /// It draws something else.
     #[error(
-        "its drawing of the trial card is {db:.1} dB from the cpu backend's, not {RIGHT_DB} dB"
+        "its drawing of the trial card is {db:.1} dB from the cpu backend's, not {MIN_PSNR_DB} dB"
     )]
     Wrong {
         /// PSNR of linear colour and opacity, in dB.
@@ -64,19 +64,19 @@ pub enum Doubt {
 ///
 /// # Errors
 /// It fails, differs from itself, or differs from the truth.
-pub fn trial(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, Doubt> {
+pub fn self_test(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, SelfTestError> {
     let (scene, views) = (card(), card_views());
     let drawn = draw(backend, &scene, &views)?;
     let again = draw(backend, &scene, &views)?;
     // By bits: NaN differs from itself.
     let bits = |image: &[f32]| image.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
     if bits(&drawn) != bits(&again) {
-        return Err(Doubt::Unstable);
+        return Err(SelfTestError::Unstable);
     }
     let truth = draw(truth, &scene, &views)?;
     let db = psnr_db(drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b)));
     // False for NaN too.
-    if db >= RIGHT_DB { Ok(db) } else { Err(Doubt::Wrong { db }) }
+    if db >= MIN_PSNR_DB { Ok(db) } else { Err(SelfTestError::Wrong { db }) }
 }
 
 /// Gaussians of the card. With two views some 46,000 splats: twelve blocks of the sort, and their 3,072
@@ -137,7 +137,7 @@ mod tests {
     use super::*;
     use crate::gpu::shaders::Shaders;
     use crate::reference::Reference;
-    use crate::{Finished, FrameStats};
+    use crate::{FrameStats, OnViewDone};
 
     fn broken(stage: &str, part: &str, slip: &str) -> Gpu {
         let shaders = Shaders::default().with_mutation(stage, part, slip).unwrap();
@@ -158,8 +158,8 @@ mod tests {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
         let gpu = Gpu::new(&AdapterChoice::Best, 1)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
-        assert!(trial(&gpu, &cpu).unwrap() >= 80.0);
-        assert!(trial(&cpu, &Reference).unwrap() >= 80.0);
+        assert!(self_test(&gpu, &cpu).unwrap() >= 80.0);
+        assert!(self_test(&cpu, &Reference).unwrap() >= 80.0);
     }
 
     /// What a wrong driver would do to one kernel each.
@@ -179,13 +179,13 @@ mod tests {
             ("expand", "next += countOneBits", "next = first + countOneBits"),
             ("rasterize", "sums.green += weight", "sums.green += 1.02 * weight"),
         ] {
-            let doubt = trial(&broken(stage, part, slip), &cpu);
+            let doubt = self_test(&broken(stage, part, slip), &cpu);
             // Counts that are wrong may be too many.
             let noticed = matches!(
                 doubt,
-                Err(Doubt::Wrong { .. }
-                    | Doubt::Unstable
-                    | Doubt::Render(RenderError::TooMany { .. }))
+                Err(SelfTestError::Wrong { .. }
+                    | SelfTestError::Unstable
+                    | SelfTestError::Render(RenderError::TooMany { .. }))
             );
             assert!(noticed, "{stage}: {doubt:?}");
         }
@@ -203,7 +203,7 @@ mod tests {
             &self,
             _: &Frame<'_>,
             targets: &mut [Target<'_>],
-            _: Finished<'_>,
+            _: OnViewDone<'_>,
         ) -> Result<FrameStats, RenderError> {
             let count = self.0.fetch_add(1, Relaxed);
             for target in targets {
@@ -216,8 +216,8 @@ mod tests {
     #[test]
     fn nor_is_a_restless_one_or_one_that_draws_nothing_finite() {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
-        assert_eq!(trial(&Restless(0.into(), 1e-3), &cpu), Err(Doubt::Unstable));
-        let nan = trial(&Restless(0.into(), f32::NAN), &cpu);
-        assert!(matches!(nan, Err(Doubt::Wrong { db }) if db.is_nan()), "{nan:?}");
+        assert_eq!(self_test(&Restless(0.into(), 1e-3), &cpu), Err(SelfTestError::Unstable));
+        let nan = self_test(&Restless(0.into(), f32::NAN), &cpu);
+        assert!(matches!(nan, Err(SelfTestError::Wrong { db }) if db.is_nan()), "{nan:?}");
     }
 }

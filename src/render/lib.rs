@@ -8,11 +8,11 @@ pub mod compare;
 pub mod constants;
 pub mod cpu;
 pub mod gpu;
+pub mod hybrid;
 pub mod layout;
 pub mod limits;
 mod normals;
 pub mod reference;
-pub mod relay;
 pub mod stage;
 pub mod unscented;
 pub mod view;
@@ -27,7 +27,7 @@ use wildcity_scene::geometry::camera::Field;
 use wildcity_scene::sky::{CubeMap, Drawn, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
-pub use view::{Rolling, View};
+pub use view::{RollingShutter, View};
 
 /// One chain of stages: all views of one step.
 #[derive(Clone, Copy, Debug)]
@@ -89,7 +89,7 @@ impl Target<'_> {
 
 /// Called once per view, as soon as its pixels are final, from a worker thread: the place to
 /// encode one image while others are still drawn.
-pub type Finished<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
+pub type OnViewDone<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
 
 /// What a frame cost.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
@@ -209,7 +209,7 @@ pub trait Backend: Send + Sync {
 
     /// Frames that it has in hand at once: as many callers of [`Backend::render`] get on faster
     /// than one, and more do not. A backend that uses the whole machine for a frame says 1.
-    fn frames_at_once(&self) -> usize {
+    fn frames_in_flight(&self) -> usize {
         1
     }
 
@@ -221,7 +221,7 @@ pub trait Backend: Send + Sync {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError>;
 }
 
@@ -231,7 +231,7 @@ impl Frame<'_> {
     ///
     /// # Errors
     /// [`RenderError::Sky`].
-    pub fn behind(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
+    pub fn background(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
         match &self.scene.sky {
             Some(sky) => Ok(Some((sky.drawn(self.profile.sky_error)?, sky.sky_from_world()))),
             None if self.profile.background == [0.0; 3] => Ok(None),

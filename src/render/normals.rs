@@ -73,7 +73,7 @@ fn points(view: &View, depth_m: &[f32], row: usize) -> Vec<Option<Point>> {
         let at_px = DVec2::new(x as f64 + 0.5, row as f64 + 0.5);
         let direction = view.camera.unproject(at_px)?;
         let seen_m = direction * (depth_m / view.camera.depth_m(direction));
-        let (at_m, ray) = match view.rolling {
+        let (at_m, ray) = match view.rolling_shutter {
             None => (seen_m, direction),
             Some(_) => {
                 let camera_from_then = camera_from_world * view.world_from_camera_at(at_px);

@@ -30,7 +30,7 @@ impl Stage {
 
 /// What the stages up to one of them leave of a frame: that of sort needs that of project, and so on.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Between {
+pub struct StageOutputs {
     /// From project: all views' splats, in order of (view, global id).
     pub splats: Vec<Splat>,
     /// What each splat is sorted by: [`Cutoffs::sort_key`](super::layout::Cutoffs::sort_key).
@@ -38,21 +38,21 @@ pub struct Between {
     /// From sort: indices of splats, by their keys, those with equal keys in order.
     pub order: Option<Vec<u32>>,
     /// From bin.
-    pub tiles: Option<Tiles>,
+    pub tiles: Option<TileLists>,
 }
 
 /// The lists of splats of all tiles.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Tiles {
+pub struct TileLists {
     /// First and end of each tile's list in `instances`: all views, one after the other, row by row.
     pub ranges: Vec<[u32; 2]>,
     /// Indices of splats, in each list in the order that sort left.
     pub instances: Vec<u32>,
 }
 
-impl Between {
+impl StageOutputs {
     /// The last stage that is done.
-    pub fn through(&self) -> Stage {
+    pub fn last_stage(&self) -> Stage {
         match (&self.order, &self.tiles) {
             (_, Some(_)) => Stage::Bin,
             (Some(_), None) => Stage::Sort,
@@ -61,7 +61,7 @@ impl Between {
     }
 }
 
-impl Tiles {
+impl TileLists {
     /// The list of one tile; empty if its range lies outside of the instances.
     pub fn list(&self, tile: usize) -> &[u32] {
         let [first, end] = self.ranges[tile];

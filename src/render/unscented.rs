@@ -8,23 +8,23 @@
 
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
-use super::{Rolling, View};
+use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::camera::{Cone, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole
 /// of 62° draws what is beside it, up to its plane.
-pub const BESIDE_RAD: f64 = 0.5;
+pub const FIELD_MARGIN_RAD: f64 = 0.5;
 
 /// A view of a lens or with a rolling shutter, ready to project many Gaussians.
 #[derive(Clone, Copy, Debug)]
-pub struct Bent<'a> {
+pub struct UnscentedView<'a> {
     view: &'a View,
     camera_from_world: Pose,
     /// Nearest and farthest depth of a centre, in metres.
     range_m: [f64; 2],
-    beside: Beside,
+    cull_bound: CullBound,
 }
 
 /// Where a Gaussian lands.
@@ -40,12 +40,12 @@ pub struct Footprint {
     pub camera_m: DVec3,
 }
 
-/// The numbers of the bound that [`Bent::may_see`] explains. A Gaussian whose centre is never less than an angle
+/// The numbers of the bound that [`UnscentedView::may_see`] explains. A Gaussian whose centre is never less than an angle
 /// a off the axis, and whose points are within s of it, is not seen if `a > widest`, or if
 /// `least (a - turned - image) > reach (s + turned) + blur` and its centre's largest angle and `s + turned`
 /// are below [`WIDEST_RAD`] together.
 #[derive(Clone, Copy, Debug)]
-pub struct Beside {
+pub struct CullBound {
     /// How far a centre may be off the axis, in radians.
     pub widest_rad: f64,
     /// How far off the axis the image's corner is, in radians.
@@ -64,25 +64,27 @@ pub struct Beside {
     pub rolled_rad: f64,
 }
 
-impl<'a> Bent<'a> {
+impl<'a> UnscentedView<'a> {
     /// `None` for a pinhole at rest.
-    pub fn of(view: &'a View, profile: &RenderProfile) -> Option<Self> {
-        if view.is_ideal() {
+    pub fn new(view: &'a View, profile: &RenderProfile) -> Option<Self> {
+        if view.is_static_pinhole() {
             return None;
         }
-        let [moved_m, rolled_rad] =
-            view.rolling.map_or([0.0; 2], |Rolling { world_from_camera_first: first, .. }| {
+        let [moved_m, rolled_rad] = view.rolling_shutter.map_or(
+            [0.0; 2],
+            |RollingShutter { world_from_camera_first: first, .. }| {
                 let last = &view.world_from_camera;
                 [
                     first.position_m.distance(last.position_m),
                     first.rotation.angle_between(last.rotation),
                 ]
-            });
+            },
+        );
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
         let Cone { image_rad, least_px_per_rad, most_px_per_rad } = Cone::of(&view.camera);
-        let beside = Beside {
-            widest_rad: widest_rad(&view.camera),
+        let cull_bound = CullBound {
+            widest_rad: max_center_angle_rad(&view.camera),
             image_rad,
             least_px_per_rad,
             reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
@@ -95,7 +97,7 @@ impl<'a> Bent<'a> {
             view,
             camera_from_world: view.world_from_camera.inverse(),
             range_m: [profile.near, profile.far],
-            beside,
+            cull_bound,
         })
     }
 
@@ -122,15 +124,15 @@ impl<'a> Bent<'a> {
         if !self.may_touch(at_end_m, 0.0, sigma_m) {
             return None;
         }
-        let center = self.view.land(mean_m, 1.0);
+        let center = self.view.project_beyond(mean_m, 1.0);
         let depth_m = self.view.camera.depth_m(center.point_m);
         let in_range = depth_m >= near_m
             && depth_m <= far_m
-            && angle_rad(center.point_m) <= self.beside.widest_rad;
+            && angle_rad(center.point_m) <= self.cull_bound.widest_rad;
         if !in_range {
             return None;
         }
-        let land = |point_m: DVec3| self.view.land(point_m, center.fraction).at_px;
+        let land = |point_m: DVec3| self.view.project_beyond(point_m, center.fraction).at_px;
         let pairs = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(|axis_m| {
             let offset_m = 3.0_f64.sqrt() * axis_m;
             [land(mean_m + offset_m), land(mean_m - offset_m)]
@@ -146,8 +148,8 @@ impl<'a> Bent<'a> {
     }
 
     /// What decides beside the field, for tests of many Gaussians at once.
-    pub fn beside(&self) -> &Beside {
-        &self.beside
+    pub fn cull_bound(&self) -> &CullBound {
+        &self.cull_bound
     }
 
     /// Size of the image, in pixels.
@@ -159,7 +161,8 @@ impl<'a> Bent<'a> {
     /// the image.
     #[inline(always)]
     fn may_touch(&self, center_m: DVec3, radius_m: f64, sigma_m: f64) -> bool {
-        let Beside { widest_rad, image_rad, turned_rad, moved_m, rolled_rad, .. } = self.beside;
+        let CullBound { widest_rad, image_rad, turned_rad, moved_m, rolled_rad, .. } =
+            self.cull_bound;
         let radius_m = radius_m + moved_m;
         let distance_m = center_m.length();
         if distance_m + radius_m < self.range_m[0] {
@@ -178,7 +181,7 @@ impl<'a> Bent<'a> {
         if farthest_rad + spread_rad >= WIDEST_RAD {
             return true;
         }
-        let Beside { least_px_per_rad, reach_px_per_rad, blur_px, .. } = self.beside;
+        let CullBound { least_px_per_rad, reach_px_per_rad, blur_px, .. } = self.cull_bound;
         let reach_px = reach_px_per_rad * spread_rad + blur_px;
         let beyond_px = least_px_per_rad * (nearest_rad - turned_rad - image_rad);
         let out = beyond_px > reach_px;
@@ -187,8 +190,8 @@ impl<'a> Bent<'a> {
 }
 
 /// How far off the axis a centre may lie and still be drawn, in radians.
-pub fn widest_rad(camera: &Camera) -> f64 {
-    (camera.limit_rad() + BESIDE_RAD).min(WIDEST_RAD)
+pub fn max_center_angle_rad(camera: &Camera) -> f64 {
+    (camera.limit_rad() + FIELD_MARGIN_RAD).min(WIDEST_RAD)
 }
 
 /// The angle of a point off the axis, in radians.

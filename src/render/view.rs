@@ -14,12 +14,12 @@ pub struct View {
     /// Where the camera stands: at the end of the exposure.
     pub world_from_camera: Pose,
     /// How it came there while its rows were exposed; `None` if all were at once, or it stood still.
-    pub rolling: Option<Rolling>,
+    pub rolling_shutter: Option<RollingShutter>,
 }
 
 /// The way of a camera during one exposure, straight and even.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rolling {
+pub struct RollingShutter {
     /// Which row or column is exposed first.
     pub direction: Rolls,
     /// Where the camera stood then.
@@ -29,7 +29,7 @@ pub struct Rolling {
 /// A rolling shutter as seen from the exposure's end, where little is lost in f32: what is still to come while
 /// a place of the image is exposed. The way is [`Pose::interpolate`]'s.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct StillToCome {
+pub(super) struct ShutterMotion {
     /// Of the exposure, at (x, y) of the image in pixels: the share `a x + b y + c`, from 0 to 1.
     pub(super) share: [f64; 3],
     /// Of the camera's way, for the whole exposure, in metres in the world and in the camera's frame at the
@@ -43,7 +43,7 @@ pub(super) struct StillToCome {
 
 /// Where a point of the world lands.
 #[derive(Clone, Copy, Debug)]
-pub struct Landing {
+pub struct ProjectedPoint {
     /// Where on the image or beside it, in pixels.
     pub at_px: DVec2,
     /// When it is exposed: 0 with the first row, 1 with the last.
@@ -66,7 +66,7 @@ impl View {
 
     /// A camera at rest.
     pub fn new(camera: Camera, world_from_camera: Pose) -> Self {
-        Self { camera, world_from_camera, rolling: None }
+        Self { camera, world_from_camera, rolling_shutter: None }
     }
 
     /// The cameras of a rig that stands still.
@@ -83,27 +83,32 @@ impl View {
     ) -> Vec<Self> {
         let view = |camera: &RigCamera| {
             let world_from_camera = world_from_rig * camera.rig_from_camera;
-            let rolling = camera.shutter.and_then(|shutter| {
+            let rolling_shutter = camera.shutter.and_then(|shutter| {
                 let before = world_from_rig_before(shutter.duration_us);
                 let world_from_camera_first = before * camera.rig_from_camera;
                 let moves = !still(&world_from_camera_first, &world_from_camera);
-                moves.then_some(Rolling { direction: shutter.direction, world_from_camera_first })
+                moves.then_some(RollingShutter {
+                    direction: shutter.direction,
+                    world_from_camera_first,
+                })
             });
-            Self { camera: camera.camera, world_from_camera, rolling }
+            Self { camera: camera.camera, world_from_camera, rolling_shutter }
         };
         cameras.iter().map(view).collect()
     }
 
     /// Whether it is a pinhole at rest, which a matrix projects.
-    pub fn is_ideal(&self) -> bool {
-        self.camera.is_ideal() && self.rolling.is_none()
+    pub fn is_static_pinhole(&self) -> bool {
+        self.camera.is_ideal() && self.rolling_shutter.is_none()
     }
 
     /// Where the camera stands when a place of its image, in pixels, is exposed.
     pub fn world_from_camera_at(&self, at_px: DVec2) -> Pose {
-        match &self.rolling {
+        match &self.rolling_shutter {
             None => self.world_from_camera,
-            Some(rolling) => self.on_the_way(rolling.direction.fraction(at_px, &self.camera)),
+            Some(rolling_shutter) => self.world_from_camera_at_fraction(
+                rolling_shutter.direction.fraction(at_px, &self.camera),
+            ),
         }
     }
 
@@ -136,25 +141,27 @@ impl View {
 
     /// Where a point of the world lands, in pixels; `None` outside of the lens' field.
     pub fn project_world(&self, point_m: DVec3) -> Option<DVec2> {
-        self.camera.project(self.land(point_m, 1.0).point_m)
+        self.camera.project(self.project_beyond(point_m, 1.0).point_m)
     }
 
     /// Where a point of the world lands if the lens is continued beyond its field. With a rolling
     /// shutter the row decides where the camera stands, and that decides the row: found by going back
     /// and forth, from a first guess of when.
     #[inline(always)]
-    pub fn land(&self, world_m: DVec3, guess: f64) -> Landing {
+    pub fn project_beyond(&self, world_m: DVec3, guess: f64) -> ProjectedPoint {
         let landing = |fraction: f64, world_from_camera: Pose| {
             let from_camera_m = world_m - world_from_camera.position_m;
             let point_m = world_from_camera.rotation.inverse() * from_camera_m;
             let at_px = self.camera.project_beyond(point_m);
-            Landing { at_px, fraction, world_from_camera, point_m }
+            ProjectedPoint { at_px, fraction, world_from_camera, point_m }
         };
-        let Some(rolling) = &self.rolling else { return landing(1.0, self.world_from_camera) };
-        let mut landed = landing(guess, self.on_the_way(guess));
+        let Some(rolling_shutter) = &self.rolling_shutter else {
+            return landing(1.0, self.world_from_camera);
+        };
+        let mut landed = landing(guess, self.world_from_camera_at_fraction(guess));
         let (mut sooner, mut later, mut off_before) = (0.0, 1.0, f64::INFINITY);
         for _ in 0..Self::ROUNDS {
-            let exposed = rolling.direction.fraction(landed.at_px, &self.camera);
+            let exposed = rolling_shutter.direction.fraction(landed.at_px, &self.camera);
             let off = exposed - landed.fraction;
             if off.abs() <= Self::STILL {
                 break;
@@ -167,14 +174,15 @@ impl View {
             let closes = off.abs() <= 0.5 * off_before && (sooner..=later).contains(&exposed);
             let next = if closes { exposed } else { 0.5 * (sooner + later) };
             off_before = off.abs();
-            landed = landing(next, self.on_the_way(next));
+            landed = landing(next, self.world_from_camera_at_fraction(next));
         }
         landed
     }
 
     /// Of a rolling shutter, seen from the exposure's end.
-    pub(super) fn still_to_come(&self) -> Option<StillToCome> {
-        let Rolling { direction, world_from_camera_first: first } = self.rolling.as_ref()?;
+    pub(super) fn shutter_motion(&self) -> Option<ShutterMotion> {
+        let RollingShutter { direction, world_from_camera_first: first } =
+            self.rolling_shutter.as_ref()?;
         let last = &self.world_from_camera;
         let Camera { width_px, height_px, .. } = self.camera;
         // 0 for the last row's middle, 1 for the first's; a single row is the last one.
@@ -202,7 +210,7 @@ impl View {
         // The short way round.
         let turn = if turn.w < 0.0 { -turn } else { turn };
         let sine = turn.xyz().length();
-        Some(StillToCome {
+        Some(ShutterMotion {
             share,
             moved_world_m,
             moved_m: last.rotation.inverse() * moved_world_m,
@@ -213,12 +221,12 @@ impl View {
 
     /// Where the camera stands at a fraction of the exposure.
     #[inline(always)]
-    fn on_the_way(&self, fraction: f64) -> Pose {
-        match &self.rolling {
+    fn world_from_camera_at_fraction(&self, fraction: f64) -> Pose {
+        match &self.rolling_shutter {
             None => self.world_from_camera,
-            Some(rolling) => {
-                rolling.world_from_camera_first.interpolate(&self.world_from_camera, fraction)
-            }
+            Some(rolling_shutter) => rolling_shutter
+                .world_from_camera_first
+                .interpolate(&self.world_from_camera, fraction),
         }
     }
 }

@@ -8,7 +8,7 @@ use super::ReportError;
 use super::sample_points::{OFFSETS_M, SamplePoint, scaled};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::CameraError;
-use wildcity_session::{Trained, Trust};
+use wildcity_session::{TrainingCoverage, Trust};
 use wildcity_twin::residency::Resident;
 
 /// Trust in the images at one distance from the recorded drive: statistics over all cameras at all stations.
@@ -61,7 +61,9 @@ pub fn confidence_by_offset(
     backend: &dyn Backend,
     sample_points: &[SamplePoint],
 ) -> Result<Vec<Confidence>, ReportError> {
-    let Some(trained) = Trained::new(&resident.version.manifest) else { return Ok(Vec::new()) };
+    let Some(coverage) = TrainingCoverage::new(&resident.version.manifest) else {
+        return Ok(Vec::new());
+    };
     let mut all = Vec::new();
     for offset_m in OFFSETS_M {
         let at_offset = sample_points.iter().filter(|point| point.offset_m == offset_m);
@@ -69,7 +71,7 @@ pub fn confidence_by_offset(
         let mut trusts = Vec::new();
         let mut image = ViewImage::default();
         for (station, point) in at_offset.iter().enumerate() {
-            let observed = Observed::new(resident, backend, point, &trained)?;
+            let observed = Observed::new(resident, backend, point, &coverage)?;
             if station == at_offset.len() / 2 {
                 image = observed.image(point)?;
             }
@@ -95,7 +97,7 @@ impl Observed {
         resident: &Arc<Resident>,
         backend: &dyn Backend,
         point: &SamplePoint,
-        trained: &Trained,
+        coverage: &TrainingCoverage,
     ) -> Result<Self, ReportError> {
         let world_from_rig = point.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
 
@@ -107,7 +109,7 @@ impl Observed {
 
         // Colour and opacity of each.
         let profile = &resident.version.manifest.profile;
-        let scene = resident.scene(&wildcity_session::eyes(&views), profile)?;
+        let scene = resident.scene(&wildcity_session::viewpoints(&views), profile)?;
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut rgb8: Vec<Vec<u8>> = pixels().map(|count| vec![0; 3 * count]).collect();
         let mut opacity: Vec<Vec<f32>> = pixels().map(|count| vec![0.0; count]).collect();
@@ -123,7 +125,7 @@ impl Observed {
         backend.render(&frame, &mut targets, &|_, _| {})?;
 
         let images = views.iter().zip(&opacity);
-        let trusts = images.map(|(view, opacity)| trained.of(&world_from_rig, view, opacity));
+        let trusts = images.map(|(view, opacity)| coverage.trust(&world_from_rig, view, opacity));
         let trusts = trusts.collect();
         Ok(Self { trusts, first_view: views[0], first_rgb8: rgb8.swap_remove(0) })
     }

@@ -11,10 +11,10 @@ use serde::Serialize;
 
 use super::ReportError;
 use super::measure::sky_bytes;
-use wildcity_render::compare::drawing::look;
+use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::{Gpu, GpuUsage};
-use wildcity_render::{Backend, Frame, FrameStats, RenderError, Rolling, Target, View};
+use wildcity_render::{Backend, Frame, FrameStats, RenderError, RollingShutter, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::camera::{
     Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference,
@@ -123,7 +123,7 @@ const FEATURES: [Feature; 18] = [
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
         let direction = Rolls::TopToBottom;
-        step.view.rolling = Some(Rolling { direction, world_from_camera_first: first });
+        step.view.rolling_shutter = Some(RollingShutter { direction, world_from_camera_first: first });
     }),
     feature("exposure", |step| {
         let matrix = [[1.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]];
@@ -225,7 +225,7 @@ impl Step {
         Self {
             scene: Scene::from_gaussians(&street(0)),
             profile: RenderProfile::default(),
-            view: look([320, 180], 240.0, camera_m, DVec3::X, DVec3::NEG_Z),
+            view: view_along([320, 180], 240.0, camera_m, DVec3::X, DVec3::NEG_Z),
             appearance: Appearance::default(),
             depth: false,
             opacity: false,

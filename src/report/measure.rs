@@ -17,16 +17,16 @@ use super::settings::{Family, Setting};
 use super::statistics::{min, quantile};
 use super::timing::{Step, StepTimes, encode};
 use super::{ErrorImages, ReportError};
-use wildcity_render::compare::drawing::{Drawing, draw};
-use wildcity_render::compare::errors::{Errors, Gathered, Image};
-use wildcity_render::compare::numbers::{number, numbers};
+use wildcity_render::compare::images::{RenderedImage, render_images};
+use wildcity_render::compare::errors::{ErrorAccumulator, Image, ImageErrors};
+use wildcity_render::compare::json_numbers::{serialize_number, serialize_numbers};
 use wildcity_render::gpu::Gpu;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, RenderError, View};
 use wildcity_scene::record::recorded;
 use wildcity_scene::sky::Drawn;
 use wildcity_scene::{Rays, RenderProfile, Scene};
-use wildcity_twin::residency::{Pinned, Resident};
+use wildcity_twin::residency::{PinnedScene, Resident};
 
 /// A twin, the backends, and the sample points that settings are measured at.
 pub struct Benchmark<'a> {
@@ -53,9 +53,9 @@ pub struct Measurement {
     #[serde(flatten)]
     pub setting: Setting,
     /// Errors over all windows at all sample points.
-    pub errors: Errors,
+    pub errors: ImageErrors,
     /// PSNR at each distance of [`OFFSETS_M`], in dB. Only one value for a twin without a drive.
-    #[serde(serialize_with = "numbers")]
+    #[serde(serialize_with = "serialize_numbers")]
     pub psnr_db_by_offset: Vec<f64>,
     /// Results at each sample point.
     #[serde(rename = "by_place")]
@@ -77,10 +77,10 @@ pub struct SampleResult {
     #[serde(rename = "chooses")]
     pub for_selection: bool,
     /// PSNR over all windows of the point, in dB.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
     /// PSNR of the window that has the least, in dB. A setting is selected by it.
-    #[serde(rename = "least_db", serialize_with = "number")]
+    #[serde(rename = "least_db", serialize_with = "serialize_number")]
     pub min_db: f64,
     /// 95th percentile of the step time, in milliseconds: of fewer than twenty steps, the longest. None
     /// beside the drive, where no step is timed.
@@ -147,7 +147,7 @@ impl Benchmark<'_> {
             progress(done);
             let scene = self.scene(&point.views, &profile)?;
             let start = Instant::now();
-            let drawings = draw(&Reference, &scene, &profile, &point.windows)?;
+            let drawings = render_images(&Reference, &scene, &profile, &point.windows)?;
             let windows_ms = start.elapsed().as_secs_f64() * 1e3;
             let pixel_ratio = pixels(&point.views) as f64 / pixels(&point.windows) as f64;
             step_ms += windows_ms * pixel_ratio / self.sample_points.len() as f64;
@@ -181,7 +181,7 @@ impl Benchmark<'_> {
 
             // Errors, in the windows.
             let views = &scaled_point.windows;
-            let drawings = draw(backend, scene, &profile, views)?;
+            let drawings = render_images(backend, scene, &profile, views)?;
             let mut images = Vec::with_capacity(views.len());
             for ((view, drawing), reference) in views.iter().zip(&drawings).zip(references) {
                 images.push(received(setting, view, drawing, reference.size_px)?);
@@ -236,14 +236,14 @@ impl Benchmark<'_> {
         self.resident.version.manifest.profile
     }
 
-    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<Pinned, ReportError> {
-        Ok(self.resident.scene(&wildcity_session::eyes(views), profile)?)
+    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<PinnedScene, ReportError> {
+        Ok(self.resident.scene(&wildcity_session::viewpoints(views), profile)?)
     }
 }
 
 /// Errors of one setting, gathered over the sample points.
 struct ErrorTotals {
-    by_offset: Vec<Gathered>,
+    by_offset: Vec<ErrorAccumulator>,
     worst: Option<WorstWindow>,
 }
 
@@ -265,7 +265,7 @@ struct PointErrors {
 
 impl ErrorTotals {
     fn new() -> Self {
-        Self { by_offset: vec![Gathered::default(); OFFSETS_M.len()], worst: None }
+        Self { by_offset: vec![ErrorAccumulator::default(); OFFSETS_M.len()], worst: None }
     }
 
     /// Adds the windows of a sample point.
@@ -275,7 +275,7 @@ impl ErrorTotals {
         images: Vec<Image>,
         references: &[Image],
     ) -> PointErrors {
-        let mut gathered = Gathered::default();
+        let mut gathered = ErrorAccumulator::default();
         let mut windows_db = Vec::with_capacity(images.len());
         for (image, reference) in images.into_iter().zip(references) {
             let psnr_db = gathered.add(&image, reference);
@@ -296,15 +296,15 @@ impl ErrorTotals {
     }
 
     /// Errors at all sample points together.
-    fn all(&self) -> Result<Errors, ReportError> {
-        let mut all = Gathered::default();
+    fn all(&self) -> Result<ImageErrors, ReportError> {
+        let mut all = ErrorAccumulator::default();
         self.by_offset.iter().for_each(|gathered| all.merge(gathered));
         all.errors().ok_or(ReportError::NoSamplePoints)
     }
 
     /// In dB; only of distances that have sample points.
     fn psnr_db_by_offset(&self) -> Vec<f64> {
-        let errors = self.by_offset.iter().filter_map(Gathered::errors);
+        let errors = self.by_offset.iter().filter_map(ErrorAccumulator::errors);
         errors.map(|errors| errors.psnr_db).collect()
     }
 
@@ -416,7 +416,7 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
 fn received(
     setting: &Setting,
     view: &View,
-    drawing: &Drawing,
+    drawing: &RenderedImage,
     size_px: [u32; 2],
 ) -> Result<Image, ReportError> {
     let mut image = displayed(view, drawing);
@@ -441,7 +441,7 @@ fn decode(file: &[u8]) -> Result<Vec<u8>, ReportError> {
 }
 
 /// A drawing as a display shows it: colour clamped to [0, 1].
-fn displayed(view: &View, drawing: &Drawing) -> Image {
+fn displayed(view: &View, drawing: &RenderedImage) -> Image {
     let rgba = drawing.rgba.chunks_exact(4);
     Image {
         size_px: [view.camera.width_px, view.camera.height_px],

@@ -302,7 +302,7 @@ fn stress(report: &Report) -> Markup {
                         td.text { (row.bound) }
                         @for outcome in &row.outcomes {
                             td class=(verdict_class(outcome.verdict)) {
-                                b { (outcome.word()) } br; (outcome.told)
+                                b { (outcome.word()) } br; (outcome.detail)
                             }
                         }
                     }

@@ -16,7 +16,7 @@ use super::ReportError;
 use super::measure::{Measurement, SampleResult};
 use super::settings::{Family, ImageEncoding};
 use super::statistics::min;
-use wildcity_render::compare::numbers::number;
+use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileChanges, RenderProfile};
 
@@ -71,7 +71,7 @@ pub struct EncodingCost {
     #[serde(rename = "by_default")]
     pub is_default: bool,
     /// Least PSNR of a window at any sample point after decoding, in dB.
-    #[serde(rename = "least_db", serialize_with = "number")]
+    #[serde(rename = "least_db", serialize_with = "serialize_number")]
     pub min_db: f64,
     /// How much longer the median step takes than without encoding, in milliseconds. The two are timed in
     /// turn; it can be below 0 by chance.

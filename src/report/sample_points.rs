@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3};
 
 use wildcity_render::View;
-use wildcity_render::compare::drawing::{crop, look};
+use wildcity_render::compare::images::{crop_view, view_along};
 use wildcity_scene::geometry::{Bounds, CameraError, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Trajectory};
@@ -129,7 +129,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
         let toward_camera = DVec3::new(cos, sin, slope).normalize();
         let position_m = middle_m + distance_m * toward_camera;
         let view =
-            look(AROUND_SIZE_PX, AROUND_FOCAL_PX, position_m, -toward_camera, DVec3::NEG_Z);
+            view_along(AROUND_SIZE_PX, AROUND_FOCAL_PX, position_m, -toward_camera, DVec3::NEG_Z);
         let point = SamplePoint {
             name: format!("{:.1}° around", 360.0 * turn),
             offset_m: 0.0,
@@ -163,7 +163,7 @@ impl SamplePoint {
                 let in_image = 0.5 + share * (in_unit_square - 0.5);
                 (in_image * f64::from(image_px[axis] - size_px[axis])) as i32
             });
-            crop(*view, corner_px, size_px)
+            crop_view(*view, corner_px, size_px)
         };
         self.windows = self.views.iter().enumerate().map(window).collect();
         self

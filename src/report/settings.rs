@@ -414,7 +414,7 @@ impl TwinFeatures {
                 Some(Model::Network(..)) => BackgroundKind::Network,
                 Some(Model::Cube(_)) => BackgroundKind::Images,
             },
-            has_non_pinhole: views.iter().any(|view| !view.is_ideal()),
+            has_non_pinhole: views.iter().any(|view| !view.is_static_pinhole()),
         }
     }
 }

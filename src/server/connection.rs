@@ -10,7 +10,7 @@ use std::sync::Arc;
 use tokio::time::{Instant, sleep_until, timeout};
 
 use crate::limits;
-use wildcity_session::{Frame, Outcome, Session, SessionError};
+use wildcity_session::{Observation, Outcome, Session, SessionError};
 
 use super::Server;
 use super::auth::Grant;
@@ -253,7 +253,7 @@ impl Connection {
         self.place.as_mut().and_then(|place| place.session.as_mut()).ok_or(NO_SESSION)
     }
 
-    fn observation(&mut self, seq: u64, frame: Frame) -> Result<Answer, Fault> {
+    fn observation(&mut self, seq: u64, frame: Observation) -> Result<Answer, Fault> {
         let frame = convert::observation(seq, self.session()?, frame)?;
         Ok(Answer::Observation(Arc::new(frame)))
     }

@@ -256,7 +256,7 @@ pub(super) fn is_content(error: &StoreError) -> bool {
         StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),
         StoreError::Clamped { .. }
         | StoreError::Profile(_)
-        | StoreError::Field { .. }
+        | StoreError::FieldMismatch { .. }
         | StoreError::ManifestSize { .. } => true,
         _ => false,
     }

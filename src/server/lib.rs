@@ -48,7 +48,7 @@ use wildcity_render::Backend;
 use wildcity_scene::ProfileChanges;
 use wildcity_session::{Engine, EngineSettings, SessionError};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{CacheSettings, Catalog, StoreError};
+use wildcity_twin::store::{Catalog, DiskCacheSettings, StoreError};
 
 use spool::Spool;
 
@@ -64,7 +64,7 @@ pub struct Config {
     /// Directory of twins, or their URL.
     pub twins: PathBuf,
     /// Where parts of twins at a URL are kept on disk.
-    pub cache: Option<CacheSettings>,
+    pub cache: Option<DiskCacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.

@@ -183,7 +183,7 @@ pub(super) async fn show(
     metrics.sessions.set(server.sessions.count() as i64);
     let free = server.agents.available_permits();
     metrics.connections.set((server.limits.connections - free) as i64);
-    metrics.frames_queued.set(server.engine.queued() as i64);
+    metrics.frames_queued.set(server.engine.queued_frames() as i64);
     let (uploads, spool_bytes) = server.spool.as_ref().map_or((0, 0), |spool| spool.load());
     metrics.uploads.set(uploads as i64);
     metrics.spool_bytes.set(spool_bytes);

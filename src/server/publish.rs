@@ -11,9 +11,12 @@ use crate::limits;
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, RenderProfile};
-use wildcity_session::{Changed, Engine, HeldLatest};
+use wildcity_session::{Engine, LatestPin, ProposedChange};
 use wildcity_twin::ingest::{self, IngestError};
-use wildcity_twin::store::{Catalog, Change, Kind, NewSky, Settings, Storage, StoreError, Version};
+use wildcity_twin::store::{
+    Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
+    VersionSettings,
+};
 
 use super::Server;
 use super::fault::Fault;
@@ -75,7 +78,7 @@ async fn publish(
     let (engine, told, asked) = (server.engine.clone(), push.clone(), ask.clone());
     let (held, version) = blocking(move || {
         // Until it is ready, who opens the latest gets what is the latest now: comparing took its time.
-        let held = hold_latest(&engine, &asked.twin)?;
+        let held = pin_latest(&engine, &asked.twin)?;
         let version = commit(engine.catalog(), &told, &asked, &scene, base.as_deref())?;
         Ok((held, version))
     })
@@ -187,13 +190,13 @@ fn find_base(catalog: &Catalog, ask: &Ask) -> Result<Option<Version>, Fault> {
 }
 
 /// Keeps what is the latest version; none if the twin is new.
-fn hold_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<HeldLatest>, Fault> {
+fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, Fault> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
         Err(StoreError::NoTwin { .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
-    Ok(versions.last().map(|latest| engine.hold_latest(twin, latest.number)))
+    Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
 /// Looks at what would change, and at how it looks.
@@ -209,7 +212,8 @@ async fn validate(
         blocking(move || changes(&told, &asked, scene, before.as_ref())).await?;
     if let Some(changed) = changed {
         let progress = |done, total| push.progress(done, total);
-        scene.report.golden = server.engine.compare(changed, ask.poses.clone(), &progress).await?;
+        scene.report.golden =
+            server.engine.preview_psnr(changed, ask.poses.clone(), &progress).await?;
         push.tell(scene.report.clone());
     }
     looks_alike(ask, &scene, base.as_deref())?;
@@ -222,7 +226,7 @@ fn changes(
     ask: &Ask,
     scene: Scene,
     base: Option<&Arc<Version>>,
-) -> Result<(Scene, Option<Changed>), Fault> {
+) -> Result<(Scene, Option<ProposedChange>), Fault> {
     let Scene { mut gaussians, sources, options, mut report } = scene;
     // What is stored of a twin has one SH degree; a lower one gets zeros.
     if let Some(base) = base
@@ -251,7 +255,7 @@ fn changes(
     let changed = match base {
         Some(base) => {
             let changed: BTreeSet<_> = report.cells.iter().map(|change| change.cell).collect();
-            Some(Changed {
+            Some(ProposedChange {
                 before: base.clone(),
                 gaussians: inside(&gaussians, &changed, left_out),
                 cells: changed,
@@ -339,8 +343,8 @@ fn commit(
 ) -> Result<Version, Fault> {
     let was = base.map(|base| &base.manifest);
     let record = ask.record.or(was.map(|was| was.record)).unwrap_or_default();
-    let storage = Storage { record, levels: ask.levels };
-    let mut commit = catalog.begin(&ask.twin, Kind::Push, storage)?;
+    let storage = StorageOptions { record, levels: ask.levels };
+    let mut commit = catalog.begin(&ask.twin, CommitKind::Push, storage)?;
     let only = match &ask.cells {
         AskedCells::These(cells) => Some(cells),
         AskedCells::Touched | AskedCells::All => None,
@@ -351,11 +355,12 @@ fn commit(
     Ok(match base {
         Some(base) if ask.cells != AskedCells::All => {
             let profile = (!ask.profile.is_empty()).then_some(new_profile);
-            let change = Change { profile, rig: None, trajectories: None, sky: None, provenance };
+            let change =
+                VersionChange { profile, rig: None, trajectories: None, sky: None, provenance };
             commit.change(base.number, change)?
         }
         _ => {
-            let settings = Settings {
+            let settings = VersionSettings {
                 profile: new_profile,
                 rig: was.and_then(|was| was.rig.clone()),
                 trajectories: was.map(|was| was.trajectories.clone()).unwrap_or_default(),

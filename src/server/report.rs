@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::limits;
 use wildcity_scene::{Gaussians, Manifest};
-use wildcity_session::Golden;
+use wildcity_session::PsnrPreview;
 use wildcity_twin::ingest::BadGaussian;
 
 use super::fault::Fault;
@@ -41,7 +41,7 @@ pub(super) struct Report {
     pub(super) ranges: Option<Ranges>,
     /// Cells that are replaced, in order of (y, x).
     pub(super) cells: Vec<CellChange>,
-    pub(super) golden: Vec<Golden>,
+    pub(super) golden: Vec<PsnrPreview>,
 }
 
 /// A cell that is replaced, and its Gaussians before and after.

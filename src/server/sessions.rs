@@ -8,8 +8,8 @@ use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Frame, Outcome, Session};
-use wildcity_twin::residency::Eye;
+use wildcity_session::{Observation, Outcome, Session};
+use wildcity_twin::residency::Viewpoint;
 
 use super::fault::Fault;
 
@@ -40,7 +40,7 @@ pub(super) struct About {
     pub(super) step: u64,
     pub(super) world_from_rig: Pose,
     /// What its next frame needs, if it stays where it is.
-    pub(super) eyes: Vec<Eye>,
+    pub(super) eyes: Vec<Viewpoint>,
 }
 
 /// A session with what a lost connection must not lose.
@@ -60,7 +60,7 @@ pub(super) enum Answer {
     /// A control message.
     Text(Arc<str>),
     /// An observation.
-    Observation(Arc<Frame>),
+    Observation(Arc<Observation>),
 }
 
 /// A connection's hold on a seat. Dropping it parks the session, or forgets a closed one.
@@ -216,7 +216,7 @@ impl Place {
             version: version.number,
             step: session.episode().step(),
             world_from_rig: session.episode().world_from_rig(),
-            eyes: session.eyes(),
+            eyes: session.viewpoints(),
         };
         if let Some(entry) = self.sessions.lock().get_mut(&self.name) {
             entry.about = Some(about);

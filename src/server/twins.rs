@@ -53,7 +53,7 @@ pub(super) async fn versions(
     let (versions, held) = blocking(move || {
         let versions = engine.catalog().versions(&name)?;
         // After the log: a push holds the latest before it commits.
-        let held = engine.held_latest(&name);
+        let held = engine.pinned_latest(&name);
         Ok((versions, held))
     })
     .await?;
@@ -74,7 +74,7 @@ pub(super) async fn rollback(
     let version = blocking(move || {
         let version = engine.catalog().rollback(&name, number)?;
         // A push that is on its way to be ready does not keep it back.
-        engine.hold_instead(&name, version.number);
+        engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok(version)
     });

@@ -10,7 +10,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_sim::{Command, Ego, Ground};
 
-use super::SessionError;
+use crate::error::SessionError;
 
 /// How far back the history reaches: 15 steps of 0.1 s before now.
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
@@ -55,7 +55,7 @@ pub enum Outcome {
 /// How an episode went.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Summary {
+pub struct EpisodeSummary {
     /// Why it ended.
     pub outcome: Outcome,
     /// Steps done.
@@ -71,7 +71,7 @@ pub struct Summary {
 
 /// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last is the identity.
 #[derive(Clone, Debug, PartialEq)]
-pub struct History {
+pub struct EgoHistory {
     /// Positions `[16, 3]`, in metres.
     pub xyz_m: [[f32; 3]; HISTORY_POSES],
     /// Rotation matrices `[16, 3, 3]`, row by row.
@@ -88,7 +88,7 @@ impl Episode {
 
     /// The same behind a warm-up: where the rig was (`world_from_rig`) by time in microseconds, rising
     /// and below 0.
-    pub(super) fn warmed_up(seed: u64, ego: Ego, warm_up: &[(i64, Pose)], dt_us: i64) -> Self {
+    pub(crate) fn warmed_up(seed: u64, ego: Ego, warm_up: &[(i64, Pose)], dt_us: i64) -> Self {
         let now = (0, ego.world_from_rig());
         let track: VecDeque<_> = warm_up.iter().copied().chain([now]).collect();
         let begin_us = track[0].0;
@@ -141,7 +141,7 @@ impl Episode {
     /// Some of a rig's cameras, by their indices, where the rig stands somewhere. If it `moves`, as the ego
     /// has just moved: so a rolling shutter sees from any place what it would see if the ego had come
     /// there as it came to where it is. At the start of an episode it stands, and in a warm-up.
-    pub(super) fn views(
+    pub(crate) fn views(
         &self,
         (cameras, which): (&[RigCamera], &[usize]),
         world_from_rig: Pose,
@@ -179,7 +179,7 @@ impl Episode {
     }
 
     /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
-    pub(super) fn begin_us(&self) -> i64 {
+    pub(crate) fn begin_us(&self) -> i64 {
         self.begin_us
     }
 
@@ -194,7 +194,7 @@ impl Episode {
     }
 
     /// How it went so far. An episode that the agent ended stays completed, whatever came after.
-    pub fn summary(&self, outcome: Outcome) -> Summary {
+    pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
         let outcome = match (self.terminated, outcome) {
             (true, _) | (_, Outcome::Completed) => match self.least_trust {
                 Some(trust) if trust < limits::OFF_MODEL_TRUST => Outcome::OffModel,
@@ -203,12 +203,12 @@ impl Episode {
             (false, outcome) => outcome,
         };
         let (steps, time_us, distance_m) = (self.step, self.time_us(), self.distance_m);
-        Summary { outcome, steps, time_us, distance_m, least_trust: self.least_trust }
+        EpisodeSummary { outcome, steps, time_us, distance_m, least_trust: self.least_trust }
     }
 
     /// Remembers how far the images of an observation may be believed, 0 to 1 each; nothing if there are
     /// none.
-    pub(super) fn judged(&mut self, trusts: impl Iterator<Item = f64>) {
+    pub(crate) fn judged(&mut self, trusts: impl Iterator<Item = f64>) {
         let (sum, count) =
             trusts.fold((0.0, 0.0), |(sum, count), trust| (sum + trust, count + 1.0));
         if count > 0.0 {
@@ -218,7 +218,7 @@ impl Episode {
     }
 
     /// What the ego remembers now.
-    pub fn history(&self) -> History {
+    pub fn history(&self) -> EgoHistory {
         let rig_from_world = self.world_from_rig().inverse();
         let mut xyz_m = [[0.0; 3]; HISTORY_POSES];
         let mut rotation = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]; HISTORY_POSES];
@@ -231,11 +231,11 @@ impl Episode {
         }
         let steps_back = (self.time_us() - self.begin_us) / HISTORY_STEP_US;
         let count = usize::try_from(steps_back).unwrap_or(0).min(HISTORY_POSES - 1) + 1;
-        History { xyz_m, rotation, count }
+        EgoHistory { xyz_m, rotation, count }
     }
 
     /// `world_from_rig` at a time, between the poses of the track.
-    pub(super) fn at(&self, time_us: i64) -> Pose {
+    pub(crate) fn at(&self, time_us: i64) -> Pose {
         let after = self.track.partition_point(|&(t, _)| t < time_us);
         let Some(&(after_us, to)) = self.track.get(after) else { return self.world_from_rig() };
         match after.checked_sub(1) {
@@ -295,7 +295,7 @@ mod tests {
         let quarter = std::f64::consts::FRAC_PI_2;
         let turned = moved(&begun(at(0.0, 0.0), 100_000), at(0.0, quarter), false).unwrap();
         let forward = Pose { position_m: DVec3::Y, ..at(0.0, quarter) };
-        let History { xyz_m, rotation, .. } = moved(&turned, forward, false).unwrap().history();
+        let EgoHistory { xyz_m, rotation, .. } = moved(&turned, forward, false).unwrap().history();
         assert_eq!(xyz_m[15], [0.0; 3]);
         assert!((xyz_m[14][0] + 1.0).abs() < 1e-6, "one metre behind: {:?}", xyz_m[14]);
         // Two steps ago the rig looked along what is now to its right: row 1 (left) of x is -1.
@@ -324,18 +324,18 @@ mod tests {
         let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
         let still = begun(at(0.0, 0.0), 100_000);
         let driven = driven(3, 100_000, 3.0);
-        assert_eq!(views(&driven, &camera, 9.0)[0].rolling, None, "global");
+        assert_eq!(views(&driven, &camera, 9.0)[0].rolling_shutter, None, "global");
         camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
-        assert_eq!(views(&still, &camera, 0.0)[0].rolling, None, "it stands");
+        assert_eq!(views(&still, &camera, 0.0)[0].rolling_shutter, None, "it stands");
         // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
         for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {
             let view = views(&driven, &camera, x_m)[0];
             assert!((view.world_from_camera.position_m.x - x_m - 1.5).abs() < 1e-9);
-            let first = view.rolling.unwrap().world_from_camera_first;
+            let first = view.rolling_shutter.unwrap().world_from_camera_first;
             assert!((first.position_m.x - first_m).abs() < 1e-9, "{first:?}");
         }
         let stopped = moved(&driven, at(9.0, 0.0), false).unwrap();
-        assert_eq!(views(&stopped, &camera, 9.0)[0].rolling, None, "it stands again");
+        assert_eq!(views(&stopped, &camera, 9.0)[0].rolling_shutter, None, "it stands again");
     }
 
     #[test]
@@ -359,7 +359,7 @@ mod tests {
         assert!((episode.ego().velocity_m_s() - DVec3::X * 10.0).length() < 1e-12);
         let over = moved(&episode, at(1.5, 0.0), true).unwrap();
         let summary = over.summary(Outcome::AgentLost);
-        let expected = Summary {
+        let expected = EpisodeSummary {
             outcome: Outcome::Completed,
             steps: 4,
             time_us: 200_000,

@@ -8,7 +8,7 @@ use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-use super::record::RecordError;
+use crate::record::format::RecordError;
 
 /// Why a request was refused. The session is then as it was before.
 #[derive(Debug, thiserror::Error)]

@@ -6,20 +6,22 @@ use std::sync::Arc;
 use tokio::time::Instant;
 
 use crate::limits;
-use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::{Frame, Target, View};
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Chunk, Gaussians, Manifest, RenderProfile, Rig, Scene};
-use wildcity_twin::residency::{Needed, demand};
+use wildcity_twin::residency::{SectionRef, demand};
 use wildcity_twin::store::{Catalog, Version};
 
-use super::{Engine, SessionError, observation};
+use crate::engine::Engine;
+use crate::error::SessionError;
+use crate::observe::builder::viewpoints;
 
 /// One pose, before and after.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Golden {
+pub struct PsnrPreview {
     /// Where the rig stands.
     pub world_from_rig: Pose,
     /// How alike the images of all cameras are together, in dB; infinite if they are equal.
@@ -27,7 +29,7 @@ pub struct Golden {
 }
 
 /// A version as it would be with other cells.
-pub struct Changed {
+pub struct ProposedChange {
     /// As it is.
     pub before: Arc<Version>,
     /// What lies in the replaced cells instead.
@@ -44,12 +46,12 @@ impl Engine {
     ///
     /// # Errors
     /// What is there cannot be read, or the backend refuses a frame.
-    pub async fn compare(
+    pub async fn preview_psnr(
         self: &Arc<Self>,
-        changed: Changed,
+        changed: ProposedChange,
         poses: Option<Vec<Pose>>,
         progress: &(dyn Fn(u64, u64) + Sync),
-    ) -> Result<Vec<Golden>, SessionError> {
+    ) -> Result<Vec<PsnrPreview>, SessionError> {
         let poses = poses.unwrap_or_else(|| stations(&changed));
         let manifest = &changed.before.manifest;
         let rig = manifest.rig.clone().or_else(|| Rig::preset(limits::RIG));
@@ -96,8 +98,8 @@ impl Engine {
             (new, loaded) = (kept, kept_loaded);
             let was = self.draw(before?, manifest.profile, views.clone()).await?;
             let will_be = self.draw(after?, changed.profile, views).await?;
-            let psnr_db = psnr_db_of_bytes(was.iter().zip(&will_be));
-            golden.push(Golden { world_from_rig, psnr_db });
+            let psnr_db = psnr_db_u8(was.iter().zip(&will_be));
+            golden.push(PsnrPreview { world_from_rig, psnr_db });
         }
         Ok(golden)
     }
@@ -135,7 +137,7 @@ fn scene(
 ) -> Result<Scene, SessionError> {
     let chunks = &version.manifest.chunks;
     let mut scene = Scene::default();
-    for Needed { chunk, section } in demand(&version.manifest, &observation::eyes(views), profile) {
+    for SectionRef { chunk, section } in demand(&version.manifest, &viewpoints(views), profile) {
         let entry = &chunks[chunk];
         if without.contains(&entry.cell) {
             continue;
@@ -152,14 +154,14 @@ fn scene(
 }
 
 /// Poses along the first trajectory: spread over where it crosses what changes, or over all of it.
-fn stations(changed: &Changed) -> Vec<Pose> {
+fn stations(changed: &ProposedChange) -> Vec<Pose> {
     let Manifest { trajectories, .. } = &changed.before.manifest;
     let Some(log) = trajectories.first() else { return Vec::new() };
     let changes = |pose: &&Pose| changed.cells.contains(&cell_at(&pose.position_m.to_array()));
     let keyframes: Vec<Pose> = log.keyframes.iter().map(|key| key.world_from_rig).collect();
     let near: Vec<&Pose> = keyframes.iter().filter(changes).collect();
     let from = if near.is_empty() { keyframes.iter().collect() } else { near };
-    let count = limits::GOLDEN_STATIONS.min(from.len());
+    let count = limits::PREVIEW_POSES.min(from.len());
     // The middles of as many equal parts.
     (0..count).map(|k| *from[(2 * k + 1) * from.len() / (2 * count)]).collect()
 }
@@ -167,7 +169,7 @@ fn stations(changed: &Changed) -> Vec<Pose> {
 /// A camera with the same field of view, and fewer pixels.
 fn small(camera: &RigCamera) -> Option<RigCamera> {
     let Camera { width_px, height_px, .. } = camera.camera;
-    let scale = f64::from(limits::GOLDEN_SIDE_PX) / f64::from(width_px.max(height_px));
+    let scale = f64::from(limits::PREVIEW_SIDE_PX) / f64::from(width_px.max(height_px));
     if scale >= 1.0 {
         return Some(camera.clone());
     }

@@ -109,20 +109,20 @@ pub const PREFETCH_POSES: usize = 256;
 pub const ROUTE_NEAR_M: f64 = 15.0;
 
 /// A step that is shorter is none, in metres.
-pub const STANDING_M: f64 = 0.01;
+pub const STANDSTILL_STEP_M: f64 = 0.01;
 
 /// What is loaded ahead of an ego that stands on a recorded drive, in metres: five seconds of a town's
 /// speed.
-pub const STANDING_AHEAD_M: f64 = 50.0;
+pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
 /// Steps ahead at most, however much faster than the clock they come.
 pub const STEPS_AHEAD: usize = 256;
 
 /// Poses along the twin's trajectory at which a push is compared, unless it names others.
-pub const GOLDEN_STATIONS: usize = 4;
+pub const PREVIEW_POSES: usize = 4;
 
 /// Longest side of the images that are compared, in pixels.
-pub const GOLDEN_SIDE_PX: u32 = 320;
+pub const PREVIEW_SIDE_PX: u32 = 320;
 
 /// How long a push may load what its version changes where sessions drive, before it is ready all the
 /// same.

@@ -3,10 +3,10 @@
 use glam::{DMat3, DQuat, DVec3};
 
 use super::order::evenly;
-use super::{Case, Run, Trial};
+use super::{Case, CaseRun, Run};
 use wildcity_render::RenderError;
-use wildcity_render::compare::blobs::{Blob, ahead, raw};
-use wildcity_render::compare::drawing::max_difference;
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
+use wildcity_render::compare::images::max_difference;
 use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
 pub(super) const T25: Case = Case {
@@ -16,9 +16,9 @@ pub(super) const T25: Case = Case {
     run: Run::Light(t25),
 };
 
-fn t25(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t25(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let actor = actor();
-    let (profile, view) = (RenderProfile::default(), ahead([160, 120], 150.0));
+    let (profile, view) = (RenderProfile::default(), forward_view([160, 120], 150.0));
     let still = trial.agreed("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
     trial.holds("seen", still.opacity.iter().any(|&o| o > 0.9));
     for (what, turn) in [
@@ -42,14 +42,14 @@ fn t25(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 fn actor() -> Gaussians {
     let balls = (0..60).map(|i| {
         let [x, y, z, ..] = evenly(i);
-        Blob {
+        GaussianSpec {
             mean_m: DVec3::new(2.0 * x - 1.0, 1.6 * y - 0.8, 4.0 + 2.0 * z),
             sigma_m: DVec3::new(0.3, 0.1, 0.2),
             rotation: DQuat::from_rotation_y(6.0 * x),
-            ..Blob::default()
+            ..GaussianSpec::default()
         }
     });
-    let mut actor = raw(&balls.collect::<Vec<_>>());
+    let mut actor = gaussians_of(&balls.collect::<Vec<_>>());
     actor.raise_sh_degree(3);
     for (i, colour) in actor.sh.chunks_exact_mut(3 * sh::coefficients(3)).enumerate() {
         for (k, value) in colour[3..].iter_mut().enumerate() {

@@ -3,11 +3,11 @@
 use glam::{DQuat, DVec2, DVec3};
 
 use super::order::evenly;
-use super::{Case, Run, Trial};
-use wildcity_render::compare::blobs::{Blob, scene};
-use wildcity_render::compare::drawing::crop;
+use super::{Case, CaseRun, Run};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::images::crop_view;
 use wildcity_render::compare::psnr::psnr_db;
-use wildcity_render::{RenderError, Rolling, View};
+use wildcity_render::{RenderError, RollingShutter, View};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
@@ -20,22 +20,22 @@ pub(super) const T22: Case = Case {
 };
 
 /// A fisheye of 160 x 120 px, and what is wide and close before it.
-fn wide() -> (Camera, Blob) {
+fn wide() -> (Camera, GaussianSpec) {
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 80.0, cy: 60.0 };
     let lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
-    let blob = Blob {
+    let blob = GaussianSpec {
         mean_m: DVec3::new(0.8, 0.3, 2.0),
         rotation: DQuat::from_rotation_y(0.5),
         sigma_m: DVec3::new(0.2, 0.12, 0.25),
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
     (Camera { lens, ..Camera::ideal(160, 120, pinhole) }, blob)
 }
 
-fn t22(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (camera, blob) = wide();
     let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
-    let drawing = trial.agreed("six points", &scene(&[blob]), &profile, view)?;
+    let drawing = trial.agreed("six points", &scene_of(&[blob]), &profile, view)?;
     let pixels = drawing.opacity.iter().enumerate().map(|(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         (f64::from(opacity), at_px)
@@ -60,7 +60,7 @@ fn t22(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 }
 
 /// Mean and variances on the image of 20,000 points of a blob.
-fn sampled(camera: &Camera, blob: &Blob) -> (DVec2, [f64; 3]) {
+fn sampled(camera: &Camera, blob: &GaussianSpec) -> (DVec2, [f64; 3]) {
     const POINTS: usize = 20_000;
     // Box and Muller's normal numbers, of fractions that fill the cube evenly.
     let normal = |u: f64, v: f64| (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos();
@@ -89,12 +89,12 @@ pub(super) const T23: Case = Case {
     run: Run::Light(t23),
 };
 
-fn t23(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t23(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
     let camera = Camera { lens, ..Camera::ideal(120, 100, pinhole) };
     let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
-    let ball = |mean_m: DVec3| scene(&[Blob { mean_m, ..Blob::default() }]);
+    let ball = |mean_m: DVec3| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
 
     let behind = trial.draw(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
     trial.holds("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
@@ -102,8 +102,9 @@ fn t23(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let beside = trial.agreed("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
     trial.holds("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
 
-    let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
-    let wall = trial.agreed("all around", &scene(&[wall]), &profile, view)?;
+    let wall =
+        GaussianSpec { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..GaussianSpec::default() };
+    let wall = trial.agreed("all around", &scene_of(&[wall]), &profile, view)?;
     let wrong = wall.opacity.iter().enumerate().filter(|&(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
         (opacity > 0.0) != camera.unproject(at_px).is_some()
@@ -113,7 +114,7 @@ fn t23(trial: &mut Trial<'_>) -> Result<(), RenderError> {
 }
 
 /// Balls within and beyond the fold of a lens whose image turns back there.
-fn folded(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn folded(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // r (1 + k3 r⁶) rises up to a slope of r = 0.8, where it is 6/7 of it; at 1.107 it is back at the axis.
     const FOLD: f64 = 0.8;
     const FOCAL_PX: f64 = 80.0;
@@ -122,19 +123,19 @@ fn folded(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let pinhole = Pinhole { fx: FOCAL_PX, fy: FOCAL_PX, cx: 80.0, cy: 60.0 };
     let camera = Camera { lens: Lens::opencv(lens), ..Camera::ideal(160, 120, pinhole) };
     let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
-    let ball = |slope: f64, around: f64| Blob {
+    let ball = |slope: f64, around: f64| GaussianSpec {
         mean_m: 5.0 * DVec3::new(slope * around.cos(), slope * around.sin(), 1.0),
         sigma_m: DVec3::splat(0.02),
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
-    let within = trial.agreed("within the fold", &scene(&[ball(0.5, 0.4)]), &profile, view)?;
+    let within = trial.agreed("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
     trial.holds("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
     // As if there were no fold they would land within 0.65 focal lengths of the axis. What is beyond the field
     // may reach over its edge, which is at 0.68, by as much as the blur.
     let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
     let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
     let drawing =
-        trial.agreed("beyond the fold", &scene(&beyond.collect::<Vec<_>>()), &profile, view)?;
+        trial.agreed("beyond the fold", &scene_of(&beyond.collect::<Vec<_>>()), &profile, view)?;
     let mirrored = drawing.opacity.iter().enumerate().filter(|&(pixel, _)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         at_px.distance(DVec2::new(80.0, 60.0)) < 0.65 * FOCAL_PX
@@ -151,7 +152,7 @@ pub(super) const T24: Case = Case {
     run: Run::Light(t24),
 };
 
-fn t24(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     const SIZE_PX: [u32; 2] = [96, 64];
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 48.0, cy: 32.0 };
     let camera = Camera::ideal(SIZE_PX[0], SIZE_PX[1], pinhole);
@@ -163,14 +164,14 @@ fn t24(trial: &mut Trial<'_>) -> Result<(), RenderError> {
             position_m: DVec3::new(-0.05, 0.0, -0.9),
             rotation: DQuat::from_rotation_y(-0.01),
         };
-        let rolling = Some(Rolling { direction, world_from_camera_first });
-        let view = View { rolling, ..View::new(camera, Pose::IDENTITY) };
+        let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first });
+        let view = View { rolling_shutter, ..View::new(camera, Pose::IDENTITY) };
         let drawing = trial.agreed(format!("{direction:?}"), &balls, &profile, view)?;
         let (mut drawn, mut truth) = (Vec::new(), Vec::new());
         for row in (0..SIZE_PX[1]).step_by(5) {
             let at_px = DVec2::splat(f64::from(row) + 0.5);
             let still = View::new(camera, view.world_from_camera_at(at_px));
-            let own = crop(still, [0, row as i32], [SIZE_PX[0], 1]);
+            let own = crop_view(still, [0, row as i32], [SIZE_PX[0], 1]);
             truth.extend(trial.truth(&balls, &exact, own)?.rgba);
             let first = 4 * (row * SIZE_PX[0]) as usize;
             drawn.extend_from_slice(&drawing.rgba[first..first + 4 * SIZE_PX[0] as usize]);
@@ -187,14 +188,14 @@ fn balls() -> Scene {
     let ball = |i: usize| {
         let [x, y, z, size, ..] = evenly(i);
         let away_m = 5.0 + 15.0 * z;
-        Blob {
+        GaussianSpec {
             mean_m: away_m * DVec3::new(1.4 * x - 0.7, 0.9 * y - 0.45, 1.0),
             sigma_m: DVec3::splat(0.15 + 0.3 * size),
             rgb: [x, y, z],
-            ..Blob::default()
+            ..GaussianSpec::default()
         }
     };
-    scene(&(0..150).map(ball).collect::<Vec<_>>())
+    scene_of(&(0..150).map(ball).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
@@ -204,7 +205,12 @@ mod tests {
     /// Mean and variances on the image by the scaled unscented transform (Wan and van der Merwe 2000), with
     /// kappa 0: of points `alpha √3` standard deviations off, and of the centre, whose weight comes first. With
     /// alpha 1 and beta 0, six points are left, as the renderer has them.
-    fn unscented(camera: &Camera, blob: &Blob, alpha: f64, beta: f64) -> (f64, DVec2, [f64; 3]) {
+    fn unscented(
+        camera: &Camera,
+        blob: &GaussianSpec,
+        alpha: f64,
+        beta: f64,
+    ) -> (f64, DVec2, [f64; 3]) {
         let scale = 3.0 * alpha * alpha;
         let (w0, w) = ((scale - 3.0) / scale, 0.5 / scale);
         let land = |unit: DVec3| {
@@ -225,7 +231,7 @@ mod tests {
     /// How far off 20,000 points a rule is: its centre in pixels, and the worst of its spreads as a share.
     fn off(mean_m: DVec3, [alpha, beta]: [f64; 2]) -> (f64, f64) {
         let (camera, blob) = wide();
-        let blob = Blob { mean_m, ..blob };
+        let blob = GaussianSpec { mean_m, ..blob };
         let (point_px, point_px2) = sampled(&camera, &blob);
         let (_, mean_px, px2) = unscented(&camera, &blob, alpha, beta);
         let size_px2 = point_px2[0] + point_px2[1];

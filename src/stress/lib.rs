@@ -13,6 +13,7 @@
 
 mod actors;
 
+mod case_run;
 mod lenses;
 mod opacities;
 mod order;
@@ -20,7 +21,6 @@ mod places;
 mod shapes;
 mod sizes;
 pub mod table;
-mod trial;
 
 use std::time::Instant;
 
@@ -28,7 +28,7 @@ use serde::Serialize;
 
 use wildcity_render::{Backend, RenderError};
 
-pub use trial::{Check, Trial};
+pub use case_run::{CaseRun, Check};
 
 /// One row of the table.
 #[derive(Clone, Copy, Debug)]
@@ -51,7 +51,7 @@ enum Run {
     Heavy(Body),
 }
 
-type Body = fn(&mut Trial<'_>) -> Result<(), RenderError>;
+type Body = fn(&mut CaseRun<'_>) -> Result<(), RenderError>;
 
 /// Every case, in order of their numbers.
 pub static CASES: [Case; 28] = [
@@ -95,11 +95,14 @@ pub struct Outcome {
     /// Whether it was run, and how it went.
     pub verdict: Verdict,
     /// What was drawn, where that is less than what the case says.
-    pub only: Option<String>,
+    #[serde(rename = "only")]
+    pub reduced_to: Option<String>,
     /// What was compared, the first miss first, else what came closest to its bound; or what was refused.
-    pub told: String,
+    #[serde(rename = "told")]
+    pub detail: String,
     /// How much of its bound that took: 1 is all of it, 0 none or nothing that has a size.
-    pub strain: f64,
+    #[serde(rename = "strain")]
+    pub bound_usage: f64,
     /// How many bounds were looked at.
     pub checks: usize,
     /// How long it took.
@@ -116,7 +119,7 @@ pub enum Verdict {
     Missed,
     /// More than the device may hold, which it said with how much fits: a limit, and no miss.
     Refused,
-    /// Not run: `told` says why.
+    /// Not run: `detail` says why.
     NotRun,
 }
 
@@ -130,7 +133,7 @@ impl Case {
             Run::Light(body) | Run::Heavy(body) => body,
         };
         let start = Instant::now();
-        let mut trial = Trial::new(backend);
+        let mut trial = CaseRun::new(backend);
         let ended = body(&mut trial);
         Outcome { seconds: start.elapsed().as_secs_f64(), ..trial.outcome(self, ended) }
     }
@@ -141,7 +144,7 @@ impl Case {
     /// A frame failed.
     pub fn checks(&self, backend: &dyn Backend) -> Result<Vec<Check>, RenderError> {
         let (Run::Light(body) | Run::Heavy(body)) = self.run;
-        let mut trial = Trial::new(backend);
+        let mut trial = CaseRun::new(backend);
         body(&mut trial)?;
         Ok(trial.into_checks())
     }
@@ -152,9 +155,9 @@ impl Case {
             case: self.number,
             backend,
             verdict: Verdict::NotRun,
-            only: None,
-            told: why.to_owned(),
-            strain: 0.0,
+            reduced_to: None,
+            detail: why.to_owned(),
+            bound_usage: 0.0,
             checks: 0,
             seconds: 0.0,
         }
@@ -164,8 +167,8 @@ impl Case {
 impl Outcome {
     /// Its verdict in a word, with what was drawn where that is less than what the case says.
     pub fn word(&self) -> String {
-        match &self.only {
-            Some(only) => format!("{} ({only})", self.verdict.word()),
+        match &self.reduced_to {
+            Some(reduced_to) => format!("{} ({reduced_to})", self.verdict.word()),
             None => self.verdict.word().to_owned(),
         }
     }

@@ -3,10 +3,10 @@
 use glam::DVec3;
 
 use super::places::street_view;
-use super::{Case, Run, Trial};
+use super::{Case, CaseRun, Run};
 use wildcity_render::RenderError;
-use wildcity_render::compare::blobs::{Blob, ahead, raw, scene};
-use wildcity_render::compare::drawing::max_difference;
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of, scene_of};
+use wildcity_render::compare::images::max_difference;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 pub(super) const T11: Case = Case {
@@ -16,10 +16,10 @@ pub(super) const T11: Case = Case {
     run: Run::Light(t11),
 };
 
-fn t11(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), ahead([65, 65], 100.0));
-    let peak = |trial: &mut Trial<'_>, logit: f32| {
-        let mut g = raw(&[Blob::default()]);
+fn t11(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (profile, view) = (RenderProfile::default(), forward_view([65, 65], 100.0));
+    let peak = |trial: &mut CaseRun<'_>, logit: f32| {
+        let mut g = gaussians_of(&[GaussianSpec::default()]);
         g.logit_opacities[0] = logit;
         let scene = Scene::from_gaussians(&g);
         let drawing = trial.agreed(format!("logit {logit}"), &scene, &profile, view)?;
@@ -55,7 +55,7 @@ pub(super) const T12: Case = Case {
     run: Run::Light(t12),
 };
 
-fn t12(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t12(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (good, view) = (wildcity_generate::canyon(2_000, &mut |_, _| {}), street_view([160, 100]));
     let profile = RenderProfile::default();
     let right = trial.draw(&Scene::from_gaussians(&good), &profile, view)?;
@@ -122,17 +122,17 @@ pub(super) const T19: Case = Case {
     run: Run::Light(t19),
 };
 
-fn t19(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t19(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // Layers of alpha 0.9 at the centre: the transmittance is 0.1, 0.01, 0.001, then 1e-4: the
     // fourth would reach the stop and is left out. Ten thousand layers change nothing. Layers of opacity 1
     // are capped at 0.99: 0.01, then 1e-4, and no more than the cap's rounding to f32 off, 2e-6 of it.
-    let layer = |i: i32| Blob {
+    let layer = |i: i32| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),
         rgb: [1.0; 3],
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
-    let view = ahead([9, 9], 1000.0);
+    let view = forward_view([9, 9], 1000.0);
     for (count, opacity, stop, left) in [
         (3, 0.9, 1.0001e-4, 1e-3),
         (4, 0.9, 1.0001e-4, 1e-3),
@@ -143,17 +143,17 @@ fn t19(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         (10_000, 1.0, 0.9999e-4, 1e-4),
     ] {
         let profile = RenderProfile { stop, ..RenderProfile::default() };
-        let layer = |i| Blob { opacity, ..layer(i) };
-        let layers = scene(&(0..count).map(layer).collect::<Vec<_>>());
+        let layer = |i| GaussianSpec { opacity, ..layer(i) };
+        let layers = scene_of(&(0..count).map(layer).collect::<Vec<_>>());
         let what = format!("{count} layers of {opacity}, stop {stop:e}");
         let drawing = trial.agreed(what.clone(), &layers, &profile, view)?;
         let off = (1.0 - f64::from(drawing.opacity[4 * 9 + 4]) - left).abs();
         trial.at_most(format!("{what}: transmittance off by"), off, 1e-6);
     }
     // Once stopped, a pixel stays stopped, though what follows would fit, and its neighbours go on.
-    let dot = |i| Blob { sigma_m: DVec3::splat(0.015), ..layer(i) };
-    let thin = |i| Blob { opacity: 0.1, ..layer(10 + i) };
-    let layers = scene(&(0..4).map(dot).chain((0..50).map(thin)).collect::<Vec<_>>());
+    let dot = |i| GaussianSpec { sigma_m: DVec3::splat(0.015), ..layer(i) };
+    let thin = |i| GaussianSpec { opacity: 0.1, ..layer(10 + i) };
+    let layers = scene_of(&(0..4).map(dot).chain((0..50).map(thin)).collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1.0001e-4, ..RenderProfile::default() };
     let drawing = trial.agreed("thin layers", &layers, &profile, view)?;
     let off = (1.0 - f64::from(drawing.opacity[4 * 9 + 4]) - 1e-3).abs();
@@ -168,17 +168,17 @@ pub(super) const T28: Case = Case {
     run: Run::Light(t28),
 };
 
-fn t28(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let fog = (0..70_000).map(|i| Blob {
+fn t28(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let fog = (0..70_000).map(|i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
         // 80 px, so that all of the tile is just above the cut; no pixel stops before the last of them.
         sigma_m: DVec3::splat(100.0),
         opacity: 1.05 / 255.0,
-        ..Blob::default()
+        ..GaussianSpec::default()
     });
-    let fog = scene(&fog.collect::<Vec<_>>());
+    let fog = scene_of(&fog.collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
-    match trial.agreed("the fog", &fog, &profile, ahead([16, 16], 4.0)) {
+    match trial.agreed("the fog", &fog, &profile, forward_view([16, 16], 4.0)) {
         Err(error) => trial.refused(error)?,
         Ok(drawing) => {
             let least = drawing.opacity.iter().fold(1.0_f32, |least, &o| least.min(o));

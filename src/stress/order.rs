@@ -3,9 +3,9 @@
 use glam::{DQuat, DVec3};
 
 use super::places::street_view;
-use super::{Case, Run, Trial};
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
-use wildcity_render::compare::drawing::{look, max_difference};
+use super::{Case, CaseRun, Run};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
@@ -16,17 +16,17 @@ pub(super) const T6: Case = Case {
     run: Run::Light(t6),
 };
 
-fn t6(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t6(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let grid = |rgb: [f64; 3]| {
-        (0..100).map(move |i| Blob {
+        (0..100).map(move |i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i % 10), 0.1 * f64::from(i / 10), 5.0),
             rgb,
-            ..Blob::default()
+            ..GaussianSpec::default()
         })
     };
-    let blobs: Vec<Blob> = grid([1.0, 0.0, 0.0]).chain(grid([0.0, 1.0, 0.0])).collect();
+    let blobs: Vec<GaussianSpec> = grid([1.0, 0.0, 0.0]).chain(grid([0.0, 1.0, 0.0])).collect();
     let (scene, profile, view) =
-        (scene(&blobs), RenderProfile::default(), ahead([200, 150], 150.0));
+        (scene_of(&blobs), RenderProfile::default(), forward_view([200, 150], 150.0));
     let drawing = trial.agreed("the walls", &scene, &profile, view)?;
     let center = 4 * (80 * 200 + 110);
     let [red, green] = [0, 1].map(|channel| drawing.rgba[center + channel]);
@@ -46,23 +46,23 @@ pub(super) const T8: Case = Case {
     run: Run::Light(t8),
 };
 
-fn t8(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t8(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // Their centres change places in depth in the middle of the turn: there one image jumps to another,
     // since whole Gaussians are sorted. It is measured, and it is no more than the definition's.
-    let bar = |angle: f64, x: f64, rgb| Blob {
+    let bar = |angle: f64, x: f64, rgb| GaussianSpec {
         mean_m: DVec3::new(x, 0.0, 5.0),
         rotation: DQuat::from_rotation_y(angle),
         sigma_m: DVec3::new(1.0, 0.3, 0.1),
         rgb,
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
-    let crossing = scene(&[bar(0.8, 0.02, [1.0, 0.2, 0.1]), bar(-0.8, -0.02, [0.1, 0.3, 1.0])]);
+    let crossing = scene_of(&[bar(0.8, 0.02, [1.0, 0.2, 0.1]), bar(-0.8, -0.02, [0.1, 0.3, 1.0])]);
     let profile = RenderProfile::default();
     let (mut pops, mut last) = ([0.0_f32; 2], None);
     for step in -10..=10 {
         let yaw = (0.05 * f64::from(step)).to_radians();
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-        let view = look([160, 120], 150.0, DVec3::ZERO, forward, DVec3::Y);
+        let view = view_along([160, 120], 150.0, DVec3::ZERO, forward, DVec3::Y);
         let drawing = trial.agreed(format!("step {step}"), &crossing, &profile, view)?;
         let truth = trial.truth(&crossing, &profile, view)?;
         if let Some((drawing_before, truth_before)) = &last {
@@ -86,7 +86,7 @@ pub(super) const T20: Case = Case {
     run: Run::Light(t20),
 };
 
-fn t20(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t20(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let street = Scene::from_gaussians(&wildcity_generate::canyon(60_000, &mut |_, _| {}));
     trial.agreed("a street", &street, &RenderProfile::default(), street_view([240, 135]))?;
     Ok(())
@@ -100,7 +100,7 @@ pub(super) const T21: Case = Case {
 };
 
 /// Sixteen views of 4,400,000 Gaussians each, and each of them alone.
-fn t21(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t21(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let n = 4_400_000;
     let mut dust = Gaussians::with_capacity(0, n);
     for i in 0..n {
@@ -115,7 +115,9 @@ fn t21(trial: &mut Trial<'_>) -> Result<(), RenderError> {
     let scene = Scene::from_gaussians(&dust);
     drop(dust);
     let views: Vec<View> = (0..16)
-        .map(|i| look([16, 16], 15.0, DVec3::new(0.0, 0.0, 0.1 * f64::from(i)), DVec3::Z, DVec3::Y))
+        .map(|i| {
+            view_along([16, 16], 15.0, DVec3::new(0.0, 0.0, 0.1 * f64::from(i)), DVec3::Z, DVec3::Y)
+        })
         .collect();
     let profile = RenderProfile::default();
     let together = match trial.draw_all(&scene, &profile, &views) {
@@ -138,12 +140,12 @@ pub(super) const T27: Case = Case {
     run: Run::Light(t27),
 };
 
-fn t27(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t27(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // A facade that the camera faces exactly: all depths are equal, and as sums of f32 they are not.
     let turn = DQuat::from_rotation_y(0.7) * DQuat::from_rotation_x(0.3);
     let surfels = (0..4_000).map(|i| {
         let [x, y, red, green, blue, _] = evenly(i);
-        Blob {
+        GaussianSpec {
             mean_m: turn * DVec3::new(8.0 * x - 4.0, 6.0 * y - 3.0, 5.0)
                 + DVec3::new(21.3, 17.7, 9.1),
             rotation: turn,
@@ -152,8 +154,8 @@ fn t27(trial: &mut Trial<'_>) -> Result<(), RenderError> {
             rgb: [red, green, blue],
         }
     });
-    let facade = scene(&surfels.collect::<Vec<_>>());
-    let mut view = ahead([240, 180], 180.0);
+    let facade = scene_of(&surfels.collect::<Vec<_>>());
+    let mut view = forward_view([240, 180], 180.0);
     view.world_from_camera.position_m = DVec3::new(21.3, 17.7, 9.1);
     view.world_from_camera.rotation = turn;
     let profile = RenderProfile::default();

@@ -2,9 +2,9 @@
 
 use glam::DVec3;
 
-use super::{Case, Run, Trial};
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
-use wildcity_render::compare::drawing::{look, max_difference};
+use super::{Case, CaseRun, Run};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
 use wildcity_scene::chunk::column;
 use wildcity_scene::record::recorded;
@@ -17,17 +17,17 @@ pub(super) const T4: Case = Case {
     run: Run::Light(t4),
 };
 
-fn t4(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t4(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for near in [0.01, 0.2] {
         let profile = RenderProfile { near, ..RenderProfile::default() };
         for z in [0.0100001, 0.011, 0.05, 0.19, 0.21] {
-            let close = scene(&[Blob {
+            let close = scene_of(&[GaussianSpec {
                 mean_m: DVec3::new(0.002, -0.001, z),
                 sigma_m: DVec3::new(0.003, 0.02, 0.1),
-                ..Blob::default()
+                ..GaussianSpec::default()
             }]);
             let what = format!("{z} m, near {near} m");
-            let view = ahead([160, 120], 1800.0);
+            let view = forward_view([160, 120], 1800.0);
             let drawing = trial.agreed(what.clone(), &close, &profile, view)?;
             let drawn = drawing.opacity.iter().any(|&o| o > 0.0);
             trial.holds(format!("{what}: drawn as near says"), drawn == (z > near));
@@ -43,16 +43,16 @@ pub(super) const T5: Case = Case {
     run: Run::Light(t5),
 };
 
-fn t5(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), ahead([160, 120], 100.0));
-    let at = |z, sigma_m| Blob {
+fn t5(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (profile, view) = (RenderProfile::default(), forward_view([160, 120], 100.0));
+    let at = |z, sigma_m| GaussianSpec {
         mean_m: DVec3::new(0.1, 0.0, z),
         sigma_m: DVec3::splat(sigma_m),
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
-    let inside = trial.agreed("inside", &scene(&[at(0.3, 2.0)]), &profile, view)?;
+    let inside = trial.agreed("inside", &scene_of(&[at(0.3, 2.0)]), &profile, view)?;
     trial.holds("inside: seen", inside.opacity.iter().any(|&o| o > 0.5));
-    let behind = trial.agreed("behind", &scene(&[at(-1.0, 3.0)]), &profile, view)?;
+    let behind = trial.agreed("behind", &scene_of(&[at(-1.0, 3.0)]), &profile, view)?;
     let most = behind.opacity.iter().fold(0.0_f32, |most, &o| most.max(o));
     trial.at_most("behind: opacity", most.into(), 0.0);
     Ok(())
@@ -65,25 +65,25 @@ pub(super) const T7: Case = Case {
     run: Run::Light(t7),
 };
 
-fn t7(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t7(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (mut blobs, mut centers) = (Vec::new(), Vec::new());
     // Along +x, where chunks follow each other, so that centres keep their f32.
     for (i, x) in [0.0101_f32, 0.5, 3.0, 70.0, 1000.0, 9999.0].into_iter().enumerate() {
         let slope = (i as f64 - 2.5) * 0.3;
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
             let x = f64::from(x);
-            blobs.push(Blob {
+            blobs.push(GaussianSpec {
                 mean_m: DVec3::new(x, -slope * x, 0.0),
                 sigma_m: DVec3::splat(0.02 * x),
                 rgb,
                 opacity: 0.95,
-                ..Blob::default()
+                ..GaussianSpec::default()
             });
         }
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }
-    let view = look([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
-    let drawing = trial.agreed("pairs", &scene(&blobs), &RenderProfile::default(), view)?;
+    let view = view_along([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
+    let drawing = trial.agreed("pairs", &scene_of(&blobs), &RenderProfile::default(), view)?;
     for (x, pixel) in centers {
         let [red, green] = [0, 1].map(|channel| drawing.rgba[4 * pixel + channel]);
         trial.holds(format!("{x} m: the nearer one is in front"), red > 0.8 && green < 0.2);
@@ -98,7 +98,7 @@ pub(super) const T9: Case = Case {
     run: Run::Light(t9),
 };
 
-fn t9(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t9(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (near, view) = (wildcity_generate::canyon(10_000, &mut |_, _| {}), street_view([200, 120]));
     let profile = RenderProfile::default();
     let here = trial.draw(&Scene::from_gaussians(&near), &profile, view)?;
@@ -126,12 +126,12 @@ pub(super) const T10: Case = Case {
     run: Run::Light(t10),
 };
 
-fn t10(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t10(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     through(trial, Record::Q32)
 }
 
 /// A street through a record.
-fn through(trial: &mut Trial<'_>, record: Record) -> Result<(), RenderError> {
+fn through(trial: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
     let away = DVec3::new(64.0 * 15_625.0, 64.0 * 15_625.0, 0.0);
     for mean in &mut street.means_m {
@@ -161,7 +161,7 @@ fn through(trial: &mut Trial<'_>, record: Record) -> Result<(), RenderError> {
 /// A camera in the middle of [`wildcity_generate::canyon`], along it.
 pub(super) fn street_view(size_px: [u32; 2]) -> View {
     let focal_px = 0.75 * f64::from(size_px[0]);
-    look(size_px, focal_px, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z)
+    view_along(size_px, focal_px, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z)
 }
 
 #[cfg(test)]
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn a_coarser_record_misses_the_bound_of_centres() {
-        let mut trial = Trial::new(&Reference);
+        let mut trial = CaseRun::new(&Reference);
         through(&mut trial, Record::Q24).unwrap();
         let missed: Vec<String> =
             trial.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();

@@ -2,10 +2,10 @@
 
 use glam::{DQuat, DVec3};
 
-use super::{Case, Run, Trial};
+use super::{Case, CaseRun, Run};
 use wildcity_render::RenderError;
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
-use wildcity_render::compare::drawing::max_difference;
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::images::max_difference;
 use wildcity_render::constants::TILE_PX;
 use wildcity_scene::RenderProfile;
 
@@ -16,14 +16,14 @@ pub(super) const T1: Case = Case {
     run: Run::Light(t1),
 };
 
-fn t1(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), ahead([320, 240], 500.0));
+fn t1(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (profile, view) = (RenderProfile::default(), forward_view([320, 240], 500.0));
     for sigma_px in [1e3, 3e3, 1e4] {
         for degrees in (0..180).step_by(2) {
-            let needle = scene(&[Blob {
+            let needle = scene_of(&[GaussianSpec {
                 rotation: DQuat::from_rotation_z(f64::from(degrees).to_radians()),
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
-                ..Blob::default()
+                ..GaussianSpec::default()
             }]);
             let drawing = trial.draw(&needle, &profile, view)?;
             let what = format!("{sigma_px} px at {degrees}°");
@@ -57,18 +57,18 @@ pub(super) const T2: Case = Case {
     run: Run::Light(t2),
 };
 
-fn t2(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t2(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (profile, mut some_seen) = (RenderProfile::default(), false);
     for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 7.0], [9.0, -7.0]] {
         for angle in [0.0, 0.5, 1.2, 2.5] {
-            let long = scene(&[Blob {
+            let long = scene_of(&[GaussianSpec {
                 mean_m: DVec3::new(x, y, 4.0),
                 rotation: DQuat::from_rotation_y(angle),
                 sigma_m: DVec3::new(4.0, 0.05, 0.3),
-                ..Blob::default()
+                ..GaussianSpec::default()
             }]);
             let what = format!("({x}, {y}) m at {angle} rad");
-            let drawing = trial.agreed(what, &long, &profile, ahead([320, 240], 200.0))?;
+            let drawing = trial.agreed(what, &long, &profile, forward_view([320, 240], 200.0))?;
             some_seen |= drawing.opacity.iter().any(|&o| o > 0.5);
         }
     }
@@ -83,23 +83,23 @@ pub(super) const T3: Case = Case {
     run: Run::Light(t3),
 };
 
-fn t3(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t3(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     for sigma_m in [10.0, 1e3, 1e4] {
-        let wall = Blob { sigma_m: DVec3::splat(sigma_m), ..Blob::default() };
+        let wall = GaussianSpec { sigma_m: DVec3::splat(sigma_m), ..GaussianSpec::default() };
         let what = format!("{sigma_m} m");
-        let view = ahead([333, 250], 300.0);
-        let drawing = trial.agreed(what.clone(), &scene(&[wall]), &profile, view)?;
+        let view = forward_view([333, 250], 300.0);
+        let drawing = trial.agreed(what.clone(), &scene_of(&[wall]), &profile, view)?;
         let off = drawing.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
         trial.at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
         // Forty of them, on 4 x 5 macro tiles of a device: a whole workgroup lists them.
-        let walls = (0..40_u32).map(|i| Blob {
+        let walls = (0..40_u32).map(|i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i), 0.0, 5.0 + 0.1 * f64::from(i)),
             opacity: 0.03,
             ..wall
         });
-        let walls = scene(&walls.collect::<Vec<_>>());
-        let (what, view) = (format!("forty of {sigma_m} m"), ahead([444, 280], 300.0));
+        let walls = scene_of(&walls.collect::<Vec<_>>());
+        let (what, view) = (format!("forty of {sigma_m} m"), forward_view([444, 280], 300.0));
         trial.agreed(what.clone(), &walls, &profile, view)?;
         // The definition has no tiles.
         if !trial.is_reference() {
@@ -119,14 +119,14 @@ pub(super) const T13: Case = Case {
     run: Run::Light(t13),
 };
 
-fn t13(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t13(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     for sigma_m in [DVec3::splat(1e-8), DVec3::new(1.0, 1e-6, 1e-6), DVec3::new(1e-8, 1e-2, 1e-8)] {
-        let thin = scene(&[Blob { sigma_m, ..Blob::default() }]);
-        trial.agreed(format!("{sigma_m} m"), &thin, &profile, ahead([96, 96], 120.0))?;
+        let thin = scene_of(&[GaussianSpec { sigma_m, ..GaussianSpec::default() }]);
+        trial.agreed(format!("{sigma_m} m"), &thin, &profile, forward_view([96, 96], 120.0))?;
     }
-    let dust = scene(&[Blob { sigma_m: DVec3::splat(1e-8), ..Blob::default() }]);
-    let drawing = trial.agreed("dust", &dust, &profile, ahead([9, 9], 100.0))?;
+    let dust = scene_of(&[GaussianSpec { sigma_m: DVec3::splat(1e-8), ..GaussianSpec::default() }]);
+    let drawing = trial.agreed("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
     // The middle of 9 px is the centre of a pixel, which has all of it.
     let off = (drawing.opacity[4 * 9 + 4] - 0.9).abs();
     trial.at_most("dust: its centre's opacity from 0.9", off.into(), 1e-4);
@@ -140,16 +140,16 @@ pub(super) const T26: Case = Case {
     run: Run::Light(t26),
 };
 
-fn t26(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t26(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // 22 km long, 1 mm thin, a centimetre before a lens of 1,000 px: xx² is 1e37.
     for angle in [0.0, 0.4, 0.8, 1.3] {
-        let needle = scene(&[Blob {
+        let needle = scene_of(&[GaussianSpec {
             mean_m: DVec3::new(0.0, 0.0, 0.0101),
             rotation: DQuat::from_rotation_z(angle),
             sigma_m: DVec3::new(2.2e4, 1e-3, 1e-3),
-            ..Blob::default()
+            ..GaussianSpec::default()
         }]);
-        let (what, view) = (format!("at {angle} rad"), ahead([160, 120], 1000.0));
+        let (what, view) = (format!("at {angle} rad"), forward_view([160, 120], 1000.0));
         let drawing = trial.agreed(what, &needle, &RenderProfile::default(), view)?;
         let seen = drawing.opacity.iter().any(|&o| o > 0.5);
         trial.holds(format!("at {angle} rad: seen"), seen);

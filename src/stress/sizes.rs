@@ -4,10 +4,10 @@ use glam::DVec3;
 
 use super::order::evenly;
 use super::places::street_view;
-use super::{Case, Run, Trial};
+use super::{Case, CaseRun, Run};
 use wildcity_render::RenderError;
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
-use wildcity_render::compare::drawing::{crop, cut, max_difference};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::images::{crop_rgba, crop_view, max_difference};
 use wildcity_scene::{RenderProfile, Scene};
 
 pub(super) const T14: Case = Case {
@@ -17,21 +17,21 @@ pub(super) const T14: Case = Case {
     run: Run::Light(t14),
 };
 
-fn t14(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t14(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // At 5 m and 160 px focal length a centre of 0.5 m x k lies on the edge of a tile of 16 px, and
     // reaches 16 px and so the next edge with a sigma of 16 px / √(2 ln(255 · 0.9)).
     let exact_m = 16.0 * 5.0 / 160.0 / (2.0 * (255.0_f64 * 0.9).ln()).sqrt();
     let splats = (0..800_i32).map(|i| {
         let ulps = f64::from(i % 41 - 20) * f64::from(f32::EPSILON);
         let [x, y] = [f64::from(i % 16 - 8), f64::from(i / 16 % 10 - 5)];
-        Blob {
+        GaussianSpec {
             mean_m: DVec3::new(0.5 * x * (1.0 + ulps), 0.5 * y, 5.0),
             sigma_m: DVec3::splat(exact_m * (1.0 + ulps)),
-            ..Blob::default()
+            ..GaussianSpec::default()
         }
     });
-    let splats = scene(&splats.collect::<Vec<_>>());
-    let (profile, view) = (RenderProfile::default(), ahead([256, 160], 160.0));
+    let splats = scene_of(&splats.collect::<Vec<_>>());
+    let (profile, view) = (RenderProfile::default(), forward_view([256, 160], 160.0));
     let drawing = trial.agreed("edges", &splats, &profile, view)?;
     let mut equal = true;
     for _ in 1..20 {
@@ -48,9 +48,9 @@ pub(super) const T15: Case = Case {
     run: Run::Light(t15),
 };
 
-fn t15(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t15(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
-    let small = (scene(&[Blob::default()]), ahead([64, 48], 50.0));
+    let small = (scene_of(&[GaussianSpec::default()]), forward_view([64, 48], 50.0));
     let before = trial.agreed("a small frame", &small.0, &profile, small.1)?;
     let mut street = wildcity_generate::canyon(40_000, &mut |_, _| {});
     // Mist over many tiles, so that instances grow faster than splats.
@@ -74,11 +74,11 @@ pub(super) const T16: Case = Case {
     run: Run::Light(t16),
 };
 
-fn t16(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), ahead([50, 40], 40.0));
+fn t16(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (profile, view) = (RenderProfile::default(), forward_view([50, 40], 40.0));
     // 51, 89.25 and 216.75 of 255.
     let background = [0.2, 0.35, 0.85];
-    let at = |mean_m| scene(&[Blob { mean_m, ..Blob::default() }]);
+    let at = |mean_m| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
     for (what, empty) in [
         ("none", Scene::default()),
         ("one behind", at(DVec3::new(0.0, 0.0, -5.0))),
@@ -102,9 +102,14 @@ fn t16(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         let off = max_difference(&coloured.rgba, &wanted);
         trial.at_most(format!("{what}: off the background by"), off.into(), 0.5 / 65_535.0 + 1e-7);
     }
-    let one = trial.agreed("one", &at(Blob::default().mean_m), &profile, view)?;
+    let one = trial.agreed("one", &at(GaussianSpec::default().mean_m), &profile, view)?;
     trial.holds("one: seen", one.opacity.iter().any(|&o| o > 0.5));
-    trial.agreed("one pixel", &at(Blob::default().mean_m), &profile, ahead([1, 1], 1.0))?;
+    trial.agreed(
+        "one pixel",
+        &at(GaussianSpec::default().mean_m),
+        &profile,
+        forward_view([1, 1], 1.0),
+    )?;
     Ok(())
 }
 
@@ -116,15 +121,15 @@ pub(super) const T17: Case = Case {
     run: Run::Light(t17),
 };
 
-fn t17(trial: &mut Trial<'_>) -> Result<(), RenderError> {
+fn t17(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // The definition has no tiles, and would take 40 B a pixel: of it a quarter of the sides.
     let size_px = if trial.is_reference() { [1921, 1081] } else { [7681, 4321] };
     if trial.is_reference() {
-        trial.draws_only(format!("{} x {} px", size_px[0], size_px[1]));
+        trial.reduce_to(format!("{} x {} px", size_px[0], size_px[1]));
     }
     let focal_px = 0.52 * f64::from(size_px[0]);
     let balls = balls();
-    let (profile, whole) = (RenderProfile::default(), ahead(size_px, focal_px));
+    let (profile, whole) = (RenderProfile::default(), forward_view(size_px, focal_px));
     let drawing = trial.draw(&balls, &profile, whole)?;
     let (part_px, margin_px) = ([401, 300], 32);
     let [right, bottom] = [0, 1].map(|axis| size_px[axis] - part_px[axis]);
@@ -132,10 +137,10 @@ fn t17(trial: &mut Trial<'_>) -> Result<(), RenderError> {
         // The slope clamp follows an image's own edges (gsplat's rule), so that an image draws otherwise
         // what is centred beyond its edges: a margin, which is not compared, takes what that changes.
         let padded_at = at.map(|px| px as i32 - margin_px as i32);
-        let padded = crop(whole, padded_at, part_px.map(|px| px + 2 * margin_px));
+        let padded = crop_view(whole, padded_at, part_px.map(|px| px + 2 * margin_px));
         let truth = trial.truth(&balls, &profile, padded)?;
-        let truth = cut(&truth, padded.camera.width_px, [margin_px; 2], part_px);
-        let own = cut(&drawing, size_px[0], at, part_px);
+        let truth = crop_rgba(&truth, padded.camera.width_px, [margin_px; 2], part_px);
+        let own = crop_rgba(&drawing, size_px[0], at, part_px);
         let what = format!("at {at:?}");
         let seen = own.chunks_exact(4).any(|rgba| rgba[3] > 0.2);
         trial.holds(format!("{what}: something is seen"), seen);
@@ -152,15 +157,15 @@ fn balls() -> Scene {
     let balls = (0..3_000).map(|i| {
         let [x, y, z, red, green, blue] = evenly(i);
         let z_m = 4.0 + 60.0 * z;
-        Blob {
+        GaussianSpec {
             mean_m: DVec3::new(1.9 * z_m * (x - 0.5), 1.1 * z_m * (y - 0.5), z_m),
             sigma_m: DVec3::splat(0.006 * z_m),
             opacity: 0.2 + 0.7 * red,
             rgb: [red, green, blue],
-            ..Blob::default()
+            ..GaussianSpec::default()
         }
     });
-    scene(&balls.collect::<Vec<_>>())
+    scene_of(&balls.collect::<Vec<_>>())
 }
 
 pub(super) const T18: Case = Case {
@@ -170,16 +175,16 @@ pub(super) const T18: Case = Case {
     run: Run::Light(t18),
 };
 
-fn t18(trial: &mut Trial<'_>) -> Result<(), RenderError> {
-    let (profile, whole) = (RenderProfile::default(), ahead([600, 400], 320.0));
+fn t18(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (profile, whole) = (RenderProfile::default(), forward_view([600, 400], 320.0));
     let balls = balls();
     let drawing = trial.draw(&balls, &profile, whole)?;
     for at in [[0, 0], [430, 300]] {
-        let part = crop(whole, at.map(|px| px as i32), [170, 100]);
+        let part = crop_view(whole, at.map(|px| px as i32), [170, 100]);
         let own = trial.agreed(format!("crop at {at:?}"), &balls, &profile, part)?;
         // The margin: see T17.
-        let own = cut(&own, 170, [40, 20], [90, 60]);
-        let of_whole = cut(&drawing, 600, [at[0] + 40, at[1] + 20], [90, 60]);
+        let own = crop_rgba(&own, 170, [40, 20], [90, 60]);
+        let of_whole = crop_rgba(&drawing, 600, [at[0] + 40, at[1] + 20], [90, 60]);
         trial.holds(format!("crop at {at:?}: seen"), own.chunks_exact(4).any(|rgba| rgba[3] > 0.2));
         let off = max_difference(&own, &of_whole);
         trial.at_most(format!("crop at {at:?}: off the whole by"), off.into(), CROP_OFF);

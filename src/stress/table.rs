@@ -90,7 +90,7 @@ impl Row {
     pub fn tightest(&self) -> Option<&Outcome> {
         let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
         let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);
-        let closest = || held().max_by(|a, b| a.strain.total_cmp(&b.strain));
+        let closest = || held().max_by(|a, b| a.bound_usage.total_cmp(&b.bound_usage));
         let not_run = || self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::NotRun);
         missed.or_else(closest).or_else(not_run)
     }
@@ -128,8 +128,8 @@ impl fmt::Display for Table {
             writeln!(f, "{}", row.what)?;
             writeln!(f, "{:indent$}{}", "", row.bound)?;
             let refused = row.outcomes.iter().filter(|o| o.verdict == Verdict::Refused);
-            for Outcome { backend, told, .. } in row.tightest().into_iter().chain(refused) {
-                writeln!(f, "{:indent$}{backend}: {told}", "")?;
+            for Outcome { backend, detail, .. } in row.tightest().into_iter().chain(refused) {
+                writeln!(f, "{:indent$}{backend}: {detail}", "")?;
             }
         }
         let [held, refused, missed, not_run] =

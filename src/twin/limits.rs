@@ -59,11 +59,11 @@ pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 pub const PUBLISH_TRIES: u32 = 32;
 
 /// Largest lease or list of candidates for garbage collection: 20,000 hashes of 85 bytes are 1.7 MB.
-pub const NOTE_BYTES: u64 = 16 << 20;
+pub const SIDE_FILE_BYTES: u64 = 16 << 20;
 
 /// Objects that one garbage collection notes; what is beyond is noted by the next. Each takes 67 bytes
 /// and a time of at most 20.
-pub const GC_CANDIDATES: usize = (NOTE_BYTES / 88) as usize;
+pub const GC_CANDIDATES: usize = (SIDE_FILE_BYTES / 88) as usize;
 
 /// How long one request to an object store may take: a cell of 300 MB at 5 MB/s.
 pub const REMOTE_TIMEOUT: Duration = Duration::from_secs(60);
@@ -127,7 +127,7 @@ pub const QUEUED_SECTIONS: usize = 1 << 18;
 
 /// Squares that the search for a twin's worst place looks at. A square cell of 64 m of 20 km of road is
 /// one of 320 in a row, and twice as many lie above them.
-pub const WORST_PLACES: usize = 4096;
+pub const WORST_CASE_SQUARES: usize = 4096;
 
 /// Rigs whose worst place in a twin is remembered, so that sessions open at once.
-pub const REMEMBERED_LENSES: usize = 16;
+pub const REMEMBERED_WORST_CASES: usize = 16;

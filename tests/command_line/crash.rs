@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use wildcity_twin::store::{Catalog, Sum};
+use wildcity_twin::store::{Catalog, ObjectTotals};
 
 use crate::scene_files::{gaussians, inria_columns, ply};
 use crate::support::{commit, files, street};
@@ -131,7 +131,7 @@ fn killed_at_a_hundred_points_nothing_is_lost() {
         assert!([&old.hash, &new.hash].contains(&&now.hash), "killed at {point}");
         let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound() && !checked.staging, "killed at {point}: {checked:?}");
-        assert_eq!(checked.unreferenced, Sum::default(), "killed at {point}");
+        assert_eq!(checked.unreferenced, ObjectTotals::default(), "killed at {point}");
         if now.hash == new.hash {
             catalog.rollback("street", old.number).unwrap();
         }

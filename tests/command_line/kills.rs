@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use wildcity_client::{HttpClient, PushState};
+use wildcity_client::{ConnectOptions, HttpClient, PushState};
 use wildcity_twin::store::Catalog;
 
 use crate::http::{push_of, write};
@@ -40,7 +40,7 @@ impl Serving {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let url = line.trim().strip_prefix("listening on ws://").expect(&line);
         let url = format!("http://{}", url.strip_suffix("/v1/session").unwrap());
-        Self { child, client: HttpClient::new(&url, None).unwrap() }
+        Self { child, client: HttpClient::new(&url, &ConnectOptions::default()).unwrap() }
     }
 }
 
@@ -58,7 +58,7 @@ async fn push(client: HttpClient, path: std::path::PathBuf, id: String) -> u64 {
     let mut asked = push_of(&[&upload.id]);
     asked.id = Some(id);
     let begun = client.push("test", &asked).await.unwrap();
-    let ended = client.wait(begun, &mut |_| {}).await.unwrap();
+    let ended = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
     assert_eq!(ended.state, PushState::Ready, "{ended:?}");
     ended.version.unwrap()
 }

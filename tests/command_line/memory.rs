@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use wildcity_scene::RenderProfile;
-use wildcity_twin::residency::{Cache, Eye};
+use wildcity_twin::residency::{Cache, Viewpoint};
 use wildcity_twin::store::Catalog;
 
 use crate::scene_files::{gaussians, inria_columns, ply, ply_header};
@@ -45,7 +45,7 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     let before = status_bytes("self", "VmRSS").unwrap();
     let resident = cache.open("degree1", None).unwrap();
     // What a frame of all of it in full detail draws, and no other level.
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     let everything = RenderProfile { tau_px: 0.0, reach_m: None, ..RenderProfile::default() };
     let scene = resident.scene(&[eye], &everything).unwrap();
     assert!(scene.gaussians() == n && scene.bytes() >= 92 * n);

@@ -2,7 +2,7 @@
 
 use std::process::{Command, Output};
 
-use wildcity_render::compare::points::Points;
+use wildcity_render::compare::reprojection::ReprojectionErrors;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, View};
 use wildcity_scene::Rig;
@@ -71,7 +71,8 @@ fn a_real_cars_points_land_where_its_lenses_say() {
         for (backend, camera) in [(&cpu as &dyn Backend, full), (&cpu, small), (&Reference, small)]
         {
             let view = View::new(camera, Pose::IDENTITY);
-            let Points { count, worst_px } = Points::of(backend, &view).unwrap();
+            let ReprojectionErrors { count, worst_px } =
+                ReprojectionErrors::measure(backend, &view).unwrap();
             let (name, width, drawn_by) = (&mounted.name, camera.width_px, backend.name());
             eprintln!("{name}, {width} px wide, {drawn_by}: {worst_px:.3} px");
             assert!(count > 20 && worst_px < 0.1, "{name}: {count} points, {worst_px} px");

@@ -2,24 +2,24 @@
 //! pinhole.
 
 use glam::DVec3;
-use wildcity_render::compare::blobs::{Blob, scene};
-use wildcity_render::compare::points::Points;
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::ReprojectionErrors;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
-use wildcity_render::{RenderError, Rolling, View};
+use wildcity_render::{RenderError, RollingShutter, View};
 use wildcity_scene::geometry::camera::{Rolls, Windshield, WindshieldReference};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
-use crate::images::{agree, cpu, look, psnr, render, render_one, try_render};
+use crate::images::{agree, cpu, psnr, render, render_one, try_render, view_along};
 use crate::lenses::{driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of};
 use crate::streets::{demo_street, street};
 
 /// Along a street, as [`crate::streets::street_views`] are.
 fn straight() -> View {
     let at = DVec3::new(0.4, 0.0, 20.0);
-    look([150, 90], 110.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y)
+    view_along([150, 90], 110.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y)
 }
 
 /// Every lens at rest, and shutters that roll all four ways; one windshield is given the other way round.
@@ -33,13 +33,13 @@ pub(crate) fn bent_views() -> Vec<View> {
     let behind = Camera { windshield: Some(shield), ..behind };
     let pose = straight().world_from_camera;
     let still = lenses.iter().map(|(_, camera)| View::new(*camera, pose));
-    let rolling = [
+    let rolling_shutter = [
         driven(straight().camera, pose, Rolls::TopToBottom),
         driven(camera("opencv"), pose, Rolls::BottomToTop),
         driven(behind, pose, Rolls::LeftToRight),
         driven(camera("f-theta by pixels"), pose, Rolls::RightToLeft),
     ];
-    still.chain(rolling).collect()
+    still.chain(rolling_shutter).collect()
 }
 
 #[test]
@@ -72,7 +72,10 @@ fn the_demo_street_through_lenses_and_shutters() {
             position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
             ..pose
         };
-        View { rolling: Some(Rolling { direction, world_from_camera_first }), ..view }
+        View {
+            rolling_shutter: Some(RollingShutter { direction, world_from_camera_first }),
+            ..view
+        }
     };
     let views = [
         lens(0),
@@ -110,12 +113,12 @@ fn known_points_land_where_the_model_says() {
 
 #[test]
 fn what_passes_close_is_drawn_as_by_the_cpu() {
-    let ball = |k: i32| Blob {
+    let ball = |k: i32| GaussianSpec {
         mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
         sigma_m: DVec3::splat(0.05),
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
-    let balls = scene(&[0, 1, 2, 3, 4].map(ball));
+    let balls = scene_of(&[0, 1, 2, 3, 4].map(ball));
     let profile = RenderProfile::default();
     let truth = render_one(&cpu(), &balls, &profile, passing());
     agree(&render_one(&*gpu(), &balls, &profile, passing()), &truth).unwrap();
@@ -129,8 +132,8 @@ fn a_real_cars_points_land_where_its_lenses_say() {
     let full = rig.cameras[..2].iter().map(|mounted| mounted.camera);
     let small = rig.cameras.iter().map(|mounted| mounted.camera.scaled(576, 320).unwrap());
     for camera in full.chain(small) {
-        let Points { count, worst_px } =
-            Points::of(&gpu, &View::new(camera, Pose::IDENTITY)).unwrap();
+        let ReprojectionErrors { count, worst_px } =
+            ReprojectionErrors::measure(&gpu, &View::new(camera, Pose::IDENTITY)).unwrap();
         eprintln!("{} x {}: {worst_px:.3} px", camera.width_px, camera.height_px);
         assert!(count > 20 && worst_px < 0.1, "{count} points, {worst_px} px");
     }

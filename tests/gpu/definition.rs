@@ -4,7 +4,7 @@
 use glam::DVec2;
 use wildcity_render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
 use wildcity_render::reference;
-use wildcity_render::stage::Between;
+use wildcity_render::stage::StageOutputs;
 use wildcity_render::{Frame, layout};
 use wildcity_scene::geometry::Camera;
 
@@ -72,7 +72,7 @@ impl Splat {
 }
 
 /// What a backend's stage project left.
-pub(crate) fn splats(between: &Between) -> Vec<Splat> {
+pub(crate) fn splats(between: &StageOutputs) -> Vec<Splat> {
     let pairs = between.keys.iter().zip(&between.splats);
     pairs.map(|(&key, splat)| Splat::of_backend(key, splat)).collect()
 }

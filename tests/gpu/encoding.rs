@@ -10,15 +10,15 @@ use wildcity_render::{Frame, View};
 use wildcity_scene::chunk::{CLUSTER, column};
 use wildcity_scene::{RenderProfile, Scene, sh};
 
-use crate::blobs::{Blob, ahead, scene};
 use crate::definition::{self, Splat};
+use crate::gaussians::{GaussianSpec, forward_view, scene_of};
 use crate::gpu::{gpu, gpu_with};
 use crate::scene_files::Random;
 
 /// Three clusters side by side in one chunk, all before the camera, with colours of a degree.
 fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     let mut random = Random(71);
-    let mut wall = crate::blobs::raw(&[]);
+    let mut wall = crate::gaussians::gaussians_of(&[]);
     wall.sh_degree = sh_degree;
     for i in 0..3 * CLUSTER {
         let (x, y) = ((i % 32) as f64, (i / 32) as f64);
@@ -53,7 +53,7 @@ fn projected(gpu: &Gpu, scene: &Scene, view: View) -> (Vec<Splat>, Vec<Splat>) {
 /// and what f32 rounds: 1e-4, for values up to 50. Clusters whose colour exceeds its share, by how
 /// much; and how far the second cluster is off.
 fn beyond_the_bound(gpu: &Gpu, scene: &Scene) -> (Vec<String>, f64) {
-    let (found, truths) = projected(gpu, scene, ahead([640, 480], 600.0));
+    let (found, truths) = projected(gpu, scene, forward_view([640, 480], 600.0));
     let (chunk, values) = (&scene.chunks[0], 3 * sh::coefficients(scene.sh_degree()));
     assert_eq!(scene.chunks.len(), 1);
     let (mut beyond, mut second) = (Vec::new(), 0.0);
@@ -110,15 +110,15 @@ fn t10_a_colour_is_off_by_half_a_step_of_its_clusters_largest() {
 #[test]
 fn t10_a_needle_is_turned_by_less_than_six_millionths() {
     let mut random = Random(72);
-    let needles: Vec<Blob> = (0..1_000)
-        .map(|_| Blob {
+    let needles: Vec<GaussianSpec> = (0..1_000)
+        .map(|_| GaussianSpec {
             rotation: DQuat::from_rotation_z(TAU * random.unit())
                 * DQuat::from_rotation_x(TAU * random.unit()),
             sigma_m: DVec3::new(1.0, 1e-3, 1e-3),
-            ..Blob::default()
+            ..GaussianSpec::default()
         })
         .collect();
-    let (found, truths) = projected(&gpu(), &scene(&needles), ahead([640, 480], 1000.0));
+    let (found, truths) = projected(&gpu(), &scene_of(&needles), forward_view([640, 480], 1000.0));
     // Of the axis along which the conic `(l0 dx + l1 dy)² + (l2 dy)²` is flattest, modulo pi.
     let angle_rad = |splat: &Splat| {
         let [l0, l1, l2] = splat.factor;

@@ -5,12 +5,12 @@ use std::ops::Range;
 
 use glam::DVec3;
 use wildcity_render::gpu::Gpu;
-use wildcity_render::{Backend, Finished, Frame, RenderError, Target, View};
+use wildcity_render::{Backend, Frame, OnViewDone, RenderError, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::blobs::{self, Blob};
+use crate::gaussians::{self, GaussianSpec};
 use crate::gpu::{bindings, gpu, gpu_with_limits};
-use crate::images::look;
+use crate::images::view_along;
 use crate::streets::street;
 
 /// What one step may leave behind is 4 MiB / 10,000 = 419 B; a bind group or a buffer is more.
@@ -58,13 +58,13 @@ fn ten_thousand_steps() {
 #[ignore = "a process of its own, started by memory_is_flat_over_changing_scenes_and_frames_that_fail"]
 fn three_at_once() {
     let gpu = gpu_with_limits(bindings(64 << 10));
-    let layer = |i| Blob {
+    let layer = |i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 40.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
     // One row of tiles may have 2,048 splats.
-    let too_many = blobs::scene(&(0..3_000).map(layer).collect::<Vec<_>>());
+    let too_many = gaussians::scene_of(&(0..3_000).map(layer).collect::<Vec<_>>());
     let streets = [300, 900].map(|n| street(n, 1, 62));
     let step = |step: u32| {
         let scene = Scene::from_gaussians(&streets[step as usize % 2]);
@@ -76,7 +76,7 @@ fn three_at_once() {
     };
     let round = || {
         std::thread::scope(|scope| {
-            for _ in 0..gpu.frames_at_once() {
+            for _ in 0..gpu.frames_in_flight() {
                 scope.spawn(|| (0..ROUND).for_each(step));
             }
         });
@@ -85,7 +85,7 @@ fn three_at_once() {
         memory(&gpu)
     };
     // Each buffer that is read back has seen the widest frame, whichever thread gets its turn when.
-    draw_within(&gpu, &Scene::from_gaussians(&streets[1]), gpu.frames_at_once());
+    draw_within(&gpu, &Scene::from_gaussians(&streets[1]), gpu.frames_in_flight());
     let rounds = [(); 6].map(|()| round());
     let [(before, _), .., (after, _)] = rounds;
     assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
@@ -122,12 +122,12 @@ fn draw_and(
     gpu: &Gpu,
     scene: &Scene,
     step: u32,
-    finished: Finished<'_>,
+    finished: OnViewDone<'_>,
 ) -> Result<(), RenderError> {
     let view = |yaw: f64| -> View {
         let at = DVec3::new(0.0, 0.0, 20.0 + 0.05 * f64::from(step % ROUND));
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-        look([24 + 8 * (step % 3), 16], 20.0, at, forward, DVec3::Y)
+        view_along([24 + 8 * (step % 3), 16], 20.0, at, forward, DVec3::Y)
     };
     let (views, profile) = ([view(0.0), view(2.0)], RenderProfile::default());
     let mut images = views.map(|view| vec![0; 3 * view.camera.pixels()]);

@@ -31,4 +31,4 @@ mod sky;
 mod stages;
 mod twins;
 
-use wildcity_render::compare::blobs;
+use wildcity_render::compare::gaussians;

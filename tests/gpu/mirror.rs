@@ -10,7 +10,7 @@ use wildcity_scene::chunk::{CellRun, Partition};
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, lod};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
-use crate::images::{look, render};
+use crate::images::{render, view_along};
 use crate::streets::{street, turning_views};
 
 /// Most bytes per resident Gaussian of SH degree 1.
@@ -45,7 +45,7 @@ fn demo(focal_px: f32) -> Scene {
 
 fn bytes_per_gaussian(scene: &Scene) -> f64 {
     let backend = gpu();
-    let view = look([64, 64], 50.0, DVec3::ZERO, DVec3::X, DVec3::Z);
+    let view = view_along([64, 64], 50.0, DVec3::ZERO, DVec3::X, DVec3::Z);
     render(&backend, scene, &RenderProfile::default(), &[view]);
     backend.usage().unwrap().mirror_bytes as f64 / scene.gaussians() as f64
 }
@@ -98,7 +98,7 @@ fn what_was_not_drawn_for_longest_makes_room() {
     };
     let view = |at: usize| {
         let eye_m = DVec3::new(64.0 * (at + 1) as f64, 0.0, 0.0);
-        look([96, 64], 60.0, eye_m, DVec3::new(1.0, 0.1, 0.2), DVec3::Y)
+        view_along([96, 64], 60.0, eye_m, DVec3::new(1.0, 0.1, 0.2), DVec3::Y)
     };
     let free = gpu();
     // Small bindings too, so that a scene lies on many pages.

@@ -6,7 +6,7 @@ use wildcity_render::{Backend, RenderError, View};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{gpu, gpu_with};
-use crate::images::{agree, cpu, look, render, try_render};
+use crate::images::{agree, cpu, render, try_render, view_along};
 use crate::streets::{street, street_views};
 
 /// A fault to plant in a shader.
@@ -151,7 +151,8 @@ pub(crate) fn misty_street(n: usize) -> Gaussians {
 /// The street's views, and one of many macro tiles.
 pub(crate) fn wide_views() -> Vec<View> {
     let [first, ..] = street_views();
-    let wide = look([700, 300], 400.0, first.world_from_camera.position_m, DVec3::Z, DVec3::Y);
+    let wide =
+        view_along([700, 300], 400.0, first.world_from_camera.position_m, DVec3::Z, DVec3::Y);
     street_views().into_iter().chain([wide]).collect()
 }
 

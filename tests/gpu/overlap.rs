@@ -5,7 +5,7 @@ use std::thread;
 use std::time::Duration;
 
 use wildcity_render::gpu::{AdapterChoice, Gpu};
-use wildcity_render::{Backend, Finished, Frame, Target};
+use wildcity_render::{Backend, Frame, OnViewDone, Target};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::gpu_on;
@@ -15,7 +15,7 @@ use crate::streets::{street, turning_views};
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Renders the first view to 8-bit colour.
-fn draw(gpu: &Gpu, scene: &Scene, finished: Finished<'_>) -> Vec<u8> {
+fn draw(gpu: &Gpu, scene: &Scene, finished: OnViewDone<'_>) -> Vec<u8> {
     let (profile, views) = (RenderProfile::default(), &turning_views()[..1]);
     let mut image = vec![77; 3 * views[0].camera.pixels()];
     let target = Target { rgb8: Some(&mut image), ..Target::default() };
@@ -27,9 +27,9 @@ fn draw(gpu: &Gpu, scene: &Scene, finished: Finished<'_>) -> Vec<u8> {
 fn a_frame_is_drawn_while_another_is_encoded() {
     // The encoder of the first frame waits until all that the backend takes beside it are drawn.
     let gpu = gpu_on(&AdapterChoice::Best, 1);
-    let beside = gpu.frames_at_once() - 1;
+    let beside = gpu.frames_in_flight() - 1;
     assert!(beside > 0);
-    let gpu = gpu_on(&AdapterChoice::Best, gpu.frames_at_once());
+    let gpu = gpu_on(&AdapterChoice::Best, gpu.frames_in_flight());
     let scene = Scene::from_gaussians(&street(5_000, 1, 51));
     let alone = render_one(&gpu, &scene, &RenderProfile::default(), turning_views()[0]).rgb8;
     let ((encoding, is_encoding), (drawn, all_drawn)) = (mpsc::channel(), mpsc::channel());

@@ -7,7 +7,7 @@ use wildcity_scene::{RenderProfile, Scene};
 
 use crate::data::real;
 use crate::gpu::gpu;
-use crate::images::{agree, cpu, look, max_difference, psnr, render, render_one};
+use crate::images::{agree, cpu, max_difference, psnr, render, render_one, view_along};
 use crate::scene_files::gaussians;
 use crate::streets::{demo_street, street, street_views};
 use crate::truths::{gsplat, read, skull_front};
@@ -72,7 +72,7 @@ fn every_field_of_the_profile() {
 
 #[test]
 fn a_cloud_around_the_camera() {
-    let view = look([128, 96], 80.0, DVec3::ZERO, DVec3::new(0.3, -0.2, 1.0), DVec3::Y);
+    let view = view_along([128, 96], 80.0, DVec3::ZERO, DVec3::new(0.3, -0.2, 1.0), DVec3::Y);
     let cloud = Scene::from_gaussians(&gaussians(3_000, 2, 2.0, 8));
     compare(&cloud, &RenderProfile::default(), &[view], "cloud");
 }
@@ -85,7 +85,7 @@ fn sixteen_views_of_sizes_that_are_no_multiple_of_a_tile() {
             let yaw = 0.4 * f64::from(i);
             let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
             let size_px = [17 + 13 * i, 1 + 11 * i];
-            look(size_px, 60.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
+            view_along(size_px, 60.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
         })
         .collect();
     let images = render(&gpu(), &scene, &RenderProfile::default(), &views);
@@ -124,7 +124,7 @@ fn real_captures() {
         ("scenes/playcanvas-logo/meta.json", DVec3::new(0.0, -1.2, -4.0), DVec3::Z, DVec3::Y),
     ] {
         let Some(path) = real(file) else { return };
-        let view = look([640, 480], 600.0, at, forward, down);
+        let view = view_along([640, 480], 600.0, at, forward, down);
         let profile = RenderProfile { near: 0.2, alpha_cap: 0.999, ..RenderProfile::default() };
         compare_colors(&read(&path), &profile, &[view], file);
     }

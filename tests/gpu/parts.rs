@@ -5,7 +5,7 @@ use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
-use crate::images::{agree, cpu, look, render, render_one};
+use crate::images::{agree, cpu, render, render_one, view_along};
 use crate::scene_files::{Random, gaussians};
 use crate::streets::{street, turning_views};
 
@@ -24,7 +24,7 @@ fn misty(n: usize, step: usize, seed: u64) -> Scene {
 fn the_image_does_not_depend_on_the_parts() {
     let view = |yaw: f64| {
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-        look([90, 360], 150.0, DVec3::ZERO, forward, DVec3::Y)
+        view_along([90, 360], 150.0, DVec3::ZERO, forward, DVec3::Y)
     };
     let (views, profile) =
         ((0..6).map(f64::from).map(view).collect::<Vec<_>>(), RenderProfile::default());
@@ -81,8 +81,8 @@ fn a_row_of_tiles_that_exceeds_a_device_is_an_error() {
     }
     let (scene, profile) = (Scene::from_gaussians(&wall), RenderProfile::default());
     let limited = gpu_with_limits(bindings(64 << 10));
-    let one_row = look([64, 16], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
-    let rows = look([64, 64], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let one_row = view_along([64, 16], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let rows = view_along([64, 64], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     for view in [one_row, rows] {
         let mut image = vec![77; 3 * view.camera.pixels()];
         let target = Target { rgb8: Some(&mut image), ..Target::default() };
@@ -115,7 +115,7 @@ fn more_splats_than_lavapipe_holds_at_once() {
         dust.logit_opacities.push(-2.0);
         dust.sh.extend([random.between(-1.0, 1.0), 0.2, 0.4]);
     }
-    let view = look([width, height], focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let view = view_along([width, height], focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y);
     exceeds_lavapipe(&Scene::from_gaussians(&dust), view);
 }
 
@@ -125,7 +125,7 @@ fn more_instances_than_lavapipe_holds_at_once() {
     let mut mist = street(60_000, 0, 37);
     mist.ln_scales.fill([2.5; 3]);
     mist.logit_opacities.fill(-3.0);
-    let view = look([960, 600], 500.0, DVec3::new(0.0, 0.0, -5.0), DVec3::Z, DVec3::Y);
+    let view = view_along([960, 600], 500.0, DVec3::new(0.0, 0.0, -5.0), DVec3::Z, DVec3::Y);
     exceeds_lavapipe(&Scene::from_gaussians(&mist), view);
 }
 
@@ -152,7 +152,7 @@ fn more_splats_in_a_tile_than_software_blends() {
         fog.sh.extend([0.5; 3]);
     }
     let scene = Scene::from_gaussians(&fog);
-    let view = look([16, 16], 4.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let view = view_along([16, 16], 4.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     let mut image = vec![77; 3 * 256];
     let target = Target { rgb8: Some(&mut image), ..Target::default() };
@@ -180,7 +180,7 @@ fn huge_splats_on_a_large_image() {
         haze.sh.extend([0.01 * i as f32, 0.5, 0.2]);
     }
     let (scene, profile) = (Scene::from_gaussians(&haze), RenderProfile::default());
-    let view = look([2_000, 1_360], 1_000.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
+    let view = view_along([2_000, 1_360], 1_000.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let image = render_one(&gpu(), &scene, &profile, view);
     agree(&image, &render_one(&cpu(), &scene, &profile, view)).unwrap();
 }

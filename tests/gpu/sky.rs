@@ -15,7 +15,7 @@ use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::cameras::bent_views;
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
-use crate::images::{agree, cpu, look, max_difference, render, render_one, try_render};
+use crate::images::{agree, cpu, max_difference, render, render_one, try_render, view_along};
 use crate::skies::{SKY_FROM_WORLD, appearance, demo_model, draw_seen, empty, network, sky};
 use crate::streets::{street, street_views};
 
@@ -27,7 +27,7 @@ fn all_around() -> Vec<View> {
         [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::new(0.2, 0.1, 1.0), DVec3::NEG_Z];
     let sizes = [[64, 48], [33, 17], [48, 48], [20, 50], [64, 64], [16, 16]];
     let views = forwards.into_iter().zip(sizes);
-    views.map(|(forward, size_px)| look(size_px, 20.0, DVec3::ZERO, forward, down)).collect()
+    views.map(|(forward, size_px)| view_along(size_px, 20.0, DVec3::ZERO, forward, down)).collect()
 }
 
 /// Largest difference from the cpu backend in all views.

@@ -3,13 +3,13 @@
 
 use std::sync::LazyLock;
 
-use wildcity_render::compare::psnr::RIGHT_DB;
+use wildcity_render::compare::psnr::MIN_PSNR_DB;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::hybrid::{HybridBackend, bisect};
 use wildcity_render::layout::Cutoffs;
-use wildcity_render::relay::{Relay, bisect};
-use wildcity_render::stage::{Between, Stage};
+use wildcity_render::stage::{Stage, StageOutputs};
 use wildcity_render::{Backend, Frame, RenderError, View};
 use wildcity_scene::{RenderProfile, Scene};
 
@@ -26,7 +26,7 @@ struct Truth {
     profile: RenderProfile,
     views: Vec<View>,
     /// What the cpu left after project, sort and bin.
-    cpu: [Between; 3],
+    cpu: [StageOutputs; 3],
     images: Vec<Image>,
     /// By definition, in f64.
     splats: Vec<Splat>,
@@ -47,7 +47,7 @@ impl Truth {
         let scene = Scene::from_gaussians(&misty_street(gaussians));
         let profile = RenderProfile::default();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        let stages = Stage::ALL.map(|stage| cpu.through(&frame, stage).unwrap().0);
+        let stages = Stage::ALL.map(|stage| cpu.run_through(&frame, stage).unwrap().0);
         let of_cpu = definition::splats(&stages[0]);
         let order = definition::sort(&of_cpu);
         Self {
@@ -70,7 +70,7 @@ impl Truth {
     /// The stages of a gpu that are wrong, by name, and what its twins on the cpu and in f64 object to.
     fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Objections)> {
         let [project, sort, bin] = &self.cpu;
-        let object = |done, last, objections: &dyn Fn(&Between) -> Objections| {
+        let object = |done, last, objections: &dyn Fn(&StageOutputs) -> Objections| {
             match gpu.run_through(&self.frame(), done, last) {
                 Ok(found) => objections(&found),
                 // A stage that counts wrong may ask for more than there is.
@@ -90,11 +90,11 @@ impl Truth {
     }
 
     /// The images that a gpu makes of what was left after a stage.
-    fn drawn(&self, gpu: &Gpu, between: &Between) -> Vec<Image> {
+    fn drawn(&self, gpu: &Gpu, between: &StageOutputs) -> Vec<Image> {
         render(&GoOn { gpu, between }, &self.scene, &self.profile, &self.views)
     }
 
-    fn object_to_project(&self, found: &Between) -> Objections {
+    fn object_to_project(&self, found: &StageOutputs) -> Objections {
         let splats = definition::splats(found);
         let cpu = definition::splats(&self.cpu[0]);
         [&cpu, &self.splats].map(|truths| {
@@ -114,7 +114,7 @@ impl Truth {
                 Some((index, splat)) => {
                     close(splat, truth, view).map_err(|e| format!("splat {index}: {e}"))?;
                     let is_exact = splat.depth_m == f64::from(truth.depth_m as f32);
-                    exact += usize::from(is_exact || view.rolling.is_some());
+                    exact += usize::from(is_exact || view.rolling_shutter.is_some());
                     next.next();
                 }
                 None if inside_px > 0.01 => {
@@ -134,7 +134,7 @@ impl Truth {
         }
     }
 
-    fn object_to_sort(&self, found: &Between) -> Objections {
+    fn object_to_sort(&self, found: &StageOutputs) -> Objections {
         [self.cpu[1].order.as_ref(), Some(&self.order)].map(|order| {
             let kept = found.keys == self.cpu[0].keys && found.splats == self.cpu[0].splats;
             let is_equal = found.order.as_ref() == order;
@@ -144,7 +144,7 @@ impl Truth {
     }
 
     /// Like the cpu's but for a few roundings; nothing missing that f64 finds, and little in vain.
-    fn object_to_bin(&self, found: &Between) -> Objections {
+    fn object_to_bin(&self, found: &StageOutputs) -> Objections {
         let (found, cpu) = (found.tiles.as_ref().unwrap(), self.cpu[2].tiles.as_ref().unwrap());
         let mut ranks = vec![None; self.order.len()];
         for (rank, &place) in self.order.iter().enumerate() {
@@ -194,7 +194,7 @@ impl Truth {
 /// What the cpu and f64 object to.
 type Objections = [Option<String>; 2];
 
-fn check_keys(found: &Between, cutoffs: &Cutoffs) -> Result<(), String> {
+fn check_keys(found: &StageOutputs, cutoffs: &Cutoffs) -> Result<(), String> {
     let splats = definition::splats(found);
     for (splat, (&key, of)) in splats.iter().zip(found.keys.iter().zip(&found.splats)) {
         let truth = cutoffs.sort_key(splat.view, of.depth_m);
@@ -208,7 +208,7 @@ fn check_keys(found: &Between, cutoffs: &Cutoffs) -> Result<(), String> {
 /// The rest of a frame as a backend.
 struct GoOn<'a> {
     gpu: &'a Gpu,
-    between: &'a Between,
+    between: &'a StageOutputs,
 }
 
 impl Backend for GoOn<'_> {
@@ -220,7 +220,7 @@ impl Backend for GoOn<'_> {
         &self,
         frame: &Frame<'_>,
         targets: &mut [wildcity_render::Target<'_>],
-        finished: wildcity_render::Finished<'_>,
+        finished: wildcity_render::OnViewDone<'_>,
     ) -> Result<wildcity_render::FrameStats, wildcity_render::RenderError> {
         self.gpu.resume(self.between, frame, targets, finished)
     }
@@ -235,7 +235,7 @@ fn slope_bound(truth: &Splat) -> f64 {
 /// One step of f32. While a shutter rolls, a camera goes 0.9 m here, and the row that sees a point is known
 /// to a millionth of that.
 fn depth_bound_m(truth: &Splat, view: &View) -> f64 {
-    1.2e-7 * truth.depth_m + if view.rolling.is_some() { 1e-6 } else { 0.0 }
+    1.2e-7 * truth.depth_m + if view.rolling_shutter.is_some() { 1e-6 } else { 0.0 }
 }
 
 /// Whether two splats can only be the same Gaussian's.
@@ -253,7 +253,7 @@ fn close(found: &Splat, truth: &Splat, view: &View) -> Result<(), String> {
     let step = slope_bound(truth);
     let mean = |k: usize| 2e-3 + step * (truth.mean_px[k].abs() + 200.0);
     // Mist around the camera is six points all over the image of a lens.
-    let wide = if view.is_ideal() { 1e-5 } else { 1e-4 };
+    let wide = if view.is_static_pinhole() { 1e-5 } else { 1e-4 };
     let reach = |k: usize| 1e-3 + (wide + 2.0 * step) * truth.reach_px[k];
     let factor = |of: f64| (1e-4 + 2.0 * step) * of;
     let numbers = [
@@ -340,14 +340,14 @@ fn a_healthy_gpu_is_right_from_every_stage_on() {
         let frame = Frame { scene: &scene, profile: &profile, views };
         let bisection = bisect(&cpu(), &gpu(), &frame).unwrap();
         assert_eq!(bisection.psnr_db.len(), 4);
-        assert!(bisection.psnr_db.iter().all(|(_, db)| *db >= RIGHT_DB), "{bisection:?}");
+        assert!(bisection.psnr_db.iter().all(|(_, db)| *db >= MIN_PSNR_DB), "{bisection:?}");
         assert_eq!(bisection.wrong(), None);
     }
 }
 
 /// With every output, growing buffers, and another frame before that must leave nothing behind.
 #[test]
-fn a_relay_draws_what_the_cpu_draws() {
+fn a_hybrid_draws_what_the_cpu_draws() {
     let scene = Scene::from_gaussians(&street(100_000, 1, 43));
     let (profile, views) = (RenderProfile::default(), street_views());
     let truths = render(&cpu(), &scene, &profile, &views);
@@ -355,13 +355,13 @@ fn a_relay_draws_what_the_cpu_draws() {
     // Listens to what the others cause too.
     let _watched = gpu();
     for stage in Stage::ALL {
-        let relay = Relay::new(cpu(), Gpu::new(&AdapterChoice::Best, 0).unwrap(), stage);
-        render(&relay, &other, &profile, &views[..2]);
-        let images = render(&relay, &scene, &profile, &views);
+        let hybrid = HybridBackend::new(cpu(), Gpu::new(&AdapterChoice::Best, 0).unwrap(), stage);
+        render(&hybrid, &other, &profile, &views[..2]);
+        let images = render(&hybrid, &scene, &profile, &views);
         for (view, (image, truth)) in images.iter().zip(&truths).enumerate() {
             agree(image, truth).unwrap_or_else(|e| panic!("{stage:?}, view {view}: {e}"));
         }
-        render(&relay, &Scene::default(), &profile, &views);
+        render(&hybrid, &Scene::default(), &profile, &views);
     }
 }
 
@@ -372,7 +372,7 @@ fn a_gpu_that_hands_over_to_itself_changes_nothing() {
     let images = render(&gpu, &truth.scene, &truth.profile, &truth.views);
     for stage in Stage::ALL {
         let between = gpu.run_through(&truth.frame(), None, stage).unwrap();
-        assert_eq!(between.through(), stage);
+        assert_eq!(between.last_stage(), stage);
         assert!(truth.drawn(&gpu, &between) == images, "{stage:?}");
     }
 }

@@ -8,7 +8,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 use wildcity_twin::ingest::{self, Axes};
 
 use crate::data;
-use crate::images::{cpu, look, psnr, render};
+use crate::images::{cpu, psnr, render, view_along};
 
 /// How far a number may be from the original's.
 #[derive(Clone, Copy, Debug)]
@@ -331,7 +331,7 @@ fn losses_db(read: &Gaussians, original: &Gaussians) -> Vec<f64> {
     let views = [DVec3::new(0.0, 0.0, -1.0), DVec3::new(0.8, -0.5, -0.4)].map(|side| -> View {
         let centre_m = DVec3::new(0.0, -0.53, 0.04);
         let forward = -side.normalize();
-        look([480, 480], 480.0, centre_m - 2.2 * forward, forward, DVec3::Y)
+        view_along([480, 480], 480.0, centre_m - 2.2 * forward, forward, DVec3::Y)
     });
     let profile = RenderProfile { near: 0.2, ..RenderProfile::default() };
     let images =

@@ -1,26 +1,26 @@
 use glam::DVec3;
 use wildcity_scene::{Manifest, RenderProfile};
-use wildcity_twin::residency::{Eye, Needed, demand};
-use wildcity_twin::store::Storage;
+use wildcity_twin::residency::{SectionRef, Viewpoint, demand};
+use wildcity_twin::store::StorageOptions;
 
 use crate::{commit, streets, tau};
 
 fn manifest() -> Manifest {
     let dir = tempfile::tempdir().unwrap();
     let (scene, _) = streets::demo_street();
-    commit(dir.path(), &scene, Storage::default()).unwrap().manifest
+    commit(dir.path(), &scene, StorageOptions::default()).unwrap().manifest
 }
 
-fn eye(x: f64, focal_px: f64) -> Eye {
-    Eye { position_m: DVec3::new(x, 0.0, 1.6), focal_px }
+fn eye(x: f64, focal_px: f64) -> Viewpoint {
+    Viewpoint { position_m: DVec3::new(x, 0.0, 1.6), focal_px }
 }
 
-fn gaussians(manifest: &Manifest, needed: &[Needed]) -> u64 {
-    let count = |n: &Needed| u64::from(manifest.chunks[n.chunk].sections[n.section].count);
+fn gaussians(manifest: &Manifest, needed: &[SectionRef]) -> u64 {
+    let count = |n: &SectionRef| u64::from(manifest.chunks[n.chunk].sections[n.section].count);
     needed.iter().map(count).sum()
 }
 
-fn levels(manifest: &Manifest, needed: &[Needed]) -> Vec<u8> {
+fn levels(manifest: &Manifest, needed: &[SectionRef]) -> Vec<u8> {
     needed.iter().map(|n| manifest.chunks[n.chunk].sections[n.section].level).collect()
 }
 
@@ -63,7 +63,8 @@ fn the_set_is_one_level_of_every_block_and_follows_from_the_table() {
 #[test]
 fn nearer_eyes_longer_lenses_and_smaller_errors_need_more() {
     let manifest = manifest();
-    let count = |eyes: &[Eye], tau_px| gaussians(&manifest, &demand(&manifest, eyes, &tau(tau_px)));
+    let count =
+        |eyes: &[Viewpoint], tau_px| gaussians(&manifest, &demand(&manifest, eyes, &tau(tau_px)));
     let here = count(&[eye(60.0, 1800.0)], 4.0);
     assert!(count(&[eye(-5_000.0, 1800.0)], 4.0) < here / 4, "far away");
     assert!(count(&[eye(60.0, 18_000.0)], 4.0) > here, "a longer lens");

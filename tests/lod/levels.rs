@@ -7,7 +7,7 @@ use wildcity_scene::chunk::{Partition, column};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{Chunk, Gaussians, Record, Scene, lod};
-use wildcity_twin::store::{Catalog, Storage};
+use wildcity_twin::store::{Catalog, StorageOptions};
 
 use crate::{commit, decibels, eyes, stored, streets, tau};
 
@@ -113,7 +113,8 @@ fn levels_are_the_same_bytes_at_any_thread_count() {
     let hash = |threads: usize| {
         let dir = tempfile::tempdir().unwrap();
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let version = pool.install(|| commit(dir.path(), &scene, Storage::default())).unwrap();
+        let version =
+            pool.install(|| commit(dir.path(), &scene, StorageOptions::default())).unwrap();
         assert!(version.manifest.chunks.iter().any(|c| c.sections.iter().any(|s| s.level > 2)));
         version.hash
     };
@@ -127,7 +128,7 @@ fn levels_are_the_same_bytes_at_any_thread_count() {
 fn a_section_is_read_by_itself() {
     let dir = tempfile::tempdir().unwrap();
     let scene = streets::street(30_000, 1, 1);
-    let version = commit(dir.path(), &scene, Storage::default()).unwrap();
+    let version = commit(dir.path(), &scene, StorageOptions::default()).unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
     let chunk = version.manifest.chunks.iter().max_by_key(|chunk| chunk.sections.len()).unwrap();
     let path = dir.path().join("street/objects").join(&chunk.object[..2]).join(&chunk.object);

@@ -21,13 +21,17 @@ use std::sync::Arc;
 use wildcity_render::View;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Record, RenderProfile, Scene};
-use wildcity_twin::residency::{Cache, Eye, Pinned, Resident};
-use wildcity_twin::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use wildcity_twin::residency::{Cache, PinnedScene, Resident, Viewpoint};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoreError, Version};
 
 use images::{cpu, psnr, render};
 
 /// Stores a scene as the next version of twin "street".
-fn commit(dir: &Path, gaussians: &Gaussians, storage: Storage) -> Result<Version, StoreError> {
+fn commit(
+    dir: &Path,
+    gaussians: &Gaussians,
+    storage: StorageOptions,
+) -> Result<Version, StoreError> {
     let provenance = Provenance::of("test".into());
     let new = NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) };
     Catalog::open(dir)?.commit(new, &mut |_, _| {})
@@ -41,20 +45,20 @@ struct Stored {
 
 fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Stored {
     let dir = tempfile::tempdir().unwrap();
-    commit(dir.path(), gaussians, Storage { record, levels }).unwrap();
+    commit(dir.path(), gaussians, StorageOptions { record, levels }).unwrap();
     let resident = Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap();
     Stored { resident, _dir: dir }
 }
 
 impl Stored {
     /// What is read again for a frame.
-    fn scene(&self, eyes: &[Eye], profile: &RenderProfile) -> Pinned {
+    fn scene(&self, eyes: &[Viewpoint], profile: &RenderProfile) -> PinnedScene {
         self.resident.scene(eyes, profile).unwrap()
     }
 }
 
-fn eyes(views: &[View]) -> Vec<Eye> {
-    let eye = |view: &View| Eye {
+fn eyes(views: &[View]) -> Vec<Viewpoint> {
+    let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };

@@ -2,7 +2,7 @@ use wildcity_render::View;
 use wildcity_scene::chunk::{CellRun, Partition, column, columns};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::{Chunk, Gaussians, Record, Scene};
-use wildcity_twin::store::{Storage, StoreError};
+use wildcity_twin::store::{StorageOptions, StoreError};
 
 use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
 
@@ -141,7 +141,7 @@ fn values_are_off_by_half_a_step_at_most() {
 fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = scene_files::gaussians(20_000, 1, 20.0, 1);
-    let storage = Storage { record: Record::Q32, levels: false };
+    let storage = StorageOptions { record: Record::Q32, levels: false };
     // Two of 20,000 are 0.01 %: as many as may be.
     (scene.sh[5], scene.sh[12 + 4]) = (900.0, -900.0);
     commit(dir.path(), &scene, storage).unwrap();
@@ -156,7 +156,7 @@ fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
         wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number,
         1
     );
-    commit(dir.path(), &scene, Storage { record: Record::H52, levels: false }).unwrap();
+    commit(dir.path(), &scene, StorageOptions { record: Record::H52, levels: false }).unwrap();
 }
 
 #[test]

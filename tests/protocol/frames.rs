@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value, json};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
-use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings};
+use wildcity_protocol::observation::{Ego, Image, ObservationMetadata, Residency, Stage, Timings};
 
 use super::messages::{front, rear};
 
@@ -18,7 +18,7 @@ pub(crate) struct Tensor {
 /// A frame in its parts.
 #[derive(Clone)]
 pub(crate) struct Frame {
-    pub(crate) metadata: Observation,
+    pub(crate) metadata: ObservationMetadata,
     pub(crate) tensors: Vec<Tensor>,
 }
 
@@ -103,7 +103,10 @@ impl Frame {
                 });
             }
         }
-        Self { metadata: Observation { history, ..observation(seq, images, frame_hash) }, tensors }
+        Self {
+            metadata: ObservationMetadata { history, ..observation(seq, images, frame_hash) },
+            tensors,
+        }
     }
 
     /// The frame's bytes.
@@ -230,8 +233,8 @@ fn image(
     }
 }
 
-fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> Observation {
-    Observation {
+fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationMetadata {
+    ObservationMetadata {
         seq,
         step: 2,
         time_us: 200_000,

@@ -4,14 +4,14 @@
 //! Schemas and vectors are generated from the types by these tests. After a change of the wire:
 //! `WILDCITY_BLESS=1 cargo test --release --test protocol`, and look at the difference.
 
+mod client;
 mod damaged;
 mod fake_server;
 mod frames;
 mod messages;
 mod observations;
-mod page;
+mod readme;
 mod schema;
-mod talking;
 
 use std::fs;
 use std::path::PathBuf;

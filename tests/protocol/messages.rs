@@ -1,7 +1,7 @@
 //! Golden text messages: one file per request and per answer.
 
 use serde_json::{Value, json};
-use wildcity_protocol::camera::{Exposure, Lens, Rolls, Shutter};
+use wildcity_protocol::camera::{Exposure, Lens, Shutter, ShutterDirection};
 use wildcity_protocol::error::Code;
 use wildcity_protocol::message::*;
 use wildcity_protocol::{PROTOCOL, unknown_field};
@@ -110,7 +110,7 @@ pub(crate) fn rear() -> RigCamera {
     RigCamera {
         name: "rear".into(),
         lens: Some(Lens::Fisheye { k: [-0.03, -0.005, -0.001, 0.001], max_angle: Some(1.2) }),
-        shutter: Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 }),
+        shutter: Some(Shutter { direction: ShutterDirection::TopToBottom, duration_us: 30_000 }),
         exposure: Some(Exposure {
             matrix: Some([[1.25, 0.0, 0.0], [0.0, 1.125, -0.0625], [0.0, 0.0, 1.5]]),
             gain: None,
@@ -164,10 +164,10 @@ fn requests() -> Vec<(&'static str, Request)> {
         profile: [("tau_px".to_owned(), 2.0.into())].into_iter().collect(),
         ..Open::twin("street")
     };
-    let dynamics = Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true };
+    let dynamics = Dynamics { model: DynamicsModel::Dynamic, speed: 8.25, reverse: true };
     let driven =
         Open { seq: 1, dynamics: Some(DynamicsChoice::Full(dynamics)), ..Open::twin("street") };
-    let model = Some(DynamicsChoice::Model(Model::Kinematic));
+    let model = Some(DynamicsChoice::Model(DynamicsModel::Kinematic));
     let model = Open { seq: 1, dynamics: model, ..Open::twin("street") };
     let step = |seq, pose, trajectory, action, terminate| Request::Step {
         seq,
@@ -247,7 +247,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         backend: "cpu".into(),
         seed: 42,
         start: pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]),
-        dynamics: Dynamics { model: Model::Dynamic, speed: 8.25, reverse: true },
+        dynamics: Dynamics { model: DynamicsModel::Dynamic, speed: 8.25, reverse: true },
         dt_us: 100_000,
         deadline_ms: 20_000,
         decision_us: 500_000,

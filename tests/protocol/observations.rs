@@ -107,7 +107,7 @@ fn unknown_fields_of_the_metadata_are_ignored() {
     let frame = raw_frame();
     let mut metadata = serde_json::to_value(&frame.metadata).unwrap();
     super::messages::add_unknown_fields(&mut metadata);
-    let known: wildcity_protocol::observation::Observation =
+    let known: wildcity_protocol::observation::ObservationMetadata =
         serde_json::from_value(metadata).unwrap();
     assert_eq!(known, frame.metadata);
 }

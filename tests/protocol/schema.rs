@@ -14,7 +14,7 @@ fn schemas_are_fresh() {
     check_closed::<http::NewPush>("new_push");
     check_closed::<http::Rollback>("rollback");
     check::<message::Answer>("answer");
-    check::<observation::Observation>("observation");
+    check::<observation::ObservationMetadata>("observation");
     check::<http::Upload>("upload");
     check::<http::Push>("push");
     check::<http::VersionInfo>("version");

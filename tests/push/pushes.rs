@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use serde_json::json;
-use wildcity_client::{Cells, NewPush, Push, PushState};
+use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushState};
 use wildcity_protocol::error::Code;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_twin::store::Catalog;
@@ -30,7 +30,7 @@ async fn a_push_replaces_the_cells_that_it_touches() {
     let cells: Vec<_> = report.cells.iter().map(|c| (c.cell, c.before, c.after)).collect();
     assert_eq!(cells, [([3, -1], 0, 10), ([0, 0], 32, 40)]);
     assert_eq!((report.gaussians, report.left_out, report.files.len()), (50, 0, 1));
-    assert_eq!(report.golden.len(), 4, "a few poses along the trajectory");
+    assert_eq!(report.previews.len(), 4, "a few poses along the trajectory");
 
     let catalog = Catalog::open(server.twins.path()).unwrap();
     let version = catalog.version("test", None).unwrap();
@@ -59,7 +59,7 @@ async fn a_push_makes_a_new_twin() {
     let client = client(&server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
     let begun = client.push("fresh", &push_of(&[&upload.id])).await.unwrap();
-    let pushed = client.wait(begun, &mut |_| {}).await.unwrap();
+    let pushed = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
     assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(1)), "{pushed:?}");
     assert_eq!(get(&server, "/v1/twins/fresh").await.body["gaussians"], 20);
 }
@@ -117,7 +117,7 @@ async fn a_margin_does_not_wipe_the_neighbour() {
     let error = refused.error.unwrap();
     assert_eq!((refused.state, error.cells), (PushState::Refused, vec![[1, 0]]));
     assert!(error.message.contains("3 Gaussians in place of 32"), "{}", error.message);
-    let named = |cells: &[[i32; 2]]| Some(Cells::These(cells.to_vec()));
+    let named = |cells: &[[i32; 2]]| Some(CellSelection::Listed(cells.to_vec()));
     let pushed = push(&server, &gaussians, |push| push.cells = named(&[[0, 0]])).await;
     assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
     assert_eq!(pushed.report.unwrap().left_out, 3);
@@ -156,7 +156,7 @@ async fn what_others_changed_is_not_overwritten() {
     assert_eq!((refused.status, &refused.body["cells"]), (409, &json!([[1, 0]])));
     let whole = in_cell([2, 2], 7, 4);
     let all = push(&server, &whole, |push| {
-        push.cells = Some(Cells::All(wildcity_client::All::All));
+        push.cells = Some(CellSelection::All(AllCells::All));
         push.base = Some(3);
     });
     assert_eq!(all.await.version, Some(4));
@@ -168,17 +168,17 @@ async fn views_before_and_after_are_compared() {
     let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
     let server = TestServer::configured(|config| config.backend = cpu).await;
     let gaussians = in_cell([0, 0], 400, 1);
-    let refused = push(&server, &gaussians, |push| push.golden.min_psnr_db = Some(90.0)).await;
+    let refused = push(&server, &gaussians, |push| push.preview.min_psnr_db = Some(90.0)).await;
     assert_eq!(refused.state, PushState::Refused);
     assert!(refused.error.unwrap().message.contains("min_psnr_db is 90"));
-    let golden = refused.report.unwrap().golden;
+    let golden = refused.report.unwrap().previews;
     assert_eq!(golden.len(), 4);
     assert!(golden.iter().all(|golden| golden.psnr_db.is_some_and(|db| db < 90.0)), "{golden:?}");
-    let pushed = push(&server, &gaussians, |push| push.golden.min_psnr_db = Some(1.0)).await;
+    let pushed = push(&server, &gaussians, |push| push.preview.min_psnr_db = Some(1.0)).await;
     assert_eq!(pushed.version, Some(2), "{pushed:?}");
     // The same again looks the same, within what the record rounds.
     let again = push(&server, &gaussians, |push| {
-        push.golden.min_psnr_db = Some(40.0);
+        push.preview.min_psnr_db = Some(40.0);
         push.note = Some("once more".to_owned());
     });
     let again = again.await;
@@ -189,7 +189,7 @@ async fn views_before_and_after_are_compared() {
 #[tokio::test]
 async fn a_likeness_that_cannot_be_seen_is_refused() {
     let server = TestServer::start().await;
-    let alike = |push: &mut NewPush| push.golden.min_psnr_db = Some(1.0);
+    let alike = |push: &mut NewPush| push.preview.min_psnr_db = Some(1.0);
     let refused = |pushed: &Push, why: &str| {
         let error = pushed.error.as_ref().expect(why);
         assert_eq!((pushed.state, error.code), (PushState::Refused, Code::OutOfRange));
@@ -203,20 +203,20 @@ async fn a_likeness_that_cannot_be_seen_is_refused() {
         let mut asked = push_of(&[&upload.id]);
         change(&mut asked);
         let begun = client.push("fresh", &asked).await.unwrap();
-        client.wait(begun, &mut |_| {}).await.unwrap()
+        client.wait_for_push(begun, &mut |_| {}).await.unwrap()
     };
     refused(&fresh(&alike).await, "no version before");
     assert_eq!(fresh(&|_| {}).await.state, PushState::Ready);
     refused(&fresh(&alike).await, "no trajectory");
     let nowhere = |push: &mut NewPush| {
         alike(push);
-        push.golden.poses = Some(Vec::new());
+        push.preview.poses = Some(Vec::new());
     };
     refused(&fresh(&nowhere).await, "names none");
     let other = gaussians(40, 1, 8.0, 3);
     let pushed = push(&server, &other, |push| {
         alike(push);
-        push.cells = Some(Cells::All(wildcity_client::All::All));
+        push.cells = Some(CellSelection::All(AllCells::All));
     });
     refused(&pushed.await, "SH degree is 1, and 0");
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
-use wildcity_client::{Client, HttpClient};
+use wildcity_client::{Client, ConnectOptions, HttpClient};
 use wildcity_server::Tokens;
 
 use crate::http::{Reply, push_of, send};
@@ -12,6 +12,10 @@ const DRIVER: &str = "driver-driver-driver";
 const PUSHER: &str = "pusher-pusher-pusher";
 const ADMIN: &str = "admin-admin-admin-admin";
 const ELSEWHERE: &str = "elsewhere-elsewhere";
+
+fn with_token(token: &str) -> ConnectOptions {
+    ConnectOptions::with_token(Some(token.to_owned()))
+}
 
 async fn guarded() -> TestServer {
     let hash = blake3::hash(PUSHER.as_bytes());
@@ -131,22 +135,22 @@ async fn the_client_sends_its_token() {
     let url = format!("http://127.0.0.1:{}", server.address().port());
     let dir = tempfile::tempdir().unwrap();
     let path = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
-    let stranger = HttpClient::new(&url, None).unwrap();
+    let stranger = HttpClient::new(&url, &ConnectOptions::default()).unwrap();
     let refused = stranger.upload(&path, &mut |_, _| {}).await.unwrap_err();
     assert!(refused.to_string().contains("refused, 401"), "{refused}");
-    let pusher = HttpClient::new(&url, Some(PUSHER.to_owned())).unwrap();
+    let pusher = HttpClient::new(&url, &with_token(PUSHER)).unwrap();
     assert!(!format!("{pusher:?}").contains(PUSHER));
     let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap();
     let begun = pusher.push("test", &push_of(&[&upload.id])).await.unwrap();
-    assert_eq!(pusher.wait(begun, &mut |_| {}).await.unwrap().version, Some(2));
+    assert_eq!(pusher.wait_for_push(begun, &mut |_| {}).await.unwrap().version, Some(2));
     assert!(pusher.rollback("test", 1).await.unwrap_err().to_string().contains("403"));
-    let admin = HttpClient::new(&url, Some(ADMIN.to_owned())).unwrap();
+    let admin = HttpClient::new(&url, &with_token(ADMIN)).unwrap();
     assert_eq!(admin.rollback("test", 1).await.unwrap(), 3);
 
     let url = format!("ws://127.0.0.1:{}/v1/session", server.address().port());
     let refused = Client::connect(&url, "stranger").await.unwrap_err();
     assert!(refused.to_string().contains("401"), "{refused}");
-    let mut driver = Client::connect_as(&url, "driver", Some(DRIVER.to_owned())).await.unwrap();
+    let mut driver = Client::connect_with(&url, "driver", &with_token(DRIVER)).await.unwrap();
     assert!(!format!("{driver:?}").contains(DRIVER));
     driver.open(wildcity_client::Open::twin("test")).await.unwrap();
     assert_eq!(driver.switch_version(Some(2)).await.unwrap().version, 2);

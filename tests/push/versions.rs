@@ -9,7 +9,8 @@ use serde_json::json;
 use wildcity_client::PushState;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Extent, Opening, Outputs, Recording, Session,
+    Encoding, Engine, EngineSettings, Outputs, RecordedEpisode, ReplayUntil, Session,
+    SessionOptions,
 };
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
@@ -139,14 +140,14 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     assert_eq!(closed["summary"]["steps"], 5, "{closed}");
 
     // What was recorded follows.
-    let recording = Recording::read(&server.recorded()[0]).unwrap();
+    let recording = RecordedEpisode::read(&server.recorded()[0]).unwrap();
     let switches: Vec<_> = recording.versions.iter().map(|(at, v)| (*at, v.version)).collect();
     assert_eq!(switches, [(2, 2), (4, 1)]);
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let cpu = Cpu::new(2, Simd::Best).unwrap();
-    let replay = |recording: &Recording| {
+    let replay = |recording: &RecordedEpisode| {
         let mut open = |version| cache.open("test", Some(version));
-        recording.replay(&mut open, &cpu, Extent::Whole, &mut |_| Ok(())).unwrap()
+        recording.replay(&mut open, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
     };
     let report = replay(&recording);
     assert_eq!((report.difference, report.images, report.changes), (None, 10, vec![]));
@@ -170,20 +171,20 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     });
     let engine = engine.unwrap();
     let latest = async || {
-        let opening = Opening::twin("test", Outputs::colour(Encoding::Raw));
+        let opening = SessionOptions::twin("test", Outputs::colour(Encoding::Raw));
         let session = Session::open(engine.clone(), "a".to_owned(), opening).await.unwrap();
         session.resident().version.number
     };
     assert_eq!(latest().await, 2);
     let listed = async || engine.twins().await.unwrap()[0].number;
     assert_eq!(listed().await, 2);
-    let held = engine.hold_latest("test", 1);
+    let held = engine.pin_latest("test", 1);
     assert_eq!((latest().await, listed().await), (1, 1));
     // A rollback in between is the latest at once.
-    engine.hold_instead("test", 2);
+    engine.move_latest_pin("test", 2);
     assert_eq!((latest().await, listed().await), (2, 2));
     drop(held);
-    engine.hold_instead("test", 1);
+    engine.move_latest_pin("test", 1);
     assert_eq!((latest().await, listed().await), (2, 2), "nothing is held");
 }
 

@@ -2,11 +2,11 @@
 //! pixel's own ray, and against the same scene row by row.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use wildcity_render::compare::blobs::{Blob, scene};
-use wildcity_render::compare::points::centroid;
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference::Reference;
-use wildcity_render::unscented::Bent;
-use wildcity_render::{Backend, RenderError, Rolling, Target, View};
+use wildcity_render::unscented::UnscentedView;
+use wildcity_render::{Backend, RenderError, RollingShutter, Target, View};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
@@ -63,13 +63,13 @@ fn zero_distortion_draws_the_bytes_of_a_pinhole() {
     let (street, pose) = street_scene();
     let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let none = Lens::opencv(OpenCv::new([0.0; 6], [0.0; 2], [0.0; 4]));
-    let still = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: pose };
+    let still = RollingShutter { direction: Rolls::TopToBottom, world_from_camera_first: pose };
     let same = View::new(Camera { lens: none, ..ideal }, pose);
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &street, &profile, View::new(ideal, pose));
     assert!(render_one(&cpu(), &street, &profile, same) == image);
     // A shutter that rolls while nothing moves is told apart only by how the shape is computed.
-    let unmoved = View { rolling: Some(still), ..same };
+    let unmoved = View { rolling_shutter: Some(still), ..same };
     let db = psnr(&render_one(&cpu(), &street, &profile, unmoved).rgba, &image.rgba);
     eprintln!("a pinhole by six points: {db:.1} dB of a pinhole");
     assert!(db > 40.0, "{db:.1} dB");
@@ -95,21 +95,25 @@ fn t23_beyond_180_degrees_and_never_around() {
     let camera = beyond_half();
     assert_eq!(camera.check(), Ok(()));
     // A ball straight behind, and one at 100° to the right, beyond a pinhole's world.
-    let behind = Blob { mean_m: DVec3::new(0.0, 0.0, -3.0), ..Blob::default() };
+    let behind = GaussianSpec { mean_m: DVec3::new(0.0, 0.0, -3.0), ..GaussianSpec::default() };
     let (sin, cos) = 100_f64.to_radians().sin_cos();
-    let right = Blob { mean_m: 3.0 * DVec3::new(sin, 0.0, cos), ..Blob::default() };
+    let right = GaussianSpec { mean_m: 3.0 * DVec3::new(sin, 0.0, cos), ..GaussianSpec::default() };
     let view = View::new(camera, Pose::IDENTITY);
     let profile = RenderProfile::default();
     for backend in [&Reference as &dyn Backend, &cpu()] {
-        let image = render_one(backend, &scene(&[behind_of(&behind)]), &profile, view);
+        let image = render_one(backend, &scene_of(&[behind_of(&behind)]), &profile, view);
         assert!(image.opacity.iter().all(|&o| o == 0.0), "{}: from behind", backend.name());
-        let image = render_one(backend, &scene(&[behind_of(&right)]), &profile, view);
+        let image = render_one(backend, &scene_of(&[behind_of(&right)]), &profile, view);
         let at_px = camera.project(right.mean_m).unwrap();
         let found_px = centroid(&image.opacity, [120, 100], at_px, f64::INFINITY).unwrap();
         assert!(found_px.distance(at_px) < 0.3);
         // A wall all around: what the lens does not see stays empty, to the pixel.
-        let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
-        let image = render_one(backend, &scene(&[wall]), &profile, view);
+        let wall = GaussianSpec {
+            sigma_m: DVec3::splat(50.0),
+            mean_m: DVec3::Z,
+            ..GaussianSpec::default()
+        };
+        let image = render_one(backend, &scene_of(&[wall]), &profile, view);
         for (pixel, &opacity) in image.opacity.iter().enumerate() {
             let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
             let seen = camera.unproject(at_px).is_some();
@@ -130,29 +134,35 @@ fn t23_beyond_180_degrees_and_never_around() {
     assert!(db >= 40.0, "{db:.1} dB");
 }
 
-fn behind_of(blob: &Blob) -> Blob {
-    Blob { mean_m: blob.mean_m, ..Blob::default() }
+fn behind_of(blob: &GaussianSpec) -> GaussianSpec {
+    GaussianSpec { mean_m: blob.mean_m, ..GaussianSpec::default() }
 }
 
 #[test]
 fn t5_a_camera_within_a_gaussian_and_one_before_it() {
-    let inside =
-        Blob { mean_m: DVec3::new(0.1, 0.0, 0.3), sigma_m: DVec3::splat(2.0), ..Blob::default() };
-    let behind =
-        Blob { mean_m: DVec3::new(0.0, 0.0, -2.0), sigma_m: DVec3::splat(0.3), ..Blob::default() };
+    let inside = GaussianSpec {
+        mean_m: DVec3::new(0.1, 0.0, 0.3),
+        sigma_m: DVec3::splat(2.0),
+        ..GaussianSpec::default()
+    };
+    let behind = GaussianSpec {
+        mean_m: DVec3::new(0.0, 0.0, -2.0),
+        sigma_m: DVec3::splat(0.3),
+        ..GaussianSpec::default()
+    };
     for (name, camera) in lenses() {
         let view = View::new(camera, Pose::IDENTITY);
         let profile = RenderProfile::default();
-        let truth = render_one(&Reference, &scene(&[behind_of_size(&inside)]), &profile, view);
-        let image = render_one(&cpu(), &scene(&[behind_of_size(&inside)]), &profile, view);
+        let truth = render_one(&Reference, &scene_of(&[behind_of_size(&inside)]), &profile, view);
+        let image = render_one(&cpu(), &scene_of(&[behind_of_size(&inside)]), &profile, view);
         agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
-        let image = render_one(&cpu(), &scene(&[behind_of_size(&behind)]), &profile, view);
+        let image = render_one(&cpu(), &scene_of(&[behind_of_size(&behind)]), &profile, view);
         assert!(image.opacity.iter().all(|&o| o == 0.0), "{name}: a mirrored contribution");
     }
 }
 
-fn behind_of_size(blob: &Blob) -> Blob {
-    Blob { mean_m: blob.mean_m, sigma_m: blob.sigma_m, ..Blob::default() }
+fn behind_of_size(blob: &GaussianSpec) -> GaussianSpec {
+    GaussianSpec { mean_m: blob.mean_m, sigma_m: blob.sigma_m, ..GaussianSpec::default() }
 }
 
 #[test]
@@ -161,11 +171,11 @@ fn t2_long_things_on_the_ground_beside_the_view() {
         let view = View::new(camera, Pose::IDENTITY);
         for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 5.0]] {
             for angle in [0.0, 0.5, 1.2, 2.5] {
-                let long = scene(&[Blob {
+                let long = scene_of(&[GaussianSpec {
                     mean_m: DVec3::new(x, y, 4.0),
                     rotation: DQuat::from_rotation_y(angle),
                     sigma_m: DVec3::new(2.0, 0.05, 0.3),
-                    ..Blob::default()
+                    ..GaussianSpec::default()
                 }]);
                 let profile = RenderProfile::default();
                 let truth = render_one(&Reference, &long, &profile, view);
@@ -239,7 +249,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
                 .flat_map(|(_, (a, b))| a.iter().copied().zip(b.iter().copied()))
                 .unzip();
             let db = psnr(&of_rows.0, &of_rows.1);
-            let still = View { rolling: None, ..view };
+            let still = View { rolling_shutter: None, ..view };
             let still = render_one(&cpu(), &street, &profile, still);
             let without = psnr(&still.rgba, &image.rgba);
             eprintln!(
@@ -275,21 +285,21 @@ fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
     let view = passing();
     for step in 0..200 {
         let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
-        let landed = view.land(point_m, 1.0);
+        let landed = view.project_beyond(point_m, 1.0);
         let exposed = Rolls::LeftToRight.fraction(landed.at_px, &view.camera);
         assert!((exposed - landed.fraction).abs() < 1e-6, "{point_m}: {landed:?}");
     }
-    let balls: Vec<Blob> = (0..5)
-        .map(|k| Blob {
+    let balls: Vec<GaussianSpec> = (0..5)
+        .map(|k| GaussianSpec {
             mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
             sigma_m: DVec3::splat(0.05),
-            ..Blob::default()
+            ..GaussianSpec::default()
         })
         .collect();
     let profile = RenderProfile::default();
-    let truth = render_one(&Reference, &scene(&balls), &profile, view);
+    let truth = render_one(&Reference, &scene_of(&balls), &profile, view);
     assert!(truth.opacity.iter().filter(|&&o| o > 0.5).count() > 50, "little is seen");
-    agree(&render_one(&cpu(), &scene(&balls), &profile, view), &truth).unwrap();
+    agree(&render_one(&cpu(), &scene_of(&balls), &profile, view), &truth).unwrap();
 }
 
 #[test]
@@ -297,7 +307,7 @@ fn t22_six_points_scatter_as_a_million() {
     // A wide disc at an angle, through the fisheye: mean and covariance on the image, by drawing.
     let camera = lenses()[1].1;
     let view = View::new(camera, Pose::IDENTITY);
-    let bent = Bent::of(&view, &RenderProfile::default()).unwrap();
+    let bent = UnscentedView::new(&view, &RenderProfile::default()).unwrap();
     let mean_m = DVec3::new(0.6, 0.3, 1.5);
     let axes_m = DMat3::from_quat(DQuat::from_rotation_y(0.7))
         * DMat3::from_diagonal(DVec3::new(0.2, 0.3, 0.01));

@@ -1,8 +1,8 @@
 //! Camera models on their own: there and back, by formulas written another way, and what is refused.
 
 use glam::{DVec2, DVec3};
-use wildcity_render::compare::blobs::{Blob, scene};
-use wildcity_render::compare::points::centroid;
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
 use wildcity_render::{Backend, View};
 use wildcity_scene::geometry::camera::{
@@ -325,13 +325,13 @@ fn tangential_distortion_mirrors_nothing_into_the_image() {
     let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
     for backend in [&reference::Reference as &dyn Backend, &cpu()] {
         let row_of = |slope: f64| {
-            let ball = Blob {
+            let ball = GaussianSpec {
                 mean_m: DVec3::new(0.0, 2.0 * slope, 2.0),
                 sigma_m: DVec3::splat(0.003),
-                ..Blob::default()
+                ..GaussianSpec::default()
             };
             let view = View::new(camera, Pose::IDENTITY);
-            let image = render_one(backend, &scene(&[ball]), &fine, view);
+            let image = render_one(backend, &scene_of(&[ball]), &fine, view);
             let middle_px = camera.size_px() / 2.0;
             centroid(&image.opacity, [160, 100], middle_px, f64::INFINITY).map(|at_px| at_px.y)
         };
@@ -357,8 +357,12 @@ fn a_lens_shows_all_of_its_field() {
         };
         let view = View::new(camera, Pose::IDENTITY);
         for backend in [&reference::Reference as &dyn Backend, &cpu()] {
-            let wall = Blob { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..Blob::default() };
-            let image = render_one(backend, &scene(&[wall]), &RenderProfile::default(), view);
+            let wall = GaussianSpec {
+                sigma_m: DVec3::splat(50.0),
+                mean_m: DVec3::Z,
+                ..GaussianSpec::default()
+            };
+            let image = render_one(backend, &scene_of(&[wall]), &RenderProfile::default(), view);
             for (pixel, &opacity) in image.opacity.iter().enumerate() {
                 let from_axis = DVec2::new((pixel % 300) as f64, (pixel / 300) as f64) - 149.5;
                 let seen = from_axis.length() < edge_px;

@@ -1,9 +1,9 @@
 //! Normals: of surfaces whose normal is known, through every lens, and where surfaces end.
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::reference::Reference;
-use wildcity_render::{Backend, Frame, RenderError, Rolling, Target, View};
+use wildcity_render::{Backend, Frame, RenderError, RollingShutter, Target, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::Rolls;
 use wildcity_scene::{RenderProfile, Scene};
@@ -34,16 +34,16 @@ fn draw(backend: &dyn Backend, scene: &Scene, view: View) -> Drawn {
 }
 
 /// A wall of small flat discs through a point, `facing` the camera.
-fn wall(through_m: DVec3, facing: DVec3, side_m: f64) -> Vec<Blob> {
+fn wall(through_m: DVec3, facing: DVec3, side_m: f64) -> Vec<GaussianSpec> {
     let rotation = DQuat::from_rotation_arc(DVec3::Z, facing);
     let count = (side_m / 0.05) as i32 / 2;
     let places = (-count..=count).flat_map(|i| (-count..=count).map(move |k| (i, k)));
-    let disc = |(i, k): (i32, i32)| Blob {
+    let disc = |(i, k): (i32, i32)| GaussianSpec {
         mean_m: through_m + rotation * DVec3::new(0.05 * f64::from(i), 0.05 * f64::from(k), 0.0),
         rotation,
         sigma_m: DVec3::new(0.04, 0.04, 1e-4),
         opacity: 0.9,
-        ..Blob::default()
+        ..GaussianSpec::default()
     };
     places.map(disc).collect()
 }
@@ -64,15 +64,19 @@ fn off_deg(drawn: &Drawn, facing: DVec3) -> Vec<f64> {
 #[test]
 fn a_wall_faces_where_it_does() {
     let facing = DVec3::new(0.4, -0.3, -1.0).normalize();
-    let scene = scene(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
+    let scene = scene_of(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
-    let rolling = Rolling { direction: Rolls::TopToBottom, world_from_camera_first: way };
+    let rolling_shutter =
+        RollingShutter { direction: Rolls::TopToBottom, world_from_camera_first: way };
     let mut views: Vec<(&str, View)> = lenses()
         .into_iter()
         .map(|(name, camera)| (name, View::new(camera, Pose::IDENTITY)))
         .collect();
-    views.push(("pinhole", ahead([160, 100], 90.0)));
-    views.push(("rolling", View { rolling: Some(rolling), ..ahead([160, 100], 90.0) }));
+    views.push(("pinhole", forward_view([160, 100], 90.0)));
+    views.push((
+        "rolling",
+        View { rolling_shutter: Some(rolling_shutter), ..forward_view([160, 100], 90.0) },
+    ));
     for (name, view) in views {
         for backend in [&cpu() as &dyn Backend, &Reference] {
             let off_deg = off_deg(&draw(backend, &scene, view), facing);
@@ -90,8 +94,8 @@ fn an_edge_belongs_to_neither_side() {
     // A board 2 m away before a wall 4 m away: between them is one step, and no slope.
     let board = wall(DVec3::new(-1.0, 0.0, 2.0), DVec3::NEG_Z, 2.0);
     let behind = wall(DVec3::new(0.0, 0.0, 4.0), DVec3::NEG_Z, 12.0);
-    let scene = scene(&[board, behind].concat());
-    let drawn = draw(&cpu(), &scene, ahead([160, 100], 90.0));
+    let scene = scene_of(&[board, behind].concat());
+    let drawn = draw(&cpu(), &scene, forward_view([160, 100], 90.0));
     // The board's last discs fade out over some pixels, whose depth is between the two and has a slope.
     let (mut on_one, mut slopes) = (0, 0);
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
@@ -106,15 +110,15 @@ fn an_edge_belongs_to_neither_side() {
 
 #[test]
 fn where_nothing_is_nothing_faces() {
-    let ball = scene(&[Blob::default()]);
-    let drawn = draw(&cpu(), &ball, ahead([40, 30], 30.0));
+    let ball = scene_of(&[GaussianSpec::default()]);
+    let drawn = draw(&cpu(), &ball, forward_view([40, 30], 30.0));
     let mut covered = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
         assert_eq!(normal == [0.0; 3], *depth_m == 0.0);
         covered += usize::from(*depth_m > 0.0);
     }
     assert!((10..600).contains(&covered), "{covered}");
-    let views = [ahead([4, 3], 4.0)];
+    let views = [forward_view([4, 3], 4.0)];
     let mut normals = [0.0; 36];
     let target = Target { normals: Some(&mut normals), ..Target::default() };
     let frame = Frame { scene: &ball, profile: &RenderProfile::DEFAULT, views: &views };

@@ -8,7 +8,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene};
 use wildcity_twin::ingest;
 
 use crate::data::real;
-use crate::images::{agree, cpu, look, render, render_one};
+use crate::images::{agree, cpu, render, render_one, view_along};
 use crate::scene_files::gaussians;
 use crate::streets::{demo_street, street, street_views};
 
@@ -52,7 +52,7 @@ fn every_field_of_the_profile() {
 #[test]
 fn a_cloud_around_the_camera() {
     // Centres from beside the lens to 2 m, half of them behind.
-    let view = look([128, 96], 80.0, DVec3::ZERO, DVec3::new(0.3, -0.2, 1.0), DVec3::Y);
+    let view = view_along([128, 96], 80.0, DVec3::ZERO, DVec3::new(0.3, -0.2, 1.0), DVec3::Y);
     compare(&gaussians(3_000, 2, 2.0, 8), &RenderProfile::default(), &[view]);
 }
 
@@ -79,7 +79,7 @@ fn real_captures() {
     ] {
         let Some(path) = real(file) else { return };
         let scene = ingest::read(&path, &mut |_, _| {}).unwrap();
-        let view = look([160, 120], 150.0, at, forward, down);
+        let view = view_along([160, 120], 150.0, at, forward, down);
         let near = RenderProfile { near: 0.2, alpha_cap: 0.999, ..RenderProfile::default() };
         compare(&scene, &near, &[view]);
     }

@@ -9,7 +9,7 @@ use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_scene::sky::{CubeMap, Drawn, Model, SKY_CUT, SkyError};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 
-use crate::images::{agree, cpu, look, max_difference, render, render_one};
+use crate::images::{agree, cpu, max_difference, render, render_one, view_along};
 use crate::scene_files::Random;
 use crate::skies::{demo_model, empty, network, sky};
 use crate::streets::{street, street_views};
@@ -59,7 +59,7 @@ fn the_network_is_what_numpy_says() {
 fn what_backends_evaluate_is_exact() {
     let scene = empty(Arc::new(Sky::new(demo_model(None), DMat3::IDENTITY)));
     let forward = DVec3::new(-0.7, -0.5, 0.5);
-    let view = look([96, 80], 60.0, DVec3::new(1e5, 3.0, 2.0), forward, DVec3::NEG_Z);
+    let view = view_along([96, 80], 60.0, DVec3::new(1e5, 3.0, 2.0), forward, DVec3::NEG_Z);
     let sky = scene.sky.as_ref().unwrap();
     let truth: Vec<f32> = (0..96 * 80)
         .flat_map(|pixel| {
@@ -81,7 +81,7 @@ fn what_backends_evaluate_is_exact() {
 
 #[test]
 fn networks_of_every_shape() {
-    let view = look([33, 21], 20.0, DVec3::ZERO, DVec3::new(0.2, 1.0, 0.4), DVec3::NEG_Z);
+    let view = view_along([33, 21], 20.0, DVec3::ZERO, DVec3::new(0.2, 1.0, 0.4), DVec3::NEG_Z);
     for (identity, octaves, appearance, skip) in [
         (true, 0, 0, true),
         (true, 1, 0, false),
@@ -171,7 +171,7 @@ fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     assert!(error.to_string().contains("set sky_error to"), "{error}");
     let scene = empty(sky);
     let profile = RenderProfile { sky_error: 1e-4, ..RenderProfile::DEFAULT };
-    let view = look([8, 8], 8.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
+    let view = view_along([8, 8], 8.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
     let frame = Frame { scene: &scene, profile: &profile, views: &[view] };
     let mut image = vec![0.0; 4 * 64];
     let mut targets = [Target { rgba: Some(&mut image), ..Target::default() }];
@@ -240,7 +240,7 @@ fn a_sky_behind_gaussians() {
 fn a_sky_has_no_parallax() {
     let scene = empty(sky());
     let at = |position_m, forward| {
-        let view = look([40, 30], 30.0, position_m, forward, DVec3::NEG_Z);
+        let view = view_along([40, 30], 30.0, position_m, forward, DVec3::NEG_Z);
         render_one(&cpu(), &scene, &RenderProfile::DEFAULT, view).rgba
     };
     let here = at(DVec3::ZERO, DVec3::X);
@@ -261,7 +261,7 @@ fn images_are_their_own_map() {
     let sky = Sky::new(Model::cube(CubeMap::from_faces(side, &rgb8).unwrap()), DMat3::IDENTITY);
     let scene = empty(Arc::new(sky));
     for forward in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::new(0.5, -0.7, 0.9)] {
-        let view = look([64, 48], 24.0, DVec3::ZERO, forward, DVec3::new(0.11, 0.13, -1.0));
+        let view = view_along([64, 48], 24.0, DVec3::ZERO, forward, DVec3::new(0.11, 0.13, -1.0));
         for profile in [RenderProfile::DEFAULT, EXACT] {
             let [image, truth] =
                 [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &profile, view));
@@ -281,7 +281,7 @@ fn images_are_their_own_map() {
 fn a_background_is_a_sky_of_one_colour() {
     let mut profile = RenderProfile::default();
     profile.set("background=0.25,0.5,1").unwrap();
-    let view: View = look([20, 20], 20.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
+    let view: View = view_along([20, 20], 20.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
     for backend in [&cpu() as &dyn Backend, &Reference] {
         let image = render_one(backend, &Scene::default(), &profile, view);
         assert!(image.rgb8.chunks(3).all(|rgb| rgb == [64, 128, 255]), "{:?}", &image.rgb8[..3]);

@@ -13,10 +13,10 @@ use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Rays, Record, RenderProfile, Scene};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{Catalog, NewVersion, Storage};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
 use crate::gpu::gpu;
-use crate::images::{cpu, look, render_one};
+use crate::images::{cpu, render_one, view_along};
 use crate::skies::sky;
 use crate::streets::street;
 
@@ -29,7 +29,7 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let scene = street(20_000, 1, 5);
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -138,7 +138,7 @@ fn after_all_features_the_base_is_as_before() {
     let gpu = gpu();
     let base = Scene::from_gaussians(&street(5_000, 0, 3));
     let rich = Scene { sky: Some(sky()), ..Scene::from_gaussians(&street(5_000, 1, 3)) };
-    let view = look([64, 48], 40.0, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z);
+    let view = view_along([64, 48], 40.0, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z);
     let mut bent = view;
     bent.camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
     let made = |scene: &Scene, view: View| {

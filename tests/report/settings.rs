@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
-use wildcity_render::compare::drawing::{Drawing, draw};
-use wildcity_render::compare::errors::Errors;
+use wildcity_render::compare::errors::ImageErrors;
+use wildcity_render::compare::images::{RenderedImage, render_images};
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
@@ -23,10 +23,10 @@ use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Opening, Outputs, Session, Tensor, TensorKind,
+    Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
 };
 use wildcity_twin::residency::{Cache, Resident};
-use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
 
 use crate::reported::{commit, commit_reaching, drive, rig};
 use crate::skies::demo_sky;
@@ -371,9 +371,9 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     let scene = Scene::from_gaussians(&wildcity_generate::canyon(30_000, &mut |_, _| {}));
     let at = |pose: &Pose| {
         let views = View::of_rig(&rig().cameras, *pose);
-        draw(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
+        render_images(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
     };
-    let colours = |drawing: Drawing| {
+    let colours = |drawing: RenderedImage| {
         let rgba = drawing.rgba.chunks_exact(4);
         rgba.flat_map(|rgba| [0, 1, 2].map(|c| rgba[c].clamp(0.0, 1.0))).collect()
     };
@@ -387,7 +387,10 @@ async fn least_db_of_session(
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
-    let opening = Opening { profile, ..Opening::twin("street", Outputs::colour(Encoding::Raw)) };
+    let opening = SessionOptions {
+        profile,
+        ..SessionOptions::twin("street", Outputs::colour(Encoding::Raw))
+    };
     let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
     session.reset(0, None).await.unwrap();
     let mut frame = session.observe(poses.to_vec()).await.unwrap();
@@ -412,7 +415,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -454,7 +457,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: Storage { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: Record::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -483,7 +486,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
 
 #[test]
 fn json_says_what_it_has_no_number_for() {
-    let errors = Errors {
+    let errors = ImageErrors {
         psnr_db: f64::INFINITY,
         ssim: f64::NAN,
         max: 0.0,

@@ -5,31 +5,31 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use wildcity_scene::Chunk;
-use wildcity_twin::residency::{Cache, Lens, Needed, ResidencyError};
+use wildcity_twin::residency::{Cache, ResidencyError, RigExtent, SectionRef};
 
 use crate::scene_files::{Random, gaussians};
 use crate::streaming::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
 
-const LENS: Lens = Lens { focal_px: 70.0, radius_m: 1.7 };
+const LENS: RigExtent = RigExtent { focal_px: 70.0, radius_m: 1.7 };
 
 #[test]
 fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
-    let worst_bytes = unlimited().open("demo", None).unwrap().worst_bytes(LENS);
-    let limit_bytes = 2 * worst_bytes + 1;
+    let worst_case_bytes = unlimited().open("demo", None).unwrap().worst_case_bytes(LENS);
+    let limit_bytes = 2 * worst_case_bytes + 1;
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     let resident = cache.open("demo", None).unwrap();
-    assert!(limit_bytes < resident.whole_bytes(), "else there is room for everything");
+    assert!(limit_bytes < resident.total_bytes(), "else there is room for everything");
     let held = [resident.reserve(LENS).unwrap(), resident.reserve(LENS).unwrap()];
     let refused = resident.reserve(LENS).unwrap_err();
     match &refused {
         ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes: limit } => {
             let said = (twin.as_str(), *needed_bytes, *held_bytes, *limit);
-            assert_eq!(said, ("demo", worst_bytes, 2 * worst_bytes, limit_bytes));
+            assert_eq!(said, ("demo", worst_case_bytes, 2 * worst_case_bytes, limit_bytes));
         }
         other => panic!("{other}"),
     }
     assert!(refused.to_string().contains("--memory-gib"), "{refused}");
-    assert_eq!(cache.stats().reserved_bytes, 2 * worst_bytes);
+    assert_eq!(cache.stats().reserved_bytes, 2 * worst_case_bytes);
     drop(held);
     assert!(resident.reserve(LENS).is_ok(), "what is given back is there again");
     assert_eq!(cache.stats().reserved_bytes, 0);
@@ -44,13 +44,13 @@ fn another_version_takes_the_room_of_the_one_before() {
     commit(dir.path(), "street", &scene);
     let catalog = wildcity_twin::store::Catalog::open(dir.path()).unwrap();
     let all = Cache::new(catalog.clone()).open("street", None).unwrap();
-    let limit_bytes = all.worst_bytes(LENS) * 3 / 2;
-    assert!(limit_bytes < all.whole_bytes());
+    let limit_bytes = all.worst_case_bytes(LENS) * 3 / 2;
+    assert!(limit_bytes < all.total_bytes());
     let cache = Cache::limited(catalog, Some(limit_bytes));
     let [old, new] = [1, 2].map(|number| cache.open("street", Some(number)).unwrap());
     let mut reservation = old.reserve(LENS).unwrap();
     assert!(new.reserve(LENS).is_err(), "there is no room for both");
-    reservation.exchange(new.clone(), new.worst_bytes(LENS)).unwrap();
+    reservation.exchange(new.clone(), new.worst_case_bytes(LENS)).unwrap();
     // Refused, it stays what it is.
     assert!(reservation.exchange(old, limit_bytes + 1).is_err());
     assert!(Arc::ptr_eq(reservation.resident(), &new));
@@ -61,18 +61,18 @@ fn another_version_takes_the_room_of_the_one_before() {
 
 #[test]
 fn a_twin_that_fits_as_a_whole_has_room_for_any_number_of_sessions() {
-    let whole_bytes = unlimited().open("demo", None).unwrap().whole_bytes();
-    let cache = Cache::limited(demo().catalog(), Some(whole_bytes));
+    let total_bytes = unlimited().open("demo", None).unwrap().total_bytes();
+    let cache = Cache::limited(demo().catalog(), Some(total_bytes));
     let resident = cache.open("demo", None).unwrap();
     let held: Vec<_> = (0..100).map(|_| resident.reserve(LENS).unwrap()).collect();
-    assert_eq!(cache.stats().reserved_bytes, whole_bytes);
+    assert_eq!(cache.stats().reserved_bytes, total_bytes);
     drop(held);
 }
 
 #[test]
 fn as_many_sessions_as_there_is_room_for_race_without_a_deadlock() {
     let all = unlimited().open("demo", None).unwrap();
-    let limit_bytes = 3 * all.worst_bytes(LENS);
+    let limit_bytes = 3 * all.worst_case_bytes(LENS);
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     let resident = cache.open("demo", None).unwrap();
     race(&resident, 3, true);
@@ -84,7 +84,7 @@ fn as_many_sessions_as_there_is_room_for_race_without_a_deadlock() {
 fn askers_that_nobody_admitted_get_on_one_after_the_other() {
     // Room for the worst frame, and eight that want another one each.
     let all = unlimited().open("demo", None).unwrap();
-    let limit_bytes = all.worst_bytes(LENS);
+    let limit_bytes = all.worst_case_bytes(LENS);
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     race(&cache.open("demo", None).unwrap(), 8, false);
     assert!(cache.stats().held_bytes <= limit_bytes);
@@ -98,7 +98,7 @@ fn the_end_of_a_frame_makes_room_at_once() {
     let bytes = |station_m: f64| -> u64 {
         let needed = all.demand(&frame(station_m), &PROFILE);
         let chunks = &all.version.manifest.chunks;
-        let count = |n: &Needed| chunks[n.chunk].sections[n.section].count;
+        let count = |n: &SectionRef| chunks[n.chunk].sections[n.section].count;
         needed.iter().map(|n| Chunk::bytes_of(1, count(n).into())).sum()
     };
     // Either fits, and both together do not.

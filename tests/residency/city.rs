@@ -21,7 +21,7 @@ fn two_kilometres_in_the_memory_of_their_worst_frame_look_as_with_all_of_it() {
         (0..=50).map(|i| route.at(f64::from(i) * route.length_m() / 50.0).world_from_rig).collect();
     let need = |pose| bytes(&whole, &whole.demand(&eyes(&views(pose)), &PROFILE));
     let limit_bytes = poses.iter().map(|&pose| need(pose)).max().unwrap();
-    assert!(8 * limit_bytes < whole.whole_bytes(), "{limit_bytes} of {}", whole.whole_bytes());
+    assert!(8 * limit_bytes < whole.total_bytes(), "{limit_bytes} of {}", whole.total_bytes());
 
     let (cache, resident) = open(Some(limit_bytes));
     for pose in poses {

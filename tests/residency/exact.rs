@@ -1,7 +1,7 @@
 //! The set that is drawn is a function of the pose: memory changes when, and never what.
 
 use wildcity_scene::RenderProfile;
-use wildcity_twin::residency::{Cache, Index, Lens, Resident, demand};
+use wildcity_twin::residency::{BlockIndex, Cache, Resident, RigExtent, demand};
 
 use crate::scene_files::Random;
 use crate::streaming::{PROFILE, bytes, demo, eyes, need_bytes, pixels, unlimited, views};
@@ -59,7 +59,7 @@ fn two_hundred_teleports_under_random_budgets_draw_what_the_whole_twin_does() {
 fn the_index_finds_what_looking_at_every_block_finds() {
     let resident = unlimited().open("demo", None).unwrap();
     let manifest = &resident.version.manifest;
-    let index = Index::new(manifest);
+    let index = BlockIndex::new(manifest);
     let mut random = Random(3);
     for reach_m in [None, Some(0.0), Some(30.0), Some(120.0), Some(5_000.0)] {
         for tau_px in [0.0, 0.5, 4.0] {
@@ -79,15 +79,15 @@ fn the_index_finds_what_looking_at_every_block_finds() {
 /// The rule without an index.
 fn plain_walk(
     manifest: &wildcity_scene::Manifest,
-    eyes: &[wildcity_twin::residency::Eye],
+    eyes: &[wildcity_twin::residency::Viewpoint],
     profile: &RenderProfile,
-) -> Vec<wildcity_twin::residency::Needed> {
+) -> Vec<wildcity_twin::residency::SectionRef> {
     let focal_px = eyes.iter().map(|eye| eye.focal_px).fold(0.0, f64::max);
     let mut needed = Vec::new();
     for (chunk, entry) in manifest.chunks.iter().enumerate() {
         for (section, full) in entry.sections.iter().enumerate().filter(|(_, s)| s.level == 0) {
             let bounds = entry.section_bounds(full);
-            let far = |eye: &wildcity_twin::residency::Eye| bounds.distance_m(eye.position_m);
+            let far = |eye: &wildcity_twin::residency::Viewpoint| bounds.distance_m(eye.position_m);
             let distance_m = eyes.iter().map(far).fold(f64::INFINITY, f64::min);
             if profile.reach_m.is_some_and(|reach_m| distance_m > reach_m) {
                 continue;
@@ -98,7 +98,7 @@ fn plain_walk(
                 .filter(|(_, s)| focal_px * f64::from(s.error_m) <= profile.tau_px * distance_m)
                 .last();
             let level = drawn.map_or(0, |(level, _)| level);
-            needed.push(wildcity_twin::residency::Needed { chunk, section: section + level });
+            needed.push(wildcity_twin::residency::SectionRef { chunk, section: section + level });
         }
     }
     needed
@@ -108,8 +108,8 @@ fn plain_walk(
 fn no_frame_anywhere_needs_more_than_the_worst() {
     let resident = unlimited().open("demo", None).unwrap();
     let mut random = Random(11);
-    let lens = Lens { focal_px: 70.0, radius_m: 1.7 };
-    let worst_bytes = resident.worst_bytes(lens);
+    let lens = RigExtent { focal_px: 70.0, radius_m: 1.7 };
+    let worst_case_bytes = resident.worst_case_bytes(lens);
     let mut most_bytes = 0;
     for _ in 0..3_000 {
         let mut pose = demo().at(650.0 * random.unit() - 25.0);
@@ -119,7 +119,10 @@ fn no_frame_anywhere_needs_more_than_the_worst() {
         let needed = resident.demand(&eyes(&views(pose)), &PROFILE);
         most_bytes = most_bytes.max(bytes(&resident, &needed));
     }
-    assert!(most_bytes <= worst_bytes, "{most_bytes} of {worst_bytes}");
-    assert!(worst_bytes <= 2 * most_bytes, "{worst_bytes} is no bound of {most_bytes} to use");
-    assert!(worst_bytes < resident.whole_bytes());
+    assert!(most_bytes <= worst_case_bytes, "{most_bytes} of {worst_case_bytes}");
+    assert!(
+        worst_case_bytes <= 2 * most_bytes,
+        "{worst_case_bytes} is no bound of {most_bytes} to use"
+    );
+    assert!(worst_case_bytes < resident.total_bytes());
 }

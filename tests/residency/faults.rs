@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
-use wildcity_twin::residency::{Cache, Needed, Pinned, ResidencyError, Resident, Stats, Ticket};
+use wildcity_twin::residency::{
+    Cache, PinnedScene, ResidencyError, Resident, SceneRequest, SectionRef, Stats,
+};
 
 use crate::source::{Fault, Faulty, Place};
 use crate::streaming::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
@@ -25,7 +27,7 @@ fn broken(fault: Fault) -> Broken {
     let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
     let (near, far) = (at(0.0), at(300.0));
     let only_far: Vec<_> = far.into_iter().filter(|n| !near.contains(n)).collect();
-    let Needed { chunk, section } = only_far[only_far.len() / 2];
+    let SectionRef { chunk, section } = only_far[only_far.len() / 2];
     let chunk = &resident.version.manifest.chunks[chunk];
     let section = &chunk.sections[section];
     let place = (chunk.cell, section.block, section.level);
@@ -34,17 +36,17 @@ fn broken(fault: Fault) -> Broken {
 }
 
 impl Broken {
-    fn frame(&self, station_m: f64) -> Result<Pinned, ResidencyError> {
+    fn frame(&self, station_m: f64) -> Result<PinnedScene, ResidencyError> {
         self.resident.scene(&eyes(&views(demo().at(station_m))), &PROFILE)
     }
 
-    fn ask(&self, station_m: f64) -> (Ticket, Receiver<Result<Pinned, ResidencyError>>) {
+    fn ask(&self, station_m: f64) -> (SceneRequest, Receiver<Result<PinnedScene, ResidencyError>>) {
         let (tell, told) = channel();
         let eyes = eyes(&views(demo().at(station_m)));
         let done = Box::new(move |pinned| {
             let _ = tell.send(pinned);
         });
-        (self.resident.ask(&eyes, &PROFILE, done).unwrap(), told)
+        (self.resident.request(&eyes, &PROFILE, done).unwrap(), told)
     }
 
     fn assert_draws(&self, station_m: f64) {
@@ -108,19 +110,19 @@ fn a_section_that_fails_once_delays_the_frame_and_no_more() {
 #[test]
 fn a_section_that_hangs_holds_up_only_who_needs_it() {
     let broken = broken(Fault::Hangs);
-    let (ticket, told) = broken.ask(300.0);
+    let (request, told) = broken.ask(300.0);
     broken.source.await_read(broken.place);
     broken.assert_draws(0.0);
     assert!(told.recv_timeout(Duration::from_millis(50)).is_err(), "it is not there");
-    match ticket.late() {
-        ResidencyError::Late { twin, missing, needed, waited } => {
+    match request.timeout_error() {
+        ResidencyError::TimedOut { twin, missing, needed, waited } => {
             assert_eq!(twin, "demo");
             assert!((1..needed).contains(&missing), "{missing} of {needed}");
             assert!(waited >= Duration::from_millis(50), "{waited:?}");
         }
         other => panic!("{other}"),
     }
-    drop(ticket);
+    drop(request);
     assert_eq!(broken.cache.stats().waits_given_up, 1);
     // The load goes on: whoever comes next does not start it again.
     let (_ticket, told) = broken.ask(300.0);

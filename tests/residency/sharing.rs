@@ -4,15 +4,15 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use wildcity_scene::{Chunk, RenderProfile};
-use wildcity_twin::residency::{Cache, Eye, Lens, Resident};
+use wildcity_twin::residency::{Cache, Resident, RigExtent, Viewpoint};
 
 use crate::scene_files::gaussians;
 use crate::source::Faulty;
 use crate::streaming::{PROFILE, commit, demo, eyes, need_bytes, unlimited, views};
 
 /// Everything in full detail.
-fn all_of(resident: &Arc<Resident>) -> wildcity_twin::residency::Pinned {
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+fn all_of(resident: &Arc<Resident>) -> wildcity_twin::residency::PinnedScene {
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     let profile = RenderProfile { tau_px: 0.0, reach_m: None, ..PROFILE };
     resident.scene(&[eye], &profile).unwrap()
 }
@@ -87,7 +87,7 @@ fn what_a_section_is_said_to_take_is_what_it_takes() {
 #[test]
 fn a_thousand_sessions_leave_nothing_behind() {
     let cache = Cache::limited(demo().catalog(), Some(32 << 20));
-    let lens = Lens { focal_px: 70.0, radius_m: 1.7 };
+    let lens = RigExtent { focal_px: 70.0, radius_m: 1.7 };
     let before = cache.stats();
     for session in 0..1_000 {
         let resident = cache.open("demo", None).unwrap();

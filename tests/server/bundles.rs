@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use wildcity_render::Backend;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Extent, Recording};
+use wildcity_session::{RecordedEpisode, ReplayUntil};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
@@ -250,11 +250,11 @@ async fn what_was_drawn_for_later_is_rendered_again_in_a_replay() {
     agent.look(json!({ "type": "observe", "poses": [pose(3.0)] })).await;
     agent.ask(json!({ "type": "close" })).await;
 
-    let recording = Recording::read(&server.recorded()[0]).unwrap();
+    let recording = RecordedEpisode::read(&server.recorded()[0]).unwrap();
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let replayed = |backend: &dyn Backend| {
         let mut open = |version| cache.open("test", Some(version));
-        recording.replay(&mut open, backend, Extent::Whole, &mut |_| Ok(())).unwrap()
+        recording.replay(&mut open, backend, ReplayUntil::End, &mut |_| Ok(())).unwrap()
     };
     let report = replayed(&Painter::default());
     assert_eq!(report.difference, None);

@@ -229,11 +229,11 @@ async fn a_lap_driven_twice_is_the_same_and_is_on_record() {
     let action = json!({ "acceleration_m_s2": 1.5, "curvature_1_m": -0.09 });
     assert_eq!(written[2]["command"], json!({ "action": action }));
     let report = replay(&server, &path, &Painter::default()).unwrap();
-    assert_eq!((report.images, report.strayed, report.difference), (82, None, None));
+    assert_eq!((report.images, report.diverged, report.difference), (82, None, None));
 
     // A hundredth of a metre per second squared leads elsewhere, and the step says so.
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, text.replacen(":1.5,", ":1.49,", 1)).unwrap();
-    let strayed = replay(&server, &path, &Painter::default()).unwrap().strayed.unwrap();
-    assert_eq!((strayed.line, strayed.step), (3, 1));
+    let diverged = replay(&server, &path, &Painter::default()).unwrap().diverged.unwrap();
+    assert_eq!((diverged.line, diverged.step), (3, 1));
 }

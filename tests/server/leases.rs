@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use wildcity_twin::store::{Catalog, Keep};
+use wildcity_twin::store::{Catalog, Retention};
 
 use crate::support::{PATIENCE, TestServer, commit_twin_of};
 
@@ -12,7 +12,7 @@ async fn a_version_that_a_session_sees_is_kept() {
     let mut agent = server.driver("a").await;
     let catalog = Catalog::open(server.twins.path()).unwrap();
     commit_twin_of(server.twins.path(), 1.0);
-    let keep = Keep { versions: 1, grace: Duration::ZERO };
+    let keep = Retention { versions: 1, grace: Duration::ZERO };
     for _ in 0..2 {
         assert_eq!(catalog.collect("test", keep, false).unwrap().kept, [1, 2]);
     }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use wildcity_render::Backend;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_session::{Extent, FrameRequest, Recording, ReplayError, Report};
+use wildcity_session::{FrameRequest, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
@@ -22,18 +22,21 @@ pub(crate) fn replay(
     server: &TestServer,
     path: &Path,
     backend: &dyn Backend,
-) -> Result<Report, ReplayError> {
-    let recording = Recording::read(path)?;
+) -> Result<ReplayReport, ReplayError> {
+    let recording = RecordedEpisode::read(path)?;
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let mut open = |version| cache.open(&recording.header.twin, Some(version));
-    recording.replay(&mut open, backend, Extent::FirstDifference, &mut |_| Ok(()))
+    recording.replay(&mut open, backend, ReplayUntil::FirstDifference, &mut |_| Ok(()))
 }
 
 #[tokio::test]
 async fn what_was_recorded_is_rendered_again() {
     let (server, path) = recorded().await;
     let report = replay(&server, &path, &Painter::default()).unwrap();
-    assert_eq!(report, Report { images: 24, changes: vec![], strayed: None, difference: None });
+    assert_eq!(
+        report,
+        ReplayReport { images: 24, changes: vec![], diverged: None, difference: None }
+    );
 }
 
 #[tokio::test]
@@ -76,7 +79,7 @@ async fn damaged_files_are_named_by_line() {
     let lines: Vec<&str> = whole.lines().collect();
     let damaged = |text: &str| {
         std::fs::write(&path, text).unwrap();
-        match Recording::read(&path) {
+        match RecordedEpisode::read(&path) {
             Err(ReplayError::Line { line, reason, .. }) => (line, reason),
             other => panic!("{other:?}"),
         }
@@ -92,7 +95,10 @@ async fn damaged_files_are_named_by_line() {
     assert!(line == 1 && reason.contains('7'), "{reason}");
     let (line, reason) = damaged(&format!("{}\n\"{}\"\n", lines[0], "x".repeat(2 << 20)));
     assert!(line == 2 && reason.contains("longer"), "{reason}");
-    assert!(matches!(Recording::read(Path::new("/nowhere.jsonl")), Err(ReplayError::Read { .. })));
+    assert!(matches!(
+        RecordedEpisode::read(Path::new("/nowhere.jsonl")),
+        Err(ReplayError::Read { .. })
+    ));
     // Without its last line, the episode of a killed server can still be replayed.
     std::fs::write(&path, lines[..lines.len() - 1].join("\n") + "\n").unwrap();
     assert_eq!(replay(&server, &path, &Painter::default()).unwrap().difference, None);

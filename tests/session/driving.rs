@@ -7,9 +7,10 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Frame, Opening, Outputs, RigChoice, Session, SessionError,
+    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Session, SessionError,
+    SessionOptions,
 };
-use wildcity_twin::residency::{Cache, Needed, ResidencyError, Resident};
+use wildcity_twin::residency::{Cache, ResidencyError, Resident, SectionRef};
 
 use crate::source::{Fault, Faulty, Place};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
@@ -46,18 +47,18 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let opening = Opening {
+        let opening = SessionOptions {
             start: Some(wildcity_session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
             deadline,
-            ..Opening::twin("demo", Outputs::colour(Encoding::Raw))
+            ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
         };
         Session::open(self.engine.clone(), name.to_owned(), opening).await
     }
 }
 
 /// Hashes of a frame's images.
-fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
+fn hashes(frame: &Observation) -> Vec<blake3::Hash> {
     frame.images.iter().map(|image| image.hash).collect()
 }
 
@@ -65,12 +66,12 @@ fn hashes(frame: &Frame) -> Vec<blake3::Hash> {
 fn later_section() -> Place {
     let resident = unlimited().open("demo", None).unwrap();
     let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
-    let early: Vec<Needed> = (0..25).flat_map(|k| at(10.0 * f64::from(k))).collect();
+    let early: Vec<SectionRef> = (0..25).flat_map(|k| at(10.0 * f64::from(k))).collect();
     let only_late: Vec<_> = at(250.0).into_iter().filter(|n| !early.contains(n)).collect();
     place(&resident, only_late[0])
 }
 
-fn place(resident: &Resident, Needed { chunk, section }: Needed) -> Place {
+fn place(resident: &Resident, SectionRef { chunk, section }: SectionRef) -> Place {
     let chunk = &resident.version.manifest.chunks[chunk];
     (chunk.cell, chunk.sections[section].block, chunk.sections[section].level)
 }
@@ -78,9 +79,9 @@ fn place(resident: &Resident, Needed { chunk, section }: Needed) -> Place {
 #[tokio::test(flavor = "multi_thread")]
 async fn thirty_metres_a_second_wait_for_nothing_once_under_way() {
     let all = unlimited().open("demo", None).unwrap();
-    let lens = wildcity_twin::residency::Lens { focal_px: 70.0, radius_m: 1.7 };
-    let limit_bytes = all.worst_bytes(lens) * 3 / 2;
-    assert!(limit_bytes < all.whole_bytes() / 2, "else all of it fits");
+    let lens = wildcity_twin::residency::RigExtent { focal_px: 70.0, radius_m: 1.7 };
+    let limit_bytes = all.worst_case_bytes(lens) * 3 / 2;
+    assert!(limit_bytes < all.total_bytes() / 2, "else all of it fits");
     let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
     let mut session = bench.session("a", None).await.unwrap();
     let mut waited = Vec::new();
@@ -150,7 +151,7 @@ async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on(
                             assert!(matches!(error, ResidencyError::Load { .. }), "{error}");
                         }
                         (_, SessionError::Residency(error)) => {
-                            assert!(matches!(error, ResidencyError::Late { .. }), "{error}");
+                            assert!(matches!(error, ResidencyError::TimedOut { .. }), "{error}");
                         }
                         (_, error) => panic!("{error}"),
                     }
@@ -225,7 +226,7 @@ async fn a_session_that_does_not_fit_is_refused_and_one_that_closes_makes_room()
     let all = unlimited().open("demo", None).unwrap();
     let probe = bench(unlimited());
     let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
-    assert!(2 * reserved_bytes < all.whole_bytes());
+    assert!(2 * reserved_bytes < all.total_bytes());
     let bench = bench(Cache::limited(demo().catalog(), Some(2 * reserved_bytes - 1)));
     let first = bench.session("first", None).await.unwrap();
     let refused = bench.session("second", None).await.unwrap_err();

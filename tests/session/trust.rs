@@ -11,8 +11,8 @@ use wildcity_render::cpu::Cpu;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Record, RenderProfile, Rig, Scene};
-use wildcity_session::{Trained, Trust};
-use wildcity_twin::store::{Catalog, NewVersion, Storage};
+use wildcity_session::{TrainingCoverage, Trust};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
 use crate::images::{Image, cpu, render};
 
@@ -24,7 +24,7 @@ struct Pair {
     street: Street,
     world: Scene,
     twin: Scene,
-    trained: Trained,
+    trained: TrainingCoverage,
     cpu: Cpu,
 }
 
@@ -61,14 +61,14 @@ fn far_from_everything_nothing_is_believed() {
     let away = Pose { position_m: DVec3::new(5_000.0, 0.0, 0.0), ..Pose::IDENTITY };
     let view = View::of_rig(&small_rig().cameras, away)[0];
     let clear = vec![1.0; view.camera.pixels()];
-    let Trust { value, outside, low_coverage, .. } = pair.trained.of(&away, &view, &clear);
+    let Trust { value, outside, low_coverage, .. } = pair.trained.trust(&away, &view, &clear);
     assert!(value < 1e-6 && outside == 1.0 && low_coverage == 0.0, "{value} {outside}");
     let on_it = pair.street.trajectory.at_station(30.0);
     let view = View::of_rig(&small_rig().cameras, on_it)[0];
-    let Trust { value, outside, angle_rad, .. } = pair.trained.of(&on_it, &view, &clear);
+    let Trust { value, outside, angle_rad, .. } = pair.trained.trust(&on_it, &view, &clear);
     assert!(value > 0.95 && outside == 0.0 && angle_rad < 0.05, "{value} {outside} {angle_rad}");
     let empty = vec![0.2; view.camera.pixels()];
-    assert_eq!(pair.trained.of(&on_it, &view, &empty).value, 0.0);
+    assert_eq!(pair.trained.trust(&on_it, &view, &empty).value, 0.0);
 }
 
 impl Pair {
@@ -84,7 +84,7 @@ impl Pair {
             let draw = |scene| render(&self.cpu, scene, &RenderProfile::default(), &views);
             for ((world, twin), view) in draw(&self.world).iter().zip(&draw(&self.twin)).zip(&views)
             {
-                let trust = self.trained.of(&world_from_rig, view, &twin.opacity);
+                let trust = self.trained.trust(&world_from_rig, view, &twin.opacity);
                 all.push((share_right(world, twin), trust));
             }
         }
@@ -120,11 +120,11 @@ fn pair() -> Pair {
     let dir = tempfile::tempdir().unwrap();
     let new = NewVersion {
         trajectories: vec![street.trajectory.clone()],
-        storage: Storage { record: Record::F32, levels: false },
+        storage: StorageOptions { record: Record::F32, levels: false },
         ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();
-    let trained = Trained::new(&version.manifest).unwrap();
+    let trained = TrainingCoverage::new(&version.manifest).unwrap();
     Pair { twin: Scene::from_gaussians(&twin), street, world, trained, cpu }
 }
 

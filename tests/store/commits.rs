@@ -4,19 +4,19 @@ use std::collections::BTreeSet;
 
 use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
 use wildcity_twin::store::{
-    Catalog, CellDiff, CellSize, Change, Commit, Kind, NewVersion, Settings, Storage, StoreError,
-    Version,
+    Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
+    Version, VersionChange, VersionSettings,
 };
 
 use crate::scene_files::gaussians;
 use crate::support::{commit, files, street, turn};
 
-const EXACT: Storage = Storage { record: Record::F32, levels: false };
+const EXACT: StorageOptions = StorageOptions { record: Record::F32, levels: false };
 
-/// Settings as `street` has them.
-fn settings() -> Settings {
+/// VersionSettings as `street` has them.
+fn settings() -> VersionSettings {
     let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
-    Settings { profile, rig, trajectories, sky, provenance }
+    VersionSettings { profile, rig, trajectories, sky, provenance }
 }
 
 static EMPTY: Gaussians = Gaussians {
@@ -29,10 +29,10 @@ static EMPTY: Gaussians = Gaussians {
 };
 
 /// A change of cells alone, by `who`.
-fn change(who: &str) -> Change {
+fn change(who: &str) -> VersionChange {
     let mut provenance = settings().provenance;
     provenance.source = who.to_owned();
-    Change { profile: None, rig: None, trajectories: None, sky: None, provenance }
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.
@@ -53,7 +53,7 @@ fn put(commit: &mut Commit, scene: &Gaussians) {
 /// A twin of cells (0, 0), (1, 0) and (2, 0).
 fn three(dir: &tempfile::TempDir) -> (Catalog, Version) {
     let catalog = Catalog::open(dir.path()).unwrap();
-    let mut commit = catalog.begin("street", Kind::Import, EXACT).unwrap();
+    let mut commit = catalog.begin("street", CommitKind::Import, EXACT).unwrap();
     for x in 0..3 {
         put(&mut commit, &cell([x, 0], 1));
     }
@@ -62,7 +62,7 @@ fn three(dir: &tempfile::TempDir) -> (Catalog, Version) {
 }
 
 fn changed(catalog: &Catalog, cells: &[[i32; 2]], seed: u64) -> Commit {
-    let mut commit = catalog.begin("street", Kind::Push, EXACT).unwrap();
+    let mut commit = catalog.begin("street", CommitKind::Push, EXACT).unwrap();
     for &at in cells {
         put(&mut commit, &cell(at, seed));
     }
@@ -77,11 +77,11 @@ fn object(manifest: &Manifest, cell: [i32; 2]) -> &str {
 fn part_by_part_is_the_same_version_as_at_once() {
     let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let scene = gaussians(5_000, 1, 150.0, 3);
-    let storage = Storage::default();
+    let storage = StorageOptions::default();
     let whole = commit(one.path(), NewVersion { storage, ..street(&scene) }).unwrap();
 
     let catalog = Catalog::open(two.path()).unwrap();
-    let mut parts = catalog.begin("street", Kind::Import, storage).unwrap();
+    let mut parts = catalog.begin("street", CommitKind::Import, storage).unwrap();
     let cells: Vec<_> = whole.manifest.chunks.iter().map(|chunk| chunk.cell).collect();
     assert!(cells.len() > 9);
     let mut left_out = 0;
@@ -114,7 +114,7 @@ fn a_dropped_commit_leaves_nothing_and_is_in_nobodys_way() {
     drop(one);
     let mut provenance = settings().provenance;
     provenance.source = "two".into();
-    let second = two.change(1, Change { provenance, ..change("") }).unwrap();
+    let second = two.change(1, VersionChange { provenance, ..change("") }).unwrap();
     assert_eq!(second.number, 2);
     let objects = ["the chunk", "the table", "the manifest", "the record"].len();
     assert_eq!(files(dir.path()).len(), before.len() + objects);
@@ -135,19 +135,19 @@ fn a_change_keeps_every_other_cell() {
     // What the twin would be if it had been put whole.
     let other = tempfile::tempdir().unwrap();
     let mut whole =
-        Catalog::open(other.path()).unwrap().begin("street", Kind::Import, EXACT).unwrap();
+        Catalog::open(other.path()).unwrap().begin("street", CommitKind::Import, EXACT).unwrap();
     for (at, seed) in [([0, 0], 1), ([1, 0], 2), ([2, 0], 1), ([5, -2], 2)] {
         put(&mut whole, &cell(at, seed));
     }
     let provenance = change("push").provenance;
     assert_eq!(
-        whole.replace(None, Settings { provenance, ..settings() }).unwrap().hash,
+        whole.replace(None, VersionSettings { provenance, ..settings() }).unwrap().hash,
         second.hash
     );
 
     let mut profile = RenderProfile::default();
     profile.set("near=0.3").unwrap();
-    let change = Change { profile: Some(profile), ..change("profile") };
+    let change = VersionChange { profile: Some(profile), ..change("profile") };
     let third = changed(&catalog, &[], 0).change(2, change).unwrap();
     assert_eq!(third.manifest.profile, profile);
     assert_eq!(third.manifest.chunks, second.manifest.chunks);
@@ -183,8 +183,8 @@ fn changes_of_other_cells_are_both_in_and_of_the_same_are_refused() {
 }
 
 /// A twin in preparation, whole: cells (0, 0) and (1, 0), and of another profile if told so.
-fn whole(catalog: &Catalog, near: Option<&str>) -> (Commit, Settings) {
-    let mut commit = catalog.begin("street", Kind::Push, EXACT).unwrap();
+fn whole(catalog: &Catalog, near: Option<&str>) -> (Commit, VersionSettings) {
+    let mut commit = catalog.begin("street", CommitKind::Push, EXACT).unwrap();
     for x in 0..2 {
         put(&mut commit, &cell([x, 0], 1));
     }
@@ -201,7 +201,7 @@ fn a_whole_replaces_nothing_that_came_since_its_base() {
     let [(late, settings), (unaware, same)] = [(); 2].map(|()| whole(&catalog, None));
     let mut near = RenderProfile::default();
     near.set("near=0.3").unwrap();
-    let since = Change { profile: Some(near), ..change("since") };
+    let since = VersionChange { profile: Some(near), ..change("since") };
     changed(&catalog, &[[1, 0], [8, 8]], 2).change(1, since).unwrap();
 
     let before = files(dir.path());
@@ -234,7 +234,7 @@ fn the_same_again_from_the_same_base_is_what_was_made_of_it() {
     let (catalog, _) = three(&dir);
     let mut near = RenderProfile::default();
     near.set("near=0.3").unwrap();
-    let again = || Change { profile: Some(near), ..change("one") };
+    let again = || VersionChange { profile: Some(near), ..change("one") };
     let second = changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap();
     assert_eq!(changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap(), second);
     // Others came since, in other cells; in the same cell it is refused.
@@ -291,10 +291,12 @@ fn settings_overlap_too() {
     near.set("near=0.3").unwrap();
     let commits = [(); 2].map(|()| changed(&catalog, &[], 0));
     let [one, two] = commits;
-    one.change(1, Change { profile: Some(near), ..change("one") }).unwrap();
+    one.change(1, VersionChange { profile: Some(near), ..change("one") }).unwrap();
     near.set("near=0.4").unwrap();
-    let said =
-        two.change(1, Change { profile: Some(near), ..change("two") }).unwrap_err().to_string();
+    let said = two
+        .change(1, VersionChange { profile: Some(near), ..change("two") })
+        .unwrap_err()
+        .to_string();
     assert!(said.contains("version 2 has other profile; make"), "{said}");
 }
 
@@ -320,7 +322,7 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
     let before = files(dir.path());
     let mut twice = changed(&catalog, &[[1, 0]], 2);
     let error = twice.put(&cell([1, 0], 3), None, &mut |_, _| {}).unwrap_err();
-    assert!(matches!(error, StoreError::CellTwice { cell: [1, 0], .. }), "{error}");
+    assert!(matches!(error, StoreError::DuplicateCell { cell: [1, 0], .. }), "{error}");
     let said = twice.put(&gaussians(9, 2, 1.0, 1), None, &mut |_, _| {}).unwrap_err().to_string();
     assert_eq!(
         said,
@@ -328,12 +330,12 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
     );
     drop(twice);
 
-    let mut other = catalog.begin("street", Kind::Push, Storage::default()).unwrap();
+    let mut other = catalog.begin("street", CommitKind::Push, StorageOptions::default()).unwrap();
     put(&mut other, &cell([1, 0], 2));
     let said = other.change(1, change("q32")).unwrap_err().to_string();
     assert!(said.starts_with("record is q32, but twin \"street\" has f32"), "{said}");
 
-    let mut other = catalog.begin("street", Kind::Push, EXACT).unwrap();
+    let mut other = catalog.begin("street", CommitKind::Push, EXACT).unwrap();
     put(&mut other, &gaussians(9, 1, 1.0, 1));
     let said = other.change(1, change("degree")).unwrap_err().to_string();
     assert!(said.starts_with("sh_degree is 1, but twin \"street\" has 0"), "{said}");
@@ -341,12 +343,12 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
     let error = changed(&catalog, &[[0, 0]], 2).change(9, change("from")).unwrap_err();
     assert!(matches!(error, StoreError::NoVersion { number: 9, latest: 1, .. }), "{error}");
     let log = Trajectory { name: "log".into(), keyframes: Vec::new() };
-    let change = Change { trajectories: Some(vec![log]), ..change("empty") };
+    let change = VersionChange { trajectories: Some(vec![log]), ..change("empty") };
     let error = changed(&catalog, &[], 2).change(1, change).unwrap_err();
     assert!(matches!(error, StoreError::Trajectory(_)), "{error}");
     assert_eq!(files(dir.path()), before);
     assert!(matches!(
-        catalog.begin("a@b", Kind::Push, EXACT).unwrap_err(),
+        catalog.begin("a@b", CommitKind::Push, EXACT).unwrap_err(),
         StoreError::Name { .. }
     ));
 }
@@ -372,10 +374,10 @@ fn an_old_version_comes_back_under_a_new_number_and_the_log_says_so() {
     assert_eq!(
         told,
         [
-            (1, Kind::Import, None),
-            (2, Kind::Push, Some(1)),
-            (3, Kind::Rollback, Some(1)),
-            (4, Kind::Rollback, Some(2))
+            (1, CommitKind::Import, None),
+            (2, CommitKind::Push, Some(1)),
+            (3, CommitKind::Rollback, Some(1)),
+            (4, CommitKind::Rollback, Some(2))
         ]
     );
     assert_eq!(log[1].commit, Some(id));
@@ -406,7 +408,7 @@ fn a_version_that_lost_an_object_does_not_come_back() {
 fn a_diff_names_cells_and_sizes() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
-    let mut whole = catalog.begin("street", Kind::Import, EXACT).unwrap();
+    let mut whole = catalog.begin("street", CommitKind::Import, EXACT).unwrap();
     put(&mut whole, &cell([1, 0], 1));
     put(&mut whole, &cell([2, 0], 9));
     put(&mut whole, &cell([3, 0], 1));

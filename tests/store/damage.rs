@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 use wildcity_scene::Gaussians;
 use wildcity_scene::RenderProfile;
-use wildcity_twin::residency::{Cache, Eye, Pinned, ResidencyError};
+use wildcity_twin::residency::{Cache, PinnedScene, ResidencyError, Viewpoint};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::scene_files::gaussians;
@@ -57,9 +57,9 @@ impl Twin {
 }
 
 /// Reads all of the twin but its coarse levels.
-fn everything(catalog: Catalog) -> Result<Pinned, ResidencyError> {
+fn everything(catalog: Catalog) -> Result<PinnedScene, ResidencyError> {
     let resident = Cache::new(catalog).open("street", None)?;
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     resident.scene(&[eye], &RenderProfile { tau_px: 0.0, ..RenderProfile::default() })
 }
 

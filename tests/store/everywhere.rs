@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use wildcity_twin::store::{Catalog, Kind, NewVersion, Settings, StoreError, Version};
+use wildcity_twin::store::{Catalog, CommitKind, NewVersion, StoreError, Version, VersionSettings};
 
 use crate::places::{cells_alone, change, commit, everywhere, whole};
 use crate::s3::S3;
@@ -91,7 +91,7 @@ fn the_same_cell_is_refused_and_an_old_version_comes_back() {
         assert_eq!((back.number, &back.hash), (3, &first.hash));
         let kinds: Vec<_> =
             catalog.versions("street").unwrap().iter().map(|entry| entry.kind).collect();
-        assert_eq!(kinds, [Kind::Import, Kind::Push, Kind::Rollback]);
+        assert_eq!(kinds, [CommitKind::Import, CommitKind::Push, CommitKind::Rollback]);
         let diff = catalog.diff("street", 2, 3).unwrap();
         assert_eq!((diff.cells.len(), diff.cells[0].cell, diff.cells[0].after), (1, [3, 3], None));
     });
@@ -150,8 +150,9 @@ fn settings_are_replaced_whole() {
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
-        let version =
-            commit.replace(None, Settings { profile, rig, trajectories, sky, provenance }).unwrap();
+        let version = commit
+            .replace(None, VersionSettings { profile, rig, trajectories, sky, provenance })
+            .unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));
     });

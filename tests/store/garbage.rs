@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use wildcity_twin::store::{Catalog, Keep, StoreError, Sum};
+use wildcity_twin::store::{Catalog, ObjectTotals, Retention, StoreError};
 
 use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
@@ -30,10 +30,10 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
     everywhere(|place| {
         let catalog = twin(place, 5);
         let before = place.objects();
-        let keep = |versions, grace| Keep { versions, grace };
+        let keep = |versions, grace| Retention { versions, grace };
         // Seen, but nothing done.
         let dry = catalog.collect("street", keep(2, NOW), true).unwrap();
-        assert_eq!((&dry.kept[..], dry.removed), (&[4, 5][..], Sum::default()));
+        assert_eq!((&dry.kept[..], dry.removed), (&[4, 5][..], ObjectTotals::default()));
         // Of the first version, which had no cell (3, 3), the manifest and the table.
         assert_eq!(dry.noted.objects, 2 + 2 * OWN);
         assert_eq!(catalog.collect("street", keep(2, NOW), true).unwrap(), dry);
@@ -43,10 +43,10 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
         assert_eq!(place.objects(), before);
         // Not old enough.
         let second = catalog.collect("street", keep(2, DAY), false).unwrap();
-        assert_eq!((second.removed, second.noted), (Sum::default(), dry.noted));
+        assert_eq!((second.removed, second.noted), (ObjectTotals::default(), dry.noted));
         assert_eq!(place.objects(), before);
         let third = catalog.collect("street", keep(2, NOW), false).unwrap();
-        assert_eq!((third.removed, third.noted), (dry.noted, Sum::default()));
+        assert_eq!((third.removed, third.noted), (dry.noted, ObjectTotals::default()));
         assert_eq!(place.objects().len() as u64, before.len() as u64 - dry.noted.objects);
 
         for number in [4, 5] {
@@ -56,14 +56,14 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
             }
         }
         let error = catalog.version("street", Some(2)).unwrap_err();
-        assert!(matches!(error, StoreError::Collected { number: 2, .. }), "{error}");
+        assert!(matches!(error, StoreError::GarbageCollected { number: 2, .. }), "{error}");
         let error = catalog.rollback("street", 3).unwrap_err();
-        assert!(matches!(error, StoreError::Collected { number: 3, .. }), "{error}");
+        assert!(matches!(error, StoreError::GarbageCollected { number: 3, .. }), "{error}");
         let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound(), "{checked:?}");
         assert_eq!(
             (&checked.collected[..], checked.unreferenced),
-            (&[1, 2, 3][..], Sum::default())
+            (&[1, 2, 3][..], ObjectTotals::default())
         );
         // And a killed commit's rest can still be told from it.
         assert_eq!(change(&catalog, [9, 9], 1).change(5, cells_alone()).unwrap().number, 6);
@@ -76,7 +76,7 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
 fn a_version_in_use_stays_however_old() {
     everywhere(|place| {
         let catalog = twin(place, 4);
-        let keep = Keep { versions: 1, grace: NOW };
+        let keep = Retention { versions: 1, grace: NOW };
         let error = catalog.lease("street", 9, "nobody", DAY).unwrap_err();
         assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
         let mut lease = catalog.lease("street", 2, "a test", DAY).unwrap();
@@ -91,7 +91,7 @@ fn a_version_in_use_stays_however_old() {
         let cell = version.manifest.chunks.iter().find(|chunk| chunk.cell == [3, 3]).unwrap();
         catalog.section(&version, cell, &cell.sections[0]).unwrap();
         let error = catalog.version("street", Some(3)).unwrap_err();
-        assert!(matches!(error, StoreError::Collected { .. }), "{error}");
+        assert!(matches!(error, StoreError::GarbageCollected { .. }), "{error}");
         drop(lease);
         let found = catalog.collect("street", keep, false).unwrap();
         assert_eq!((&found.kept[..], found.noted.objects), (&[4][..], OWN));
@@ -102,7 +102,7 @@ fn a_version_in_use_stays_however_old() {
 fn an_object_that_is_put_again_is_no_garbage_any_more() {
     everywhere(|place| {
         let catalog = twin(place, 3);
-        let keep = Keep { versions: 1, grace: NOW };
+        let keep = Retention { versions: 1, grace: NOW };
         catalog.collect("street", keep, false).unwrap();
         // The cell of version 2 comes again, and its object with it.
         let again = change(&catalog, [3, 3], 2).change(3, cells_alone()).unwrap();
@@ -123,7 +123,7 @@ fn a_commit_in_preparation_is_not_disturbed() {
     let catalog = twin(&place, 3);
     // One of a new object, and one of an object that goes meanwhile.
     let (new, old) = (change(&catalog, [5, 5], 7), change(&catalog, [3, 3], 2));
-    let keep = Keep { versions: 1, grace: NOW };
+    let keep = Retention { versions: 1, grace: NOW };
     let removed: u64 = (0..3)
         .map(|_| place.catalog().collect("street", keep, false).unwrap().removed.objects)
         .sum();
@@ -138,7 +138,7 @@ fn a_commit_in_preparation_is_not_disturbed() {
 fn a_version_that_is_leased_while_garbage_waits_to_be_removed_stays() {
     let place = Place::Directory(tempfile::tempdir().unwrap());
     let catalog = twin(&place, 4);
-    let keep = Keep { versions: 1, grace: NOW };
+    let keep = Retention { versions: 1, grace: NOW };
     catalog.collect("street", keep, false).unwrap();
     let turn = turn(&place.twins());
     let (found, lease) = std::thread::scope(|scope| {
@@ -165,12 +165,12 @@ fn a_version_that_is_no_more_is_not_leased() {
         let catalog = twin(place, 3);
         let mut ended = catalog.lease("street", 2, "late", Duration::ZERO).unwrap();
         for _ in 0..2 {
-            catalog.collect("street", Keep { versions: 1, grace: NOW }, false).unwrap();
+            catalog.collect("street", Retention { versions: 1, grace: NOW }, false).unwrap();
         }
         let error = catalog.lease("street", 1, "a test", DAY).unwrap_err();
-        assert!(matches!(error, StoreError::Collected { number: 1, .. }), "{error}");
+        assert!(matches!(error, StoreError::GarbageCollected { number: 1, .. }), "{error}");
         let error = ended.renew().unwrap_err();
-        assert!(matches!(error, StoreError::Collected { number: 2, .. }), "{error}");
+        assert!(matches!(error, StoreError::GarbageCollected { number: 2, .. }), "{error}");
     });
 }
 
@@ -186,7 +186,7 @@ fn what_is_no_name_is_not_looked_for() {
     std::os::unix::fs::symlink("nowhere", outside.join("objects/ab/cd")).unwrap();
     let name = "../outside";
     let errors = [
-        catalog.collect(name, Keep { versions: 1, grace: NOW }, false).unwrap_err(),
+        catalog.collect(name, Retention { versions: 1, grace: NOW }, false).unwrap_err(),
         catalog.fsck(name, &mut |_, _| {}).unwrap_err(),
         catalog.verify(name, &mut |_, _| {}).unwrap_err(),
     ];
@@ -201,7 +201,7 @@ fn a_note_that_could_not_be_read_again_is_not_written() {
         let catalog = twin(place, 1);
         let holder = "x".repeat(16 << 20);
         let error = catalog.lease("street", 1, &holder, DAY).unwrap_err();
-        assert!(matches!(error, StoreError::NoteSize { .. }), "{error}");
+        assert!(matches!(error, StoreError::SideFileSize { .. }), "{error}");
     });
 }
 

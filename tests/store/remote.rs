@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use wildcity_scene::Gaussians;
 use wildcity_twin::store::{
-    CacheSettings, Catalog, NewVersion, Patience, Storage, StoreError, Version,
+    Catalog, DiskCacheSettings, NewVersion, RetryPolicy, StorageOptions, StoreError, Version,
 };
 
 use crate::places::{cells_alone, change};
@@ -13,7 +13,7 @@ use crate::scene_files::gaussians;
 use crate::support::street;
 
 fn commit(catalog: &Catalog, scene: &Gaussians) -> Result<Version, StoreError> {
-    let new = NewVersion { storage: Storage::default(), ..street(scene) };
+    let new = NewVersion { storage: StorageOptions::default(), ..street(scene) };
     catalog.commit(new, &mut |_, _| {})
 }
 
@@ -60,7 +60,7 @@ fn a_record_that_nobody_can_ask_for_is_said_to_be_unknown() {
     s3.fail("PUT", "street/log/", 1, Fault::AnswerLost);
     s3.fail("GET", "street/log/0000000002", 3, Fault::Status(500));
     let error = commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap_err();
-    assert!(matches!(error, StoreError::Unsettled { number: 2, .. }), "{error}");
+    assert!(matches!(error, StoreError::OutcomeUnknown { number: 2, .. }), "{error}");
     // As it happens, it is there, and the same again is the same.
     assert_eq!(commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap().number, 2);
 }
@@ -140,7 +140,7 @@ fn what_the_disk_has_is_not_asked_for() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
     let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
-    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let cache = DiskCacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
     let read_all = |catalog: &Catalog| {
         let version = catalog.version("street", None).unwrap();
         for chunk in &version.manifest.chunks {
@@ -164,7 +164,7 @@ fn what_the_disk_has_is_not_asked_for() {
 fn what_only_the_disk_has_is_lost() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
-    let cache = CacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
+    let cache = DiskCacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
     let catalog = s3.cached(Some(&cache)).unwrap();
     let first = commit(&catalog, &gaussians(500, 0, 50.0, 1)).unwrap();
     commit(&catalog, &gaussians(500, 0, 50.0, 2)).unwrap();
@@ -187,10 +187,10 @@ fn a_section_is_not_waited_for_as_long_as_a_cell() {
     let s3 = S3::start();
     let version = commit(&s3.catalog(), &gaussians(500, 0, 50.0, 1)).unwrap();
     let (section_timeout, section_tries) = (Duration::from_millis(200), 2);
-    let patience = Patience { section_timeout, section_tries, ..Patience::default() };
+    let patience = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
     let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, patience).unwrap();
     let chunk = &version.manifest.chunks[0];
-    assert_eq!(catalog.skim(&version, chunk).unwrap(), chunk.bytes);
+    assert_eq!(catalog.read_and_discard(&version, chunk).unwrap(), chunk.bytes);
     s3.fail("GET", "/objects/", 2, Fault::Silence);
     let began = Instant::now();
     let error = catalog.section(&version, chunk, &chunk.sections[0]).unwrap_err();

@@ -3,8 +3,8 @@ use wildcity_scene::chunk::columns;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
 use wildcity_scene::{Chunk, Scene, Trajectory};
-use wildcity_twin::residency::{Cache, Eye};
-use wildcity_twin::store::{Catalog, Listing, NewVersion, StoreError};
+use wildcity_twin::residency::{Cache, Viewpoint};
+use wildcity_twin::store::{Catalog, NewVersion, StoreError, TwinListing};
 
 use crate::scene_files::gaussians;
 use crate::support::{commit, files, street};
@@ -72,7 +72,7 @@ fn the_same_content_is_the_same_version() {
     let catalog = Catalog::open(one.path()).unwrap();
     assert_eq!(catalog.version("street", Some(1)).unwrap(), first);
     assert_eq!(catalog.version("street", None).unwrap(), other);
-    let listing = Listing { name: "street".into(), number: 2, hash: other.hash };
+    let listing = TwinListing { name: "street".into(), number: 2, hash: other.hash };
     assert_eq!(catalog.twins().unwrap(), [listing]);
 
     let back = commit(one.path(), street(&scene)).unwrap();
@@ -173,7 +173,7 @@ fn a_twin_may_be_empty() {
     let catalog = Catalog::open(dir.path()).unwrap();
     assert_eq!(catalog.version("street", None).unwrap(), version);
     let resident = Cache::new(catalog).open("street", None).unwrap();
-    assert_eq!(resident.whole_bytes(), 0);
-    let eye = Eye { position_m: DVec3::ZERO, focal_px: 1000.0 };
+    assert_eq!(resident.total_bytes(), 0);
+    let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     assert!(resident.scene(&[eye], &version.manifest.profile).unwrap().chunks.is_empty());
 }

@@ -8,7 +8,9 @@ use wildcity_scene::RenderProfile;
 use wildcity_scene::sky::Model;
 use wildcity_twin::ingest;
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{Catalog, Change, Keep, Kind, NewSky, NewVersion, SkyBytes, Storage};
+use wildcity_twin::store::{
+    Catalog, CommitKind, NewSky, NewVersion, Retention, SkyBytes, StorageOptions, VersionChange,
+};
 
 use crate::places::{cells_alone, everywhere};
 use crate::scene_files::{gaussians, safetensors};
@@ -21,12 +23,12 @@ fn sky_bytes(seed: usize) -> SkyBytes {
     SkyBytes { bytes: read.bytes.into(), image: None, sky_from_world: DMat3::IDENTITY }
 }
 
-fn with_sky(change: Option<NewSky>) -> Change {
-    Change { sky: Some(change), ..cells_alone() }
+fn with_sky(change: Option<NewSky>) -> VersionChange {
+    VersionChange { sky: Some(change), ..cells_alone() }
 }
 
 /// The storage of twins by `street`.
-fn storage() -> Storage {
+fn storage() -> StorageOptions {
     street(&gaussians(0, 0, 1.0, 1)).storage
 }
 
@@ -44,11 +46,11 @@ fn a_sky_comes_back_and_versions_share_it() {
 
         // What a change does not name stays; another one takes its place; and none.
         let change = |base, change| {
-            let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+            let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
             commit.change(base, change).unwrap()
         };
         let profile = Some(RenderProfile { near: 0.2, ..RenderProfile::DEFAULT });
-        let second = change(1, Change { profile, ..cells_alone() });
+        let second = change(1, VersionChange { profile, ..cells_alone() });
         assert_eq!(second.manifest.sky, Some(named.clone()));
         let third = change(2, with_sky(put(2)));
         assert_ne!(third.manifest.sky, second.manifest.sky);
@@ -76,7 +78,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         assert!(four.scene(&[], &RenderProfile::DEFAULT).unwrap().sky.is_none());
         let bytes = one.sky().unwrap().bytes() as u64;
         assert!(bytes > 6 * 129 * 129 * 8);
-        assert_eq!(one.whole_bytes(), four.whole_bytes() + bytes);
+        assert_eq!(one.total_bytes(), four.total_bytes() + bytes);
     });
 }
 
@@ -87,7 +89,7 @@ fn garbage_collection_and_fsck_know_it() {
         let scene = gaussians(300, 0, 10.0, 1);
         let put = |seed| Some(NewSky::Put(sky_bytes(seed)));
         catalog.commit(NewVersion { sky: put(1), ..street(&scene) }, &mut |_, _| {}).unwrap();
-        let commit = catalog.begin("street", Kind::Push, storage()).unwrap();
+        let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
         commit.change(1, with_sky(put(2))).unwrap();
         let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound());
@@ -95,7 +97,7 @@ fn garbage_collection_and_fsck_know_it() {
         // Two manifests, a table, a chunk, and two skies.
         assert_eq!(checked.verified.objects, 6);
 
-        let keep = Keep { versions: 1, grace: Duration::ZERO };
+        let keep = Retention { versions: 1, grace: Duration::ZERO };
         catalog.collect("street", keep, false).unwrap();
         let removed = catalog.collect("street", keep, false).unwrap().removed;
         assert_eq!(removed.objects, 2, "a manifest and a sky");

@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::blobs::{Blob, ahead, scene};
-use wildcity_render::compare::drawing::{crop, cut, draw};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::images::{crop_rgba, crop_view, render_images};
 use wildcity_render::reference::Reference;
-use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target, View};
+use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 use wildcity_scene::chunk::{ActiveRecord, column, columns};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::Lens;
@@ -26,7 +26,7 @@ fn case(number: &str) -> &'static Case {
 fn all_hold(backend: &dyn Backend) {
     let outcomes = CASES.iter().map(|case| case.run(backend, false));
     let wrong = outcomes.filter(|outcome| match outcome.verdict {
-        Verdict::Held => outcome.checks == 0 || outcome.strain > 1.0,
+        Verdict::Held => outcome.checks == 0 || outcome.bound_usage > 1.0,
         Verdict::NotRun => !NOT_RUN.contains(&outcome.case),
         Verdict::Missed | Verdict::Refused => true,
     });
@@ -126,7 +126,7 @@ impl Backend for Faulty<'_> {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         let count = self.count.fetch_add(1, Relaxed);
         let (mut scene, mut profile) = (frame.scene.clone(), *frame.profile);
@@ -155,15 +155,15 @@ impl Backend for Faulty<'_> {
                 *position_m = position_m.as_vec3().as_dvec3();
             }),
             Fault::Straight => views.iter_mut().for_each(|view| view.camera.lens = Lens::Pinhole),
-            Fault::Global => views.iter_mut().for_each(|view| view.rolling = None),
+            Fault::Global => views.iter_mut().for_each(|view| view.rolling_shutter = None),
             _ => {}
         }
         if let Fault::Clamp = self.fault {
             let [view] = views[..] else { panic!("one view") };
             let [width, height] = [view.camera.width_px, view.camera.height_px];
-            let wide = crop(view, [-(width as i32), 0], [3 * width, height]);
-            let drawing = draw(self.inner, &scene, &profile, &[wide])?.remove(0);
-            let rgba = cut(&drawing, 3 * width, [width, 0], [width, height]);
+            let wide = crop_view(view, [-(width as i32), 0], [3 * width, height]);
+            let drawing = render_images(self.inner, &scene, &profile, &[wide])?.remove(0);
+            let rgba = crop_rgba(&drawing, 3 * width, [width, 0], [width, height]);
             self.inner.render(frame, targets, finished)?;
             targets[0].rgba.as_mut().unwrap().copy_from_slice(&rgba);
             return Ok(FrameStats::default());
@@ -391,7 +391,7 @@ impl Backend for Refusing {
         &self,
         _: &Frame<'_>,
         _: &mut [Target<'_>],
-        _: Finished<'_>,
+        _: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         Err(self.1.clone())
     }
@@ -404,7 +404,7 @@ fn a_refusal_is_a_limit_of_devices_alone_and_where_a_case_names_it() {
     let verdict = |number: &str, name, error| case(number).run(&Refusing(name, error), false);
     let refused = verdict("T28", "gpu", TOO_MANY);
     assert_eq!(refused.verdict, Verdict::Refused);
-    assert!(refused.told.contains("65535"), "{}", refused.told);
+    assert!(refused.detail.contains("65535"), "{}", refused.detail);
     assert_eq!(verdict("T28", "cpu", TOO_MANY).verdict, Verdict::Missed);
     assert_eq!(verdict("T3", "gpu", TOO_MANY).verdict, Verdict::Missed);
     let lost = RenderError::Device { device: "a card".to_owned(), reason: "lost".to_owned() };
@@ -435,12 +435,13 @@ fn the_table_says_what_was_refused_and_what_was_drawn_instead() {
 #[test]
 fn too_much_is_refused_and_the_next_frame_is_right() {
     // 400,000 tiles of an 10,240 px square times 340 walls are beyond 2^27 pairs.
-    let wall = || Blob { sigma_m: DVec3::splat(1e3), opacity: 0.01, ..Blob::default() };
-    let walls: Vec<Blob> = (0..340).map(|_| wall()).collect();
+    let wall =
+        || GaussianSpec { sigma_m: DVec3::splat(1e3), opacity: 0.01, ..GaussianSpec::default() };
+    let walls: Vec<GaussianSpec> = (0..340).map(|_| wall()).collect();
     let (backend, profile) = (cpu(), RenderProfile::default());
-    let view = ahead([10_240, 10_240], 300.0);
-    let small = ahead([64, 48], 50.0);
-    let walls = scene(&walls);
+    let view = forward_view([10_240, 10_240], 300.0);
+    let small = forward_view([64, 48], 50.0);
+    let walls = scene_of(&walls);
     let fresh = render_one(&backend, &walls, &profile, small);
     let mut opacity = vec![7.0; view.camera.pixels()];
     let target = Target { opacity: Some(&mut opacity), ..Target::default() };
@@ -458,8 +459,9 @@ fn a_pose_turns_and_moves_the_image() {
         position_m: DVec3::new(3.0, 0.0, 0.0),
         rotation: DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2),
     };
-    let view = View { world_from_camera: east, ..ahead([65, 65], 100.0) };
-    let blob = scene(&[Blob { mean_m: DVec3::new(8.0, 0.0, 0.0), ..Blob::default() }]);
+    let view = View { world_from_camera: east, ..forward_view([65, 65], 100.0) };
+    let blob =
+        scene_of(&[GaussianSpec { mean_m: DVec3::new(8.0, 0.0, 0.0), ..GaussianSpec::default() }]);
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &blob, &profile, view);
     agree(&image, &render_one(&Reference, &blob, &profile, view)).unwrap();

@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 use wildcity_generate::CitySettings;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig, Trajectory};
-use wildcity_twin::store::{Catalog, Kind, Settings, Storage};
+use wildcity_twin::store::{Catalog, CommitKind, StorageOptions, VersionSettings};
 
 pub(crate) struct City {
     pub(crate) dir: tempfile::TempDir,
@@ -22,12 +22,13 @@ pub(crate) fn city() -> &'static City {
             CitySettings { seed: 3, length_m: 2_000.0, millions_per_km: 1.0, speed_m_s: 30.0 };
         let dir = tempfile::tempdir().unwrap();
         let catalog = Catalog::open(dir.path()).unwrap();
-        let mut commit = catalog.begin("city", Kind::Import, Storage::default()).unwrap();
+        let mut commit =
+            catalog.begin("city", CommitKind::Import, StorageOptions::default()).unwrap();
         for cell in wildcity_generate::city(&settings).unwrap() {
             commit.put(&cell.gaussians, None, &mut |_, _| {}).unwrap();
         }
         let drive = wildcity_generate::city_drive(&settings).unwrap();
-        let settings = Settings {
+        let settings = VersionSettings {
             profile: RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT },
             rig: Rig::preset("vehicle6"),
             trajectories: vec![drive.clone()],

@@ -8,7 +8,7 @@ use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
-use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 /// The best device of this machine.
 pub(crate) fn gpu() -> Watched {
@@ -75,15 +75,15 @@ impl Backend for Watched {
         self.deref().threads()
     }
 
-    fn frames_at_once(&self) -> usize {
-        self.deref().frames_at_once()
+    fn frames_in_flight(&self) -> usize {
+        self.deref().frames_in_flight()
     }
 
     fn render(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.deref().render(frame, targets, finished)
     }

@@ -6,8 +6,8 @@ use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::{Backend, View};
 use wildcity_scene::{RenderProfile, Scene};
 
-pub(crate) use wildcity_render::compare::drawing::{
-    Drawing as Image, agree, draw as try_render, look, max_difference,
+pub(crate) use wildcity_render::compare::images::{
+    RenderedImage as Image, agree, max_difference, render_images as try_render, view_along,
 };
 
 /// The cpu backend on all cores.

@@ -1,10 +1,10 @@
 //! A camera of every model, and what each must show.
 
 use glam::{DQuat, DVec2, DVec3};
-use wildcity_render::compare::blobs::{Blob, scene};
-use wildcity_render::compare::points::centroid;
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
-use wildcity_render::{Backend, Rolling, View};
+use wildcity_render::{Backend, RollingShutter, View};
 use wildcity_scene::geometry::camera::{
     Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Rolls, Windshield,
     WindshieldReference,
@@ -12,7 +12,7 @@ use wildcity_scene::geometry::camera::{
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
 
-use crate::images::{look, psnr, render_one};
+use crate::images::{psnr, render_one, view_along};
 use crate::streets::street;
 
 /// A camera of each model at moderate distortion, 160 x 100 px, and one bent windshield.
@@ -56,7 +56,7 @@ pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
 /// A street, and where a camera stands in it.
 pub(crate) fn street_scene() -> (Scene, Pose) {
     let at = DVec3::new(0.4, 0.0, 20.0);
-    let pose = look([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
+    let pose = view_along([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
     (Scene::from_gaussians(&street(20_000, 1, 31)), pose)
 }
 
@@ -66,8 +66,8 @@ pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
         position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
         rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
     };
-    let rolling = Some(Rolling { direction, world_from_camera_first });
-    View { camera, world_from_camera: pose, rolling }
+    let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first });
+    View { camera, world_from_camera: pose, rolling_shutter }
 }
 
 /// A camera to the side at 30 m/s, whose columns are exposed in 100 ms against the way that things pass: what
@@ -75,8 +75,9 @@ pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
 pub(crate) fn passing() -> View {
     let camera = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let first = Pose { position_m: DVec3::new(-3.0, 0.0, 0.0), ..Pose::IDENTITY };
-    let rolling = Rolling { direction: Rolls::LeftToRight, world_from_camera_first: first };
-    View { rolling: Some(rolling), ..View::new(camera, Pose::IDENTITY) }
+    let rolling_shutter =
+        RollingShutter { direction: Rolls::LeftToRight, world_from_camera_first: first };
+    View { rolling_shutter: Some(rolling_shutter), ..View::new(camera, Pose::IDENTITY) }
 }
 
 /// Of small opaque balls on a wall 2 m ahead, so far apart, each is drawn alone and compared; returns how
@@ -93,9 +94,9 @@ pub(crate) fn lands(backend: &dyn Backend, name: &str, camera: Camera, apart_m: 
         if at_px.min(camera.size_px() - at_px).min_element() <= 5.0 {
             continue;
         }
-        let ball = Blob { mean_m, sigma_m: DVec3::splat(0.003), ..Blob::default() };
+        let ball = GaussianSpec { mean_m, sigma_m: DVec3::splat(0.003), ..GaussianSpec::default() };
         let view = View::new(camera, Pose::IDENTITY);
-        let image = render_one(backend, &scene(&[ball]), &fine, view);
+        let image = render_one(backend, &scene_of(&[ball]), &fine, view);
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
         assert!(off_px < 0.1, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());

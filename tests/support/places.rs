@@ -5,14 +5,16 @@
 use std::path::PathBuf;
 
 use wildcity_scene::Gaussians;
-use wildcity_twin::store::{Catalog, Change, Commit, Kind, NewVersion, Storage, Version};
+use wildcity_twin::store::{
+    Catalog, Commit, CommitKind, NewVersion, StorageOptions, Version, VersionChange,
+};
 
 use crate::s3::{S3, keys};
 use crate::scene_files::gaussians;
 use crate::support::{files, street};
 
 pub(crate) fn whole(scene: &Gaussians) -> NewVersion<'_> {
-    NewVersion { storage: Storage::default(), ..street(scene) }
+    NewVersion { storage: StorageOptions::default(), ..street(scene) }
 }
 
 pub(crate) enum Place {
@@ -57,12 +59,12 @@ pub(crate) fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
         mean_m[0] += 64.0 * f64::from(cell[0]);
         mean_m[1] += 64.0 * f64::from(cell[1]);
     }
-    let mut commit = catalog.begin("street", Kind::Push, Storage::default()).unwrap();
+    let mut commit = catalog.begin("street", CommitKind::Push, StorageOptions::default()).unwrap();
     commit.put(&scene, None, &mut |_, _| {}).unwrap();
     commit
 }
 
-pub(crate) fn cells_alone() -> Change {
+pub(crate) fn cells_alone() -> VersionChange {
     let provenance = street(&gaussians(0, 0, 1.0, 0)).provenance;
-    Change { profile: None, rig: None, trajectories: None, sky: None, provenance }
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use wildcity_client::{Golden, HttpClient, NewPush, Push, PushFile};
+use wildcity_client::{ConnectOptions, HttpClient, NewPush, PreviewRequest, Push, PushFile};
 use wildcity_scene::Gaussians;
 
 use crate::scene_files::{self, inria_columns, ply};
@@ -64,7 +64,7 @@ pub(crate) async fn get(server: &TestServer, path: &str) -> Reply {
 }
 
 pub(crate) fn client(server: &TestServer) -> HttpClient {
-    HttpClient::new(&format!("http://{}", server.address()), None).unwrap()
+    HttpClient::new(&format!("http://{}", server.address()), &ConnectOptions::default()).unwrap()
 }
 
 /// Writes Gaussians as a PLY file of INRIA's.
@@ -88,7 +88,7 @@ pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
         levels: true,
         profile: Vec::new(),
         note: None,
-        golden: Golden::default(),
+        preview: PreviewRequest::default(),
     }
 }
 
@@ -105,7 +105,7 @@ pub(crate) async fn push(
     let mut asked = push_of(&[&upload.id]);
     change(&mut asked);
     let begun = client.push("test", &asked).await.unwrap();
-    client.wait(begun, &mut |_| {}).await.unwrap()
+    client.wait_for_push(begun, &mut |_| {}).await.unwrap()
 }
 
 /// Gaussians in one cell, about its centre.

@@ -11,7 +11,7 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_scene::{Record, RenderProfile, Rig};
 use wildcity_twin::residency::{Cache, Resident};
-use wildcity_twin::store::{Catalog, NewVersion, Storage};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
 /// Two cameras of a twin whose levels are seen: a street of 40 m, 30,000 Gaussians.
 pub(crate) fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Arc<Resident> {
@@ -31,7 +31,7 @@ pub(crate) fn commit_reaching(
         profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
-        storage: Storage { record: Record::F32, levels: true },
+        storage: StorageOptions { record: Record::F32, levels: true },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

@@ -18,7 +18,7 @@ use object_store::aws::AmazonS3Builder;
 use object_store::{ObjectStore, RetryConfig};
 use s3s::auth::SimpleAuth;
 use s3s::service::{S3Service, S3ServiceBuilder};
-use wildcity_twin::store::{CacheSettings, Catalog, Patience, StoreError};
+use wildcity_twin::store::{Catalog, DiskCacheSettings, RetryPolicy, StoreError};
 
 const KEYS: [&str; 2] = ["test", "secret"];
 const BUCKET: &str = "bucket";
@@ -114,7 +114,7 @@ impl S3 {
         self.cached(None).unwrap()
     }
 
-    pub(crate) fn cached(&self, cache: Option<&CacheSettings>) -> Result<Catalog, StoreError> {
+    pub(crate) fn cached(&self, cache: Option<&DiskCacheSettings>) -> Result<Catalog, StoreError> {
         Catalog::over(self.store(), &Self::url(), "twins", cache, quick())
     }
 
@@ -130,9 +130,9 @@ impl S3 {
 }
 
 /// The patience of tests.
-pub(crate) fn quick() -> Patience {
+pub(crate) fn quick() -> RetryPolicy {
     let (timeout, backoff) = (Duration::from_secs(3), Duration::from_millis(10));
-    Patience { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
+    RetryPolicy { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
 }
 
 /// All files below a folder that are objects of the server: it keeps notes of its own beside them.

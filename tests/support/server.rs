@@ -16,7 +16,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Bytes, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
-use wildcity_render::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::Gaussians;
 use wildcity_scene::ProfileChanges;
 use wildcity_scene::geometry::camera::Pinhole;
@@ -68,7 +68,7 @@ impl Backend for Painter {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         self.begun.fetch_add(1, Ordering::SeqCst);

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use wildcity_scene::Chunk;
 use wildcity_scene::manifest::{ChunkEntry, Section};
-use wildcity_twin::residency::Source;
+use wildcity_twin::residency::SectionSource;
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::streaming::PATIENCE;
@@ -82,7 +82,7 @@ impl Faulty {
     }
 }
 
-impl Source for Faulty {
+impl SectionSource for Faulty {
     fn section(
         &self,
         version: &Version,

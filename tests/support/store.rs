@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Record};
-use wildcity_twin::store::{Catalog, NewVersion, Storage, StoreError, Version};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 pub(crate) fn street(gaussians: &Gaussians) -> NewVersion<'_> {
-    let storage = Storage { record: Record::F32, levels: false };
+    let storage = StorageOptions { record: Record::F32, levels: false };
     let provenance = Provenance::of("test".into());
     NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }

@@ -12,10 +12,10 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
-use wildcity_twin::residency::{Cache, Eye, Needed, Resident};
+use wildcity_twin::residency::{Cache, Resident, SectionRef, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, Version};
 
-use crate::images::{cpu, look, render};
+use crate::images::{cpu, render, view_along};
 
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -64,11 +64,14 @@ pub(crate) fn views(world_from_rig: Pose) -> [View; 2] {
     let at = world_from_rig.position_m + DVec3::Z * 1.6;
     let forward = world_from_rig.rotation * DVec3::X;
     let left = world_from_rig.rotation * DVec3::Y;
-    [look([96, 64], 70.0, at, forward, -DVec3::Z), look([64, 64], 40.0, at, left, -DVec3::Z)]
+    [
+        view_along([96, 64], 70.0, at, forward, -DVec3::Z),
+        view_along([64, 64], 40.0, at, left, -DVec3::Z),
+    ]
 }
 
-pub(crate) fn eyes(views: &[View]) -> Vec<Eye> {
-    let eye = |view: &View| Eye {
+pub(crate) fn eyes(views: &[View]) -> Vec<Viewpoint> {
+    let eye = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };
@@ -82,9 +85,9 @@ pub(crate) fn pixels(scene: &Scene, world_from_rig: Pose) -> Vec<Vec<u8>> {
 }
 
 /// Bytes of memory that sections take.
-pub(crate) fn bytes(resident: &Resident, needed: &[Needed]) -> u64 {
+pub(crate) fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     let manifest = &resident.version.manifest;
-    let of = |n: &Needed| {
+    let of = |n: &SectionRef| {
         let count = manifest.chunks[n.chunk].sections[n.section].count;
         Chunk::bytes_of(manifest.sh_degree, count.into())
     };

@@ -7,7 +7,7 @@ use wildcity_generate::StreetSettings;
 use wildcity_render::View;
 use wildcity_scene::{Gaussians, Rig, sh};
 
-use crate::images::look;
+use crate::images::view_along;
 use crate::scene_files::Random;
 
 /// `n` Gaussians of a road, two facades and clutter along +z, y down (a camera's own axes).
@@ -45,7 +45,7 @@ pub(crate) fn turning_views() -> Vec<View> {
         .map(|i| {
             let yaw = f64::from(i);
             let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
-            look([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
+            view_along([150 + 7 * i, 90], 110.0, DVec3::new(0.0, 0.0, 30.0), forward, DVec3::Y)
         })
         .collect()
 }
@@ -54,9 +54,9 @@ pub(crate) fn turning_views() -> Vec<View> {
 pub(crate) fn street_views() -> [View; 3] {
     let at = DVec3::new(0.4, 0.0, 20.0);
     [
-        look([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
-        look([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
-        look([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
+        view_along([200, 131], 240.0, at, DVec3::new(0.1, 0.02, 1.0), DVec3::Y),
+        view_along([131, 100], 90.0, at, DVec3::new(1.0, 0.1, 0.3), DVec3::Y),
+        view_along([97, 64], 60.0, at, DVec3::new(-0.4, 0.0, -1.0), DVec3::new(0.2, 1.0, 0.0)),
     ]
 }
 

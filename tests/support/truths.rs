@@ -11,7 +11,7 @@ use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::ingest;
 
 use crate::data::real;
-use crate::images::look;
+use crate::images::view_along;
 
 /// Somebody else's image, and what it was made of.
 pub(crate) struct Truth {
@@ -33,7 +33,7 @@ pub(crate) fn gsplat() -> Option<Truth> {
     let at = DVec3::new(0.123, 0.456, -8.0);
     let view = View {
         camera: Camera::ideal(width_px, height_px, pinhole),
-        ..look([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
+        ..view_along([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
     };
     let rgba = out.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
     let rgba = rgba.collect();

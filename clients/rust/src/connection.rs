@@ -1,74 +1,120 @@
-//! One WebSocket: a message out, a message in, each with a limit and a time-out.
+//! One WebSocket: sends a message and receives its answer, with size limits and time limits.
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::handshake::client::Request as UpgradeRequest;
 use tokio_tungstenite::tungstenite::http::HeaderValue;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Bytes, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async_with_config};
+use tokio_tungstenite::{
+    Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config,
+};
 
 use wildcity_protocol::PROTOCOL;
+use wildcity_protocol::limits::{HELLO_TIMEOUT, OBSERVATION_BYTES};
 use wildcity_protocol::message::{Answer, Request};
 
-use super::error::ClientError;
-use super::observation::Observation;
+use crate::error::ClientError;
+use crate::observation::Observation;
+use crate::options::ConnectOptions;
+use crate::tls;
+
+/// A server's address, with all that is needed to connect to it again.
+#[derive(Clone)]
+pub(crate) struct Endpoint {
+    url: String,
+    upgrade: UpgradeRequest,
+    connector: Connector,
+}
 
 #[derive(Debug)]
-pub(super) struct Connection {
+pub(crate) struct Connection {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
 }
 
-/// An answer that is not an error.
+/// A message from the server.
 #[derive(Debug)]
-pub(super) enum Incoming {
+pub(crate) enum Incoming {
     Answer(Answer),
     Observation(Box<Observation>),
 }
 
-impl Connection {
-    /// Connects, with a token for a server that has tokens.
-    pub(super) async fn open(url: &str, token: Option<&str>) -> Result<Self, ClientError> {
+impl Endpoint {
+    /// Checks the address and the options; nothing is sent yet.
+    pub(crate) fn new(url: &str, options: &ConnectOptions) -> Result<Self, ClientError> {
         let failed = |reason: String| ClientError::Connect { url: url.to_owned(), reason };
-        let mut request = url.into_client_request().map_err(|e| failed(e.to_string()))?;
-        let subprotocol = HeaderValue::from_static(PROTOCOL);
-        request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
-        if let Some(token) = token {
-            let bearer = HeaderValue::try_from(format!("Bearer {token}"));
-            let bearer = bearer.map_err(|_| failed("no header may have that token".to_owned()))?;
-            request.headers_mut().insert("Authorization", bearer);
+        let mut upgrade = url.into_client_request().map_err(|error| failed(error.to_string()))?;
+
+        let headers = upgrade.headers_mut();
+        headers.insert("Sec-WebSocket-Protocol", HeaderValue::from_static(PROTOCOL));
+        if let Some(token) = &options.token {
+            let mut bearer = HeaderValue::try_from(format!("Bearer {token}")).map_err(|_| {
+                failed("the token has a character that an HTTP header cannot carry".to_owned())
+            })?;
+            bearer.set_sensitive(true);
+            headers.insert("Authorization", bearer);
         }
-        let limits = WebSocketConfig::default()
-            .max_message_size(Some(wildcity_protocol::limits::OBSERVATION_BYTES))
-            .max_frame_size(Some(wildcity_protocol::limits::OBSERVATION_BYTES));
-        // Lock step on TCP: a request must not wait for the acknowledgement of the last one.
-        let without_delay = true;
-        let connecting = connect_async_with_config(request, Some(limits), without_delay);
-        match timeout(wildcity_protocol::limits::HELLO_TIMEOUT, connecting).await {
-            Ok(Ok((socket, _))) => Ok(Self { socket }),
-            Ok(Err(error)) => Err(failed(error.to_string())),
-            Err(_) => Err(failed(format!(
-                "no answer within {:?}",
-                wildcity_protocol::limits::HELLO_TIMEOUT
-            ))),
-        }
+
+        let connector = if upgrade.uri().scheme_str() == Some("wss") {
+            let config = tls::client_config(&options.root_certificates_pem).map_err(failed)?;
+            Connector::Rustls(Arc::new(config))
+        } else {
+            Connector::Plain
+        };
+        Ok(Self { url: url.to_owned(), upgrade, connector })
     }
 
-    /// Sends a request and gives its answer, which must bear the same number.
-    pub(super) async fn exchange(
+    /// Opens a connection. Fails after [`HELLO_TIMEOUT`].
+    pub(crate) async fn connect(&self) -> Result<Connection, ClientError> {
+        let failed = |reason: String| ClientError::Connect { url: self.url.clone(), reason };
+        let limits = WebSocketConfig::default()
+            .max_message_size(Some(OBSERVATION_BYTES))
+            .max_frame_size(Some(OBSERVATION_BYTES));
+        // Sets TCP_NODELAY: in lock step a request must not wait for the acknowledgement of the one before.
+        let no_delay = true;
+        let connecting = connect_async_tls_with_config(
+            self.upgrade.clone(),
+            Some(limits),
+            no_delay,
+            Some(self.connector.clone()),
+        );
+        match timeout(HELLO_TIMEOUT, connecting).await {
+            Ok(Ok((socket, _response))) => Ok(Connection { socket }),
+            Ok(Err(error)) => Err(failed(error.to_string())),
+            Err(_) => Err(failed(format!("no answer within {HELLO_TIMEOUT:?}"))),
+        }
+    }
+}
+
+/// Hides the token, which is in the request.
+impl fmt::Debug for Endpoint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Endpoint").field("url", &self.url).finish_non_exhaustive()
+    }
+}
+
+impl Connection {
+    /// Sends a request and returns its answer, which must have the same number.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if the answer is an error; otherwise the connection cannot be used again.
+    pub(crate) async fn exchange(
         &mut self,
         request: &Request,
         seq: u64,
-        patience: Duration,
+        time_limit: Duration,
     ) -> Result<Incoming, ClientError> {
         let text = serde_json::to_string(request).map_err(ClientError::Request)?;
-        let both_ways = async {
+        let send_and_receive = async {
             let sent = self.socket.send(Message::text(text)).await;
-            // A server that closes says why first, and that outlives the failure to send.
+            // A server that closes the connection says why before it does. That message can be read even
+            // after a failed send, and says more than the failure.
             let answer = self.receive().await;
             match sent {
                 Err(error) if matches!(answer, Err(ClientError::Disconnected(_))) => {
@@ -77,18 +123,19 @@ impl Connection {
                 _ => answer,
             }
         };
-        let incoming =
-            timeout(patience, both_ways).await.map_err(|_| ClientError::TimedOut(patience))??;
-        let answered = incoming.seq();
+        let incoming = timeout(time_limit, send_and_receive)
+            .await
+            .map_err(|_| ClientError::TimedOut(time_limit))??;
+        let answered_seq = incoming.seq();
         match incoming {
-            // A request that could not be read has no number to answer with.
-            Incoming::Answer(Answer::Error { seq: of, code, message, field, fatal })
-                if of.is_none_or(|of| of == seq) =>
+            // An error has no number if the server could not read the request.
+            Incoming::Answer(Answer::Error { seq: error_seq, code, message, field, fatal })
+                if error_seq.is_none_or(|error_seq| error_seq == seq) =>
             {
                 Err(ClientError::Refused { code, message, field, fatal })
             }
-            incoming if answered == Some(seq) => Ok(incoming),
-            _ => Err(ClientError::SeqMismatch { expected: seq, got: answered }),
+            incoming if answered_seq == Some(seq) => Ok(incoming),
+            _ => Err(ClientError::SeqMismatch { expected: seq, got: answered_seq }),
         }
     }
 
@@ -96,17 +143,20 @@ impl Connection {
         loop {
             match self.socket.next().await {
                 Some(Ok(Message::Text(text))) => {
-                    return Ok(Incoming::Answer(
-                        serde_json::from_str(&text).map_err(ClientError::Answer)?,
-                    ));
+                    let answer = serde_json::from_str(&text).map_err(ClientError::Answer)?;
+                    return Ok(Incoming::Answer(answer));
                 }
                 Some(Ok(Message::Binary(frame))) => return decode(frame),
                 Some(Ok(Message::Close(Some(close)))) => {
-                    let reason = format!("the server closed: {} {}", close.code, close.reason);
+                    let reason = format!(
+                        "the server closed the connection: {} {}",
+                        close.code, close.reason
+                    );
                     return Err(ClientError::Disconnected(reason));
                 }
                 Some(Ok(Message::Close(None))) | None => {
-                    return Err(ClientError::Disconnected("the server closed".into()));
+                    let reason = "the server closed the connection".to_owned();
+                    return Err(ClientError::Disconnected(reason));
                 }
                 Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => {}
                 Some(Err(error)) => return Err(ClientError::Disconnected(error.to_string())),
@@ -116,11 +166,12 @@ impl Connection {
 }
 
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
-    let seen = Observation::decode(frame).map_err(ClientError::Frame)?;
-    Ok(Incoming::Observation(Box::new(seen)))
+    let observation = Observation::decode(frame).map_err(ClientError::Frame)?;
+    Ok(Incoming::Observation(Box::new(observation)))
 }
 
 impl Incoming {
+    /// Number of the request that this message answers.
     fn seq(&self) -> Option<u64> {
         match self {
             Self::Observation(observation) => Some(observation.metadata().seq),
@@ -137,7 +188,7 @@ impl Incoming {
     }
 }
 
-/// Short, for messages.
+/// A short form for error messages.
 impl fmt::Display for Incoming {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

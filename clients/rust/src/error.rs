@@ -1,4 +1,4 @@
-//! What can go wrong between a client and its server.
+//! Errors of the session client.
 
 use std::time::Duration;
 
@@ -6,114 +6,115 @@ use safetensors::SafeTensorError;
 
 use wildcity_protocol::error::Code;
 
-/// Why a call failed.
+/// Why a call of the session client failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// There is no connection to be had.
+    /// The client could not connect.
     #[error("cannot connect to {url}: {reason}")]
     Connect {
-        /// Where.
+        /// The address.
         url: String,
-        /// Why not.
+        /// The cause.
         reason: String,
     },
-    /// The server refused the request; nothing changed, and it can be sent again.
+    /// The server refused the request. Nothing changed, and the request can be sent again.
     #[error("refused, {code:?}: {message}")]
     Refused {
         /// What went wrong.
         code: Code,
-        /// For people: what, and how to fix it.
+        /// What went wrong and how to fix it, in words.
         message: String,
-        /// The field at fault, as `pose.q[2]`.
+        /// The field at fault, for example `pose.q[2]`.
         field: Option<String>,
-        /// Whether the connection ended with it.
+        /// Whether the server closed the connection after this error.
         fatal: bool,
     },
-    /// No answer within the time set; the connection was given up.
+    /// No answer came within the time limit. The client closed the connection.
     #[error("no answer within {0:?}")]
     TimedOut(Duration),
-    /// The connection is gone; `reconnect` may continue the session.
+    /// The connection is lost. `reconnect` may continue the session.
     #[error("disconnected: {0}")]
     Disconnected(String),
-    /// The server answered something else; the connection was given up.
+    /// The server sent another kind of answer. The client closed the connection.
     #[error("expected {expected}, got {got}")]
     UnexpectedAnswer {
-        /// What the protocol asks for.
+        /// The kind of answer that the protocol requires.
         expected: &'static str,
-        /// What came.
+        /// The answer that came.
         got: String,
     },
-    /// The answer belongs to another request; the connection was given up.
+    /// The answer has the number of another request. The client closed the connection.
     #[error("expected an answer to request {expected}, got one to {got:?}")]
     SeqMismatch {
-        /// The request's number.
+        /// Number of the request.
         expected: u64,
-        /// The answer's.
+        /// Number of the answer.
         got: Option<u64>,
     },
     /// The request cannot be written as JSON.
     #[error("cannot write the request: {0}")]
     Request(serde_json::Error),
-    /// A text frame is no answer; the connection was given up.
+    /// A text frame is not an answer. The client closed the connection.
     #[error("cannot read an answer: {0}")]
     Answer(serde_json::Error),
-    /// A binary frame is no observation; the connection was given up.
+    /// A binary frame is not an observation. The client closed the connection.
     #[error("cannot read an observation: {0}")]
     Frame(FrameError),
 }
 
-/// Why a binary frame is not an observation.
+/// Why a binary frame is not a valid observation.
 #[derive(Debug, thiserror::Error)]
 pub enum FrameError {
-    /// The header is longer than any honest one.
+    /// The header is longer than the client accepts.
     #[error("the header is {bytes} bytes; at most {limit} are accepted")]
     HeaderTooLong {
-        /// What the frame says.
+        /// Header length in the frame.
         bytes: u64,
-        /// What is accepted.
+        /// Largest header length that the client accepts.
         limit: u64,
     },
-    /// Not safetensors: truncated, no JSON, tensors that overlap or reach beyond the end.
+    /// The frame is not in safetensors layout: it is truncated, its header is not JSON, or tensors overlap
+    /// or reach beyond the end.
     #[error("not in safetensors layout: {0}")]
     Layout(SafeTensorError),
     /// `__metadata__` has no `observation`.
     #[error("the header's __metadata__ has no observation")]
     NoObservation,
-    /// `__metadata__.observation` is not what the protocol says.
+    /// `__metadata__.observation` is not the JSON object that the protocol defines.
     #[error("cannot read __metadata__.observation: {0}")]
     Observation(serde_json::Error),
-    /// A tensor is missing.
+    /// A tensor that the metadata names is missing.
     #[error("there is no tensor {name:?}")]
     Missing {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
     },
-    /// A tensor has another type or shape than the observation says.
+    /// A tensor has another type or shape than the metadata requires.
     #[error("tensor {name:?} is {found}; expected {expected}")]
     Tensor {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
         /// Its type and shape.
         found: String,
-        /// The type and shape that the protocol asks for.
+        /// The type and shape that the metadata requires.
         expected: String,
     },
     /// A JPEG or PNG file cannot be decoded.
-    #[error("image {name:?}: {cause}")]
+    #[error("image {name:?} cannot be decoded: {reason}")]
     Image {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
-        /// What the decoder says.
-        cause: image::ImageError,
+        /// The decoder's error.
+        reason: String,
     },
-    /// Pixels, or hashes, do not have the hash that the observation names.
+    /// Pixels, or the images' hashes, do not have the hash that the metadata names.
     #[error("{name:?} hashes to {found}, not to {expected}")]
     Hash {
-        /// A tensor, or `frame_hash`.
+        /// Name of a tensor, or `frame_hash`.
         name: String,
-        /// BLAKE3 of what came, in hex.
+        /// BLAKE3 of the received data, in hex.
         found: String,
-        /// BLAKE3 that the observation names, in hex.
+        /// BLAKE3 that the metadata names, in hex.
         expected: String,
     },
 }

@@ -1,243 +1,294 @@
-//! The client of what HTTP carries: uploads, pushes, versions.
+//! The HTTP client: pushes and versions. Uploads are in `upload`.
 //!
-//! A connection per request: there are few, and each may be the one that a broken network cuts.
+//! Each request opens a connection of its own. There are few of them, and a connection that is kept open may
+//! be the one that a broken network cuts.
 
+use std::error::Error;
+use std::fmt::{self, Display};
 use std::time::Duration;
 
-use bytes::Bytes;
-use http_body_util::combinators::UnsyncBoxBody;
-use http_body_util::{BodyExt as _, Full, Limited};
-use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST};
-use hyper::{Method, Request, StatusCode};
-use hyper_util::rt::TokioIo;
-use serde::Serialize;
+use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
+use reqwest::redirect::Policy;
+use reqwest::{Method, RequestBuilder, StatusCode, Url};
 use serde::de::DeserializeOwned;
-use tokio::net::TcpStream;
-use tokio::time::timeout;
+use serde::{Deserialize, Serialize};
 
-use crate::limits;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::http::{NewPush, Push, PushState, Refusal, Rollback};
 
-/// A server, and the token for it.
+use crate::limits;
+use crate::options::ConnectOptions;
+use crate::tls;
+
+/// Uploads scenes to a server and publishes them as versions of a twin.
+///
+/// ```no_run
+/// use std::path::Path;
+/// use wildcity_client::{ConnectOptions, HttpClient};
+///
+/// # async fn upload() -> Result<(), wildcity_client::HttpError> {
+/// let options = ConnectOptions::with_token(std::env::var("WILDCITY_TOKEN").ok());
+/// let client = HttpClient::new("http://127.0.0.1:8080", &options)?;
+/// let mut progress = |sent, total| eprintln!("{sent} of {total} bytes");
+/// let upload = client.upload(Path::new("street.ply"), &mut progress).await?;
+/// println!("{}", upload.id);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone)]
 pub struct HttpClient {
-    /// `host:port`.
-    authority: String,
-    token: Option<String>,
+    /// The server's address, without a path.
+    server: Url,
+    http: reqwest::Client,
 }
 
-/// Why a request failed.
+/// Why a call of the HTTP client failed.
 #[derive(Debug, thiserror::Error)]
 pub enum HttpError {
-    /// Not the address of a server.
-    #[error("{url:?} is not a server: expected http://HOST:PORT")]
+    /// The text is not the address of a server.
+    #[error("{url:?} is not a server: expected http://HOST:PORT or https://HOST:PORT")]
     Url {
-        /// What was given.
+        /// The text.
         url: String,
     },
-    /// The token cannot stand in a header.
-    #[error("the token has a character that no header may have")]
+    /// The token cannot be sent.
+    #[error("the token has a character that an HTTP header cannot carry")]
     Token,
-    /// Nobody answers, or not to the end.
-    #[error("no answer from {server}: {reason}")]
-    Lost {
-        /// The server.
-        server: String,
-        /// Why not.
+    /// TLS cannot be set up.
+    #[error("cannot set up TLS: {reason}")]
+    Tls {
+        /// The cause.
         reason: String,
     },
-    /// The server refuses.
+    /// The server did not answer, or its answer was cut off.
+    #[error("no answer from {server}: {reason}")]
+    NoAnswer {
+        /// The server.
+        server: String,
+        /// The cause.
+        reason: String,
+    },
+    /// The server refused the request.
     #[error("refused, {status}: {message}")]
     Refused {
-        /// As HTTP counts.
+        /// HTTP status.
         status: u16,
-        /// What went wrong; none if the answer is not of this protocol.
+        /// What went wrong; `None` if the answer is not of this protocol.
         code: Option<Code>,
-        /// For people: what, and how to fix it.
+        /// What went wrong and how to fix it, in words.
         message: String,
-        /// The cells at fault, as (x, y), where cells are.
+        /// The cells at fault, as (x, y), if the error concerns cells.
         cells: Vec<[i32; 2]>,
-        /// Where an upload goes on, where that is the matter.
+        /// The offset at which an upload must continue, in bytes, if the request had another one.
         offset: Option<u64>,
     },
-    /// The answer is not what was asked for.
+    /// The answer is not what the protocol defines.
     #[error("cannot read the answer of {server}: {reason}")]
     Answer {
         /// The server.
         server: String,
-        /// Why not.
+        /// The cause.
         reason: String,
     },
-    /// The file cannot be read.
+    /// A file cannot be read.
     #[error("cannot read {path}: {cause}")]
     File {
         /// The file.
         path: String,
-        /// What the operating system says.
+        /// The error of the operating system.
         cause: std::io::Error,
     },
 }
 
-/// A body on its way out: streamed, as whoever sends waits for a disk.
-pub(super) type Body = UnsyncBoxBody<Bytes, std::io::Error>;
-
 impl HttpClient {
-    /// Of `http://HOST:PORT`. Nothing is sent yet.
+    /// A client of the server at `http://HOST:PORT` or `https://HOST:PORT`. Nothing is sent yet.
     ///
     /// # Errors
-    /// The address is not one.
-    pub fn new(url: &str, token: Option<String>) -> Result<Self, HttpError> {
-        let wrong = || HttpError::Url { url: url.to_owned() };
-        let authority = url.strip_prefix("http://").ok_or_else(wrong)?.trim_end_matches('/');
-        let has_port = authority
-            .rsplit_once(':')
-            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok());
-        let is_plain =
-            authority.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.:[]_".contains(&b));
-        match has_port && is_plain {
-            true => Ok(Self { authority: authority.to_owned(), token }),
-            false => Err(wrong()),
+    /// [`HttpError::Url`], [`HttpError::Token`] or [`HttpError::Tls`].
+    pub fn new(url: &str, options: &ConnectOptions) -> Result<Self, HttpError> {
+        let server = parse_server(url).ok_or_else(|| HttpError::Url { url: url.to_owned() })?;
+
+        let mut headers = HeaderMap::new();
+        if let Some(token) = &options.token {
+            let bearer = HeaderValue::try_from(format!("Bearer {token}"));
+            let mut bearer = bearer.map_err(|_| HttpError::Token)?;
+            bearer.set_sensitive(true);
+            headers.insert(AUTHORIZATION, bearer);
         }
+
+        let tls = match server.scheme() {
+            "https" => tls::client_config(&options.root_certificates_pem),
+            _ => tls::no_roots_config(),
+        };
+        let http = reqwest::Client::builder()
+            .tls_backend_preconfigured(tls.map_err(|reason| HttpError::Tls { reason })?)
+            .default_headers(headers)
+            .connect_timeout(limits::HTTP_CONNECT_TIMEOUT)
+            .http1_only()
+            .pool_max_idle_per_host(0)
+            .redirect(Policy::none())
+            .no_proxy()
+            .build()
+            .map_err(|error| HttpError::Tls { reason: describe(error) })?;
+        Ok(Self { server, http })
     }
 
-    /// Asks for a new version of uploaded files; [`HttpClient::wait`] tells how it goes on.
+    /// Asks the server to make a new version of a twin from uploaded files, and returns as soon as the push
+    /// is queued. [`HttpClient::wait_for_push`] waits for its end.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
     pub async fn push(&self, twin: &str, push: &NewPush) -> Result<Push, HttpError> {
-        self.json(Method::POST, &format!("/v1/twins/{twin}/pushes"), Some(push)).await
+        self.request_json(Method::POST, &["v1", "twins", twin, "pushes"], Some(push)).await
     }
 
-    /// How it stands with a push.
+    /// The state of a push.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
-    pub async fn look(&self, twin: &str, id: &str) -> Result<Push, HttpError> {
-        self.json(Method::GET, &format!("/v1/twins/{twin}/pushes/{id}"), None::<&()>).await
+    pub async fn push_status(&self, twin: &str, id: &str) -> Result<Push, HttpError> {
+        let path = ["v1", "twins", twin, "pushes", id];
+        self.request_json(Method::GET, &path, None::<&()>).await
     }
 
-    /// Waits until a push is ready, refused or failed; `seen` is shown how it stands, again and again.
+    /// Waits until a push is ready, refused or failed, and returns its last state. `on_state` is called with
+    /// every state that the server reports, 10 times a second.
     ///
     /// # Errors
-    /// The server refuses, or does not answer any more.
-    pub async fn wait(
+    /// The server refuses, or does not answer [`limits::HTTP_ATTEMPTS`] times in a row.
+    pub async fn wait_for_push(
         &self,
         push: Push,
-        seen: &mut (dyn FnMut(&Push) + Send),
+        on_state: &mut (dyn FnMut(&Push) + Send),
     ) -> Result<Push, HttpError> {
-        let (mut push, mut lost) = (push, 0);
+        let mut push = push;
+        let mut unanswered = 0;
         loop {
-            seen(&push);
+            on_state(&push);
             if matches!(push.state, PushState::Ready | PushState::Refused | PushState::Failed) {
                 return Ok(push);
             }
-            tokio::time::sleep(limits::PUSH_POLL).await;
-            push = match self.look(&push.twin, &push.id).await {
-                Ok(push) => {
-                    lost = 0;
-                    push
+            tokio::time::sleep(limits::PUSH_POLL_INTERVAL).await;
+            match self.push_status(&push.twin, &push.id).await {
+                Ok(next) => {
+                    unanswered = 0;
+                    push = next;
                 }
-                Err(HttpError::Lost { .. }) if lost < limits::HTTP_TRIES => {
-                    lost += 1;
-                    push
+                Err(HttpError::NoAnswer { .. }) if unanswered < limits::HTTP_ATTEMPTS => {
+                    unanswered += 1;
                 }
                 Err(error) => return Err(error),
-            };
+            }
         }
     }
 
-    /// Makes an old version of a twin the latest again, as a new one.
+    /// Makes an old version of a twin the latest again, as a new version, and returns the number of the new
+    /// version.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
     pub async fn rollback(&self, twin: &str, version: u64) -> Result<u64, HttpError> {
-        #[derive(serde::Deserialize)]
-        struct Made {
+        #[derive(Deserialize)]
+        struct RolledBack {
             version: u64,
         }
-        let path = format!("/v1/twins/{twin}/rollback");
-        let made: Made = self.json(Method::POST, &path, Some(&Rollback { version })).await?;
+        let path = ["v1", "twins", twin, "rollback"];
+        let body = Rollback { version };
+        let made: RolledBack = self.request_json(Method::POST, &path, Some(&body)).await?;
         Ok(made.version)
     }
 
-    /// Sends a request with a body in JSON, or none, and reads the answer.
-    pub(super) async fn json<T: DeserializeOwned>(
+    /// Sends a request with an optional JSON body, and reads the JSON of the answer.
+    pub(crate) async fn request_json<T: DeserializeOwned>(
         &self,
         method: Method,
-        path: &str,
+        path: &[&str],
         body: Option<&impl Serialize>,
     ) -> Result<T, HttpError> {
-        let body = match body {
-            Some(body) => serde_json::to_vec(body).map_err(|error| self.unreadable(&error))?,
-            None => Vec::new(),
-        };
-        let request =
-            Request::builder().method(method).uri(path).header(CONTENT_TYPE, "application/json");
-        let full = Full::new(Bytes::from(body)).map_err(|never| match never {}).boxed_unsync();
-        let answer = self.send(request, full, limits::HTTP_TIMEOUT).await?;
+        let mut request = self.request(method, path);
+        if let Some(body) = body {
+            let json = serde_json::to_vec(body).map_err(|error| self.unreadable(&error))?;
+            request = request.header("Content-Type", "application/json").body(json);
+        }
+        let answer = self.send(request, limits::HTTP_TIMEOUT).await?;
         serde_json::from_slice(&answer).map_err(|error| self.unreadable(&error))
     }
 
-    /// Sends a request on a connection of its own, and gives the body of an answer that is no refusal.
-    pub(super) async fn send(
+    /// A request to a path, given by its segments.
+    pub(crate) fn request(&self, method: Method, path: &[&str]) -> RequestBuilder {
+        let mut url = self.server.clone();
+        if let Ok(mut segments) = url.path_segments_mut() {
+            segments.clear().extend(path);
+        }
+        self.http.request(method, url)
+    }
+
+    /// Sends a request and returns the body of a successful answer.
+    pub(crate) async fn send(
         &self,
-        request: hyper::http::request::Builder,
-        body: Body,
-        patience: Duration,
-    ) -> Result<Bytes, HttpError> {
-        let mut request = request.header(HOST, &self.authority);
-        if let Some(token) = &self.token {
-            let bearer = hyper::header::HeaderValue::try_from(format!("Bearer {token}"));
-            let mut bearer = bearer.map_err(|_| HttpError::Token)?;
-            bearer.set_sensitive(true);
-            request = request.header(AUTHORIZATION, bearer);
-        }
-        let request = request.body(body).map_err(|error| self.unreadable(&error))?;
-        match timeout(patience, self.exchange(request)).await {
-            Ok(answer) => answer,
-            Err(_) => Err(self.lost(&format!("none within {patience:?}"))),
-        }
-    }
-
-    async fn exchange(&self, request: Request<Body>) -> Result<Bytes, HttpError> {
-        let stream = timeout(limits::HTTP_CONNECT_TIMEOUT, TcpStream::connect(&self.authority));
-        let stream = stream.await.map_err(|_| self.lost(&"cannot connect in time"))?;
-        let stream = stream.map_err(|error| self.lost(&error))?;
-        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
-            .await
-            .map_err(|error| self.lost(&error))?;
-        // Driven beside the request, and dropped with it.
-        let exchanged = async {
-            let answer = sender.send_request(request).await.map_err(|error| self.lost(&error))?;
-            let status = answer.status();
-            let limited = Limited::new(answer.into_body(), limits::HTTP_ANSWER_BYTES);
-            let body = limited.collect().await.map_err(|error| self.lost(&error))?.to_bytes();
-            if status.is_success() { Ok(body) } else { Err(refused(status, &body)) }
+        request: RequestBuilder,
+        time_limit: Duration,
+    ) -> Result<Vec<u8>, HttpError> {
+        let no_answer = |error: reqwest::Error| {
+            if error.is_timeout() && !error.is_connect() {
+                self.no_answer(&format!("none within {time_limit:?}"))
+            } else {
+                self.no_answer(&describe(error))
+            }
         };
-        tokio::pin!(exchanged);
-        tokio::pin!(connection);
-        tokio::select! {
-            exchanged = &mut exchanged => exchanged,
-            // The connection may end before its answer is read, and the answer is there all the same.
-            _ = &mut connection => exchanged.await,
+        let mut response = request.timeout(time_limit).send().await.map_err(no_answer)?;
+        let status = response.status();
+        let mut body = Vec::new();
+        while let Some(chunk) = response.chunk().await.map_err(no_answer)? {
+            if body.len() + chunk.len() > limits::HTTP_ANSWER_BYTES {
+                let limit = limits::HTTP_ANSWER_BYTES;
+                return Err(self.unreadable(&format!("it is larger than {limit} bytes")));
+            }
+            body.extend_from_slice(&chunk);
         }
+        if status.is_success() { Ok(body) } else { Err(refused(status, &body)) }
     }
 
-    pub(super) fn lost(&self, reason: &dyn std::fmt::Display) -> HttpError {
-        HttpError::Lost { server: self.authority.clone(), reason: reason.to_string() }
+    pub(crate) fn no_answer(&self, reason: &dyn Display) -> HttpError {
+        HttpError::NoAnswer { server: self.authority(), reason: reason.to_string() }
     }
 
-    fn unreadable(&self, reason: &dyn std::fmt::Display) -> HttpError {
-        HttpError::Answer { server: self.authority.clone(), reason: reason.to_string() }
+    fn unreadable(&self, reason: &dyn Display) -> HttpError {
+        HttpError::Answer { server: self.authority(), reason: reason.to_string() }
+    }
+
+    /// `host:port`, for messages.
+    fn authority(&self) -> String {
+        self.server.authority().to_owned()
     }
 }
 
-/// Says nothing of the token.
-impl std::fmt::Debug for HttpClient {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("HttpClient").field("authority", &self.authority).finish_non_exhaustive()
+/// Hides the token, which is in the headers.
+impl fmt::Debug for HttpClient {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("HttpClient").field("server", &self.server.as_str()).finish_non_exhaustive()
     }
+}
+
+/// The address of a server: a scheme, a host, perhaps a port, and nothing else.
+fn parse_server(text: &str) -> Option<Url> {
+    let url = Url::parse(text).ok()?;
+    let is_http = matches!(url.scheme(), "http" | "https");
+    let is_plain = url.path() == "/" && url.query().is_none() && url.fragment().is_none();
+    let is_anonymous = url.username().is_empty() && url.password().is_none();
+    (is_http && url.has_host() && is_plain && is_anonymous).then_some(url)
+}
+
+/// What went wrong, with its causes: the error itself says only that a request failed.
+fn describe(error: reqwest::Error) -> String {
+    let error = error.without_url();
+    let mut causes = Vec::new();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        causes.push(cause.to_string());
+        source = cause.source();
+    }
+    if causes.is_empty() { error.to_string() } else { causes.join(": ") }
 }
 
 fn refused(status: StatusCode, body: &[u8]) -> HttpError {

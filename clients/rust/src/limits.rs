@@ -2,31 +2,36 @@
 
 use std::time::Duration;
 
-/// How long a client waits for an answer: the longest step, and the longest time to send it.
-pub const ANSWER_TIMEOUT: Duration =
-    wildcity_protocol::limits::STEP_TIMEOUT.saturating_add(wildcity_protocol::limits::SEND_TIMEOUT);
+use wildcity_protocol::limits::{SEND_TIMEOUT, STEP_TIMEOUT};
 
-/// Bytes of an upload that are written at once.
-pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
+/// How long a client waits for an answer on the WebSocket: the longest step (60 s) plus the longest time
+/// to send its answer (30 s).
+pub const ANSWER_TIMEOUT: Duration = STEP_TIMEOUT.saturating_add(SEND_TIMEOUT);
 
-/// How long a client waits for a connection.
+/// Bytes of an upload that are read from the file and sent at a time.
+pub const UPLOAD_CHUNK_BYTES: usize = 1 << 20;
+
+/// How long a client waits for a TCP and TLS connection to an HTTP server.
 pub const HTTP_CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How long a client waits for an answer of HTTP: none of them waits for a push or a render.
+/// How long a client waits for an HTTP answer. The server answers at once: no HTTP request waits for a push
+/// or a rendered image.
 pub const HTTP_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Slowest way of an upload, and slowest hashing of it, that a client waits for, in bytes per second.
+/// Lowest rate, in bytes per second, at which an upload is sent and at which the server hashes it. A client
+/// that meets a lower rate gives up.
 pub const UPLOAD_BYTES_PER_S: u64 = 1 << 20;
 
-/// Largest answer of HTTP that a client reads: the report of 100,000 cells is 5 MB.
+/// Largest HTTP answer that a client reads: the report of a push to 100,000 cells takes 5 MB.
 pub const HTTP_ANSWER_BYTES: usize = 64 << 20;
 
-/// How often a client tries again without a byte getting through.
-pub const HTTP_TRIES: u32 = 6;
+/// How many attempts in a row may fail before a client gives up. An attempt that transfers at least one
+/// byte starts the count again.
+pub const HTTP_ATTEMPTS: u32 = 6;
 
-/// How long it waits before the first of those tries; twice as long before each further one, 12 s in
-/// all.
-pub const HTTP_RETRY: Duration = Duration::from_millis(200);
+/// How long a client waits before it repeats a failed attempt. The wait doubles with every further attempt
+/// (0.2 s, 0.4 s, ...), to 12 s in total.
+pub const HTTP_RETRY_DELAY: Duration = Duration::from_millis(200);
 
-/// How often a client asks how it stands with a push.
-pub const PUSH_POLL: Duration = Duration::from_millis(100);
+/// How often a client asks for the state of a push, and reports the progress of an upload.
+pub const PUSH_POLL_INTERVAL: Duration = Duration::from_millis(100);

@@ -1,26 +1,44 @@
-//! Decoding the binary frame, without copying what can be read in place.
+//! Decoding of the binary frame. Tensors are read in place, without a copy, where that is possible.
 
 use std::borrow::Cow;
-use std::io::Cursor;
+use std::cmp::Reverse;
 
-use image::{ImageFormat, ImageReader, Limits};
 use safetensors::{Dtype, SafeTensors, tensor::Metadata};
 use tokio_tungstenite::tungstenite::Bytes;
 
+use wildcity_protocol::limits::{HISTORY_POSES, OBSERVATION_HEADER_BYTES};
 use wildcity_protocol::message::Encoding;
-use wildcity_protocol::observation as wire;
+use wildcity_protocol::observation::{self as wire, ObservationMetadata};
 
-use super::error::FrameError;
+use crate::decode::{self, DecodeError};
+use crate::error::FrameError;
 
-/// What the ego sees: the decoded metadata, and the frame with the tensors in it.
+const HISTORY_XYZ: &str = "ego.history_xyz";
+const HISTORY_ROT: &str = "ego.history_rot";
+
+/// What the ego sees at one time: metadata, images, and the ego's past poses.
 ///
-/// Everything is checked on arrival but the contents of JPEG and PNG files, which are decoded when
-/// asked for, and hashes, which are compared by [`Observation::verify`].
+/// [`Observation::decode`] checks everything but two things: the contents of JPEG and PNG files, which are
+/// decoded on demand by [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
+///
+/// ```
+/// use wildcity_client::Observation;
+///
+/// let frame = include_bytes!("../../../protocol/vectors/observations/raw.bin");
+/// let observation = Observation::decode(frame.to_vec())?;
+/// assert_eq!(observation.metadata().step, 2);
+/// let image = observation.camera("front").expect("this camera is in the frame");
+/// assert_eq!((image.metadata().width, image.metadata().height), (4, 3));
+/// // The top left pixel: red, green, blue.
+/// assert_eq!(image.rgb()?[..3], [10, 5, 3]);
+/// observation.verify()?;
+/// # Ok::<(), wildcity_client::FrameError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Observation {
-    metadata: wire::Observation,
+    metadata: ObservationMetadata,
     tensors: Metadata,
-    /// Where tensor bytes start in `frame`.
+    /// Offset of the first tensor's bytes in `frame`.
     data_start: usize,
     frame: Bytes,
 }
@@ -33,88 +51,94 @@ pub struct ImageView<'a> {
 }
 
 impl Observation {
-    /// Reads a binary frame.
+    /// Decodes a binary frame.
     ///
     /// # Errors
-    /// The frame is not in safetensors layout, or its tensors are not what its metadata says.
+    /// The frame is not in safetensors layout, or a tensor is missing or differs from what the metadata says.
     pub fn decode(frame: impl Into<Bytes>) -> Result<Self, FrameError> {
         let frame = frame.into();
         check_header_length(&frame)?;
         let (header_bytes, tensors) =
             SafeTensors::read_metadata(&frame).map_err(FrameError::Layout)?;
-        let text = tensors.metadata().as_ref().and_then(|m| m.get("observation"));
-        let metadata = serde_json::from_str(text.ok_or(FrameError::NoObservation)?)
-            .map_err(FrameError::Observation)?;
+        let texts = tensors.metadata().as_ref();
+        let text =
+            texts.and_then(|texts| texts.get("observation")).ok_or(FrameError::NoObservation)?;
+        let metadata = serde_json::from_str(text).map_err(FrameError::Observation)?;
         let data_start = size_of::<u64>() + header_bytes;
         let observation = Self { metadata, tensors, data_start, frame };
-        observation.check()?;
+        observation.check_tensors()?;
         Ok(observation)
     }
 
-    /// What the observation says beside its tensors.
-    pub fn metadata(&self) -> &wire::Observation {
+    /// Everything that the observation holds beside its tensors.
+    pub fn metadata(&self) -> &ObservationMetadata {
         &self.metadata
     }
 
-    /// The frame as it came.
+    /// The frame as it was received.
     pub fn frame(&self) -> &Bytes {
         &self.frame
     }
 
-    /// Image `k`, in the order of `metadata().images`.
-    pub fn image(&self, k: usize) -> Option<ImageView<'_>> {
-        self.metadata.images.get(k).map(|metadata| ImageView { observation: self, metadata })
+    /// Image number `index`, in the order of `metadata().images`.
+    pub fn image(&self, index: usize) -> Option<ImageView<'_>> {
+        self.metadata.images.get(index).map(|metadata| self.view(metadata))
     }
 
-    /// The image of a camera; of the first pose, if there are several.
+    /// The image of a camera. If the observation has several poses, that of the first one.
     pub fn camera(&self, name: &str) -> Option<ImageView<'_>> {
         self.images().find(|image| image.metadata.camera == name)
     }
 
-    /// All images, in order.
+    /// All images of this time, in order.
     pub fn images(&self) -> impl Iterator<Item = ImageView<'_>> {
-        self.metadata.images.iter().map(|metadata| ImageView { observation: self, metadata })
+        self.metadata.images.iter().map(|metadata| self.view(metadata))
     }
 
-    /// The last frames of a camera, oldest first: as many as `outputs.frames` asked for, fewer at an
-    /// episode's start, none between two decisions.
+    /// The last frames of a camera, oldest first: as many as `outputs.frames` asked for, fewer at the start
+    /// of an episode, and none between two decisions.
     pub fn frames(&self, camera: &str) -> Vec<ImageView<'_>> {
-        let metadata = &self.metadata;
-        let newest_first = metadata.images.iter().filter(|image| image.pose == 0);
-        let of_camera = newest_first.chain(&metadata.history).filter(|i| i.camera == camera);
-        let mut frames: Vec<_> =
-            of_camera.map(|metadata| ImageView { observation: self, metadata }).collect();
-        frames.sort_by_key(|frame| std::cmp::Reverse(frame.metadata.back));
+        let current = self.metadata.images.iter().filter(|image| image.pose == 0);
+        let mut frames: Vec<_> = current
+            .chain(&self.metadata.history)
+            .filter(|image| image.camera == camera)
+            .map(|metadata| self.view(metadata))
+            .collect();
+        frames.sort_by_key(|frame| Reverse(frame.metadata.back));
         frames
     }
 
-    /// Past positions of the rig, in metres in the rig frame of now: `[16, 3]`, oldest first, 0.1 s
-    /// apart, the last one zero.
+    /// Past positions of the rig, f32 `[16, 3]`, in metres in the current rig frame: oldest first, 0.1 s
+    /// apart. The last one is now, which is zero.
     pub fn history_xyz_m(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(HISTORY_XYZ))
     }
 
-    /// Past rotations `rig(now)_from_rig(then)`: `[16, 3, 3]`, row by row, the last one identity.
+    /// Past rotations `rig(now)_from_rig(then)`, f32 `[16, 3, 3]`, row by row: oldest first, 0.1 s apart. The
+    /// last one is now, which is the identity.
     pub fn history_rot(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(HISTORY_ROT))
     }
 
-    /// Compares the frame hash with the images' hashes, and each lossless image's pixels with its
-    /// hash, those of earlier frames too. A JPEG's pixels are not those that were hashed, so they are left out.
+    /// Compares the hash of each lossless image, earlier frames included, with its pixels, and the frame
+    /// hash with the images' hashes. JPEG images are skipped: they are hashed before encoding, and JPEG
+    /// changes their pixels.
     ///
     /// # Errors
-    /// Names the first hash that differs, or the first image that cannot be decoded.
+    /// The first hash that differs, or the first image that cannot be decoded.
     pub fn verify(&self) -> Result<(), FrameError> {
-        let mut frame_hasher = blake3::Hasher::new();
         for metadata in &self.metadata.history {
-            ImageView { observation: self, metadata }.verify()?;
+            self.view(metadata).verify()?;
         }
+        let mut frame_hasher = blake3::Hasher::new();
         for image in self.images() {
             image.verify()?;
-            // A hash that is no hash differs from every frame hash.
-            let hash = blake3::Hash::from_hex(&image.metadata.hash).map_err(|_| {
-                let (name, expected) = (image.metadata.tensor.clone(), "64 hex digits".to_owned());
-                FrameError::Hash { name, found: image.metadata.hash.clone(), expected }
+            let hash = &image.metadata.hash;
+            // A text that is not a hash equals no hash.
+            let hash = blake3::Hash::from_hex(hash).map_err(|_| FrameError::Hash {
+                name: image.metadata.tensor.clone(),
+                found: hash.clone(),
+                expected: "64 hex digits".to_owned(),
             })?;
             frame_hasher.update(hash.as_bytes());
         }
@@ -122,52 +146,59 @@ impl Observation {
         compare_hashes("frame_hash", found, &self.metadata.frame_hash)
     }
 
-    /// Every tensor that the metadata names is there, with the type and shape it must have.
-    fn check(&self) -> Result<(), FrameError> {
-        self.expect(HISTORY_XYZ, Dtype::F32, &[wildcity_protocol::limits::HISTORY_POSES, 3])?;
-        self.expect(HISTORY_ROT, Dtype::F32, &[wildcity_protocol::limits::HISTORY_POSES, 3, 3])?;
-        let history = self.metadata.history.iter();
-        let history = history.map(|metadata| ImageView { observation: self, metadata });
-        for image in self.images().chain(history) {
-            let wire::Image { tensor, width, height, .. } = image.metadata;
-            let side = |px: u64| usize::try_from(px).unwrap_or(usize::MAX);
-            let size = [side(*height), side(*width)];
-            match image.metadata.encoding {
-                Encoding::Raw => self.expect(tensor, Dtype::U8, &[size[0], size[1], 3])?,
-                Encoding::Jpeg | Encoding::Png => self.expect_file(tensor)?,
+    fn view<'a>(&'a self, metadata: &'a wire::Image) -> ImageView<'a> {
+        ImageView { observation: self, metadata }
+    }
+
+    /// Checks that every tensor that the metadata names exists, with the type and shape that it must have.
+    fn check_tensors(&self) -> Result<(), FrameError> {
+        self.check_tensor(HISTORY_XYZ, Dtype::F32, &[HISTORY_POSES, 3])?;
+        self.check_tensor(HISTORY_ROT, Dtype::F32, &[HISTORY_POSES, 3, 3])?;
+        for metadata in self.metadata.images.iter().chain(&self.metadata.history) {
+            let image = self.view(metadata);
+            let [width, height] = image.size();
+            match metadata.encoding {
+                Encoding::Raw => {
+                    self.check_tensor(&metadata.tensor, Dtype::U8, &[height, width, 3])?;
+                }
+                Encoding::Jpeg | Encoding::Png => self.check_file(&metadata.tensor)?,
             }
-            let maps =
-                [("depth", &size[..]), ("opacity", &size), ("normals", &[size[0], size[1], 3])];
+            // These are there only if the session asked for them.
+            let maps: [(&str, &[usize]); 3] = [
+                ("depth", &[height, width]),
+                ("opacity", &[height, width]),
+                ("normals", &[height, width, 3]),
+            ];
             for (output, shape) in maps {
-                let name = image.sibling(output);
+                let name = image.sibling_tensor(output);
                 if self.tensors.info(&name).is_some() {
-                    self.expect(&name, Dtype::F32, shape)?;
+                    self.check_tensor(&name, Dtype::F32, shape)?;
                 }
             }
         }
         Ok(())
     }
 
-    fn expect(&self, name: &str, dtype: Dtype, shape: &[usize]) -> Result<(), FrameError> {
+    fn check_tensor(&self, name: &str, dtype: Dtype, shape: &[usize]) -> Result<(), FrameError> {
         let info = self.tensors.info(name).ok_or_else(|| missing(name))?;
         if info.dtype == dtype && info.shape == shape {
             return Ok(());
         }
-        let found = format!("{} {:?}", info.dtype, info.shape);
         Err(FrameError::Tensor {
             name: name.to_owned(),
-            found,
+            found: format!("{} {:?}", info.dtype, info.shape),
             expected: format!("{dtype} {shape:?}"),
         })
     }
 
-    /// A JPEG or PNG file: bytes, as many as there are.
-    fn expect_file(&self, name: &str) -> Result<(), FrameError> {
+    /// Checks that the tensor of a JPEG or PNG file is one-dimensional bytes, of any length.
+    fn check_file(&self, name: &str) -> Result<(), FrameError> {
         let info = self.tensors.info(name).ok_or_else(|| missing(name))?;
-        self.expect(name, Dtype::U8, &[info.shape.iter().product()])
+        let bytes = info.shape.iter().product();
+        self.check_tensor(name, Dtype::U8, &[bytes])
     }
 
-    /// The bytes of a tensor that [`Observation::check`] saw; none if there is no such tensor.
+    /// The bytes of a tensor that [`Observation::check_tensors`] checked; empty if there is no such tensor.
     fn tensor_bytes(&self, name: &str) -> &[u8] {
         let Some(info) = self.tensors.info(name) else { return &[] };
         let (start, end) = info.data_offsets;
@@ -176,17 +207,69 @@ impl Observation {
 }
 
 impl<'a> ImageView<'a> {
-    /// Camera, size, intrinsics, times and hash.
+    /// Camera, size, intrinsics, times and hash of the image.
     pub fn metadata(&self) -> &'a wire::Image {
         self.metadata
     }
 
-    /// The image as it travelled: raw pixels, or a JPEG or PNG file.
+    /// The image as it was received: raw pixels, or a JPEG or PNG file.
     pub fn encoded(&self) -> &'a [u8] {
         self.observation.tensor_bytes(&self.metadata.tensor)
     }
 
-    /// Compares lossless pixels with their hash.
+    /// Pixels, u8 `[height, width, 3]`: red, green, blue, row by row from the top left. Raw images are
+    /// returned in place, the others are decoded by every call.
+    ///
+    /// # Errors
+    /// The JPEG or PNG file cannot be decoded, or has another size than the metadata says.
+    pub fn rgb(&self) -> Result<Cow<'a, [u8]>, FrameError> {
+        let size = self.size();
+        let decoded = match self.metadata.encoding {
+            Encoding::Raw => return Ok(Cow::Borrowed(self.encoded())),
+            Encoding::Jpeg => decode::jpeg(self.encoded(), size),
+            Encoding::Png => decode::png(self.encoded(), size),
+        };
+        let name = &self.metadata.tensor;
+        decoded.map(Cow::Owned).map_err(|error| match error {
+            DecodeError::Invalid(reason) => FrameError::Image { name: name.clone(), reason },
+            DecodeError::Size([width, height]) => FrameError::Tensor {
+                name: name.clone(),
+                found: format!("an image of {width}x{height} px"),
+                expected: format!("{}x{} px", size[0], size[1]),
+            },
+        })
+    }
+
+    /// Depth in metres, f32 `[height, width]`, 0 where the opacity is 0: camera z, or distance for wide
+    /// lenses. `None` if the session did not ask for it.
+    pub fn depth_m(&self) -> Option<Cow<'a, [f32]>> {
+        self.map("depth")
+    }
+
+    /// Accumulated opacity, 0 to 1, f32 `[height, width]`. `None` if the session did not ask for it.
+    pub fn opacity(&self) -> Option<Cow<'a, [f32]>> {
+        self.map("opacity")
+    }
+
+    /// Unit normals of the visible surface in camera axes (x right, y down, z forward), f32
+    /// `[height, width, 3]`, 0 where there is no depth. `None` if the session did not ask for it.
+    pub fn normals(&self) -> Option<Cow<'a, [f32]>> {
+        self.map("normals")
+    }
+
+    /// Width and height, in pixels.
+    fn size(&self) -> [usize; 2] {
+        [self.metadata.width, self.metadata.height]
+            .map(|side_px| usize::try_from(side_px).unwrap_or(usize::MAX))
+    }
+
+    fn map(&self, output: &str) -> Option<Cow<'a, [f32]>> {
+        let name = self.sibling_tensor(output);
+        self.observation.tensors.info(&name)?;
+        Some(floats(self.observation.tensor_bytes(&name)))
+    }
+
+    /// Compares the pixels of a lossless image with its hash.
     fn verify(&self) -> Result<(), FrameError> {
         if self.metadata.encoding == Encoding::Jpeg {
             return Ok(());
@@ -195,71 +278,19 @@ impl<'a> ImageView<'a> {
         compare_hashes(&self.metadata.tensor, found, &self.metadata.hash)
     }
 
-    /// Pixels, u8 `[height, width, 3]`: raw ones in place, others decoded.
-    ///
-    /// # Errors
-    /// The JPEG or PNG file cannot be decoded, or is of another size than the metadata says.
-    pub fn rgb(&self) -> Result<Cow<'a, [u8]>, FrameError> {
-        let format = match self.metadata.encoding {
-            Encoding::Raw => return Ok(Cow::Borrowed(self.encoded())),
-            Encoding::Jpeg => ImageFormat::Jpeg,
-            Encoding::Png => ImageFormat::Png,
-        };
-        let wire::Image { tensor: name, width, height, .. } = self.metadata;
-        let mut reader = ImageReader::with_format(Cursor::new(self.encoded()), format);
-        // Checked before decoding, so that a small file cannot ask for a large buffer.
-        let mut limits = Limits::default();
-        limits.max_image_width = u32::try_from(*width).ok();
-        limits.max_image_height = u32::try_from(*height).ok();
-        reader.limits(limits);
-        let image =
-            reader.decode().map_err(|cause| FrameError::Image { name: name.clone(), cause })?;
-        if (u64::from(image.width()), u64::from(image.height())) != (*width, *height) {
-            let found = format!("an image of {}x{} px", image.width(), image.height());
-            let expected = format!("{width}x{height} px");
-            return Err(FrameError::Tensor { name: name.clone(), found, expected });
-        }
-        Ok(Cow::Owned(image.into_rgb8().into_raw()))
-    }
-
-    /// Expected camera z in metres, f32 `[height, width]`, 0 where opacity is 0; if asked for.
-    pub fn depth_m(&self) -> Option<Cow<'a, [f32]>> {
-        self.floats("depth")
-    }
-
-    /// Accumulated opacity in [0, 1], f32 `[height, width]`; if asked for.
-    pub fn opacity(&self) -> Option<Cow<'a, [f32]>> {
-        self.floats("opacity")
-    }
-
-    fn floats(&self, output: &str) -> Option<Cow<'a, [f32]>> {
-        let name = self.sibling(output);
-        self.observation.tensors.info(&name)?;
-        Some(floats(self.observation.tensor_bytes(&name)))
-    }
-
-    /// Unit normals of what is seen, in the camera's axes, f32 `[height, width, 3]`, 0 where there is no
-    /// depth; if asked for.
-    pub fn normals(&self) -> Option<Cow<'a, [f32]>> {
-        self.floats("normals")
-    }
-
-    /// Name of the tensor beside the colour: `camera/front/rgb` and `depth` give
-    /// `camera/front/depth`.
-    fn sibling(&self, output: &str) -> String {
+    /// Name of another tensor of the same image: `camera/front/rgb` and `depth` give `camera/front/depth`.
+    fn sibling_tensor(&self, output: &str) -> String {
         let tensor = &self.metadata.tensor;
         format!("{}{output}", tensor.strip_suffix("rgb").unwrap_or(tensor))
     }
 }
 
-const HISTORY_XYZ: &str = "ego.history_xyz";
-const HISTORY_ROT: &str = "ego.history_rot";
-
+/// Refuses a long header before anything is allocated for it. A frame that is too short to have a length is
+/// refused later, with the rest of the layout.
 fn check_header_length(frame: &[u8]) -> Result<(), FrameError> {
-    let limit = wildcity_protocol::limits::OBSERVATION_HEADER_BYTES;
+    let limit = OBSERVATION_HEADER_BYTES;
     match frame.first_chunk().map(|length| u64::from_le_bytes(*length)) {
         Some(bytes) if bytes > limit => Err(FrameError::HeaderTooLong { bytes, limit }),
-        // A frame too short for a length is refused with the rest of the layout.
         _ => Ok(()),
     }
 }
@@ -275,8 +306,8 @@ fn compare_hashes(name: &str, found: String, expected: &str) -> Result<(), Frame
     Err(FrameError::Hash { name: name.to_owned(), found, expected: expected.to_owned() })
 }
 
-/// Little-endian floats: in place where they lie on a multiple of four bytes (behind a JPEG of odd
-/// length they do not) and the machine is little-endian, else copied.
+/// Little-endian floats: in place if the machine is little-endian and the bytes are aligned to 4, otherwise
+/// copied. Bytes after a JPEG of odd length are not aligned.
 fn floats(bytes: &[u8]) -> Cow<'_, [f32]> {
     match bytemuck::try_cast_slice(bytes) {
         Ok(floats) if cfg!(target_endian = "little") => Cow::Borrowed(floats),

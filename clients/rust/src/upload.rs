@@ -1,121 +1,132 @@
-//! Uploading a file: announced by its digest, sent from where the server stands, taken up again after
-//! a cut.
+//! Resumable uploads: a file is announced by its digest, and only the bytes that the server lacks are sent.
 
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::stream;
-use http_body_util::{BodyExt as _, StreamBody};
-use hyper::body::Frame;
-use hyper::header::CONTENT_LENGTH;
-use hyper::{Method, Request};
+use http_body::Frame;
+use http_body_util::StreamBody;
+use reqwest::header::CONTENT_LENGTH;
+use reqwest::{Body, Method};
 
-use crate::limits;
 use wildcity_protocol::http::{NewUpload, Upload};
 
-use super::http::{Body, HttpClient, HttpError};
+use crate::http::{HttpClient, HttpError};
+use crate::limits;
 
 impl HttpClient {
-    /// Uploads a file, or what the server lacks of it. `progress` gets bytes done and bytes in all.
+    /// Uploads a file, or the part of it that the server lacks. `on_progress` gets the bytes on the server
+    /// and the size of the file.
     ///
     /// # Errors
-    /// The file cannot be read, or changes meanwhile; the server refuses; or it is lost again and
-    /// again without a byte getting through.
+    /// The file cannot be read, or changes during the upload; the server refuses; or
+    /// [`limits::HTTP_ATTEMPTS`] attempts in a row fail without transferring a byte.
     pub async fn upload(
         &self,
         path: &Path,
-        progress: &mut (dyn FnMut(u64, u64) + Send),
+        on_progress: &mut (dyn FnMut(u64, u64) + Send),
     ) -> Result<Upload, HttpError> {
-        let named = path.to_owned();
-        let announced = tokio::task::spawn_blocking(move || announce(&named)).await;
-        let announced = announced.map_err(|error| self.lost(&error))?;
-        let announced = announced.map_err(|cause| unreadable(path, cause))?;
-        let (mut tries, mut furthest) = (0, 0);
+        let announcement = self.announce(path).await?;
+        let mut failures = 0;
+        let mut furthest = 0;
         loop {
-            let failed = match self.send_rest(path, &announced, progress).await {
+            let failure = match self.send_rest(path, &announcement, on_progress).await {
                 Ok(upload) if upload.complete => return Ok(upload),
-                Ok(_) => self.lost(&"the upload stopped in the middle"),
-                Err(error) if is_passing(&error) => error,
+                Ok(_) => self.no_answer(&"the upload stopped in the middle"),
+                Err(error) if is_transient(&error) => error,
                 Err(error) => return Err(error),
             };
-            // Anything that got through gives hope.
-            let known: Result<Upload, _> =
-                self.json(Method::POST, "/v1/uploads", Some(&announced)).await;
-            let offset = match known {
+            // An attempt that transferred something starts the count of failures again.
+            let offset = match self.start_upload(&announcement).await {
                 Ok(upload) => upload.offset,
-                Err(error) if is_passing(&error) => furthest,
+                Err(error) if is_transient(&error) => furthest,
                 Err(error) => return Err(error),
             };
-            tries = if offset > furthest { 0 } else { tries + 1 };
+            failures = if offset > furthest { 0 } else { failures + 1 };
             furthest = furthest.max(offset);
-            if tries >= limits::HTTP_TRIES {
-                return Err(failed);
+            if failures >= limits::HTTP_ATTEMPTS {
+                return Err(failure);
             }
-            tokio::time::sleep(limits::HTTP_RETRY * 2_u32.pow(tries)).await;
+            tokio::time::sleep(limits::HTTP_RETRY_DELAY * 2_u32.pow(failures)).await;
         }
     }
 
-    /// Sends everything that the server does not have yet.
+    /// Reads the whole file for its size and digest.
+    async fn announce(&self, path: &Path) -> Result<NewUpload, HttpError> {
+        let owned_path = path.to_owned();
+        let announcement = tokio::task::spawn_blocking(move || announcement(&owned_path)).await;
+        announcement
+            .map_err(|error| self.no_answer(&error))?
+            .map_err(|cause| unreadable_file(path, cause))
+    }
+
+    /// Tells the server what will be sent, and learns how much of it is there already.
+    async fn start_upload(&self, announcement: &NewUpload) -> Result<Upload, HttpError> {
+        self.request_json(Method::POST, &["v1", "uploads"], Some(announcement)).await
+    }
+
+    /// Sends the bytes that the server does not have yet.
     async fn send_rest(
         &self,
         path: &Path,
-        announced: &NewUpload,
-        progress: &mut (dyn FnMut(u64, u64) + Send),
+        announcement: &NewUpload,
+        on_progress: &mut (dyn FnMut(u64, u64) + Send),
     ) -> Result<Upload, HttpError> {
-        let upload: Upload = self.json(Method::POST, "/v1/uploads", Some(announced)).await?;
-        progress(upload.offset, upload.size);
+        let upload = self.start_upload(announcement).await?;
+        on_progress(upload.offset, upload.size);
         if upload.complete {
             return Ok(upload);
         }
-        let rest = upload.size - upload.offset;
-        let request = Request::builder()
-            .method(Method::PATCH)
-            .uri(format!("/v1/uploads/{}", upload.id))
-            .header("upload-offset", upload.offset)
-            .header(CONTENT_LENGTH, rest);
+
+        let mut file = File::open(path).map_err(|cause| unreadable_file(path, cause))?;
+        file.seek(SeekFrom::Start(upload.offset)).map_err(|cause| unreadable_file(path, cause))?;
+        let remaining = upload.size - upload.offset;
         let sent = Arc::new(AtomicU64::new(upload.offset));
-        let mut file = File::open(path).map_err(|cause| unreadable(path, cause))?;
-        let sought = file.seek(SeekFrom::Start(upload.offset));
-        sought.map_err(|cause| unreadable(path, cause))?;
-        let body = body(file, rest, sent.clone());
-        // The server hashes all of it after the last byte.
-        let patience = limits::HTTP_TIMEOUT
-            + std::time::Duration::from_secs(2 * upload.size / limits::UPLOAD_BYTES_PER_S);
-        let sending = self.send(request, body, patience);
+        let request = self
+            .request(Method::PATCH, &["v1", "uploads", &upload.id])
+            .header("Upload-Offset", upload.offset)
+            .header(CONTENT_LENGTH, remaining)
+            .body(file_body(file, remaining, sent.clone()));
+
+        // Twice the size: the server hashes the whole file after its last byte.
+        let transfer_s = 2 * upload.size / limits::UPLOAD_BYTES_PER_S;
+        let time_limit = limits::HTTP_TIMEOUT + Duration::from_secs(transfer_s);
+        let sending = self.send(request, time_limit);
         tokio::pin!(sending);
         let answer = loop {
             tokio::select! {
                 answer = &mut sending => break answer?,
-                () = tokio::time::sleep(limits::PUSH_POLL) => {
-                    progress(sent.load(Ordering::Relaxed), upload.size);
+                () = tokio::time::sleep(limits::PUSH_POLL_INTERVAL) => {
+                    on_progress(sent.load(Ordering::Relaxed), upload.size);
                 }
             }
         };
-        progress(upload.size, upload.size);
-        serde_json::from_slice(&answer).map_err(|error| self.lost(&error))
+        on_progress(upload.size, upload.size);
+        serde_json::from_slice(&answer).map_err(|error| self.no_answer(&error))
     }
 }
 
-/// Whether the same may succeed later.
-fn is_passing(error: &HttpError) -> bool {
+/// Whether the same request may succeed later.
+fn is_transient(error: &HttpError) -> bool {
     match error {
-        HttpError::Lost { .. } => true,
-        // Somebody else, or an earlier connection of ours, is further.
+        HttpError::NoAnswer { .. } => true,
+        // Another client, or an earlier connection of this one, has sent more.
         HttpError::Refused { offset: Some(_), .. } => true,
         HttpError::Refused { status, .. } => matches!(status, 408 | 503),
         _ => false,
     }
 }
 
-/// Its name, size and digest; reads all of it.
-fn announce(path: &Path) -> io::Result<NewUpload> {
+/// Name, size and digest of a file.
+fn announcement(path: &Path) -> io::Result<NewUpload> {
     let mut file = File::open(path)?;
     let mut hasher = blake3::Hasher::new();
-    let mut buffer = vec![0; limits::UPLOAD_WRITE_BYTES];
+    let mut buffer = vec![0; limits::UPLOAD_CHUNK_BYTES];
     let mut size = 0;
     loop {
         let read = file.read(&mut buffer)?;
@@ -129,31 +140,32 @@ fn announce(path: &Path) -> io::Result<NewUpload> {
     Ok(NewUpload { name, size, digest: format!("blake3:{}", hasher.finalize().to_hex()) })
 }
 
-/// The next `rest` bytes of a file, counted as they leave.
-fn body(file: File, rest: u64, sent: Arc<AtomicU64>) -> Body {
-    let frames = stream::try_unfold((file, rest, sent), async |(file, rest, sent)| {
-        if rest == 0 {
+/// The next `remaining` bytes of a file. `sent` is increased as they are sent.
+fn file_body(file: File, remaining: u64, sent: Arc<AtomicU64>) -> Body {
+    let chunks = stream::try_unfold((file, remaining, sent), async |(file, remaining, sent)| {
+        if remaining == 0 {
             return Ok(None);
         }
-        let read = tokio::task::spawn_blocking(move || read_some(file, rest)).await;
+        let read = tokio::task::spawn_blocking(move || read_chunk(file, remaining)).await;
         let (file, bytes) = read.map_err(io::Error::other)??;
-        let rest = rest - bytes.len() as u64;
+        let remaining = remaining - bytes.len() as u64;
         sent.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        Ok::<_, io::Error>(Some((Frame::data(bytes), (file, rest, sent))))
+        Ok::<_, io::Error>(Some((Frame::data(bytes), (file, remaining, sent))))
     });
-    StreamBody::new(frames).boxed_unsync()
+    Body::wrap(StreamBody::new(chunks))
 }
 
-fn read_some(mut file: File, rest: u64) -> io::Result<(File, Bytes)> {
-    let mut bytes = vec![0; rest.min(limits::UPLOAD_WRITE_BYTES as u64) as usize];
+/// At most [`limits::UPLOAD_CHUNK_BYTES`] of a file.
+fn read_chunk(mut file: File, remaining: u64) -> io::Result<(File, Bytes)> {
+    let mut bytes = vec![0; remaining.min(limits::UPLOAD_CHUNK_BYTES as u64) as usize];
     let read = file.read(&mut bytes)?;
     if read == 0 {
-        return Err(io::Error::other("the file became shorter while it was sent"));
+        return Err(io::Error::other("the file became shorter during the upload"));
     }
     bytes.truncate(read);
     Ok((file, bytes.into()))
 }
 
-fn unreadable(path: &Path, cause: io::Error) -> HttpError {
+fn unreadable_file(path: &Path, cause: io::Error) -> HttpError {
     HttpError::File { path: path.display().to_string(), cause }
 }

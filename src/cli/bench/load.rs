@@ -129,7 +129,7 @@ impl Load {
 /// Reads the bytes of all chunks of a version, one after the other, without decoding them.
 fn read_bare(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
     for chunk in &version.manifest.chunks {
-        catalog.skim(version, chunk)?;
+        catalog.read_and_discard(version, chunk)?;
     }
     Ok(())
 }

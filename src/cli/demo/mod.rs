@@ -17,7 +17,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
 use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
-use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, Storage, StoreError, Version};
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, Version};
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
@@ -66,7 +66,7 @@ const MOSAIC_STEPS: u64 = 10;
 impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
-        let version = demo_twin(&twins, TWIN, Storage::default())?;
+        let version = demo_twin(&twins, TWIN, StorageOptions::default())?;
         output::create_dir(&self.out)?;
         let config = wildcity_server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
@@ -191,12 +191,12 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
 
 /// The demo street in the exact record format f32, under its own name.
 pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
-    demo_twin(twins, EXACT_TWIN, Storage { record: Record::F32, ..Storage::default() })
+    demo_twin(twins, EXACT_TWIN, StorageOptions { record: Record::F32, ..StorageOptions::default() })
 }
 
 /// The demo twin in the user's directory. It is built on first use, and again if the generator changed or
 /// the files are damaged.
-fn demo_twin(twins: &Path, name: &str, storage: Storage) -> anyhow::Result<Version> {
+fn demo_twin(twins: &Path, name: &str, storage: StorageOptions) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = wildcity_generate::REVISION;

@@ -7,7 +7,7 @@ use anyhow::Context;
 use image::RgbImage;
 use image::imageops;
 
-use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Rig, Scene};
 use wildcity_twin::ingest::cameras;
@@ -50,19 +50,19 @@ impl Comparison<'_> {
         output::create_dir(out)?;
 
         // Images of all cameras, profile by profile.
-        let eyes = wildcity_session::eyes(&views);
+        let viewpoints = wildcity_session::viewpoints(&views);
         let bar = progress::count("rendering");
         bar.set_length(profiles.len() as u64);
         let mut by_profile: Vec<Vec<RgbImage>> = Vec::new();
         let mut lines = Vec::new();
         for profile in &profiles {
-            let scene = resident.scene(&eyes, profile)?;
+            let scene = resident.scene(&viewpoints, profile)?;
             by_profile.push(self.render(&scene, profile, &views)?);
             let share = 100.0 * scene.gaussians() as f64 / version.manifest.gaussians() as f64;
             let full = &by_profile[0];
             let now = &by_profile[by_profile.len() - 1];
             let pairs = full.iter().zip(now).flat_map(|(full, now)| full.iter().zip(now.iter()));
-            let psnr = match psnr_db_of_bytes(pairs) {
+            let psnr = match psnr_db_u8(pairs) {
                 f64::INFINITY => "the same image".to_owned(),
                 db => format!("{db:.1} dB"),
             };

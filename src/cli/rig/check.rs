@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use super::lookup::{rig_of, view_of};
 use crate::cli::backend_options::BackendOptions;
-use wildcity_render::compare::points::Points;
+use wildcity_render::compare::reprojection::ReprojectionErrors;
 
 /// Render points whose pixels are known, and check that each camera of a rig shows them there.
 ///
@@ -35,7 +35,8 @@ impl Check {
         let mut out = io::stdout().lock();
         let mut wrong = Vec::new();
         for camera in &rig.cameras {
-            let Points { count, worst_px } = Points::of(&*backend, &view_of(camera))?;
+            let ReprojectionErrors { count, worst_px } =
+                ReprojectionErrors::measure(&*backend, &view_of(camera))?;
             writeln!(out, "{:<24} {count:>3} points, at most {worst_px:.3} px off", camera.name)?;
             if worst_px > MAX_DISTANCE_PX || count == 0 {
                 wrong.push(camera.name.clone());

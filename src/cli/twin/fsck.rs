@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::progress;
-use wildcity_twin::store::Checked;
+use wildcity_twin::store::FsckReport;
 
 /// Check a twin: read every object of every version and compare it with its hash, and check the log.
 ///
@@ -45,7 +45,7 @@ impl Fsck {
         Ok(())
     }
 
-    fn print(&self, out: &mut impl Write, checked: &Checked) -> io::Result<()> {
+    fn print(&self, out: &mut impl Write, checked: &FsckReport) -> io::Result<()> {
         for damage in &checked.verified.damaged {
             writeln!(out, "damaged {}: {}", damage.object, damage.error)?;
         }
@@ -80,7 +80,7 @@ impl Fsck {
     }
 }
 
-fn json(checked: &Checked) -> serde_json::Value {
+fn json(checked: &FsckReport) -> serde_json::Value {
     let damaged = checked.verified.damaged.iter().map(
         |damage| serde_json::json!({ "object": damage.object, "error": damage.error.to_string() }),
     );

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::cli::directories::Twins;
 use crate::cli::limits;
-use wildcity_twin::store::Keep;
+use wildcity_twin::store::Retention;
 
 /// Remove objects of a twin that none of the kept versions refers to.
 ///
@@ -41,7 +41,7 @@ pub(super) struct Gc {
 impl Gc {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
-        let keep = Keep { versions: self.keep as usize, grace: self.grace };
+        let keep = Retention { versions: self.keep as usize, grace: self.grace };
         let found = catalog.collect(&self.twin, keep, self.dry_run)?;
         let kept: Vec<_> = found.kept.iter().map(u64::to_string).collect();
         let removed = if self.dry_run { "would be removed" } else { "removed" };

@@ -11,7 +11,7 @@ use crate::cli::progress;
 use wildcity_generate::CitySettings;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig};
-use wildcity_twin::store::{Kind, Settings, Storage};
+use wildcity_twin::store::{CommitKind, StorageOptions, VersionSettings};
 
 /// Generate a twin of a procedural city: a route between houses, cars and trees.
 ///
@@ -81,14 +81,15 @@ impl Generate {
         }
 
         let begun = Instant::now();
-        let mut commit = catalog.begin(&self.twin, Kind::Import, Storage::default())?;
+        let mut commit =
+            catalog.begin(&self.twin, CommitKind::Import, StorageOptions::default())?;
         let bar = progress::count("building");
         bar.set_length(gaussians);
         for cell in city {
             commit.put(&cell.gaussians, None, &mut |_, _| {})?;
             bar.inc(cell.gaussians.len() as u64);
         }
-        let parts = Settings {
+        let parts = VersionSettings {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
             trajectories: vec![wildcity_generate::city_drive(&settings)?],

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::sky_source::SkySource;
-use wildcity_twin::store::{Change, Kind, NewSky, Storage};
+use wildcity_twin::store::{CommitKind, NewSky, StorageOptions, VersionChange};
 
 /// Add, replace or remove the sky of a twin: makes a new version with the same Gaussians.
 ///
@@ -41,10 +41,15 @@ impl Sky {
         let base = catalog.version(&self.twin.name, self.twin.number)?;
         // The Gaussians stay, and so does what the version says of their origin.
         let provenance = base.manifest.provenance.clone();
-        let storage = Storage { record: base.manifest.record, ..Storage::default() };
-        let commit = catalog.begin(&self.twin.name, Kind::Import, storage)?;
-        let change =
-            Change { profile: None, rig: None, trajectories: None, sky: Some(sky), provenance };
+        let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
+        let commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
+        let change = VersionChange {
+            profile: None,
+            rig: None,
+            trajectories: None,
+            sky: Some(sky),
+            provenance,
+        };
         let version = commit.change(base.number, change)?;
         let what = version
             .manifest

@@ -2,26 +2,26 @@
 
 use serde::Serialize;
 
-use super::numbers::number;
+use super::json_numbers::serialize_number;
 use crate::compare::psnr::psnr_db;
 
 /// How far off a set of images is. Values are those of colour, clamped to [0, 1] as they are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Errors {
+pub struct ImageErrors {
     /// Peak signal-to-noise ratio of all values together, in dB; infinite where none differs.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
     /// Mean structural similarity of the images' luma; 1 where nothing differs.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
     /// Largest error of a value.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub max: f64,
     /// The error that all but one of a thousand values keep below.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub p99_9: f64,
     /// Mean error of the depth, in metres, where both images cover at least half of the pixel.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_number")]
     pub depth_l1_m: f64,
 }
 
@@ -80,14 +80,14 @@ impl Image {
 
 /// What is gathered of pairs of images.
 #[derive(Clone, Debug, Default)]
-pub struct Gathered {
+pub struct ErrorAccumulator {
     errors: Vec<f32>,
     ssims: Vec<f64>,
     depth_sum_m: f64,
     depths: u64,
 }
 
-impl Gathered {
+impl ErrorAccumulator {
     /// Adds an image and what it should be, of the same size. Gives the pair's own PSNR in dB.
     pub fn add(&mut self, image: &Image, truth: &Image) -> f64 {
         let before = self.errors.len();
@@ -112,12 +112,12 @@ impl Gathered {
     }
 
     /// The errors of all that was added; `None` of nothing.
-    pub fn errors(&self) -> Option<Errors> {
+    pub fn errors(&self) -> Option<ImageErrors> {
         let mut sorted = self.errors.clone();
         sorted.sort_unstable_by(f32::total_cmp);
         let max = f64::from(*sorted.last()?);
         let at = ((sorted.len() - 1) as f64 * 0.999).ceil() as usize;
-        Some(Errors {
+        Some(ImageErrors {
             psnr_db: psnr_db(sorted.iter().map(|&off| f64::from(off))),
             ssim: self.ssims.iter().sum::<f64>() / self.ssims.len() as f64,
             max,
@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn known_errors() {
         let (truth, mut image) = (striped(4, 0.0), striped(4, 0.0));
-        let mut gathered = Gathered::default();
+        let mut gathered = ErrorAccumulator::default();
         assert_eq!(gathered.add(&image, &truth), f64::INFINITY);
         assert_eq!(gathered.errors().unwrap().ssim, 1.0);
         // A tenth everywhere is 20 dB; one value of 3,600 is beyond the 99.9th percentile.
@@ -217,13 +217,13 @@ mod tests {
         image.depth_m[..600].fill(5.5);
         image.opacity[1199] = 0.4;
         image.depth_m[1199] = 1e6;
-        let mut gathered = Gathered::default();
+        let mut gathered = ErrorAccumulator::default();
         gathered.add(&image, &truth);
         let errors = gathered.errors().unwrap();
         assert!((errors.psnr_db - 20.0).abs() < 0.1, "{errors:?}");
         assert!((errors.max - 0.4).abs() < 1e-6 && (errors.p99_9 - 0.1).abs() < 1e-6, "{errors:?}");
         assert!((errors.depth_l1_m - 300.0 / 1199.0).abs() < 1e-6, "{errors:?}");
-        assert_eq!(Gathered::default().errors(), None);
+        assert_eq!(ErrorAccumulator::default().errors(), None);
     }
 
     #[test]

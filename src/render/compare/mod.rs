@@ -1,8 +1,8 @@
 //! What a backend draws of a view, and how two drawings differ.
 
-pub mod blobs;
-pub mod drawing;
 pub mod errors;
-pub mod numbers;
-pub mod points;
+pub mod gaussians;
+pub mod images;
+pub mod json_numbers;
 pub mod psnr;
+pub mod reprojection;

@@ -1,7 +1,7 @@
 //! How close two drawings of one thing are.
 
 /// Least PSNR at which a drawing counts as right, in dB: what backends promise each other.
-pub const RIGHT_DB: f64 = 60.0;
+pub const MIN_PSNR_DB: f64 = 60.0;
 
 /// Peak signal-to-noise ratio in dB, of differences of values whose peak is 1: infinite where none
 /// differs, NaN where one is NaN or there is none.
@@ -12,7 +12,7 @@ pub fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// The same of two drawings in 8 bit.
-pub fn psnr_db_of_bytes<'a>(pairs: impl Iterator<Item = (&'a u8, &'a u8)>) -> f64 {
+pub fn psnr_db_u8<'a>(pairs: impl Iterator<Item = (&'a u8, &'a u8)>) -> f64 {
     psnr_db(pairs.map(|(a, b)| f64::from(a.abs_diff(*b)) / 255.0))
 }
 
@@ -23,7 +23,7 @@ mod tests {
     #[test]
     fn decibels_of_known_differences() {
         assert!((psnr_db([0.1, -0.1].into_iter()) - 20.0).abs() < 1e-9);
-        assert!((psnr_db_of_bytes([0].iter().zip(&[255])) - 0.0).abs() < 1e-9);
+        assert!((psnr_db_u8([0].iter().zip(&[255])) - 0.0).abs() < 1e-9);
         assert_eq!(psnr_db([0.0; 3].into_iter()), f64::INFINITY);
         assert!(psnr_db([f64::NAN, 0.0].into_iter()).is_nan());
         assert!(psnr_db(std::iter::empty()).is_nan());

@@ -40,9 +40,9 @@ impl Behind {
     /// # Errors
     /// The sky cannot be drawn as the profile asks.
     pub(super) fn of(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
-        let Some((drawn, axes)) = frame.behind()? else { return Ok(Vec::new()) };
+        let Some((drawn, axes)) = frame.background()? else { return Ok(Vec::new()) };
         let of_view = |view: &View| {
-            let looks = if view.is_ideal() {
+            let looks = if view.is_static_pinhole() {
                 Looks::Ideal(view.sky_from_pixel(axes))
             } else if let Some(looks) = optics::Looks::of(view, axes) {
                 Looks::Described(looks)

@@ -11,7 +11,7 @@ use super::project::{Ellipse, LOG2_UNIT, SplatLanes, along, color, rotation_colu
 use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
 use crate::layout::Cutoffs;
-use crate::unscented::{Bent, Beside, Footprint};
+use crate::unscented::{CullBound, Footprint, UnscentedView};
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{LANES, Lanes, column};
 use wildcity_scene::geometry::camera::WIDEST_RAD;
@@ -19,7 +19,7 @@ use wildcity_scene::geometry::camera::WIDEST_RAD;
 /// A chunk as a lens sees it.
 #[derive(Clone, Copy)]
 pub(super) struct BentView<'a> {
-    pub(super) bent: &'a Bent<'a>,
+    pub(super) bent: &'a UnscentedView<'a>,
     optics: Option<&'a Optics>,
     origin_m: DVec3,
     /// Rows that take a place in the chunk to the camera's frame, in metres.
@@ -36,7 +36,7 @@ impl<'a> BentView<'a> {
     pub(super) fn new(
         view: &View,
         chunk: &Chunk,
-        bent: &'a Bent<'a>,
+        bent: &'a UnscentedView<'a>,
         optics: Option<&'a Optics>,
     ) -> Self {
         let origin_m = chunk.origin_m();
@@ -109,7 +109,7 @@ fn project_lanes<S: Simd>(
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
     let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
-        & !beside(simd, center, x.max(y).max(z), view.bent.beside());
+        & !beside(simd, center, x.max(y).max(z), view.bent.cull_bound());
     if in_range.all_false() {
         return (SplatLanes::default(), 0);
     }
@@ -178,13 +178,13 @@ fn project_lanes<S: Simd>(
     (lanes, in_range.to_bitmask() & !inside.to_bitmask())
 }
 
-/// Which Gaussians surely are not seen: see [`Beside`].
+/// Which Gaussians surely are not seen: see [`CullBound`].
 #[inline(always)]
 fn beside<S: Simd>(
     simd: S,
     center_m: Vec3x16<S>,
     sigma_m: f32x16<S>,
-    bound: &Beside,
+    bound: &CullBound,
 ) -> mask32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
     let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
@@ -252,7 +252,7 @@ fn depth<S: Simd>(
 fn project_one(
     columns: &[Lanes],
     lane: usize,
-    (view, origin_m): (&Bent<'_>, DVec3),
+    (view, origin_m): (&UnscentedView<'_>, DVec3),
     cutoffs: &Cutoffs,
     to: &mut SplatLanes,
 ) -> Option<DVec3> {

@@ -2,12 +2,12 @@
 
 use super::Scratch;
 use crate::layout::Cutoffs;
-use crate::stage::{Between, Stage, Tiles};
+use crate::stage::{Stage, StageOutputs, TileLists};
 
 /// Copies what the stages up to `last` left, with splats side by side instead of on pages.
-pub(super) fn between(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> Between {
+pub(super) fn between(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> StageOutputs {
     let Scratch { projected, sorted, bins } = scratch;
-    let mut between = Between::default();
+    let mut between = StageOutputs::default();
     // The index of the splat at each place.
     let mut indices = vec![0; projected.places()];
     for unit in projected.units() {
@@ -21,7 +21,7 @@ pub(super) fn between(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> Betw
         between.order = Some(sorted.places().map(|place| indices[place as usize]).collect());
     }
     if last >= Stage::Bin {
-        between.tiles = Some(Tiles {
+        between.tiles = Some(TileLists {
             ranges: bins.starts().windows(2).map(|tile| [tile[0], tile[1]]).collect(),
             instances: bins.places().map(|place| indices[place as usize]).collect(),
         });

@@ -25,8 +25,8 @@ use crate::limits;
 
 use self::behind::Behind;
 use super::layout::Cutoffs;
-use super::stage::{Between, Stage};
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use super::stage::{Stage, StageOutputs};
+use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 /// The f32 backend.
 #[derive(Debug)]
@@ -107,11 +107,11 @@ impl Cpu {
     ///
     /// # Errors
     /// The views are none or too many, or there are too many instances.
-    pub fn through(
+    pub fn run_through(
         &self,
         frame: &Frame<'_>,
         last: Stage,
-    ) -> Result<(Between, FrameStats), RenderError> {
+    ) -> Result<(StageOutputs, FrameStats), RenderError> {
         frame.check_views()?;
         frame.check_splats(self.name())?;
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
@@ -176,7 +176,7 @@ impl Backend for Cpu {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;

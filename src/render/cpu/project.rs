@@ -14,7 +14,7 @@ use super::optics::Optics;
 use crate::Frame;
 use crate::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::layout::{ChunkView, Cutoffs, Frustum, Splat};
-use crate::unscented::Bent;
+use crate::unscented::UnscentedView;
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
 use wildcity_scene::{Chunk, sh};
 
@@ -72,10 +72,10 @@ impl Projected {
         let Self { pages, units, free } = self;
         let all_free = free.get_mut().unwrap_or_else(PoisonError::into_inner);
         all_free.append(pages);
-        let bent: Vec<Option<(Bent<'_>, Option<Optics>)>> = frame
+        let bent: Vec<Option<(UnscentedView<'_>, Option<Optics>)>> = frame
             .views
             .iter()
-            .map(|view| Some((Bent::of(view, frame.profile)?, Optics::of(view))))
+            .map(|view| Some((UnscentedView::new(view, frame.profile)?, Optics::of(view))))
             .collect();
         let jobs: Vec<Job<'_>> = jobs(frame, &bent);
         let filled: Vec<(usize, Vec<Page>)> = jobs
@@ -138,7 +138,10 @@ fn into_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
 }
 
 /// The units of a frame: chunks that a view cannot see cost one test.
-fn jobs<'a>(frame: &Frame<'a>, bent: &'a [Option<(Bent<'a>, Option<Optics>)>]) -> Vec<Job<'a>> {
+fn jobs<'a>(
+    frame: &Frame<'a>,
+    bent: &'a [Option<(UnscentedView<'a>, Option<Optics>)>],
+) -> Vec<Job<'a>> {
     let mut jobs = Vec::new();
     for (index, (view, bent)) in frame.views.iter().zip(bent).enumerate() {
         for chunk in &frame.scene.chunks {

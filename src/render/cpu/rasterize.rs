@@ -16,7 +16,7 @@ use super::project::Projected;
 use super::resolve::{self, Band, TileSums};
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::layout::{Cutoffs, Splat};
-use crate::{Finished, Target, View};
+use crate::{OnViewDone, Target, View};
 use wildcity_scene::chunk::LANES;
 
 /// Splats of a batch: 64 of 308 B stay in the first-level cache beside the sums.
@@ -39,7 +39,7 @@ pub(super) fn rasterize(
     level: Level,
     input: Input<'_>,
     targets: &mut [Target<'_>],
-    finished: Finished<'_>,
+    finished: OnViewDone<'_>,
 ) -> u64 {
     let evaluations = AtomicU64::new(0);
     targets.par_iter_mut().zip(input.views).enumerate().with_max_len(1).for_each(

@@ -77,7 +77,7 @@ impl Behind {
     ) -> Result<(), RenderError> {
         let mut behind = layout::Behind::zeroed();
         for (slot, view) in behind.sky_from_pixel.iter_mut().zip(frame.views) {
-            let rows = match view.is_ideal() {
+            let rows = match view.is_static_pinhole() {
                 true => view.sky_from_pixel(axes),
                 false => view.sky_from_camera(axes),
             };
@@ -96,7 +96,7 @@ impl Behind {
             let what = "bytes of a sky in one binding of the GPU";
             return Err(RenderError::TooMany { what, limit });
         }
-        let has_bent = !frame.views.iter().all(View::is_ideal);
+        let has_bent = !frame.views.iter().all(View::is_static_pinhole);
         let has_network = matches!(drawn, Drawn::Exact(_));
         self.variant = usize::from(has_network) + 2 * usize::from(has_bent);
         if !self.held.as_ref().is_some_and(|held| held.is(&drawn)) {

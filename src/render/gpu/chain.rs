@@ -27,7 +27,7 @@ use super::sort::{Columns, Sort};
 use super::traffic::FrameCounts;
 use crate::constants::{DEPTH_BITS, TILE_PX};
 use crate::layout::Cutoffs;
-use crate::stage::{Between, Stage};
+use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
 /// Room for splats, touches and instances to begin with; what a frame needs beyond makes it grow.
@@ -70,7 +70,7 @@ enum Source<'a> {
     /// Gaussians: all stages are to be run.
     Gaussians(&'a Work),
     /// What another backend did: the stages after it.
-    Between(&'a Between),
+    StageOutputs(&'a StageOutputs),
 }
 
 impl Source<'_> {
@@ -78,7 +78,7 @@ impl Source<'_> {
     fn leaves(self, stage: Stage) -> bool {
         match self {
             Self::Gaussians(_) => true,
-            Self::Between(between) => between.through() < stage,
+            Self::StageOutputs(between) => between.last_stage() < stage,
         }
     }
 
@@ -86,7 +86,7 @@ impl Source<'_> {
     fn items(self) -> u32 {
         match self {
             Self::Gaussians(work) => work.items(),
-            Self::Between(_) => 0,
+            Self::StageOutputs(_) => 0,
         }
     }
 }
@@ -365,7 +365,7 @@ impl Chain {
         let is_due = |stage| stage <= last && source.leaves(stage);
         let counts = match source {
             Source::Gaussians(work) => Counts { items: work.items(), ..Counts::default() },
-            Source::Between(between) => self.fill(between),
+            Source::StageOutputs(between) => self.fill(between),
         };
         let Self { device, plan, scan, splats, lenses, .. } = self;
         let (device, plan, scan) = (&*device, &*plan, &*scan);

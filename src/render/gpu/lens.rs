@@ -9,8 +9,8 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growing::Growing;
 use super::layout::Lens;
-use crate::unscented::widest_rad;
-use crate::view::StillToCome;
+use crate::unscented::max_center_angle_rad;
+use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
 use wildcity_scene::geometry::camera::{
     self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
@@ -25,11 +25,13 @@ pub(super) struct Lenses {
 impl Lenses {
     /// Sends what a frame's views have; nothing, where all are pinholes at rest.
     pub(super) fn hold(&mut self, device: &Device, frame: &Frame<'_>) {
-        if frame.views.iter().all(View::is_ideal) {
+        if frame.views.iter().all(View::is_static_pinhole) {
             return;
         }
         let mut lenses = [Lens::zeroed(); MAX_VIEWS];
-        for (lens, view) in lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_ideal()) {
+        for (lens, view) in
+            lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_static_pinhole())
+        {
             *lens = Lens::of(view);
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
@@ -50,7 +52,7 @@ impl Lens {
         let mut lens = Self {
             center_px: [pinhole.cx as f32, pinhole.cy as f32],
             linear: columns(DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy))),
-            widest_rad: widest_rad(camera) as f32,
+            widest_rad: max_center_angle_rad(camera) as f32,
             by_distance: camera.depth_is_distance().into(),
             bent: 1,
             ..Self::zeroed()
@@ -67,7 +69,7 @@ impl Lens {
         if let Some(windshield) = &camera.windshield {
             lens.set_windshield(windshield);
         }
-        if let Some(still) = view.still_to_come() {
+        if let Some(still) = view.shutter_motion() {
             lens.set_rolling(&still);
         }
         lens
@@ -129,7 +131,7 @@ impl Lens {
         }
     }
 
-    fn set_rolling(&mut self, still: &StillToCome) {
+    fn set_rolling(&mut self, still: &ShutterMotion) {
         let [a, b, c] = still.share.map(|value| value as f32);
         self.rolls = [a, b, c, 0.0];
         self.moved_world_m = still.moved_world_m.as_vec3().to_array();

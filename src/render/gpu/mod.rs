@@ -43,8 +43,8 @@ use self::read_back::Drawn;
 use self::resolve::{Pixels, Wanted};
 use self::shaders::Shaders;
 use self::turns::Turns;
-use super::stage::{Between, Stage};
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use super::stage::{Stage, StageOutputs};
+use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::limits;
 
 /// The wgpu backend.
@@ -201,10 +201,10 @@ impl Gpu {
     /// As [`Backend::render`]; and what is handed over must fit the device at once.
     pub fn resume(
         &self,
-        between: &Between,
+        between: &StageOutputs,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.render_with(frame, targets, finished, |chain, wanted| {
             chain.resume(between, frame, wanted)
@@ -219,9 +219,9 @@ impl Gpu {
     pub fn run_through(
         &self,
         frame: &Frame<'_>,
-        done: Option<&Between>,
+        done: Option<&StageOutputs>,
         last: Stage,
-    ) -> Result<Between, RenderError> {
+    ) -> Result<StageOutputs, RenderError> {
         frame.check_views()?;
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
@@ -269,7 +269,7 @@ impl Gpu {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
         draw: impl FnOnce(&mut Chain, &Wanted) -> Result<Drawn, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
@@ -328,7 +328,7 @@ impl Backend for Gpu {
         self.deliver.current_num_threads()
     }
 
-    fn frames_at_once(&self) -> usize {
+    fn frames_in_flight(&self) -> usize {
         limits::GPU_FRAMES
     }
 
@@ -336,7 +336,7 @@ impl Backend for Gpu {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.render_with(frame, targets, finished, |chain, wanted| {
             chain.draw(frame, wanted, &self.cull)

@@ -18,7 +18,7 @@ use super::plan::{Plan, job};
 use super::scan::Scan;
 use super::shaders::Shaders;
 use crate::layout::{ChunkView as CpuChunkView, Frustum};
-use crate::unscented::Bent;
+use crate::unscented::UnscentedView;
 use crate::{Frame, View};
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::Cluster;
@@ -42,8 +42,8 @@ impl Work {
         let pairs: Vec<(usize, &Arc<Chunk>)> = views
             .flat_map(|view| frame.scene.chunks.iter().map(move |chunk| (view, chunk)))
             .collect();
-        let bent: Vec<Option<Bent<'_>>> =
-            frame.views.iter().map(|view| Bent::of(view, frame.profile)).collect();
+        let bent: Vec<Option<UnscentedView<'_>>> =
+            frame.views.iter().map(|view| UnscentedView::new(view, frame.profile)).collect();
         let visible: Vec<Vec<(usize, u32)>> = pairs
             .par_iter()
             .map(|(view, chunk)| visible(frame, (*view, bent[*view].as_ref()), chunk, mirror))
@@ -62,7 +62,7 @@ impl Work {
                 false => from,
                 true => from.by_distance(world_from_camera.position_m - chunk.origin_m()),
             });
-            let bent = usize::from(!frame.views[view].is_ideal());
+            let bent = usize::from(!frame.views[view].is_static_pinhole());
             for (page, line) in clusters {
                 pages[page][bent].push(work.items.len() as u32);
                 work.items.push(Item { line, chunk_view });
@@ -90,7 +90,7 @@ impl Work {
 /// Page and first line of the clusters that one view may see of a chunk, in order.
 fn visible(
     frame: &Frame<'_>,
-    (view, bent): (usize, Option<&Bent<'_>>),
+    (view, bent): (usize, Option<&UnscentedView<'_>>),
     chunk: &Arc<Chunk>,
     mirror: &Mirror,
 ) -> Vec<(usize, u32)> {

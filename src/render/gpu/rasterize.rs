@@ -71,7 +71,7 @@ impl Rasterize {
         frame: &Frame<'_>,
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
-        let behind = match frame.behind()? {
+        let behind = match frame.background()? {
             None if !appearances.is_empty() => {
                 let black = self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
                 Some((Drawn::Map(black.clone()), DMat3::IDENTITY))

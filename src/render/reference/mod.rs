@@ -17,7 +17,7 @@ pub use project::{Splat, project};
 
 use wildcity_scene::appearance::{Appearance, Exposure};
 
-use super::{Backend, Finished, Frame, FrameStats, RenderError, Target};
+use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::Rays;
 
 /// The f64 backend.
@@ -33,7 +33,7 @@ impl Backend for Reference {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: Finished<'_>,
+        finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         let (mut project_ms, mut blend_ms) = (0.0, 0.0);

@@ -11,13 +11,15 @@ use wildcity_protocol::http::Refusal;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
-use wildcity_protocol::observation::{Ego, Image, Observation, Residency, Stage, Timings, Trust};
+use wildcity_protocol::observation::{
+    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+};
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    self, DType, Encoding, Frame, HEADER_PREFIX_BYTES, Maps, Outcome, PastImage, Session, Summary,
-    TensorKind, TrajectorySummary, TwinSummary,
+    self, DType, Encoding, EpisodeSummary, HEADER_PREFIX_BYTES, Outcome, PastImageInfo, PixelMaps,
+    Session, TensorKind, TrajectorySummary, TwinSummary,
 };
 use wildcity_sim::{Dynamics, Model};
 use wildcity_twin::store::Version;
@@ -61,7 +63,7 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
     let Version { number, hash, manifest, .. } = &*resident.version;
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let Maps { depth, opacity, normals } = session.maps();
+    let PixelMaps { depth, opacity, normals } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     let outputs = message::Outputs {
@@ -129,8 +131,8 @@ pub(crate) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
 }
 
 /// To `close`.
-pub(crate) fn closed(seq: u64, summary: &Summary) -> Result<String, Fault> {
-    let Summary { outcome, steps, time_us, distance_m, least_trust } = *summary;
+pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault> {
+    let EpisodeSummary { outcome, steps, time_us, distance_m, least_trust } = *summary;
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
         Outcome::OffModel => message::Outcome::OffModel,
@@ -183,7 +185,11 @@ pub(crate) fn twin(twin: &TwinSummary) -> serde_json::Value {
 }
 
 /// Completes an observation: writes the header that says what its bytes are.
-pub(crate) fn observation(seq: u64, session: &Session, mut frame: Frame) -> Result<Frame, Fault> {
+pub(crate) fn observation(
+    seq: u64,
+    session: &Session,
+    mut frame: wildcity_session::Observation,
+) -> Result<wildcity_session::Observation, Fault> {
     let image_names = image_names(session, &frame);
     let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
     for tensor in &frame.tensors {
@@ -236,9 +242,9 @@ struct TensorInfo<'a> {
 }
 
 /// Where an image's tensors are, without the `/rgb` at the end.
-fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
+fn image_names(session: &Session, frame: &wildcity_session::Observation) -> Vec<String> {
     let several = frame.images.iter().any(|image| image.pose > 0);
-    let name = |image: &wildcity_session::Image| {
+    let name = |image: &wildcity_session::ImageInfo| {
         let camera = &session.cameras()[image.camera].name;
         if several {
             format!("pose/{}/camera/{camera}", image.pose)
@@ -249,11 +255,16 @@ fn image_names(session: &Session, frame: &Frame) -> Vec<String> {
     frame.images.iter().map(name).collect()
 }
 
-fn past_tensor(session: &Session, past: &PastImage) -> String {
+fn past_tensor(session: &Session, past: &PastImageInfo) -> String {
     format!("camera/{}/history/{}/rgb", session.cameras()[past.camera].name, past.back)
 }
 
-fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) -> Observation {
+fn metadata(
+    seq: u64,
+    session: &Session,
+    frame: &wildcity_session::Observation,
+    image_names: &[String],
+) -> ObservationMetadata {
     let (episode, version) = (session.episode(), &session.resident().version);
     let time_us = episode.time_us();
     let (encoding, _) = encoding(session.encoding());
@@ -279,7 +290,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             cy,
             lens,
             windshield,
-            seen: session.seen(index),
+            seen: session.visible_share(index),
             camera_to_rig,
             shutter_start_us: time_us - exposed_us,
             shutter_end_us: time_us,
@@ -287,13 +298,13 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
             trust: None,
         }
     };
-    let drawn = |(drawn, name): (&wildcity_session::Image, &String)| {
+    let drawn = |(drawn, name): (&wildcity_session::ImageInfo, &String)| {
         let tensor = format!("{name}/rgb");
         let pose = drawn.pose as u64;
         let trust = drawn.trust.map(trust);
         Image { pose, trust, ..image(drawn.camera, tensor, drawn.time_us, &drawn.hash) }
     };
-    let past = |past: &PastImage| {
+    let past = |past: &PastImageInfo| {
         let (back, trust) = (past.back as u64, past.trust.map(trust));
         Image {
             back,
@@ -304,7 +315,7 @@ fn metadata(seq: u64, session: &Session, frame: &Frame, image_names: &[String]) 
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    Observation {
+    ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
@@ -350,9 +361,9 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::Model::Teleport,
-        Model::Kinematic => message::Model::Kinematic,
-        Model::Dynamic => message::Model::Dynamic,
+        Model::Teleport => message::DynamicsModel::Teleport,
+        Model::Kinematic => message::DynamicsModel::Kinematic,
+        Model::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

@@ -14,8 +14,8 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
         wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                wire::Reference::AngleToPixel => Reference::AngleToPixel,
-                wire::Reference::PixelToAngle => Reference::PixelToAngle,
+                wire::FthetaReference::AngleToPixel => Reference::AngleToPixel,
+                wire::FthetaReference::PixelToAngle => Reference::PixelToAngle,
             };
             LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
@@ -52,10 +52,10 @@ pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposu
 pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        wire::Rolls::TopToBottom => Rolls::TopToBottom,
-        wire::Rolls::BottomToTop => Rolls::BottomToTop,
-        wire::Rolls::LeftToRight => Rolls::LeftToRight,
-        wire::Rolls::RightToLeft => Rolls::RightToLeft,
+        wire::ShutterDirection::TopToBottom => Rolls::TopToBottom,
+        wire::ShutterDirection::BottomToTop => Rolls::BottomToTop,
+        wire::ShutterDirection::LeftToRight => Rolls::LeftToRight,
+        wire::ShutterDirection::RightToLeft => Rolls::RightToLeft,
     };
     let shutter = Shutter { direction, duration_us };
     shutter.check().map(|()| shutter)
@@ -71,10 +71,10 @@ pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Winds
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        Rolls::TopToBottom => wire::Rolls::TopToBottom,
-        Rolls::BottomToTop => wire::Rolls::BottomToTop,
-        Rolls::LeftToRight => wire::Rolls::LeftToRight,
-        Rolls::RightToLeft => wire::Rolls::RightToLeft,
+        Rolls::TopToBottom => wire::ShutterDirection::TopToBottom,
+        Rolls::BottomToTop => wire::ShutterDirection::BottomToTop,
+        Rolls::LeftToRight => wire::ShutterDirection::LeftToRight,
+        Rolls::RightToLeft => wire::ShutterDirection::RightToLeft,
     };
     wire::Shutter { direction, duration_us }
 }
@@ -85,8 +85,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
         LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
         LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                Reference::AngleToPixel => wire::Reference::AngleToPixel,
-                Reference::PixelToAngle => wire::Reference::PixelToAngle,
+                Reference::AngleToPixel => wire::FthetaReference::AngleToPixel,
+                Reference::PixelToAngle => wire::FthetaReference::PixelToAngle,
             };
             wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
         }

@@ -82,7 +82,7 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
     match error {
         SessionError::Twin(StoreError::Name { .. }) => (Code::InvalidName, field("twin")),
         SessionError::Twin(StoreError::NoTwin { .. }) => (Code::UnknownTwin, field("twin")),
-        SessionError::Twin(StoreError::NoVersion { .. } | StoreError::Collected { .. }) => {
+        SessionError::Twin(StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. }) => {
             (Code::UnknownVersion, field("version"))
         }
         SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
@@ -93,13 +93,15 @@ fn of_session(error: &SessionError) -> (Code, Option<String>) {
             (Code::StorageFull, None)
         }
         SessionError::Twin(
-            StoreError::NotSynced { .. } | StoreError::Unsettled { .. } | StoreError::Url { .. },
+            StoreError::NotSynced { .. }
+            | StoreError::OutcomeUnknown { .. }
+            | StoreError::Url { .. },
         ) => (Code::Internal, None),
         SessionError::Residency(error) => match error {
             ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => {
                 (Code::Busy, field("twin"))
             }
-            ResidencyError::Late { .. } => (Code::DeadlineExceeded, None),
+            ResidencyError::TimedOut { .. } => (Code::DeadlineExceeded, None),
             ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
                 (Code::TwinDamaged, field("twin"))
             }
@@ -162,7 +164,7 @@ mod tests {
             (io(io::ErrorKind::QuotaExceeded), false, Code::StorageFull),
             (io(io::ErrorKind::PermissionDenied), false, Code::TwinDamaged),
             (
-                StoreError::Unsettled {
+                StoreError::OutcomeUnknown {
                     name: name.clone(),
                     number,
                     cause: io::ErrorKind::TimedOut.into(),
@@ -180,7 +182,11 @@ mod tests {
                 Code::Internal,
             ),
             (StoreError::Url { url, reason }, false, Code::Internal),
-            (StoreError::Collected { name: name.clone(), number }, false, Code::UnknownVersion),
+            (
+                StoreError::GarbageCollected { name: name.clone(), number },
+                false,
+                Code::UnknownVersion,
+            ),
             (
                 StoreError::Format { path: "city/log/2".into(), found: 9, supported: 1 },
                 false,

@@ -53,7 +53,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
     let asked: http::NewPush = parse(body)?;
     // What was understood, not what was sent: spaces make no other push.
     let content = blake3::hash(json!([&twin, &asked]).to_string().as_bytes());
-    let http::NewPush { id, files, base, cells, record, levels, profile, note, golden } = asked;
+    let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = asked;
     let name_of = |field: &str, name: String| match is_name(&name) {
         true => Ok(name),
         false => Err(Fault::InvalidName { field: field.to_owned(), name }),
@@ -76,11 +76,11 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
     let files = files.into_iter().enumerate().map(file).collect::<Result<_, Fault>>()?;
     let cells = match cells {
         None => AskedCells::Touched,
-        Some(http::Cells::All(http::All::All)) => AskedCells::All,
-        Some(http::Cells::These(cells)) if cells.is_empty() => {
+        Some(http::CellSelection::All(http::AllCells::All)) => AskedCells::All,
+        Some(http::CellSelection::Listed(cells)) if cells.is_empty() => {
             return out_of_range("cells", "empty; leave it out, or name some".to_owned());
         }
-        Some(http::Cells::These(cells)) => {
+        Some(http::CellSelection::Listed(cells)) => {
             AskedCells::These(cells.into_iter().collect::<BTreeSet<_>>())
         }
     };
@@ -104,7 +104,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
         let must = format!("longer than {} characters", limits::NOTE_CHARS);
         return out_of_range("note", must);
     }
-    let poses = match golden.poses {
+    let poses = match preview.poses {
         Some(poses) if poses.len() > limits::GOLDEN_POSES => {
             let must = format!("{} poses; at most {}", poses.len(), limits::GOLDEN_POSES);
             return out_of_range("golden.poses", must);
@@ -127,7 +127,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
         profile,
         note,
         poses,
-        min_psnr_db: golden.min_psnr_db,
+        min_psnr_db: preview.min_psnr_db,
     })
 }
 
@@ -178,10 +178,10 @@ fn report(report: &Report) -> http::PushReport {
             .iter()
             .map(|&CellChange { cell, before, after }| http::CellReport { cell, before, after })
             .collect(),
-        golden: report
+        previews: report
             .golden
             .iter()
-            .map(|golden| http::GoldenReport {
+            .map(|golden| http::PsnrPreview {
                 pose: pose(&golden.world_from_rig),
                 psnr_db: Some(golden.psnr_db).filter(|db| db.is_finite()),
             })

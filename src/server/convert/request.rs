@@ -12,7 +12,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::json::Intrinsics;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlays, is_name};
 use wildcity_session::{
-    Encoding, ImagePart, Maps, Opening, Outputs, RigChoice, SessionError, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, Model};
@@ -47,7 +47,7 @@ pub(crate) enum Command {
         /// The name.
         name: Option<String>,
         /// The rest.
-        opening: Box<Opening>,
+        opening: Box<SessionOptions>,
     },
     /// A step.
     Step {
@@ -241,7 +241,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         message::Encoding::Png => Encoding::Png,
         message::Encoding::Raw => Encoding::Raw,
     };
-    let opening = Opening {
+    let opening = SessionOptions {
         twin: name_of("twin", open.twin)?,
         version: open.version,
         seed: open.seed,
@@ -252,7 +252,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
             encoding,
-            maps: Maps { depth, opacity, normals: normals.unwrap_or(false) },
+            maps: PixelMaps { depth, opacity, normals: normals.unwrap_or(false) },
             frames,
             trust,
             periods_us,
@@ -274,9 +274,9 @@ fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
         }
     };
     let model = match model {
-        message::Model::Teleport => Model::Teleport,
-        message::Model::Kinematic => Model::Kinematic,
-        message::Model::Dynamic => Model::Dynamic,
+        message::DynamicsModel::Teleport => Model::Teleport,
+        message::DynamicsModel::Kinematic => Model::Kinematic,
+        message::DynamicsModel::Dynamic => Model::Dynamic,
     };
     Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }

@@ -8,8 +8,8 @@ use zip::result::ZipError;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
-use super::parts::Parts;
-use super::unpacked::Budget;
+use super::scene_files::SceneFiles;
+use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
 /// Reads the scene of an archive, by the first file in it that is known.
@@ -37,12 +37,12 @@ pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
 /// An archive in memory.
 struct Archive {
     zip: ZipArchive<Cursor<Vec<u8>>>,
-    budget: Budget,
+    budget: UnpackBudget,
 }
 
 impl Archive {
     fn open(bytes: Vec<u8>) -> Result<Self, IngestError> {
-        let mut budget = Budget::default();
+        let mut budget = UnpackBudget::default();
         budget.read(bytes.len() as u64);
         let zip =
             ZipArchive::new(Cursor::new(bytes)).map_err(|e| error("directory", damaged(&e)))?;
@@ -57,7 +57,7 @@ impl Archive {
     }
 }
 
-impl Parts for Archive {
+impl SceneFiles for Archive {
     fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError> {
         let file = self.zip.by_name(name).map_err(|e| error(name, damaged(&e)))?;
         let size = file.size();
@@ -76,7 +76,7 @@ impl Parts for Archive {
         Ok(bytes)
     }
 
-    fn budget(&mut self) -> &mut Budget {
+    fn budget(&mut self) -> &mut UnpackBudget {
         &mut self.budget
     }
 }

@@ -47,7 +47,7 @@ impl Axes {
     /// From a matrix whose rows are the twin's axes in the file's.
     ///
     /// # Errors
-    /// [`IngestError::Frame`] if the rows are not of unit length and at right angles.
+    /// [`IngestError::InvalidAxes`] if the rows are not of unit length and at right angles.
     pub fn from_rows(rows: [[f64; 3]; 3]) -> Result<Self, IngestError> {
         Self::orthonormal(rows).ok_or_else(|| stretched(format!("{rows:?}")))
     }
@@ -72,7 +72,7 @@ impl Axes {
     /// The same axes with a unit of so many metres.
     ///
     /// # Errors
-    /// [`IngestError::Frame`] if the scale is not from 1e-6 to 1e6.
+    /// [`IngestError::InvalidAxes`] if the scale is not from 1e-6 to 1e6.
     pub fn scaled(self, metres_per_unit: f64) -> Result<Self, IngestError> {
         if !(1e-6..=1e6).contains(&metres_per_unit) {
             let reason = "a scale is from 1e-6 to 1e6 metres per unit".to_owned();
@@ -156,5 +156,5 @@ fn stretched(given: String) -> IngestError {
 }
 
 fn frame_error(option: &'static str, given: String, reason: String) -> IngestError {
-    IngestError::Frame { option, given, reason }
+    IngestError::InvalidAxes { option, given, reason }
 }

@@ -90,7 +90,7 @@ pub enum CamerasError {
         "camera {name:?}: a camera list has no {field}: its cameras are at rest, and drawn as they \
          are; leave {field} out, or mount the camera on a rig"
     )]
-    OfRigs {
+    RigCameraField {
         /// The camera.
         name: String,
         /// `shutter`, `exposure` or `overlay`.
@@ -171,7 +171,7 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         ("overlay", entry.overlay.is_some()),
     ];
     if let Some((field, _)) = of_rigs.into_iter().find(|(_, given)| *given) {
-        return Err(CamerasError::OfRigs { name, field });
+        return Err(CamerasError::RigCameraField { name, field });
     }
     let position = match (entry.position, entry.position_ply) {
         (Some(position), None) | (None, Some(position)) => position,

@@ -18,7 +18,7 @@ pub enum FileError {
     },
     /// Named by another file, and not within its folder.
     #[error("is not a plain path below the folder of the file that names it; move it there")]
-    Outside,
+    OutsideFolder,
     /// One of more files than are read for one scene.
     #[error("one more than the {limit} files that a scene may have; split the scene")]
     TooMany {

@@ -14,7 +14,7 @@ use half::f16;
 use wildcity_scene::{Gaussians, sh};
 
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count};
+use super::{IngestError, activation, check_count};
 
 const FORMAT: &str = ".ksplat";
 const HEADER_BYTES: usize = 4096;
@@ -200,11 +200,11 @@ impl Section {
             }));
             ([6, 8, 10].map(half), [12, 14, 16, 18].map(half), 20)
         };
-        g.ln_scales.push(scales.map(|scale| activated::ln_scale(scale.into())));
+        g.ln_scales.push(scales.map(|scale| activation::ln_scale(scale.into())));
         g.quats_wxyz.push(quat);
         let unit = |i: usize| f64::from(record[colour_at + i]) / 255.0;
-        g.sh.extend([0, 1, 2].map(|channel| activated::dc(unit(channel))));
-        g.logit_opacities.push(activated::logit(unit(3)));
+        g.sh.extend([0, 1, 2].map(|channel| activation::dc(unit(channel))));
+        g.logit_opacities.push(activation::logit(unit(3)));
         let value = |i: usize| match header.level {
             0 => single(44 + 4 * i),
             1 => half(24 + 2 * i),

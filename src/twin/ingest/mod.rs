@@ -5,24 +5,24 @@
 //! In memory they take about what an uncompressed file takes; a compressed PLY of 16 bytes per
 //! Gaussian becomes columns of 68, as if the scene came uncompressed.
 
-mod activated;
+mod activation;
 mod archive;
 pub mod axes;
 pub mod cameras;
 mod file;
 mod gltf;
-mod hashing;
+mod hash_reader;
 mod ksplat;
 mod nurec;
-mod parts;
 mod ply;
+mod progress;
 mod safetensors;
+mod scene_files;
 pub mod sky;
 mod sog;
 mod splat;
 mod spz;
-mod told;
-mod unpacked;
+mod unpack_budget;
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
@@ -36,11 +36,11 @@ pub use axes::Axes;
 pub use file::{FileError, read_whole};
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
-use hashing::Hashing;
-use parts::Folder;
-use told::Told;
+use hash_reader::HashReader;
+use progress::ProgressReader;
+use scene_files::Folder;
 
-/// Told about bytes done and bytes in all.
+/// Called with bytes done and bytes in all.
 pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
 
 /// Why a file was refused.
@@ -107,9 +107,9 @@ pub enum IngestError {
     #[error(
         "{format}, {place}: {packed} bytes unpack to {unpacked}; of so few at most {} do in a scene: \
          convert it to PLY, if it is one",
-        unpacked::limit_bytes(*packed)
+        unpack_budget::limit_bytes(*packed)
     )]
-    Bomb {
+    DecompressionBomb {
         /// The format.
         format: &'static str,
         /// Where in the file.
@@ -136,7 +136,7 @@ pub enum IngestError {
     Sky(#[from] SkyError),
     /// `--axes` or `--scale` cannot be used.
     #[error("{option} {given:?}: {reason}")]
-    Frame {
+    InvalidAxes {
         /// The option.
         option: &'static str,
         /// What was given.
@@ -176,18 +176,26 @@ pub fn read_hashed(
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
     let (file, file_bytes) = file::open(path)?;
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, Hashing::new(file));
+    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file));
     let gaussians = match Format::of(input.fill_buf()?)? {
-        Format::Json => return read_parts(path, input, progress, Parted::Json),
-        Format::Glb => return read_parts(path, input, progress, Parted::Glb),
+        Format::Json => return read_parts(path, input, progress, MultiFileFormat::Json),
+        Format::Glb => return read_parts(path, input, progress, MultiFileFormat::Glb),
         Format::Ply => ply::read(&mut input, file_bytes, progress)?,
         Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
-        Format::Spz => spz::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
-        Format::Gzip => spz::read_gzip(Told::new(&mut input, file_bytes, progress), file_bytes)?,
-        Format::Splat => splat::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
-        Format::Ksplat => ksplat::read(Told::new(&mut input, file_bytes, progress), file_bytes)?,
+        Format::Spz => {
+            spz::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
+        Format::Gzip => {
+            spz::read_gzip(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
+        Format::Splat => {
+            splat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
+        Format::Ksplat => {
+            ksplat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
         Format::Zip => {
-            let archive = read_whole_part(Told::new(&mut input, file_bytes, progress))?;
+            let archive = read_whole_part(ProgressReader::new(&mut input, file_bytes, progress))?;
             archive::read(archive)?
         }
     };
@@ -196,7 +204,7 @@ pub fn read_hashed(
 }
 
 /// What may name other files.
-enum Parted {
+enum MultiFileFormat {
     Json,
     Glb,
 }
@@ -204,20 +212,20 @@ enum Parted {
 /// Reads a scene whose first file may name others.
 fn read_parts(
     path: &Path,
-    mut input: BufReader<Hashing<File>>,
+    mut input: BufReader<HashReader<File>>,
     progress: Progress<'_>,
-    parted: Parted,
+    format: MultiFileFormat,
 ) -> Result<(Gaussians, String), IngestError> {
-    let limit_bytes = match parted {
-        Parted::Json => limits::SCENE_JSON_BYTES,
-        Parted::Glb => limits::SCENE_PART_BYTES,
+    let limit_bytes = match format {
+        MultiFileFormat::Json => limits::SCENE_JSON_BYTES,
+        MultiFileFormat::Glb => limits::SCENE_PART_BYTES,
     };
     let first = file::read_at_most(&mut input, limit_bytes)?;
     let mut folder = Folder::new(path, first.len() as u64, input.into_inner().finish(), progress);
-    let gaussians = match parted {
-        Parted::Glb => gltf::read_glb(&first, &mut folder)?,
-        Parted::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut folder)?,
-        Parted::Json => sog::read(&first, "", &mut folder)?,
+    let gaussians = match format {
+        MultiFileFormat::Glb => gltf::read_glb(&first, &mut folder)?,
+        MultiFileFormat::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut folder)?,
+        MultiFileFormat::Json => sog::read(&first, "", &mut folder)?,
     };
     Ok((gaussians, folder.finish()))
 }

@@ -8,7 +8,7 @@ use std::io::Read;
 use wildcity_scene::Gaussians;
 
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count};
+use super::{IngestError, activation, check_count};
 
 /// Bytes of a Gaussian.
 const RECORD_BYTES: usize = 32;
@@ -41,10 +41,10 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
         input.read_exact(&mut record)?;
         let [means_m, scales] = numbers(&record);
         gaussians.means_m.push(means_m.map(f64::from));
-        gaussians.ln_scales.push(scales.map(|s| activated::ln_scale(s.into())));
+        gaussians.ln_scales.push(scales.map(|s| activation::ln_scale(s.into())));
         let [r, g, b, opacity] = [24, 25, 26, 27].map(|at| f64::from(record[at]) / 255.0);
-        gaussians.sh.extend([r, g, b].map(activated::dc));
-        gaussians.logit_opacities.push(activated::logit(opacity));
+        gaussians.sh.extend([r, g, b].map(activation::dc));
+        gaussians.logit_opacities.push(activation::logit(opacity));
         gaussians.quats_wxyz.push(quat_wxyz(&record));
     }
     validate::check(&gaussians, &Field::plain_name)?;

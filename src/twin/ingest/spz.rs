@@ -14,7 +14,7 @@ use flate2::bufread::GzDecoder;
 use wildcity_scene::{Gaussians, sh};
 
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count, unpacked};
+use super::{IngestError, activation, check_count, unpack_budget};
 
 const FORMAT: &str = "SPZ";
 /// "NGSP": Niantic's Gaussian splats.
@@ -68,12 +68,12 @@ pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussian
         return Err(bad("bytes 4 to 7", reason));
     }
     let unpacked_bytes = u128::from(HEADER_BYTES) + header.body_bytes();
-    unpacked::check(FORMAT, "the gzip stream", file_bytes, unpacked_bytes)?;
+    unpack_budget::check(FORMAT, "the gzip stream", file_bytes, unpacked_bytes)?;
     let attributes = header.attributes();
     let gaussians =
         decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take))?;
     // To the end, where the checksum is.
-    let limit = unpacked::limit_bytes(file_bytes);
+    let limit = unpack_budget::limit_bytes(file_bytes);
     let more = io::copy(&mut (&mut input).take(limit), &mut io::sink());
     let more = more.map_err(|e| body("the end", format!("the gzip stream is damaged: {e}")))?;
     if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
@@ -226,7 +226,7 @@ fn read_table(
         let content = format!("{} streams", packed.len());
         return Err(IngestError::Size { format: FORMAT, promised, held, content });
     }
-    unpacked::check(FORMAT, "the zstd streams", file_bytes, header.body_bytes())?;
+    unpack_budget::check(FORMAT, "the zstd streams", file_bytes, header.body_bytes())?;
     Ok(packed)
 }
 
@@ -247,7 +247,7 @@ fn decode(
         };
         g.means_m.push(std::array::from_fn(|i| f64::from(fixed(i)) * metres));
     })?;
-    rows(1, &mut |row| g.logit_opacities.push(activated::logit(unit(row[0]))))?;
+    rows(1, &mut |row| g.logit_opacities.push(activation::logit(unit(row[0]))))?;
     let stride = 3 * sh::coefficients(header.sh_degree);
     g.sh.resize(stride * count, 0.0);
     let mut colours = g.sh.chunks_exact_mut(stride);
@@ -280,7 +280,7 @@ fn decode(
 /// Version 2: x, y, z around 127.5; w is what is left to length 1, and positive.
 fn quat_of_xyz(bytes: [u8; 3]) -> [f32; 4] {
     let xyz = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
-    activated::quat_of_smallest_three(0, xyz)
+    activation::quat_of_smallest_three(0, xyz)
 }
 
 /// Version 3: the place of the largest of (x, y, z, w) in the upper 2 bits, then sign and magnitude
@@ -291,7 +291,7 @@ fn quat_of_word(word: u32) -> [f32; 4] {
         let magnitude = f64::from(bits & 0x1ff) / f64::from(0x1ff) * 0.5f64.sqrt();
         if bits & 0x200 == 0 { magnitude } else { -magnitude }
     });
-    let [x, y, z, w] = activated::quat_of_smallest_three((word >> 30) as usize, others);
+    let [x, y, z, w] = activation::quat_of_smallest_three((word >> 30) as usize, others);
     [w, x, y, z]
 }
 

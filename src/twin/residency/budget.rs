@@ -1,4 +1,4 @@
-//! How much memory twins may take together, and who has how much of it set aside.
+//! How much memory twins may take together, and which sessions reserved how much of it.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -8,34 +8,35 @@ use crate::limits;
 
 use super::ResidencyError;
 
-/// Bytes that are set aside for the worst frames of sessions, by version.
+/// Bytes that are reserved for the worst frames of sessions, by version.
 ///
-/// Sessions on one version share what they draw, so that together they never need more than all of
-/// it.
+/// Sessions on one version share what they draw, so together they never need more than the whole
+/// version takes.
 #[derive(Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
-    versions: BTreeMap<String, Claims>,
+    versions: BTreeMap<String, VersionClaims>,
 }
 
+/// The claims of all sessions on one version.
 #[derive(Clone, Copy, Debug)]
-struct Claims {
+struct VersionClaims {
     sessions: u64,
     sum_bytes: u64,
-    whole_bytes: u64,
+    total_bytes: u64,
 }
 
-/// The worst frame of a session.
+/// The memory for the worst frame of one session.
 #[derive(Clone, Debug)]
 pub(super) struct Claim {
-    /// The twin, for the error.
+    /// The twin's name, for the error.
     pub(super) twin: String,
     /// The version's hash.
     pub(super) version: String,
-    /// What it needs at once.
+    /// Bytes that the frame needs at once.
     pub(super) bytes: u64,
-    /// What all of its version takes, in all levels of detail.
-    pub(super) whole_bytes: u64,
+    /// Bytes that all levels of detail of the whole version take.
+    pub(super) total_bytes: u64,
 }
 
 impl Budget {
@@ -43,38 +44,41 @@ impl Budget {
         Self { limit_bytes, versions: BTreeMap::new() }
     }
 
-    /// Sets memory aside.
+    /// Reserves memory.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
-    pub(super) fn take(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
-        let Claim { twin, version, bytes, whole_bytes } = claim;
-        let held_bytes = self.held_bytes();
-        let nobody = Claims { sessions: 0, sum_bytes: 0, whole_bytes: *whole_bytes };
-        let before = self.versions.get(version).copied().unwrap_or(nobody);
-        let (sessions, sum_bytes) = (before.sessions + 1, before.sum_bytes.saturating_add(*bytes));
-        let after = Claims { sessions, sum_bytes, ..before };
+    pub(super) fn reserve(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
+        let held_bytes = self.reserved_bytes();
+        let unused = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: claim.total_bytes };
+        let before = self.versions.get(&claim.version).copied().unwrap_or(unused);
+        let after = VersionClaims {
+            sessions: before.sessions + 1,
+            sum_bytes: before.sum_bytes.saturating_add(claim.bytes),
+            ..before
+        };
         let needed_bytes = after.bytes() - before.bytes();
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
-            let (twin, limit_bytes) = (twin.clone(), self.limit_bytes);
+            let twin = claim.twin.clone();
+            let limit_bytes = self.limit_bytes;
             return Err(ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes });
         }
-        self.versions.insert(version.clone(), after);
+        self.versions.insert(claim.version.clone(), after);
         Ok(())
     }
 
-    /// Sets memory aside in place of what was taken before; if that is refused, nothing changes.
+    /// Reserves memory in place of an earlier claim. If the new claim is refused, the old one stays.
     ///
     /// # Errors
-    /// As [`Budget::take`].
+    /// As [`Budget::reserve`].
     pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
         let before = self.versions.clone();
-        self.give_back(old);
-        self.take(new).inspect_err(|_| self.versions = before)
+        self.release(old);
+        self.reserve(new).inspect_err(|_| self.versions = before)
     }
 
-    /// Gives back what [`Budget::take`] took.
-    pub(super) fn give_back(&mut self, claim: &Claim) {
+    /// Returns what [`Budget::reserve`] reserved.
+    pub(super) fn release(&mut self, claim: &Claim) {
         if let Some(claims) = self.versions.get_mut(&claim.version) {
             claims.sessions -= 1;
             claims.sum_bytes -= claim.bytes;
@@ -84,24 +88,25 @@ impl Budget {
         }
     }
 
-    /// Bytes that are set aside.
-    pub(super) fn held_bytes(&self) -> u64 {
-        self.versions.values().map(Claims::bytes).sum()
+    /// Bytes that are reserved.
+    pub(super) fn reserved_bytes(&self) -> u64 {
+        self.versions.values().map(VersionClaims::bytes).sum()
     }
 }
 
-impl Claims {
+impl VersionClaims {
     fn bytes(&self) -> u64 {
-        self.sum_bytes.min(self.whole_bytes)
+        self.sum_bytes.min(self.total_bytes)
     }
 }
 
-/// Three quarters of the machine's memory.
+/// The default limit: three quarters of the machine's memory.
 pub(super) fn default_bytes() -> u64 {
     physical_bytes().map_or(limits::RESIDENT_BYTES, |physical| physical / 4 * 3)
 }
 
-/// Memory of the machine; none where /proc does not say.
+/// Memory of the machine in bytes; `None` where /proc/meminfo does not say. By hand, because it is shorter than the
+/// dependency on a crate for system information.
 fn physical_bytes() -> Option<u64> {
     let mut text = String::new();
     File::open("/proc/meminfo").ok()?.take(4096).read_to_string(&mut text).ok()?;

@@ -1,52 +1,44 @@
-//! What a frame draws: a function of its cameras, the profile and the manifest's table alone.
+//! What decides which level of detail of a block a frame draws.
 
 use glam::DVec3;
 
 use wildcity_scene::manifest::Section;
-use wildcity_scene::{Manifest, RenderProfile};
 
-use super::Index;
-
-/// A camera, as far as it matters here.
+/// The part of a camera that decides which sections a frame draws.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Eye {
-    /// Its centre in the world, in metres.
+pub struct Viewpoint {
+    /// The camera's centre in the world, in metres.
     pub position_m: DVec3,
-    /// Its larger focal length, in pixels.
+    /// The larger of its two focal lengths, in pixels.
     pub focal_px: f64,
 }
 
-/// One level of one block that a frame draws: places in [`Manifest::chunks`] and in
+/// One level of one block that a frame draws, as indices into
+/// [`Manifest::chunks`](wildcity_scene::Manifest::chunks) and
 /// [`ChunkEntry::sections`](wildcity_scene::manifest::ChunkEntry::sections).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Needed {
-    /// The chunk.
+pub struct SectionRef {
+    /// Index of the chunk.
     pub chunk: usize,
-    /// Its section.
+    /// Index of the section within its chunk.
     pub section: usize,
 }
 
-/// The sections that a frame draws, in order of (cell y, cell x, block): one for every block within
-/// `reach_m` of a camera.
-///
-/// An error of `e` metres at a distance of `d` is `f e / d` pixels wide. A block is drawn at the
-/// coarsest level for which that is at most `tau_px`, with the longest focal length of the frame, and
-/// the distance of the nearest camera from the box of everything in the block. Memory has no say.
-///
-/// Looks at every block of the twin; whoever asks often keeps an [`Index`].
-pub fn demand(manifest: &Manifest, eyes: &[Eye], profile: &RenderProfile) -> Vec<Needed> {
-    Index::new(manifest).demand(manifest, eyes, profile)
-}
-
-/// The coarsest level of a block, an index of its sections in order of level, whose error is at most
-/// `tau_px` from a distance.
-pub(super) fn level(block: &[Section], focal_px: f64, distance_m: f64, tau_px: f64) -> usize {
-    // Errors rise with the level, and level 0 has none.
+/// The coarsest level of a block whose error is at most `tau_px` pixels from a distance, as an index into the
+/// block's sections in order of level.
+pub(super) fn coarsest_level(
+    block: &[Section],
+    focal_px: f64,
+    distance_m: f64,
+    tau_px: f64,
+) -> usize {
+    // `f e / d <= tau` without the division, so that a distance of 0 needs no special case. Errors rise with
+    // the level, and level 0 has none.
     let small = |error_m: f32| focal_px * f64::from(error_m) <= tau_px * distance_m;
     block.iter().rposition(|section| small(section.error_m)).unwrap_or(0)
 }
 
 /// The longest focal length of a frame, in pixels.
-pub(super) fn longest_px(eyes: &[Eye]) -> f64 {
-    eyes.iter().fold(0.0_f64, |most, eye| most.max(eye.focal_px))
+pub(super) fn longest_focal_px(viewpoints: &[Viewpoint]) -> f64 {
+    viewpoints.iter().fold(0.0_f64, |longest, viewpoint| longest.max(viewpoint.focal_px))
 }

@@ -1,57 +1,57 @@
-//! Why a twin, or what a frame needs of it, is not in memory.
+//! Why a twin, or a section that a frame needs, is not in memory.
 
 use std::time::Duration;
 
 use crate::store::StoreError;
 use wildcity_scene::sky::SkyError;
 
-/// Why a twin cannot be opened, or a frame not be drawn.
+/// Why a twin cannot be opened, or a frame cannot be drawn.
 #[derive(Debug, thiserror::Error)]
 pub enum ResidencyError {
-    /// It is not in the store, or not as it was committed.
+    /// The version is not in the store, or differs from what was committed.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// Its worst frame does not fit beside those of the sessions that are open.
+    /// The memory for its worst frame does not fit beside that of the open sessions.
     #[error(
         "a frame of twin {twin:?} may need {needed_bytes} bytes of memory; {held_bytes} of \
-         {limit_bytes} are set aside for open sessions: close some, allow more with --memory-gib, or \
+         {limit_bytes} are reserved for open sessions: close some, allow more with --memory-gib, or \
          import the twin with a smaller reach_m or a larger tau_px"
     )]
     NoRoom {
-        /// The twin.
+        /// The twin's name.
         twin: String,
-        /// What its worst frame needs, as far as it is not set aside already.
+        /// Bytes that its worst frame needs beyond those that are reserved already.
         needed_bytes: u64,
-        /// What is set aside for sessions.
+        /// Bytes that are reserved for sessions.
         held_bytes: u64,
-        /// What there is for all.
+        /// Bytes that all twins together may use.
         limit_bytes: u64,
     },
-    /// One frame needs more than all the memory there is for twins.
+    /// One frame needs more than all the memory that twins may use.
     #[error(
-        "this frame of twin {twin:?} needs {needed_bytes} bytes of memory, and there are \
-         {limit_bytes} for all twins: allow more with --memory-gib, or draw it with a smaller reach_m \
+        "this frame of twin {twin:?} needs {needed_bytes} bytes of memory, and all twins \
+         together may use {limit_bytes}: allow more with --memory-gib, or draw it with a smaller reach_m \
          or a larger tau_px"
     )]
     TooLarge {
-        /// The twin.
+        /// The twin's name.
         twin: String,
-        /// What the frame needs.
+        /// Bytes that the frame needs.
         needed_bytes: u64,
-        /// What there is for all.
+        /// Bytes that all twins together may use.
         limit_bytes: u64,
     },
-    /// The deadline passed before everything was there.
+    /// The deadline passed before every section was in memory.
     #[error(
         "{missing} of the {needed} sections of twin {twin:?} that the frame needs were not in memory \
-         after {waited:.1?}; they go on loading: try again, or allow more time"
+         after {waited:.1?}; loading continues: try again, or allow more time"
     )]
-    Late {
-        /// The twin.
+    TimedOut {
+        /// The twin's name.
         twin: String,
-        /// Sections that are still not there.
+        /// Sections that are still missing.
         missing: usize,
-        /// Sections of the frame.
+        /// Sections that the frame needs.
         needed: usize,
         /// How long the frame waited for them.
         waited: Duration,
@@ -62,31 +62,31 @@ pub enum ResidencyError {
          {attempts} attempts: {cause}"
     )]
     Load {
-        /// The twin.
+        /// The twin's name.
         twin: String,
-        /// The cell.
+        /// Grid cell (x, y).
         cell: [i32; 2],
         /// The block within the cell.
         block: u8,
         /// The level of detail.
         level: u8,
-        /// How often it was tried.
+        /// How many attempts were made.
         attempts: u32,
-        /// What went wrong the last time.
+        /// Why the last attempt failed.
         cause: String,
     },
-    /// Its sky cannot be drawn as its profile asks.
+    /// Its sky cannot be drawn with the error that its profile asks for.
     #[error("the sky of twin {twin:?}: {cause}")]
     Sky {
-        /// The twin.
+        /// The twin's name.
         twin: String,
-        /// Why not.
+        /// The reason.
         cause: SkyError,
     },
-    /// The threads that load cannot be started.
-    #[error("cannot start the threads that load twins: {reason}")]
+    /// The loader threads cannot be started.
+    #[error("cannot start the threads that load sections: {reason}")]
     Thread {
-        /// What the operating system says.
+        /// The operating system's message.
         reason: String,
     },
 }

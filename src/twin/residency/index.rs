@@ -1,5 +1,5 @@
-//! The blocks of a version by where they lie, so that a frame looks at those near it and not at all
-//! of a city.
+//! A spatial index over the blocks of a version, so that a frame looks only at the blocks near it and not at
+//! a whole city; and the sections that a frame draws.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -8,16 +8,32 @@ use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::Section;
 use wildcity_scene::{Manifest, RenderProfile};
 
-use super::demand::{level, longest_px};
-use super::{Eye, Needed};
+use super::demand::{SectionRef, Viewpoint, coarsest_level, longest_focal_px};
 
-/// Cells along the edge of a group: 1 km, so that 20 km of road are some twenty groups, and the 200
-/// cells within 300 m of an eye lie in at most four.
+/// Cells along the edge of a group: 1 km. 20 km of road are then about twenty groups, and the 200 cells within
+/// 300 m of a viewpoint lie in at most four of them.
 const GROUP_CELLS: i32 = 16;
 
-/// The blocks of a version in order, beneath the boxes of their cells and of groups of cells.
+/// The sections that a frame draws, in order of (cell y, cell x, block): one for every block within
+/// `reach_m` of a camera. It depends on the cameras, the profile, and the manifest's table alone.
+///
+/// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal length in
+/// pixels. A block is drawn at the coarsest level for which that is at most `tau_px`, with the longest focal
+/// length of the frame, and the distance of the nearest camera from the bounding box of everything in the block.
+/// The amount of memory has no influence.
+///
+/// This looks at every block of the twin; callers that ask often keep a [`BlockIndex`].
+pub fn demand(
+    manifest: &Manifest,
+    viewpoints: &[Viewpoint],
+    profile: &RenderProfile,
+) -> Vec<SectionRef> {
+    BlockIndex::new(manifest).demand(manifest, viewpoints, profile)
+}
+
+/// The blocks of a version in order, below the bounding boxes of their cells and of groups of cells.
 #[derive(Debug)]
-pub struct Index {
+pub struct BlockIndex {
     groups: Vec<Group>,
     cells: Vec<Cell>,
     blocks: Vec<Block>,
@@ -38,73 +54,78 @@ struct Cell {
 /// A block: its sections in order of level.
 #[derive(Debug)]
 pub(super) struct Block {
-    /// Box of everything in it, in metres.
+    /// Bounding box of everything in it, in metres.
     pub(super) bounds: Bounds,
     chunk: usize,
     sections: Range<usize>,
 }
 
-impl Index {
-    /// Of a version's table.
+impl BlockIndex {
+    /// Builds the index of a version's table.
     pub fn new(manifest: &Manifest) -> Self {
         let mut groups: BTreeMap<[i32; 2], Group> = BTreeMap::new();
-        let (mut cells, mut blocks) = (Vec::with_capacity(manifest.chunks.len()), Vec::new());
+        let mut cells = Vec::with_capacity(manifest.chunks.len());
+        let mut blocks = Vec::new();
         for (chunk, entry) in manifest.chunks.iter().enumerate() {
-            let (mut section, mut bounds) = (0, Bounds::EMPTY);
-            let first = blocks.len();
+            let first_block = blocks.len();
+            let mut next_section = 0;
+            let mut bounds = Bounds::EMPTY;
             for block in entry.sections.chunk_by(|a, b| a.block == b.block) {
-                let sections = section..section + block.len();
-                section = sections.end;
+                let sections = next_section..next_section + block.len();
+                next_section = sections.end;
                 let block = Block { bounds: entry.section_bounds(&block[0]), chunk, sections };
                 bounds = bounds.union(&block.bounds);
                 blocks.push(block);
             }
-            let place = entry.cell.map(|cell| cell.div_euclid(GROUP_CELLS));
-            let nothing = || Group { bounds: Bounds::EMPTY, cells: Vec::new() };
-            let group = groups.entry(place).or_insert_with(nothing);
+
+            let group_cell = entry.cell.map(|cell| cell.div_euclid(GROUP_CELLS));
+            let empty = || Group { bounds: Bounds::EMPTY, cells: Vec::new() };
+            let group = groups.entry(group_cell).or_insert_with(empty);
             group.bounds = group.bounds.union(&bounds);
             group.cells.push(chunk);
-            cells.push(Cell { bounds, blocks: first..blocks.len() });
+            cells.push(Cell { bounds, blocks: first_block..blocks.len() });
         }
         Self { groups: groups.into_values().collect(), cells, blocks }
     }
 
-    /// What [`demand`](super::demand()) says of the manifest that this is the index of.
+    /// As [`demand`](super::demand()), for the manifest that this index was built from.
     pub fn demand(
         &self,
         manifest: &Manifest,
-        eyes: &[Eye],
+        viewpoints: &[Viewpoint],
         profile: &RenderProfile,
-    ) -> Vec<Needed> {
-        let focal_px = longest_px(eyes);
+    ) -> Vec<SectionRef> {
+        let focal_px = longest_focal_px(viewpoints);
         let distance_m = |bounds: &Bounds| {
-            let from = |eye: &Eye| bounds.distance_m(eye.position_m);
-            eyes.iter().map(from).fold(f64::INFINITY, f64::min)
+            let from = |viewpoint: &Viewpoint| bounds.distance_m(viewpoint.position_m);
+            viewpoints.iter().map(from).fold(f64::INFINITY, f64::min)
         };
-        let mut needed = Vec::new();
+        let mut sections = Vec::new();
         self.visit(profile.reach_m, &distance_m, &mut |block, distance_m| {
-            let level = level(block.levels(manifest), focal_px, distance_m, profile.tau_px);
-            needed.push(block.at(level));
+            let levels = block.levels(manifest);
+            let level = coarsest_level(levels, focal_px, distance_m, profile.tau_px);
+            sections.push(block.section_ref(level));
         });
-        needed
+        sections
     }
 
-    /// Shows the blocks within reach and how far away they are, in order. A box is never farther than
-    /// one within it, in f64 as on paper: each step of the distance rounds monotonically.
+    /// Calls `see` with each block within reach and its distance, in order.
+    ///
+    /// A box is never farther away than a box within it, in f64 arithmetic as well as on paper: each step of the
+    /// distance rounds monotonically. So no block is lost by skipping groups and cells that are out of reach.
     pub(super) fn visit(
         &self,
         reach_m: Option<f64>,
         distance_m: &dyn Fn(&Bounds) -> f64,
         see: &mut dyn FnMut(&Block, f64),
     ) {
-        let near = |bounds: &Bounds| reach_m.is_none_or(|reach_m| distance_m(bounds) <= reach_m);
-        let groups = self.groups.iter().filter(|group| near(&group.bounds));
+        let is_near = |bounds: &Bounds| reach_m.is_none_or(|reach_m| distance_m(bounds) <= reach_m);
+        let groups = self.groups.iter().filter(|group| is_near(&group.bounds));
         let mut cells: Vec<usize> = groups.flat_map(|group| group.cells.iter().copied()).collect();
-        cells.retain(|&cell| near(&self.cells[cell].bounds));
+        cells.retain(|&cell| is_near(&self.cells[cell].bounds));
         cells.sort_unstable();
-        for block in
-            cells.into_iter().flat_map(|cell| &self.blocks[self.cells[cell].blocks.clone()])
-        {
+        let near_cells = cells.into_iter().map(|cell| &self.cells[cell]);
+        for block in near_cells.flat_map(|cell| &self.blocks[cell.blocks.clone()]) {
             let distance_m = distance_m(&block.bounds);
             if reach_m.is_none_or(|reach_m| distance_m <= reach_m) {
                 see(block, distance_m);
@@ -112,7 +133,7 @@ impl Index {
         }
     }
 
-    /// Box of everything.
+    /// Bounding box of the whole version.
     pub(super) fn bounds(&self) -> Bounds {
         self.groups.iter().fold(Bounds::EMPTY, |all, group| all.union(&group.bounds))
     }
@@ -124,7 +145,7 @@ impl Block {
         &manifest.chunks[self.chunk].sections[self.sections.clone()]
     }
 
-    fn at(&self, level: usize) -> Needed {
-        Needed { chunk: self.chunk, section: self.sections.start + level }
+    fn section_ref(&self, level: usize) -> SectionRef {
+        SectionRef { chunk: self.chunk, section: self.sections.start + level }
     }
 }

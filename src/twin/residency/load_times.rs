@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::limits;
 
-/// The times of the last loads, oldest overwritten first.
+/// A ring buffer with the durations of the last [`limits::LOAD_TIMES`] loads.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LoadTimes {
     times: Vec<Duration>,
@@ -21,7 +21,7 @@ impl LoadTimes {
         }
     }
 
-    /// The time that a share of the loads did not exceed; zero before the first.
+    /// The duration that a share of the loads, 0 to 1, did not exceed; zero before the first load.
     pub(super) fn quantile(&self, share: f64) -> Duration {
         let mut sorted = self.times.clone();
         sorted.sort_unstable();

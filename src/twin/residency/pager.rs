@@ -1,46 +1,55 @@
-//! The pager: loads what is wanted, in order of urgency, and gives a frame all it needs at once.
+//! The pager: loads requested sections in order of urgency, and hands a frame all of its sections at once.
 //!
-//! A frame that waits holds nothing, so frames cannot block each other; its sections are spared by
-//! everybody but older frames ([`super::table::Asker`]). Threads of its own load, because reading blocks; nobody
-//! else ever waits in here for more than a lock.
+//! A frame that waits holds no memory, so frames cannot block each other; only older frames may evict the sections
+//! that it waits for ([`super::table::Requester`]). The pager has threads of its own for loading, because reading
+//! blocks. All other threads wait here for the lock at most.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
+
+use parking_lot::{Condvar, Mutex};
 
 use crate::limits;
 use crate::store::Version;
 use wildcity_scene::Scene;
 
+use super::demand::SectionRef;
 use super::load_times::LoadTimes;
-use super::requests::{Done, Failed, Next, Ready, Requests, Tellings, Urgency, Wanted};
-use super::table::{Id, Table};
-use super::{Needed, ResidencyError, Source, Stats};
+use super::requests::{self, CompleteFrame, LoadFailure, NextLoad, RequestedSections, Urgency};
+use super::table::{SectionTable, SlotId};
+use super::{ResidencyError, SectionSource, Stats};
 
-/// The table of sections and the threads that fill it, which end with it.
+/// The table of sections and the loader threads, which end when this is dropped.
 pub(super) struct Pager(Arc<Shared>);
 
-/// What a frame draws, all of it in memory for as long as this lives.
+/// Is called once with what a frame draws, or the reason why the frame cannot be drawn.
+pub type SceneCallback = Box<dyn FnOnce(Result<PinnedScene, ResidencyError>) + Send>;
+
+type Requests = requests::Requests<SceneCallback>;
+type Notifications = requests::Notifications<SceneCallback>;
+
+/// Everything that a frame draws, held in memory for as long as this lives.
 #[derive(Debug)]
-pub struct Pinned {
+pub struct PinnedScene {
     scene: Scene,
     shared: Arc<Shared>,
-    /// Sections that were not in memory when the frame asked.
+    /// Number of sections that were not in memory when the frame requested them.
     pub waited_for: usize,
-    /// How long it took until all were.
+    /// Time until all of them were.
     pub waited: Duration,
 }
 
-/// A frame's place among those that wait; dropping it gives the place up.
-pub(super) struct Waiting {
+/// A frame that waits for its sections. Dropping it cancels the request.
+pub(super) struct WaitingFrame {
     shared: Arc<Shared>,
     number: u64,
 }
 
 struct Shared {
-    source: Arc<dyn Source>,
+    source: Arc<dyn SectionSource>,
     state: Mutex<State>,
-    /// Rings when there may be something to load, or room for it.
+    /// Notified when there may be a section to load, or room for one.
     work: Condvar,
 }
 
@@ -51,18 +60,18 @@ struct State {
 }
 
 impl Pager {
-    pub(super) fn new(source: Arc<dyn Source>, limit_bytes: u64) -> Self {
-        let requests = Requests::new(Table::new(limit_bytes));
+    pub(super) fn new(source: Arc<dyn SectionSource>, limit_bytes: u64) -> Self {
+        let requests = Requests::new(SectionTable::new(limit_bytes));
         let state = State { requests, started: false, closed: false };
         Self(Arc::new(Shared { source, state: Mutex::new(state), work: Condvar::new() }))
     }
 
-    /// Starts the threads that load, unless they run.
+    /// Starts the loader threads, unless they run.
     ///
     /// # Errors
     /// [`ResidencyError::Thread`].
     pub(super) fn start(&self) -> Result<(), ResidencyError> {
-        let mut state = self.0.lock();
+        let mut state = self.0.state.lock();
         if state.started {
             return Ok(());
         }
@@ -70,114 +79,120 @@ impl Pager {
             let shared = self.0.clone();
             std::thread::Builder::new()
                 .name(format!("load-{number}"))
-                .spawn(move || shared.load_all())
+                .spawn(move || shared.load_until_closed())
                 .map_err(|error| ResidencyError::Thread { reason: error.to_string() })?;
             state.started = true;
         }
         Ok(())
     }
 
-    /// Changes what the table knows of versions.
-    pub(super) fn with_table<T>(&self, change: impl FnOnce(&mut Table) -> T) -> T {
-        change(&mut self.0.lock().requests.table)
+    /// Registers or unregisters sections of a version.
+    pub(super) fn with_table<T>(&self, change: impl FnOnce(&mut SectionTable) -> T) -> T {
+        change(&mut self.0.state.lock().requests.table)
     }
 
-    /// Tells `done` as soon as all of what a frame needs is in memory; at once if it is.
+    /// Requests the sections of a frame. `callback` is called once all are in memory; before this returns, if they
+    /// are already.
     ///
     /// # Errors
-    /// [`ResidencyError::TooLarge`]; `done` is dropped then.
-    pub(super) fn ask(&self, wanted: Wanted, done: Done) -> Result<Waiting, ResidencyError> {
-        let mut tellings = Tellings::new();
-        let number = self.0.lock().requests.ask(wanted, done, &mut tellings)?;
-        if tellings.is_empty() {
+    /// [`ResidencyError::TooLarge`]; `callback` is dropped then.
+    pub(super) fn request_frame(
+        &self,
+        requested: RequestedSections,
+        callback: SceneCallback,
+    ) -> Result<WaitingFrame, ResidencyError> {
+        let mut notifications = Notifications::new();
+        let added = self.0.state.lock().requests.add_frame(requested, callback, &mut notifications);
+        let number = added?;
+        if notifications.is_empty() {
             self.0.work.notify_all();
         }
-        self.0.tell(tellings);
-        Ok(Waiting { shared: self.0.clone(), number })
+        self.0.notify(notifications);
+        Ok(WaitingFrame { shared: self.0.clone(), number })
     }
 
-    /// Loads what somebody may need, in order, as far as there is room, in place of what the same
-    /// owner wanted under the number `before`; returns the new number.
+    /// Loads sections that frames may need later, in order, as far as there is room. This replaces the prefetch of
+    /// the same owner with the number `before`. Returns the new number.
     pub(super) fn prefetch(
         &self,
         before: Option<u64>,
-        wanted: Wanted,
+        requested: RequestedSections,
         urgencies: &[Urgency],
     ) -> u64 {
         let number = {
-            let requests = &mut self.0.lock().requests;
+            let requests = &mut self.0.state.lock().requests;
             if let Some(before) = before {
-                requests.withdraw_prefetch(before);
+                requests.cancel_prefetch(before);
             }
-            let number = requests.prefetch(before, wanted, urgencies);
-            requests.forget_failures();
+            let number = requests.add_prefetch(before, requested, urgencies);
+            requests.forget_unrequested_failures();
             number
         };
         self.0.work.notify_all();
         number
     }
 
-    /// Loads nothing more of what was wanted under a number.
-    pub(super) fn withdraw_prefetch(&self, number: u64) {
-        let requests = &mut self.0.lock().requests;
-        requests.withdraw_prefetch(number);
-        requests.forget_failures();
+    /// Cancels the loads of a prefetch that have not begun.
+    pub(super) fn cancel_prefetch(&self, number: u64) {
+        let requests = &mut self.0.state.lock().requests;
+        requests.cancel_prefetch(number);
+        requests.forget_unrequested_failures();
     }
 
-    /// Sections that were wanted under a number and may still come: not those that are there, that
-    /// failed or for which there was no room.
-    pub(super) fn coming(&self, number: u64) -> usize {
-        self.0.lock().requests.coming(number)
+    /// Number of sections of a prefetch that may still be loaded: without those that are in memory, that
+    /// failed, or for which there was no room.
+    pub(super) fn pending(&self, number: u64) -> usize {
+        self.0.state.lock().requests.pending(number)
     }
 
-    /// Bytes of memory in use, and bytes there are.
+    /// Bytes of memory in use, and bytes that may be used.
     pub(super) fn memory(&self) -> (u64, u64) {
-        let table = &self.0.lock().requests.table;
+        let table = &self.0.state.lock().requests.table;
         (table.held_bytes(), table.limit_bytes())
     }
 
     /// How long the last loads took.
     pub(super) fn load_times(&self) -> LoadTimes {
-        self.0.lock().requests.load_times.clone()
+        self.0.state.lock().requests.load_times.clone()
     }
 
-    /// All but what is set aside, which the pager does not know.
+    /// All statistics except the reserved bytes, which the pager does not know.
     pub(super) fn stats(&self) -> Stats {
-        // Sorted once the lock is open again.
+        // A copy, so that it is sorted without the lock.
         let times = self.load_times();
-        let stats = self.0.lock().requests.stats();
+        let stats = self.0.state.lock().requests.stats();
         Stats { load_p50: times.quantile(0.5), load_p99: times.quantile(0.99), ..stats }
     }
 }
 
 impl Drop for Pager {
     fn drop(&mut self) {
-        self.0.lock().closed = true;
+        self.0.state.lock().closed = true;
         self.0.work.notify_all();
     }
 }
 
-impl Waiting {
-    /// How many of its sections are not there.
+impl WaitingFrame {
+    /// How many of its sections are not in memory.
     pub(super) fn missing(&self) -> usize {
-        self.shared.lock().requests.missing(self.number)
+        self.shared.state.lock().requests.missing(self.number)
     }
 }
 
-impl Drop for Waiting {
+impl Drop for WaitingFrame {
     fn drop(&mut self) {
-        // What it was to be told is dropped once the lock is open: it may hold anything.
-        let _done = {
-            let requests = &mut self.shared.lock().requests;
-            let done = requests.give_up(self.number);
-            requests.forget_failures();
-            done
+        // Dropped without the lock, because the callback may own anything.
+        let _request = {
+            let requests = &mut self.shared.state.lock().requests;
+            let request = requests.cancel_frame(self.number);
+            requests.forget_unrequested_failures();
+            request
         };
         self.shared.work.notify_all();
     }
 }
 
-impl std::ops::Deref for Pinned {
+impl std::ops::Deref for PinnedScene {
     type Target = Scene;
 
     fn deref(&self) -> &Scene {
@@ -185,75 +200,63 @@ impl std::ops::Deref for Pinned {
     }
 }
 
-impl Drop for Pinned {
+impl Drop for PinnedScene {
     fn drop(&mut self) {
         self.scene.chunks.clear();
-        // Under the lock: a loader that has just found everything in use is asleep by then.
-        if self.shared.lock().requests.starving {
+        // The flag is read under the lock: a loader that has just found every section pinned sleeps by then, and
+        // gets the notification.
+        if self.shared.state.lock().requests.waiting_for_room {
             self.shared.work.notify_all();
         }
     }
 }
 
 impl Shared {
-    /// A panic elsewhere leaves nothing half-done behind this lock.
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// What a loader does, until the pager is dropped.
-    fn load_all(self: Arc<Self>) {
-        let mut state = self.lock();
+    /// The main function of a loader thread: loads sections until the pager is dropped.
+    fn load_until_closed(self: Arc<Self>) {
+        let mut state = self.state.lock();
         while !state.closed {
             match state.requests.next(Instant::now()) {
-                Next::Load { id, needed, version } => {
+                NextLoad::Load { id, section, version } => {
                     drop(state);
-                    let tellings = self.load(id, needed, &version);
+                    let notifications = self.load(id, section, &version);
                     self.work.notify_all();
-                    self.tell(tellings);
-                    state = self.lock();
+                    self.notify(notifications);
+                    state = self.state.lock();
                 }
-                Next::Wait(until) => {
-                    // A frame's end rings. What else may hold a chunk for a moment does not, so that
-                    // whoever waits for room looks again now and then.
-                    let until = if state.requests.starving {
-                        Some(Instant::now() + limits::ROOM_POLL)
-                    } else {
-                        until
-                    };
-                    state = match until {
-                        None => self.work.wait(state).unwrap_or_else(PoisonError::into_inner),
-                        Some(until) => {
-                            let patience = until.saturating_duration_since(Instant::now());
-                            let woken = self.work.wait_timeout(state, patience);
-                            woken.unwrap_or_else(PoisonError::into_inner).0
-                        }
-                    };
+                // The end of a frame notifies. Code that holds a chunk for a moment otherwise does not, so a load
+                // that waits for room also looks again from time to time.
+                NextLoad::Wait(_) if state.requests.waiting_for_room => {
+                    self.work.wait_for(&mut state, limits::ROOM_POLL);
                 }
+                NextLoad::Wait(Some(until)) => {
+                    self.work.wait_until(&mut state, until);
+                }
+                NextLoad::Wait(None) => self.work.wait(&mut state),
             }
         }
     }
 
-    fn load(&self, id: Id, needed: Needed, version: &Version) -> Tellings {
-        let chunk = &version.manifest.chunks[needed.chunk];
-        let section = &chunk.sections[needed.section];
+    fn load(&self, id: SlotId, section: SectionRef, version: &Version) -> Notifications {
+        let chunk = &version.manifest.chunks[section.chunk];
+        let section = &chunk.sections[section.section];
         let began = Instant::now();
-        // A defect in one section's loading must not end the thread that loads all.
+        // A defect in loading one section must not end the thread that loads all of them.
         let read = || self.source.section(version, chunk, section);
         let loaded = catch_unwind(AssertUnwindSafe(read));
         let took = began.elapsed();
-        let requests = &mut self.lock().requests;
+        let requests = &mut self.state.lock().requests;
         match loaded {
-            Ok(Ok(loaded)) => requests.arrived(id, Arc::new(loaded), took),
-            Ok(Err(error)) => requests.failed(id, &Failed::Store(error)),
-            Err(_) => requests.failed(id, &Failed::Crashed),
+            Ok(Ok(loaded)) => requests.loaded(id, Arc::new(loaded), took),
+            Ok(Err(error)) => requests.load_failed(id, &LoadFailure::Store(error)),
+            Err(_) => requests.load_failed(id, &LoadFailure::Crashed),
         }
     }
 
-    /// Hands over what frames waited for.
-    fn tell(self: &Arc<Self>, tellings: Tellings) {
-        for (done, told) in tellings {
-            done(told.map(|Ready { scene, waited_for, waited }| Pinned {
+    /// Calls the callbacks of frames that are complete or have failed.
+    fn notify(self: &Arc<Self>, notifications: Notifications) {
+        for (callback, result) in notifications {
+            callback(result.map(|CompleteFrame { scene, waited_for, waited }| PinnedScene {
                 scene,
                 shared: self.clone(),
                 waited_for,
@@ -269,9 +272,9 @@ impl std::fmt::Debug for Pager {
     }
 }
 
-impl std::fmt::Debug for Waiting {
+impl std::fmt::Debug for WaitingFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Waiting").field("number", &self.number).finish_non_exhaustive()
+        f.debug_struct("WaitingFrame").field("number", &self.number).finish_non_exhaustive()
     }
 }
 

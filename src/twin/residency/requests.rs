@@ -1,7 +1,8 @@
-//! Who wants what: frames that wait for all of theirs, and what is fetched ahead. Which section is loaded
-//! next, and who is told what once it is there or has failed.
+//! Requests for sections: by frames, which wait until all of theirs are in memory, and by prefetches. Decides which
+//! section is loaded next, and which frames are notified once it is loaded or has failed.
 //!
-//! No thread, no lock and no file: those are the pager's.
+//! There is no thread, lock, or file here: those belong to the pager. `C` is a frame's callback, which is
+//! stored and returned here, but never called.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -12,198 +13,208 @@ use crate::limits;
 use crate::store::{StoreError, Version};
 use wildcity_scene::{Chunk, Scene, Sky};
 
+use super::demand::SectionRef;
 use super::load_times::LoadTimes;
-use super::pager::Pinned;
-use super::table::{Asker, Id, Table};
-use super::{Needed, ResidencyError, Stats};
+use super::table::{Requester, SectionTable, SlotId};
+use super::{ResidencyError, Stats};
 
 /// All requests, and the table of sections that answers them.
-pub(super) struct Requests {
-    pub(super) table: Table,
-    /// What is to be loaded, the most urgent first. A section may stand here for several, and stays
-    /// until it is there.
-    queue: BTreeMap<Place, Needed>,
-    requests: BTreeMap<u64, Request>,
+pub(super) struct Requests<C> {
+    pub(super) table: SectionTable,
+    /// What is to be loaded, the most urgent first. A section may be queued for several requests; each entry stays
+    /// until the section is loaded.
+    queue: BTreeMap<QueueKey, SectionRef>,
+    requests: BTreeMap<u64, Request<C>>,
     /// Sections whose last load failed.
-    failures: BTreeMap<Id, Failure>,
-    /// Requests so far: numbers them, and stamps what they want.
+    failures: BTreeMap<SlotId, RetryState>,
+    /// Number of requests so far. It numbers requests, and is the time of last use of their sections.
     number: u64,
-    /// A load waits for room.
-    pub(super) starving: bool,
+    /// Whether the most urgent load waits for room.
+    pub(super) waiting_for_room: bool,
     stats: Stats,
     pub(super) load_times: LoadTimes,
 }
 
 /// Sections of a version.
-pub(super) struct Wanted {
+pub(super) struct RequestedSections {
     pub(super) version: Arc<Version>,
     pub(super) sky: Option<Arc<Sky>>,
-    pub(super) needed: Vec<Needed>,
-    /// Their names in the table, in the same order.
-    pub(super) ids: Vec<Id>,
+    pub(super) sections: Vec<SectionRef>,
+    /// Their slots in the table, in the same order.
+    pub(super) ids: Vec<SlotId>,
 }
 
-/// What a frame is told once: what it draws, or why it cannot.
-pub type Done = Box<dyn FnOnce(Result<Pinned, ResidencyError>) + Send>;
-
+/// The position of a section in the queue: the smallest is loaded first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Place {
+struct QueueKey {
     urgency: Urgency,
     request: u64,
-    /// Sooner is smaller.
+    /// Position within a prefetch; 0 for frames.
     order: u32,
-    id: Id,
+    id: SlotId,
 }
 
-/// How soon something is needed.
+/// How soon a section is needed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Urgency {
     /// A frame waits for it.
     Required,
-    /// The next second's frames will.
+    /// Frames of the next second will need it.
     Imminent,
-    /// Somebody may come that way.
+    /// A session may come this way.
     Speculative,
 }
 
-pub(super) struct Request {
-    wanted: Wanted,
-    /// What it may push out.
-    asker: Asker,
-    /// Only of frames.
-    frame: Option<Frame>,
+pub(super) struct Request<C> {
+    requested: RequestedSections,
+    /// Decides what its loads may evict.
+    requester: Requester,
+    /// `None` for a prefetch.
+    frame: Option<Frame<C>>,
 }
 
-struct Frame {
-    done: Done,
-    asked: Instant,
+struct Frame<C> {
+    callback: C,
+    requested: Instant,
     waited_for: usize,
     missing: usize,
 }
 
-struct Failure {
+/// A section whose load failed and is tried again.
+struct RetryState {
     attempts: u32,
     not_before: Instant,
 }
 
-/// What a loader does next.
-pub(super) enum Next {
-    Load { id: Id, needed: Needed, version: Arc<Version> },
+/// What a loader thread does next.
+pub(super) enum NextLoad {
+    Load {
+        id: SlotId,
+        section: SectionRef,
+        version: Arc<Version>,
+    },
+    /// Wait for a notification, at most until the given time.
     Wait(Option<Instant>),
 }
 
-/// All that a frame draws.
-pub(super) struct Ready {
+/// Everything that a frame draws.
+pub(super) struct CompleteFrame {
     pub(super) scene: Scene,
     pub(super) waited_for: usize,
     pub(super) waited: Duration,
 }
 
 /// Why a load failed.
-pub(super) enum Failed {
+pub(super) enum LoadFailure {
     Store(StoreError),
+    /// It panicked.
     Crashed,
 }
 
-/// Frames to be told, once the lock is open: whoever is told may drop what it gets, which locks.
-pub(super) type Tellings = Vec<(Done, Result<Ready, ResidencyError>)>;
+/// Callbacks to call once the lock is released: a callback may drop the scene that it gets, which locks.
+pub(super) type Notifications<C> = Vec<(C, Result<CompleteFrame, ResidencyError>)>;
 
-impl Requests {
-    pub(super) fn new(table: Table) -> Self {
+impl<C> Requests<C> {
+    pub(super) fn new(table: SectionTable) -> Self {
         Self {
             table,
             queue: BTreeMap::new(),
             requests: BTreeMap::new(),
             failures: BTreeMap::new(),
             number: 0,
-            starving: false,
+            waiting_for_room: false,
             stats: Stats::default(),
             load_times: LoadTimes::default(),
         }
     }
 
-    /// A frame asks for all that it draws; returns its number.
+    /// Adds a frame that requests everything it draws. Returns its number.
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`].
-    pub(super) fn ask(
+    pub(super) fn add_frame(
         &mut self,
-        wanted: Wanted,
-        done: Done,
-        tellings: &mut Tellings,
+        requested: RequestedSections,
+        callback: C,
+        notifications: &mut Notifications<C>,
     ) -> Result<u64, ResidencyError> {
-        let needed_bytes: u64 = wanted.ids.iter().map(|&id| self.table.bytes(id)).sum();
+        let needed_bytes: u64 = requested.ids.iter().map(|&id| self.table.bytes(id)).sum();
         let limit_bytes = self.table.limit_bytes();
         if needed_bytes > limit_bytes {
-            let twin = wanted.version.manifest.twin.clone();
+            let twin = requested.version.manifest.twin.clone();
             return Err(ResidencyError::TooLarge { twin, needed_bytes, limit_bytes });
         }
         self.number += 1;
         let number = self.number;
+
+        // Queue what is not in memory.
         let mut missing = 0;
-        for (&id, &needed) in wanted.ids.iter().zip(&wanted.needed) {
-            self.table.want(id, number);
+        for (&id, &section) in requested.ids.iter().zip(&requested.sections) {
+            self.table.touch(id, number);
             if self.table.get(id).is_none() {
                 missing += 1;
                 let urgency = Urgency::Required;
-                self.queue.insert(Place { urgency, request: number, order: 0, id }, needed);
+                self.queue.insert(QueueKey { urgency, request: number, order: 0, id }, section);
             }
         }
-        self.stats.hits += (wanted.ids.len() - missing) as u64;
+        self.stats.hits += (requested.ids.len() - missing) as u64;
         self.stats.misses += missing as u64;
-        let frame = Frame { done, asked: Instant::now(), waited_for: missing, missing };
-        let asker = Asker::Frame(number);
+
+        // Answer at once, or wait.
+        let frame = Frame { callback, requested: Instant::now(), waited_for: missing, missing };
+        let requester = Requester::Frame(number);
         if missing == 0 {
-            tellings.push(self.complete(&wanted, frame));
+            notifications.push(self.complete(&requested, frame));
         } else {
             self.stats.waits += 1;
-            wanted.ids.iter().for_each(|&id| self.table.wait(id, number));
-            self.requests.insert(number, Request { wanted, asker, frame: Some(frame) });
+            requested.ids.iter().for_each(|&id| self.table.add_waiter(id, number));
+            self.requests.insert(number, Request { requested, requester, frame: Some(frame) });
         }
         Ok(number)
     }
 
-    pub(super) fn prefetch(
+    /// Adds a prefetch, after its owner's previous one with the number `before`. Returns its number.
+    pub(super) fn add_prefetch(
         &mut self,
         before: Option<u64>,
-        wanted: Wanted,
+        requested: RequestedSections,
         urgencies: &[Urgency],
     ) -> u64 {
         self.number += 1;
         let request = self.number;
-        let all = wanted.ids.iter().zip(&wanted.needed).zip(urgencies);
-        for (order, ((&id, &needed), &urgency)) in (0..).zip(all) {
-            self.table.want(id, request);
+        let all = requested.ids.iter().zip(&requested.sections).zip(urgencies);
+        for (order, ((&id, &section), &urgency)) in (0..).zip(all) {
+            self.table.touch(id, request);
             if self.table.get(id).is_none() && self.queue.len() < limits::QUEUED_SECTIONS {
-                self.queue.insert(Place { urgency, request, order, id }, needed);
+                self.queue.insert(QueueKey { urgency, request, order, id }, section);
             }
         }
-        // What its owner has wanted since its last time stays; for an owner that is new, what any
-        // other has.
-        let since = |request: &Request| match request.asker {
-            Asker::Prefetch(since) => Some(since),
-            Asker::Frame(_) => None,
+        // It evicts nothing that was used since its owner's previous prefetch. A new owner's evicts nothing that
+        // was used since the oldest prefetch of any other owner.
+        let since = |request: &Request<C>| match request.requester {
+            Requester::Prefetch(since) => Some(since),
+            Requester::Frame(_) => None,
         };
         let others = || self.requests.values().filter_map(since).min();
-        let asker = Asker::Prefetch(before.or_else(others).unwrap_or(request));
-        self.requests.insert(request, Request { wanted, asker, frame: None });
+        let requester = Requester::Prefetch(before.or_else(others).unwrap_or(request));
+        self.requests.insert(request, Request { requested, requester, frame: None });
         request
     }
 
-    pub(super) fn withdraw_prefetch(&mut self, number: u64) {
+    pub(super) fn cancel_prefetch(&mut self, number: u64) {
         self.requests.remove(&number);
         self.unqueue(Urgency::Imminent, number);
         self.unqueue(Urgency::Speculative, number);
     }
 
-    /// Sections that were wanted under a number and may still come.
-    pub(super) fn coming(&self, number: u64) -> usize {
-        let of = |urgency| self.queue.range(places_of(urgency, number));
-        let places = of(Urgency::Imminent).chain(of(Urgency::Speculative));
-        places.filter(|(place, _)| self.table.get(place.id).is_none()).count()
+    /// Number of sections of a prefetch that may still be loaded.
+    pub(super) fn pending(&self, number: u64) -> usize {
+        let queued = |urgency| self.queue.range(keys_of(urgency, number));
+        let entries = queued(Urgency::Imminent).chain(queued(Urgency::Speculative));
+        entries.filter(|(key, _)| self.table.get(key.id).is_none()).count()
     }
 
-    /// How many sections a frame still waits for.
+    /// Number of sections that a frame still waits for.
     pub(super) fn missing(&self, number: u64) -> usize {
         let frame = self.requests.get(&number).and_then(|request| request.frame.as_ref());
         frame.map_or(0, |frame| frame.missing)
@@ -220,110 +231,123 @@ impl Requests {
     }
 
     fn unqueue(&mut self, urgency: Urgency, request: u64) {
-        let places = self.queue.range(places_of(urgency, request));
-        let places: Vec<Place> = places.map(|(place, _)| *place).collect();
-        places.iter().for_each(|place| {
-            self.queue.remove(place);
+        let entries = self.queue.range(keys_of(urgency, request));
+        let keys: Vec<QueueKey> = entries.map(|(key, _)| *key).collect();
+        keys.iter().for_each(|key| {
+            self.queue.remove(key);
         });
     }
 
-    /// Drops the failures of what nobody wants any more: whoever wants it next has all attempts, and
-    /// its name may become another section's. What is wanted and not there stands in the queue.
-    pub(super) fn forget_failures(&mut self) {
+    /// Forgets the failures of sections that are no longer requested. The next request for one gets all attempts,
+    /// and its slot may be reused for another section. What is requested and not in memory is in the queue.
+    pub(super) fn forget_unrequested_failures(&mut self) {
         if !self.failures.is_empty() {
-            let wanted: BTreeSet<Id> = self.queue.keys().map(|place| place.id).collect();
-            self.failures.retain(|id, _| wanted.contains(id));
+            let queued: BTreeSet<SlotId> = self.queue.keys().map(|key| key.id).collect();
+            self.failures.retain(|id, _| queued.contains(id));
         }
     }
 
-    /// Takes a frame from those that wait.
-    pub(super) fn give_up(&mut self, number: u64) -> Option<Request> {
+    /// Removes a frame that waits.
+    pub(super) fn cancel_frame(&mut self, number: u64) -> Option<Request<C>> {
         let request = self.requests.remove(&number)?;
-        request.wanted.ids.iter().for_each(|&id| self.table.unwait(id, number));
+        request.requested.ids.iter().for_each(|&id| self.table.remove_waiter(id, number));
         self.unqueue(Urgency::Required, number);
         let frame = request.frame.as_ref()?;
         self.stats.waits_given_up += 1;
-        self.stats.wait_time += frame.asked.elapsed();
+        self.stats.wait_time += frame.requested.elapsed();
         Some(request)
     }
 
-    /// The most urgent section that can be loaded now. Room is taken for it.
-    pub(super) fn next(&mut self, now: Instant) -> Next {
-        self.starving = false;
-        let (mut over, mut soonest, mut found) = (Vec::new(), None, None);
-        let mut full = None;
-        for (place, needed) in &self.queue {
-            let Place { urgency, request, id, .. } = *place;
-            if self.table.get(id).is_some() || full == Some(request) {
-                over.push(*place);
+    /// The most urgent section that can be loaded now. Its room is reserved.
+    pub(super) fn next(&mut self, now: Instant) -> NextLoad {
+        self.waiting_for_room = false;
+        let mut obsolete = Vec::new();
+        let mut next_retry: Option<Instant> = None;
+        let mut found = None;
+        // The prefetch that found no room: the rest of it is dropped as well.
+        let mut without_room = None;
+        for (key, section) in &self.queue {
+            let QueueKey { urgency, request, id, .. } = *key;
+            if self.table.get(id).is_some() || without_room == Some(request) {
+                obsolete.push(*key);
                 continue;
             }
-            if !self.table.is_absent(id) {
+            let is_loading = !self.table.is_absent(id);
+            if is_loading {
                 continue;
             }
+            // A failed load waits for its next attempt.
             if let Some(failure) = self.failures.get(&id)
                 && failure.not_before > now
             {
-                soonest = Some(soonest.map_or(failure.not_before, |s| failure.not_before.min(s)));
+                let not_before = failure.not_before;
+                next_retry = Some(next_retry.map_or(not_before, |soonest| soonest.min(not_before)));
                 continue;
             }
-            let Some(Request { asker, wanted, .. }) = self.requests.get(&request) else {
-                over.push(*place);
+            let Some(Request { requester, requested, .. }) = self.requests.get(&request) else {
+                obsolete.push(*key);
                 continue;
             };
-            match self.table.reserve(id, *asker) {
-                Some(dropped) => {
-                    let version = wanted.version.clone();
-                    found = Some((id, *needed, version, dropped));
+            match self.table.reserve(id, *requester) {
+                Some(evicted) => {
+                    found = Some((id, *section, requested.version.clone(), evicted));
                     break;
                 }
-                // Nobody younger may take the room that it waits for.
+                // No younger frame may take the room that this one waits for.
                 None if urgency == Urgency::Required => {
-                    self.starving = true;
+                    self.waiting_for_room = true;
                     break;
                 }
                 None => {
-                    full = Some(request);
-                    over.push(*place);
+                    without_room = Some(request);
+                    obsolete.push(*key);
                     self.stats.prefetches_dropped += 1;
                 }
             }
         }
-        over.iter().for_each(|place| {
-            self.queue.remove(place);
+        obsolete.iter().for_each(|key| {
+            self.queue.remove(key);
         });
-        self.forget_failures();
-        let Some((id, needed, version, dropped)) = found else { return Next::Wait(soonest) };
-        self.stats.evictions += dropped.len() as u64;
-        dropped.into_iter().for_each(|dropped| self.is_missing_again(dropped));
+        self.forget_unrequested_failures();
+
+        let Some((id, section, version, evicted)) = found else {
+            return NextLoad::Wait(next_retry);
+        };
+        self.stats.evictions += evicted.len() as u64;
+        evicted.into_iter().for_each(|evicted| self.requeue_evicted(evicted));
         if self.failures.contains_key(&id) {
             self.stats.retries += 1;
         }
-        Next::Load { id, needed, version }
+        NextLoad::Load { id, section, version }
     }
 
-    /// Something was dropped that younger frames wait for: they wait for it to be loaded again.
-    fn is_missing_again(&mut self, id: Id) {
-        for &number in self.table.waiting(id) {
-            let Some(Request { wanted, frame: Some(frame), .. }) = self.requests.get_mut(&number)
-            else {
-                continue;
-            };
-            let Some(index) = wanted.ids.iter().position(|&other| other == id) else { continue };
+    /// A section was evicted that younger frames need: it is queued again for them.
+    fn requeue_evicted(&mut self, id: SlotId) {
+        for &number in self.table.waiters(id) {
+            let Some(request) = self.requests.get_mut(&number) else { continue };
+            let Request { requested, frame: Some(frame), .. } = request else { continue };
+            let Some(index) = requested.ids.iter().position(|&other| other == id) else { continue };
             frame.missing += 1;
-            let place = Place { urgency: Urgency::Required, request: number, order: 0, id };
-            self.queue.insert(place, wanted.needed[index]);
+            let key = QueueKey { urgency: Urgency::Required, request: number, order: 0, id };
+            self.queue.insert(key, requested.sections[index]);
         }
     }
 
-    /// A section is in memory: frames that have all of theirs are told.
-    pub(super) fn arrived(&mut self, id: Id, chunk: Arc<Chunk>, took: Duration) -> Tellings {
+    /// A section was loaded. Returns the frames that it completes.
+    pub(super) fn loaded(
+        &mut self,
+        id: SlotId,
+        chunk: Arc<Chunk>,
+        took: Duration,
+    ) -> Notifications<C> {
         self.stats.loads += 1;
         self.load_times.add(took);
         self.failures.remove(&id);
-        self.table.fill(id, chunk, self.number);
+        self.table.loaded(id, chunk, self.number);
+
+        // Which frames have all of their sections now.
         let mut complete = Vec::new();
-        for number in self.table.waiting(id) {
+        for number in self.table.waiters(id) {
             let request = self.requests.get_mut(number);
             if let Some(frame) = request.and_then(|request| request.frame.as_mut()) {
                 frame.missing -= 1;
@@ -332,75 +356,97 @@ impl Requests {
                 }
             }
         }
-        let mut tellings = Tellings::new();
+        let mut notifications = Notifications::new();
         for number in complete {
-            let Some(Request { wanted, frame, .. }) = self.requests.remove(&number) else {
+            let Some(Request { requested, frame, .. }) = self.requests.remove(&number) else {
                 continue;
             };
             let Some(frame) = frame else { continue };
-            wanted.ids.iter().for_each(|&id| self.table.unwait(id, number));
+            requested.ids.iter().for_each(|&id| self.table.remove_waiter(id, number));
             self.unqueue(Urgency::Required, number);
-            self.stats.wait_time += frame.asked.elapsed();
-            tellings.push(self.complete(&wanted, frame));
+            self.stats.wait_time += frame.requested.elapsed();
+            notifications.push(self.complete(&requested, frame));
         }
-        tellings
+        notifications
     }
 
-    /// Everything is there: the frame takes hold of it.
-    fn complete(&self, wanted: &Wanted, frame: Frame) -> (Done, Result<Ready, ResidencyError>) {
-        let chunks = wanted.ids.iter().filter_map(|&id| self.table.get(id).cloned());
-        let ready = Ready {
-            scene: Scene { chunks: chunks.collect(), sky: wanted.sky.clone() },
+    /// Pins all sections of a frame, which are in memory.
+    fn complete(
+        &self,
+        requested: &RequestedSections,
+        frame: Frame<C>,
+    ) -> (C, Result<CompleteFrame, ResidencyError>) {
+        let chunks = requested.ids.iter().filter_map(|&id| self.table.get(id).cloned());
+        let complete = CompleteFrame {
+            scene: Scene { chunks: chunks.collect(), sky: requested.sky.clone() },
             waited_for: frame.waited_for,
-            waited: if frame.waited_for == 0 { Duration::ZERO } else { frame.asked.elapsed() },
+            waited: match frame.waited_for {
+                0 => Duration::ZERO,
+                _ => frame.requested.elapsed(),
+            },
         };
-        (frame.done, Ok(ready))
+        (frame.callback, Ok(complete))
     }
 
-    /// A load failed: it is tried again after a while, or the frames that wait for it are told.
-    pub(super) fn failed(&mut self, id: Id, failed: &Failed) -> Tellings {
-        let mut tellings = Tellings::new();
-        let (count, cause) = match failed {
-            Failed::Store(error @ StoreError::Damaged { .. }) => {
-                (&mut self.stats.failed_damaged, error.to_string())
-            }
-            Failed::Store(error) => (&mut self.stats.failed_unreadable, error.to_string()),
-            Failed::Crashed => {
-                let cause = "the program crashed; its log says where".to_owned();
-                (&mut self.stats.failed_crashed, cause)
-            }
-        };
-        *count += 1;
+    /// A load failed. It is tried again after a while; after the last attempt, the frames that wait for the section
+    /// are returned with the error.
+    pub(super) fn load_failed(&mut self, id: SlotId, failure: &LoadFailure) -> Notifications<C> {
+        let mut notifications = Notifications::new();
+        let cause = self.count_failure(failure);
         let attempts = self.failures.get(&id).map_or(0, |failure| failure.attempts) + 1;
         if attempts < limits::LOAD_ATTEMPTS {
             let not_before = Instant::now() + limits::LOAD_BACKOFF * 4_u32.pow(attempts - 1);
-            self.failures.insert(id, Failure { attempts, not_before });
-            self.forget_failures();
-            self.table.fail(id);
-            return tellings;
+            self.failures.insert(id, RetryState { attempts, not_before });
+            self.forget_unrequested_failures();
+            self.table.load_failed(id);
+            return notifications;
         }
         self.failures.remove(&id);
-        for number in self.table.waiting(id).to_vec() {
-            let Some(request) = self.give_up(number) else { continue };
-            let Request { wanted, frame: Some(frame), .. } = request else { continue };
-            let index = wanted.ids.iter().position(|&other| other == id).unwrap_or(0);
-            let Needed { chunk, section } = wanted.needed[index];
-            let manifest = &wanted.version.manifest;
-            let (chunk, twin) = (&manifest.chunks[chunk], manifest.twin.clone());
-            let (section, cell) = (&chunk.sections[section], chunk.cell);
-            let (block, level, cause) = (section.block, section.level, cause.clone());
-            let error = ResidencyError::Load { twin, cell, block, level, attempts, cause };
-            tellings.push((frame.done, Err(error)));
+        for number in self.table.waiters(id).to_vec() {
+            let Some(request) = self.cancel_frame(number) else { continue };
+            let Request { requested, frame: Some(frame), .. } = request else { continue };
+            let index = requested.ids.iter().position(|&other| other == id).unwrap_or(0);
+            let SectionRef { chunk, section } = requested.sections[index];
+            let manifest = &requested.version.manifest;
+            let chunk = &manifest.chunks[chunk];
+            let section = &chunk.sections[section];
+            let error = ResidencyError::Load {
+                twin: manifest.twin.clone(),
+                cell: chunk.cell,
+                block: section.block,
+                level: section.level,
+                attempts,
+                cause: cause.clone(),
+            };
+            notifications.push((frame.callback, Err(error)));
         }
-        // Whoever would only have liked to have it, does without.
-        self.queue.retain(|place, _| place.id != id);
-        self.table.fail(id);
-        tellings
+        // Prefetches continue without the section.
+        self.queue.retain(|key, _| key.id != id);
+        self.table.load_failed(id);
+        notifications
+    }
+
+    /// Counts a failure by kind, and returns its text.
+    fn count_failure(&mut self, failure: &LoadFailure) -> String {
+        match failure {
+            LoadFailure::Store(error @ StoreError::Damaged { .. }) => {
+                self.stats.failed_damaged += 1;
+                error.to_string()
+            }
+            LoadFailure::Store(error) => {
+                self.stats.failed_unreadable += 1;
+                error.to_string()
+            }
+            LoadFailure::Crashed => {
+                self.stats.failed_crashed += 1;
+                "the program crashed; its log says where".to_owned()
+            }
+        }
     }
 }
 
-/// Where a request's sections stand in the queue.
-fn places_of(urgency: Urgency, request: u64) -> RangeInclusive<Place> {
-    let first = Place { urgency, request, order: 0, id: 0 };
-    first..=Place { order: u32::MAX, id: Id::MAX, ..first }
+/// The queue keys of a request's sections.
+fn keys_of(urgency: Urgency, request: u64) -> RangeInclusive<QueueKey> {
+    let first = QueueKey { urgency, request, order: 0, id: 0 };
+    first..=QueueKey { order: u32::MAX, id: SlotId::MAX, ..first }
 }

@@ -1,85 +1,111 @@
-//! A session's part of the memory.
+//! A session's share of the memory, and what it prefetches.
 
-use std::sync::{Arc, Mutex};
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use parking_lot::Mutex;
 
 use wildcity_scene::RenderProfile;
 
 use super::budget::Claim;
-use super::cache::lock;
+use super::demand::{SectionRef, Viewpoint};
 use super::requests::Urgency;
-use super::{Eye, Needed, ResidencyError, Resident};
+use super::{ResidencyError, Resident, RigExtent};
 
-/// Memory that is set aside for the frames of one session, and what it expects to need next. Given
-/// back when dropped.
+/// Memory that is reserved for the frames of one session, and the session's prefetcher. Dropping it releases
+/// both.
 #[derive(Debug)]
 pub struct Reservation {
     claim: Claim,
-    expectation: Arc<Expectation>,
+    prefetcher: Arc<Prefetcher>,
 }
 
-/// What somebody expects to need of a version. Shared by whoever finds that out, which takes a
-/// while; it ends with its [`Reservation`] nevertheless.
+/// Loads sections of a version ahead of the frames that will need them. It is shared with the task that works out
+/// what those are, which takes a while; it ends with its [`Reservation`] nevertheless.
 #[derive(Debug)]
-pub struct Expectation {
+pub struct Prefetcher {
     resident: Arc<Resident>,
-    wish: Mutex<Wish>,
+    state: Mutex<PrefetchState>,
 }
 
 #[derive(Debug)]
-enum Wish {
-    /// Number of the last prefetch.
+enum PrefetchState {
+    /// Holds the number of the last prefetch request.
     Open(Option<u64>),
-    /// Nothing is expected any more.
+    /// Nothing is prefetched any more.
     Ended,
 }
 
-impl Reservation {
-    pub(super) fn new(resident: Arc<Resident>, bytes: u64) -> Result<Self, ResidencyError> {
-        let claim = claim(&resident, bytes);
-        lock(&resident.shared.budget).take(&claim)?;
-        Ok(Self { claim, expectation: Arc::new(Expectation::new(resident)) })
+impl Resident {
+    /// Reserves the most memory that a frame of a rig anywhere in the twin needs.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoom`] with the numbers.
+    pub fn reserve(self: &Arc<Self>, extent: RigExtent) -> Result<Reservation, ResidencyError> {
+        self.reserve_with(extent, &self.version.manifest.profile)
     }
 
-    /// Sets `bytes` aside for another version in place of this one, at once: there need not be room
-    /// for both. What was expected of the old version is expected no more.
+    /// As [`Resident::reserve`], for frames that are drawn with another profile than the version's.
+    ///
+    /// # Errors
+    /// As [`Resident::reserve`].
+    pub fn reserve_with(
+        self: &Arc<Self>,
+        extent: RigExtent,
+        profile: &RenderProfile,
+    ) -> Result<Reservation, ResidencyError> {
+        Reservation::new(self.clone(), self.worst_case_bytes_with(extent, profile))
+    }
+}
+
+impl Reservation {
+    fn new(resident: Arc<Resident>, bytes: u64) -> Result<Self, ResidencyError> {
+        let claim = claim(&resident, bytes);
+        resident.shared.budget.lock().reserve(&claim)?;
+        Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
+    }
+
+    /// Reserves `bytes` for another version in place of this one, in one step: there need not be room for
+    /// both. Prefetching of the old version ends.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.
     pub fn exchange(&mut self, resident: Arc<Resident>, bytes: u64) -> Result<(), ResidencyError> {
         let claim = claim(&resident, bytes);
-        lock(&resident.shared.budget).exchange(&self.claim, &claim)?;
-        self.expectation.end();
-        (self.claim, self.expectation) = (claim, Arc::new(Expectation::new(resident)));
+        resident.shared.budget.lock().exchange(&self.claim, &claim)?;
+        self.prefetcher.end();
+        self.claim = claim;
+        self.prefetcher = Arc::new(Prefetcher::new(resident));
         Ok(())
     }
 
     /// The version.
     pub fn resident(&self) -> &Arc<Resident> {
-        self.expectation.resident()
+        self.prefetcher.resident()
     }
 
-    /// What is set aside, in bytes.
+    /// The reserved memory, in bytes.
     pub fn bytes(&self) -> u64 {
         self.claim.bytes
     }
 
-    /// What its session expects to need next.
-    pub fn expectation(&self) -> &Arc<Expectation> {
-        &self.expectation
+    /// The session's prefetcher.
+    pub fn prefetcher(&self) -> &Arc<Prefetcher> {
+        &self.prefetcher
     }
 }
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        self.expectation.end();
-        lock(&self.resident().shared.budget).give_back(&self.claim);
+        self.prefetcher.end();
+        self.resident().shared.budget.lock().release(&self.claim);
     }
 }
 
-impl Expectation {
-    /// Nothing yet, of a version.
+impl Prefetcher {
+    /// A prefetcher that has requested nothing yet.
     pub fn new(resident: Arc<Resident>) -> Self {
-        Self { resident, wish: Mutex::new(Wish::Open(None)) }
+        Self { resident, state: Mutex::new(PrefetchState::Open(None)) }
     }
 
     /// The version.
@@ -87,43 +113,45 @@ impl Expectation {
         &self.resident
     }
 
-    /// Loads what frames from other places will need, in the order of the places, as far as there is
-    /// room; in place of what was expected before. Never waits for it.
-    pub fn prefetch(&self, places: &[(Urgency, Vec<Eye>)], profile: &RenderProfile) {
-        let (mut needed, mut urgencies): (Vec<Needed>, Vec<Urgency>) = Default::default();
-        let mut seen = std::collections::BTreeSet::new();
-        for (urgency, eyes) in places {
-            for one in self.resident.demand(eyes, profile) {
-                if seen.insert(one) {
-                    needed.push(one);
+    /// Loads what frames at other places will need, in the order of the places, as far as there is
+    /// room. This replaces the previous prefetch. Returns without waiting for the loads.
+    pub fn prefetch(&self, places: &[(Urgency, Vec<Viewpoint>)], profile: &RenderProfile) {
+        let mut sections: Vec<SectionRef> = Vec::new();
+        let mut urgencies: Vec<Urgency> = Vec::new();
+        let mut seen = BTreeSet::new();
+        for (urgency, viewpoints) in places {
+            for section in self.resident.demand(viewpoints, profile) {
+                if seen.insert(section) {
+                    sections.push(section);
                     urgencies.push(*urgency);
                 }
             }
         }
-        let wanted = self.resident.wanted(needed);
-        if let Wish::Open(number) = &mut *lock(&self.wish) {
+        let requested = self.resident.requested(sections);
+        if let PrefetchState::Open(number) = &mut *self.state.lock() {
             let pager = &self.resident.shared.pager;
-            *number = Some(pager.prefetch(*number, wanted, &urgencies));
+            *number = Some(pager.prefetch(*number, requested, &urgencies));
         }
     }
 
-    /// Sections that are expected and may still come: not those for which there was no room, or which
-    /// cannot be read.
-    pub fn coming(&self) -> usize {
-        match *lock(&self.wish) {
-            Wish::Open(Some(number)) => self.resident.shared.pager.coming(number),
-            Wish::Open(None) | Wish::Ended => 0,
+    /// Number of requested sections that may still be loaded: without those for which there was no room, or
+    /// which cannot be read.
+    pub fn pending(&self) -> usize {
+        match *self.state.lock() {
+            PrefetchState::Open(Some(number)) => self.resident.shared.pager.pending(number),
+            PrefetchState::Open(None) | PrefetchState::Ended => 0,
         }
     }
 
     fn end(&self) {
-        if let Wish::Open(Some(number)) = std::mem::replace(&mut *lock(&self.wish), Wish::Ended) {
-            self.resident.shared.pager.withdraw_prefetch(number);
+        let before = std::mem::replace(&mut *self.state.lock(), PrefetchState::Ended);
+        if let PrefetchState::Open(Some(number)) = before {
+            self.resident.shared.pager.cancel_prefetch(number);
         }
     }
 }
 
-impl Drop for Expectation {
+impl Drop for Prefetcher {
     fn drop(&mut self) {
         self.end();
     }
@@ -134,6 +162,6 @@ fn claim(resident: &Resident, bytes: u64) -> Claim {
         twin: resident.version.manifest.twin.clone(),
         version: resident.version.hash.clone(),
         bytes,
-        whole_bytes: resident.whole_bytes(),
+        total_bytes: resident.total_bytes(),
     }
 }

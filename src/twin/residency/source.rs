@@ -1,15 +1,15 @@
-//! Where sections come from.
+//! Where sections are read from.
 
 use crate::store::{Catalog, StoreError, Version};
 use wildcity_scene::Chunk;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 
-/// Something that reads sections: a catalog, or a test's idea of one that is slow or broken.
-pub trait Source: Send + Sync {
-    /// Reads one section, activated. Blocks.
+/// Reads sections: a catalog, or a test's replacement that is slow or broken.
+pub trait SectionSource: Send + Sync {
+    /// Reads one section and decodes it into a chunk. Blocks the calling thread.
     ///
     /// # Errors
-    /// It cannot be read, or is not what was committed.
+    /// The section cannot be read, or differs from what was committed.
     fn section(
         &self,
         version: &Version,
@@ -18,7 +18,7 @@ pub trait Source: Send + Sync {
     ) -> Result<Chunk, StoreError>;
 }
 
-impl Source for Catalog {
+impl SectionSource for Catalog {
     fn section(
         &self,
         version: &Version,

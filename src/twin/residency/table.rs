@@ -1,36 +1,36 @@
-//! Which sections are in memory: plain bookkeeping, without threads and without a clock.
+//! Which sections are in memory: bookkeeping without threads and without a clock.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use wildcity_scene::Chunk;
 
-/// What the content of a section depends on, hashed: versions that share a section share its memory.
+/// A hash of everything that a section's chunk depends on. Versions that share a section share its memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Key(pub(super) [u8; 16]);
 
-/// Name of a section in the table, for as long as a version that has it is open.
-pub(super) type Id = u32;
+/// Index of a section's slot in the table, valid as long as a version that contains the section is open.
+pub(super) type SlotId = u32;
 
-/// No section: the end of the list.
-const NONE: Id = Id::MAX;
+/// No slot: the end of the linked list.
+const NONE: SlotId = SlotId::MAX;
 
-/// Sections by what they are, those in memory in the order in which they were last wanted.
+/// Sections by key. Those in memory also form a linked list in the order of their last use.
 ///
-/// A section may be dropped if the table alone holds it (a frame's scene holds what it draws), and
-/// nobody with an older right waits for it.
+/// A section may be evicted if the table holds its only `Arc` (a frame's scene holds an `Arc` of each chunk that
+/// it draws), and no older frame waits for it.
 #[derive(Debug)]
-pub(super) struct Table {
+pub(super) struct SectionTable {
     limit_bytes: u64,
     held_bytes: u64,
     held_sections: u64,
-    ids: HashMap<Key, Id>,
+    ids: HashMap<Key, SlotId>,
     slots: Vec<Slot>,
-    vacant: Vec<Id>,
-    oldest: Id,
-    newest: Id,
-    /// Frames that wait for others beside a section, by their numbers, rising.
-    waiting: BTreeMap<Id, Vec<u64>>,
+    vacant: Vec<SlotId>,
+    oldest: SlotId,
+    newest: SlotId,
+    /// For each section, the numbers of the incomplete frames that contain it, ascending.
+    waiters: BTreeMap<SlotId, Vec<u64>>,
 }
 
 #[derive(Debug)]
@@ -38,32 +38,32 @@ struct Slot {
     key: Key,
     bytes: u64,
     state: State,
-    /// Open versions that have it.
+    /// Number of open versions that contain it.
     versions: u32,
-    /// When it was last wanted, in requests since the start.
+    /// Number of the request that used it last.
     stamp: u64,
-    older: Id,
-    newer: Id,
+    older: SlotId,
+    newer: SlotId,
 }
 
 #[derive(Debug)]
 enum State {
     Absent,
     Loading,
-    Here(Arc<Chunk>),
+    Loaded(Arc<Chunk>),
 }
 
-/// Whose load it is, and so what it may push out.
+/// The request that a load is for, which decides what the load may evict.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Asker {
-    /// A frame that waits: everything but what older frames wait for. So the oldest frame always gets
-    /// on, and no two can block each other.
+pub(super) enum Requester {
+    /// A frame that waits, by number. It may evict everything except what it waits for itself and what older
+    /// frames wait for. So the oldest frame always makes progress, and no two frames can block each other.
     Frame(u64),
-    /// Nobody waits yet: only what has not been wanted since a request of this number.
+    /// A prefetch: no frame waits yet. It may evict only what was last used before the request of this number.
     Prefetch(u64),
 }
 
-impl Table {
+impl SectionTable {
     pub(super) fn new(limit_bytes: u64) -> Self {
         Self {
             limit_bytes,
@@ -74,18 +74,25 @@ impl Table {
             vacant: Vec::new(),
             oldest: NONE,
             newest: NONE,
-            waiting: BTreeMap::new(),
+            waiters: BTreeMap::new(),
         }
     }
 
-    /// The name of a section that a version has, once per version.
-    pub(super) fn register(&mut self, key: Key, bytes: u64) -> Id {
+    /// Returns the slot of a section, made if need be. Called once per open version that contains it.
+    pub(super) fn register(&mut self, key: Key, bytes: u64) -> SlotId {
         if let Some(&id) = self.ids.get(&key) {
             self.slots[id as usize].versions += 1;
             return id;
         }
-        let (state, versions, stamp) = (State::Absent, 1, 0);
-        let slot = Slot { key, bytes, state, versions, stamp, older: NONE, newer: NONE };
+        let slot = Slot {
+            key,
+            bytes,
+            state: State::Absent,
+            versions: 1,
+            stamp: 0,
+            older: NONE,
+            newer: NONE,
+        };
         let id = match self.vacant.pop() {
             Some(id) => {
                 self.slots[id as usize] = slot;
@@ -93,40 +100,40 @@ impl Table {
             }
             None => {
                 self.slots.push(slot);
-                (self.slots.len() - 1) as Id
+                (self.slots.len() - 1) as SlotId
             }
         };
         self.ids.insert(key, id);
         id
     }
 
-    /// A version that has it was closed. What is in memory stays until its room is needed: the next
-    /// version may have it, too.
-    pub(super) fn unregister(&mut self, id: Id) {
+    /// A version that contains it was closed. A section in memory stays until its room is needed, because the
+    /// next version may contain it, too.
+    pub(super) fn unregister(&mut self, id: SlotId) {
         self.slots[id as usize].versions -= 1;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
     /// The section, if it is in memory.
-    pub(super) fn get(&self, id: Id) -> Option<&Arc<Chunk>> {
+    pub(super) fn get(&self, id: SlotId) -> Option<&Arc<Chunk>> {
         match &self.slots[id as usize].state {
-            State::Here(chunk) => Some(chunk),
+            State::Loaded(chunk) => Some(chunk),
             State::Absent | State::Loading => None,
         }
     }
 
-    /// Whether it is neither in memory nor on its way.
-    pub(super) fn is_absent(&self, id: Id) -> bool {
+    /// Whether the section is neither in memory nor being loaded.
+    pub(super) fn is_absent(&self, id: SlotId) -> bool {
         matches!(self.slots[id as usize].state, State::Absent)
     }
 
-    /// What it takes, in bytes.
-    pub(super) fn bytes(&self, id: Id) -> u64 {
+    /// Bytes of memory that the section takes.
+    pub(super) fn bytes(&self, id: SlotId) -> u64 {
         self.slots[id as usize].bytes
     }
 
-    /// Notes that it is wanted now: the last to be dropped.
-    pub(super) fn want(&mut self, id: Id, stamp: u64) {
+    /// Marks the section as just used, so that it is evicted last.
+    pub(super) fn touch(&mut self, id: SlotId, stamp: u64) {
         self.slots[id as usize].stamp = stamp;
         if self.get(id).is_some() {
             self.unlink(id);
@@ -134,77 +141,81 @@ impl Table {
         }
     }
 
-    /// A frame waits until this section and others are there together.
-    pub(super) fn wait(&mut self, id: Id, frame: u64) {
-        self.waiting.entry(id).or_default().push(frame);
+    /// A frame waits until this section and its others are in memory together.
+    pub(super) fn add_waiter(&mut self, id: SlotId, frame: u64) {
+        self.waiters.entry(id).or_default().push(frame);
     }
 
-    /// It waits no more.
-    pub(super) fn unwait(&mut self, id: Id, frame: u64) {
-        if let Some(frames) = self.waiting.get_mut(&id) {
+    /// The frame no longer waits.
+    pub(super) fn remove_waiter(&mut self, id: SlotId, frame: u64) {
+        if let Some(frames) = self.waiters.get_mut(&id) {
             frames.retain(|&other| other != frame);
             if frames.is_empty() {
-                self.waiting.remove(&id);
+                self.waiters.remove(&id);
             }
         }
     }
 
-    /// The frames that wait for it, the oldest first.
-    pub(super) fn waiting(&self, id: Id) -> &[u64] {
-        self.waiting.get(&id).map_or(&[], Vec::as_slice)
+    /// The frames that wait for the section, the oldest first.
+    pub(super) fn waiters(&self, id: SlotId) -> &[u64] {
+        self.waiters.get(&id).map_or(&[], Vec::as_slice)
     }
 
-    /// Takes the room of a section that is to be loaded, and returns what was dropped for it. If there
-    /// is not enough that may be dropped, nothing is, and nothing is taken.
-    pub(super) fn reserve(&mut self, id: Id, asker: Asker) -> Option<Vec<Id>> {
+    /// Reserves the room of a section that is to be loaded, and returns the sections evicted for it. `None` if
+    /// evicting everything permitted would not make enough room; then nothing changes.
+    pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
         let free_bytes = self.limit_bytes - self.held_bytes;
         let mut victims = Vec::new();
-        let (mut gained_bytes, mut next) = (0, self.oldest);
+        let mut gained_bytes = 0;
+        let mut next = self.oldest;
+        // From the least recently used section to the most recently used one.
         while free_bytes + gained_bytes < bytes {
             if next == NONE {
                 return None;
             }
             let slot = &self.slots[next as usize];
-            if let Asker::Prefetch(since) = asker
+            // The list is in order of stamps, so all that follow were used more recently.
+            if let Requester::Prefetch(since) = requester
                 && slot.stamp >= since
             {
                 return None;
             }
-            if self.may_drop(next, asker) {
+            if self.may_evict(next, requester) {
                 gained_bytes += slot.bytes;
                 victims.push(next);
             }
             next = slot.newer;
         }
-        victims.iter().for_each(|&victim| self.drop_section(victim));
+        victims.iter().for_each(|&victim| self.evict(victim));
         self.slots[id as usize].state = State::Loading;
         self.held_bytes += bytes;
         Some(victims)
     }
 
-    /// A section has arrived. That counts as being wanted: the list stays in order of stamps.
-    pub(super) fn fill(&mut self, id: Id, chunk: Arc<Chunk>, stamp: u64) {
+    /// A section was loaded. That counts as a use, so the list stays in order of stamps.
+    pub(super) fn loaded(&mut self, id: SlotId, chunk: Arc<Chunk>, stamp: u64) {
         let slot = &mut self.slots[id as usize];
-        (slot.state, slot.stamp) = (State::Here(chunk), stamp);
+        slot.state = State::Loaded(chunk);
+        slot.stamp = stamp;
         self.held_sections += 1;
         self.link_newest(id);
     }
 
-    /// A section has not arrived.
-    pub(super) fn fail(&mut self, id: Id) {
+    /// A section could not be loaded.
+    pub(super) fn load_failed(&mut self, id: SlotId) {
         let slot = &mut self.slots[id as usize];
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
-    /// Bytes of memory in use, what is being loaded included.
+    /// Bytes of memory in use, including sections that are being loaded.
     pub(super) fn held_bytes(&self) -> u64 {
         self.held_bytes
     }
 
-    /// Bytes of memory there are.
+    /// Bytes of memory that sections may use.
     pub(super) fn limit_bytes(&self) -> u64 {
         self.limit_bytes
     }
@@ -214,27 +225,27 @@ impl Table {
         self.held_sections
     }
 
-    fn may_drop(&self, id: Id, asker: Asker) -> bool {
-        let State::Here(chunk) = &self.slots[id as usize].state else { return false };
-        let oldest_waiting = self.waiting(id).first();
-        let spared = match asker {
-            Asker::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
-            Asker::Prefetch(_) => oldest_waiting.is_some(),
+    fn may_evict(&self, id: SlotId, requester: Requester) -> bool {
+        let State::Loaded(chunk) = &self.slots[id as usize].state else { return false };
+        let oldest_waiting = self.waiters(id).first();
+        let is_protected = match requester {
+            Requester::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
+            Requester::Prefetch(_) => oldest_waiting.is_some(),
         };
-        Arc::strong_count(chunk) == 1 && !spared
+        Arc::strong_count(chunk) == 1 && !is_protected
     }
 
-    fn drop_section(&mut self, id: Id) {
+    fn evict(&mut self, id: SlotId) {
         self.unlink(id);
         let slot = &mut self.slots[id as usize];
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
         self.held_sections -= 1;
-        self.forget_if_unused(id);
+        self.release_if_unused(id);
     }
 
-    /// Absent sections of versions that nobody has open are not worth a name.
-    fn forget_if_unused(&mut self, id: Id) {
+    /// Frees the slot of a section that is absent and in no open version.
+    fn release_if_unused(&mut self, id: SlotId) {
         let Slot { key, state, versions, .. } = &self.slots[id as usize];
         if *versions == 0 && matches!(state, State::Absent) {
             self.ids.remove(key);
@@ -242,7 +253,7 @@ impl Table {
         }
     }
 
-    fn unlink(&mut self, id: Id) {
+    fn unlink(&mut self, id: SlotId) {
         let Slot { older, newer, .. } = self.slots[id as usize];
         match older {
             NONE => self.oldest = newer,
@@ -254,14 +265,15 @@ impl Table {
         }
     }
 
-    fn link_newest(&mut self, id: Id) {
+    fn link_newest(&mut self, id: SlotId) {
         let before = std::mem::replace(&mut self.newest, id);
         match before {
             NONE => self.oldest = id,
             before => self.slots[before as usize].newer = id,
         }
         let slot = &mut self.slots[id as usize];
-        (slot.older, slot.newer) = (before, NONE);
+        slot.older = before;
+        slot.newer = NONE;
     }
 }
 
@@ -270,31 +282,34 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
-    impl Table {
-        /// What must hold at any time; `pinned` is what frames hold.
-        fn check(&self, pinned: &[(Id, Arc<Chunk>)]) {
+    impl SectionTable {
+        /// Checks the invariants; `pinned` is what frames hold.
+        fn check(&self, pinned: &[(SlotId, Arc<Chunk>)]) {
             let taken = |slot: &&Slot| !matches!(slot.state, State::Absent);
             let bytes: u64 = self.slots.iter().filter(taken).map(|slot| slot.bytes).sum();
             assert_eq!(bytes, self.held_bytes);
             assert!(bytes <= self.limit_bytes, "{bytes} of {}", self.limit_bytes);
-            let (mut listed, mut next, mut before) = (Vec::new(), self.oldest, NONE);
+            let mut listed = Vec::new();
+            let mut next = self.oldest;
+            let mut before = NONE;
             while next != NONE {
                 let slot = &self.slots[next as usize];
                 assert_eq!(slot.older, before);
-                let stamp = |id: Id| self.slots[id as usize].stamp;
+                let stamp = |id: SlotId| self.slots[id as usize].stamp;
                 assert!(before == NONE || stamp(before) <= slot.stamp, "in order of stamps");
                 listed.push(next);
-                (before, next) = (next, slot.newer);
+                before = next;
+                next = slot.newer;
             }
             assert_eq!(before, self.newest);
             listed.sort_unstable();
-            let here = |id: &Id| matches!(self.slots[*id as usize].state, State::Here(_));
-            let held: Vec<Id> = (0..self.slots.len() as Id).filter(here).collect();
-            assert_eq!(listed, held, "the list is of what is here");
+            let here = |id: &SlotId| matches!(self.slots[*id as usize].state, State::Loaded(_));
+            let held: Vec<SlotId> = (0..self.slots.len() as SlotId).filter(here).collect();
+            assert_eq!(listed, held, "the list contains the loaded sections");
             assert_eq!(held.len() as u64, self.held_sections);
             for (id, chunk) in pinned {
                 let same = self.get(*id).is_some_and(|here| Arc::ptr_eq(here, chunk));
-                assert!(same, "section {id} was dropped while a frame held it");
+                assert!(same, "section {id} was evicted while a frame held it");
             }
             for (key, id) in self.ids.iter().collect::<BTreeMap<_, _>>() {
                 assert_eq!(self.slots[*id as usize].key, *key);
@@ -303,7 +318,7 @@ mod tests {
         }
     }
 
-    /// Numbers that look random: Knuth's MMIX generator.
+    /// Pseudorandom numbers: Knuth's MMIX generator.
     struct Random(u64);
 
     impl Random {
@@ -327,44 +342,44 @@ mod tests {
     }
 
     #[test]
-    fn whatever_happens_the_books_are_right_and_what_is_held_stays() {
+    fn random_operations_keep_the_invariants_and_never_evict_what_a_frame_holds() {
         for seed in 1..=50 {
             let mut random = Random(seed);
             let sizes: Vec<u64> = (0..40).map(|_| 1 + random.below(50) as u64).collect();
-            let mut table = Table::new(200 + random.below(300) as u64);
-            let names = |table: &mut Table| -> Vec<Id> {
+            let mut table = SectionTable::new(200 + random.below(300) as u64);
+            let register_all = |table: &mut SectionTable| -> Vec<SlotId> {
                 let all = sizes.iter().enumerate();
                 all.map(|(number, &bytes)| table.register(key(number), bytes)).collect()
             };
-            let mut versions = vec![names(&mut table)];
-            let mut pinned: Vec<(Id, Arc<Chunk>)> = Vec::new();
-            let mut loading: Vec<Id> = Vec::new();
+            let mut versions = vec![register_all(&mut table)];
+            let mut pinned: Vec<(SlotId, Arc<Chunk>)> = Vec::new();
+            let mut loading: Vec<SlotId> = Vec::new();
             let mut evicted = 0;
             for now in 1..=2_000_u64 {
                 let id = versions[0][random.below(sizes.len())];
                 match random.below(8) {
-                    0 => table.want(id, now),
+                    0 => table.touch(id, now),
                     1..=3 if table.is_absent(id) => {
-                        let asker = match random.below(2) {
-                            0 => Asker::Frame(now),
-                            _ => Asker::Prefetch(now.saturating_sub(random.below(500) as u64)),
+                        let requester = match random.below(2) {
+                            0 => Requester::Frame(now),
+                            _ => Requester::Prefetch(now.saturating_sub(random.below(500) as u64)),
                         };
-                        table.want(id, now);
+                        table.touch(id, now);
                         let before = table.held_bytes();
-                        match table.reserve(id, asker) {
+                        match table.reserve(id, requester) {
                             Some(dropped) => {
                                 evicted += dropped.len();
                                 loading.push(id);
                             }
-                            None => assert_eq!(table.held_bytes(), before, "nothing was dropped"),
+                            None => assert_eq!(table.held_bytes(), before, "nothing was evicted"),
                         }
                     }
                     4 | 5 if !loading.is_empty() => {
                         let id = loading.swap_remove(random.below(loading.len()));
                         if random.below(4) > 0 {
-                            table.fill(id, chunk(), now);
+                            table.loaded(id, chunk(), now);
                         } else {
-                            table.fail(id);
+                            table.load_failed(id);
                         }
                     }
                     6 => {
@@ -377,7 +392,7 @@ mod tests {
                     }
                     7 if random.below(20) == 0 => {
                         // Another version with the same sections, and one of them is closed.
-                        versions.push(names(&mut table));
+                        versions.push(register_all(&mut table));
                         let closed = versions.remove(random.below(2));
                         closed.into_iter().for_each(|id| table.unregister(id));
                     }
@@ -389,55 +404,59 @@ mod tests {
         }
     }
 
-    /// A table with room for three sections of 10 bytes, all here, and a fourth.
-    fn full() -> (Table, [Id; 4]) {
-        let mut table = Table::new(30);
+    /// A table with room for three sections of 10 bytes, all loaded, and a fourth that is absent.
+    fn full() -> (SectionTable, [SlotId; 4]) {
+        let mut table = SectionTable::new(30);
         let ids = [0, 1, 2, 3].map(|number| table.register(key(number), 10));
         for (stamp, &id) in (1..).zip(&ids[..3]) {
-            table.want(id, stamp);
-            assert_eq!(table.reserve(id, Asker::Frame(stamp)), Some(vec![]));
-            table.fill(id, chunk(), stamp);
+            table.touch(id, stamp);
+            assert_eq!(table.reserve(id, Requester::Frame(stamp)), Some(vec![]));
+            table.loaded(id, chunk(), stamp);
         }
         (table, ids)
     }
 
     #[test]
-    fn what_was_wanted_longest_ago_goes_first() {
+    fn the_least_recently_used_section_is_evicted_first() {
         let (mut table, ids) = full();
-        table.want(ids[0], 4);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(5)), Some(vec![ids[1]]));
+        table.touch(ids[0], 4);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(5)), Some(vec![ids[1]]));
     }
 
     #[test]
-    fn a_prefetch_pushes_out_nothing_that_was_wanted_lately() {
+    fn a_prefetch_evicts_nothing_that_was_used_recently() {
         let (mut table, ids) = full();
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(1)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(2)), Some(vec![ids[0]]));
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(1)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(2)), Some(vec![ids[0]]));
     }
 
     #[test]
-    fn what_a_frame_waits_for_is_spared_by_all_but_older_frames() {
+    fn only_older_frames_evict_what_a_frame_waits_for() {
         let (mut table, ids) = full();
-        ids[..3].iter().for_each(|&id| table.wait(id, 7));
-        assert_eq!(table.reserve(ids[3], Asker::Prefetch(100)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), None);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(7)), None, "not even by itself");
-        table.unwait(ids[2], 7);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(8)), Some(vec![ids[2]]));
-        table.fail(ids[3]);
-        assert_eq!(table.reserve(ids[3], Asker::Frame(6)), Some(vec![]), "there is room now");
-        assert_eq!(table.reserve(ids[2], Asker::Frame(6)), Some(vec![ids[0]]));
+        ids[..3].iter().for_each(|&id| table.add_waiter(id, 7));
+        assert_eq!(table.reserve(ids[3], Requester::Prefetch(100)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(8)), None);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(7)), None, "nor by the frame itself");
+        table.remove_waiter(ids[2], 7);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(8)), Some(vec![ids[2]]));
+        table.load_failed(ids[3]);
+        assert_eq!(table.reserve(ids[3], Requester::Frame(6)), Some(vec![]), "there is room now");
+        assert_eq!(table.reserve(ids[2], Requester::Frame(6)), Some(vec![ids[0]]));
     }
 
     #[test]
-    fn sections_that_no_version_has_and_nobody_holds_lose_their_names() {
+    fn absent_sections_of_closed_versions_free_their_slots() {
         let (mut table, ids) = full();
         ids.into_iter().for_each(|id| table.unregister(id));
-        assert_eq!((table.ids.len(), table.held_sections()), (3, 3), "memory stays for the next");
+        assert_eq!(
+            (table.ids.len(), table.held_sections()),
+            (3, 3),
+            "what is in memory stays for the next version"
+        );
         let again = table.register(key(1), 10);
         assert_eq!(again, ids[1]);
         let new = table.register(key(9), 30);
-        assert_eq!(table.reserve(new, Asker::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
+        assert_eq!(table.reserve(new, Requester::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
         table.unregister(again);
         assert_eq!(table.ids.len(), 1);
         table.check(&[]);

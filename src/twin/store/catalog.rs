@@ -13,20 +13,20 @@ use wildcity_scene::{Chunk, Manifest, sh};
 use super::local::Local;
 use super::local::disk_cache::DiskCache;
 use super::log::LogRecord;
-use super::objects::{Objects, is_hash};
-use super::remote::{Patience, Remote, Traffic};
+use super::objects::{ObjectBackend, is_hash};
+use super::remote::{Remote, RetryPolicy, Traffic};
 use super::{StoreError, chunk_file, recover};
 
 /// Twins in a directory or an object store.
 #[derive(Clone, Debug)]
 pub struct Catalog {
-    pub(super) objects: Arc<dyn Objects>,
+    pub(super) objects: Arc<dyn ObjectBackend>,
     remote: Option<Remote>,
 }
 
 /// Where parts of remote twins are kept on disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct CacheSettings {
+pub struct DiskCacheSettings {
     /// The directory, made if need be; processes may share it.
     pub dir: PathBuf,
     /// How much it may hold, in bytes.
@@ -35,7 +35,7 @@ pub struct CacheSettings {
 
 /// One line of a listing: a twin and its latest version.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Listing {
+pub struct TwinListing {
     /// The twin's name.
     pub name: String,
     /// Number of its latest version, from 1.
@@ -73,7 +73,10 @@ impl Catalog {
     ///
     /// # Errors
     /// As [`Catalog::open`]; the cache's directory cannot be made.
-    pub fn open_cached(place: &Path, cache: Option<&CacheSettings>) -> Result<Self, StoreError> {
+    pub fn open_cached(
+        place: &Path,
+        cache: Option<&DiskCacheSettings>,
+    ) -> Result<Self, StoreError> {
         let url = place.to_str().filter(|place| place.contains("://"));
         let catalog = match (url, url.and_then(|url| url.strip_prefix("file://"))) {
             (_, Some(dir)) => Self { objects: Arc::new(Local::new(Path::new(dir))), remote: None },
@@ -93,10 +96,10 @@ impl Catalog {
         store: Arc<dyn object_store::ObjectStore>,
         url: &str,
         prefix: &str,
-        cache: Option<&CacheSettings>,
-        patience: Patience,
+        cache: Option<&DiskCacheSettings>,
+        retry: RetryPolicy,
     ) -> Result<Self, StoreError> {
-        Remote::over(store, url, prefix, open_cache(cache)?, patience).map(Self::remote)
+        Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
     }
 
     fn remote(remote: Remote) -> Self {
@@ -122,12 +125,12 @@ impl Catalog {
     ///
     /// # Errors
     /// A log cannot be read.
-    pub fn twins(&self) -> Result<Vec<Listing>, StoreError> {
+    pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
         let mut twins = Vec::new();
         for name in self.objects.names()? {
             if let Some(&number) = self.objects.numbers(&name)?.last() {
                 let hash = self.record(&name, number)?.manifest;
-                twins.push(Listing { name, number, hash });
+                twins.push(TwinListing { name, number, hash });
             }
         }
         Ok(twins)
@@ -147,7 +150,7 @@ impl Catalog {
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`], [`StoreError::NoVersion`] or
-    /// [`StoreError::Collected`] for what was asked;
+    /// [`StoreError::GarbageCollected`] for what was asked;
     /// [`StoreError::Damaged`] or [`StoreError::Format`] for what was found.
     pub fn version(&self, name: &str, number: Option<u64>) -> Result<Version, StoreError> {
         let numbers = self.numbers(name)?;
@@ -182,7 +185,7 @@ impl Catalog {
         };
         let bytes = self
             .objects
-            .part(twin, &chunk.object, section.offset_bytes..end, &section.hash)
+            .read_range(twin, &chunk.object, section.offset_bytes..end, &section.hash)
             .map_err(|error| match error {
                 StoreError::Damaged { path, reason } => of_section(path, reason),
                 error => error,
@@ -196,8 +199,12 @@ impl Catalog {
     ///
     /// # Errors
     /// It cannot be read.
-    pub fn skim(&self, version: &Version, chunk: &ChunkEntry) -> Result<u64, StoreError> {
-        self.objects.skim(&version.manifest.twin, &chunk.object)
+    pub fn read_and_discard(
+        &self,
+        version: &Version,
+        chunk: &ChunkEntry,
+    ) -> Result<u64, StoreError> {
+        self.objects.read_and_discard(&version.manifest.twin, &chunk.object)
     }
 
     /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
@@ -207,7 +214,7 @@ impl Catalog {
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
         // The hash says more than what its first wrong byte led to, and is compared first.
-        let start = self.objects.start(name, &chunk.object, most)?;
+        let start = self.objects.read_start(name, &chunk.object, most)?;
         let path = self.objects.path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)
             .map_err(|reason| StoreError::Damaged { path, reason })
@@ -247,7 +254,7 @@ impl Catalog {
     pub(super) fn fill(&self, manifest: &mut Manifest) -> Result<(), StoreError> {
         let (twin, table) = (&manifest.twin, &manifest.table.object);
         let path = self.objects.path(twin, table);
-        let table = self.objects.whole(twin, table, limits::TABLE_BYTES)?;
+        let table = self.objects.read_object(twin, table, limits::TABLE_BYTES)?;
         let Manifest { chunks, sh_degree, record, .. } = manifest;
         chunk_file::fill(chunks, *sh_degree, *record, &table)
             .map_err(|reason| StoreError::Damaged { path, reason })
@@ -256,7 +263,7 @@ impl Catalog {
     /// Reads a manifest without the sections of its chunks.
     pub(super) fn manifest(&self, name: &str, hash: &str) -> Result<Manifest, StoreError> {
         let path = self.objects.path(name, hash);
-        let bytes = self.objects.whole(name, hash, limits::MANIFEST_BYTES)?;
+        let bytes = self.objects.read_object(name, hash, limits::MANIFEST_BYTES)?;
         let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
         // The format first: of a later one, nothing else is known.
         let Format { format } =
@@ -292,6 +299,8 @@ pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
     if is_name(name) { Ok(()) } else { Err(StoreError::Name { name: name.to_owned() }) }
 }
 
-fn open_cache(cache: Option<&CacheSettings>) -> Result<Option<DiskCache>, StoreError> {
-    cache.map(|CacheSettings { dir, limit_bytes }| DiskCache::open(dir, *limit_bytes)).transpose()
+fn open_cache(cache: Option<&DiskCacheSettings>) -> Result<Option<DiskCache>, StoreError> {
+    cache
+        .map(|DiskCacheSettings { dir, limit_bytes }| DiskCache::open(dir, *limit_bytes))
+        .transpose()
 }

@@ -35,7 +35,7 @@ const ZSTD_LEVEL: i32 = 1;
 
 /// A section before it has a place.
 #[derive(Debug)]
-pub(super) struct Packed {
+pub(super) struct PackedSection {
     section: Section,
     bytes: Vec<u8>,
     bounds: Bounds,
@@ -75,7 +75,7 @@ pub(super) fn pack(
     error_m: f32,
     record: Record,
     clamped: &mut Clamped,
-) -> io::Result<Packed> {
+) -> io::Result<PackedSection> {
     let mut bytes = Vec::new();
     for start in (0..chunk.len()).step_by(PART) {
         let part = record.encode(chunk, start..chunk.len().min(start + PART), clamped);
@@ -100,7 +100,7 @@ pub(super) fn pack(
         bytes: u32::try_from(bytes.len()).map_err(io::Error::other)?,
         hash: *blake3::hash(&bytes).as_bytes(),
     };
-    Ok(Packed { section, bytes, bounds })
+    Ok(PackedSection { section, bytes, bounds })
 }
 
 /// Writes the object of one cell. Returns what is in it, in order of (block, level), and the box of
@@ -110,7 +110,7 @@ pub(super) fn write(
     (cell, origin_m): ([i32; 2], DVec3),
     sh_degree: u8,
     record: Record,
-    mut packed: Vec<Packed>,
+    mut packed: Vec<PackedSection>,
 ) -> io::Result<(Vec<Section>, Bounds)> {
     packed.sort_by_key(|packed| (std::cmp::Reverse(packed.section.level), packed.section.block));
     let mut contents = Contents {

@@ -11,9 +11,9 @@ use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory
 
 use super::catalog::check_name;
 use super::diff::Diff;
-use super::log::{Kind, LogRecord};
+use super::log::{CommitKind, LogRecord};
 use super::objects::Staging;
-use super::pack::Cells;
+use super::pack::CellPacker;
 use super::sky::NewSky;
 use super::{Catalog, StoreError, Version, chunk_file, recover};
 
@@ -24,8 +24,8 @@ pub struct Commit {
     catalog: Catalog,
     name: String,
     id: String,
-    kind: Kind,
-    storage: Storage,
+    kind: CommitKind,
+    storage: StorageOptions,
     sh_degree: Option<u8>,
     staging: Staging,
     /// What was put, by (cell y, cell x).
@@ -35,14 +35,14 @@ pub struct Commit {
 
 /// How Gaussians are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Storage {
+pub struct StorageOptions {
     /// In how many bits.
     pub record: Record,
     /// Whether levels of detail are made, too.
     pub levels: bool,
 }
 
-impl Default for Storage {
+impl Default for StorageOptions {
     fn default() -> Self {
         Self { record: Record::default(), levels: true }
     }
@@ -50,7 +50,7 @@ impl Default for Storage {
 
 /// What one [`Commit::put`] stored.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Stored {
+pub struct StoredCells {
     /// A chunk for each cell, in order of (cell y, cell x).
     pub chunks: Vec<ChunkEntry>,
     /// Gaussians of cells that were not asked for.
@@ -59,7 +59,7 @@ pub struct Stored {
 
 /// What a version consists of beside its cells.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct VersionSettings {
     /// How it must be rendered.
     pub profile: RenderProfile,
     /// The vehicle that recorded it.
@@ -74,7 +74,7 @@ pub struct Settings {
 
 /// What changes of a version beside the cells that were put: what is none stays.
 #[derive(Clone, Debug)]
-pub struct Change {
+pub struct VersionChange {
     /// How it must be rendered.
     pub profile: Option<RenderProfile>,
     /// The vehicle that recorded it.
@@ -95,7 +95,12 @@ impl Catalog {
     ///
     /// # Errors
     /// [`StoreError::Name`]; what killed commits left cannot be removed, or nothing can be written.
-    pub fn begin(&self, name: &str, kind: Kind, storage: Storage) -> Result<Commit, StoreError> {
+    pub fn begin(
+        &self,
+        name: &str,
+        kind: CommitKind,
+        storage: StorageOptions,
+    ) -> Result<Commit, StoreError> {
         check_name(name)?;
         recover::clean(self)?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
@@ -133,20 +138,20 @@ impl Commit {
         gaussians: &Gaussians,
         only: Option<&BTreeSet<[i32; 2]>>,
         progress: &mut dyn FnMut(u64, u64),
-    ) -> Result<Stored, StoreError> {
+    ) -> Result<StoredCells, StoreError> {
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let sh_degree = gaussians.sh_degree;
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
-        let cells = Cells::new(gaussians, self.storage, only);
+        let cells = CellPacker::new(gaussians, self.storage, only);
         if let Some(cell) = cells.cells().find(|&[x, y]| self.chunks.contains_key(&[y, x])) {
-            return Err(StoreError::CellTwice { name: self.name.clone(), cell });
+            return Err(StoreError::DuplicateCell { name: self.name.clone(), cell });
         }
         let (chunks, clamped) = cells.put(&mut self.staging, progress)?;
         self.sh_degree = Some(sh_degree);
         self.clamped.merge(&clamped);
         let by_cell = |chunk: &ChunkEntry| ([chunk.cell[1], chunk.cell[0]], chunk.clone());
         self.chunks.extend(chunks.iter().map(by_cell));
-        Ok(Stored { left_out: gaussians.len() as u64 - cells.gaussians(), chunks })
+        Ok(StoredCells { left_out: gaussians.len() as u64 - cells.gaussians(), chunks })
     }
 
     /// Makes the latest version exactly what was put, all or nothing. The same content as the latest
@@ -160,12 +165,16 @@ impl Commit {
     /// cannot be accepted, or could not be written, and then nothing of it is left.
     /// [`StoreError::NotSynced`] alone means that the version is there, but might not be after a
     /// power cut.
-    pub fn replace(self, base: Option<u64>, settings: Settings) -> Result<Version, StoreError> {
+    pub fn replace(
+        self,
+        base: Option<u64>,
+        settings: VersionSettings,
+    ) -> Result<Version, StoreError> {
         settings.check()?;
         self.check_clamped()?;
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
         self.publish(base.as_ref().map(|base| base.number), |commit, latest| {
-            let Settings { profile, rig, trajectories, sky, provenance } = settings.clone();
+            let VersionSettings { profile, rig, trajectories, sky, provenance } = settings.clone();
             let sky = sky.map(|sky| sky.put(&mut commit.staging)).transpose()?;
             let chunks: Vec<_> = commit.chunks.values().cloned().collect();
             let (sh_degree, record) = (commit.sh_degree.unwrap_or(0), commit.storage.record);
@@ -186,7 +195,7 @@ impl Commit {
                 && latest != base.number
             {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
-                commit.check_apart(base, &latest, &manifest)?;
+                commit.check_overlap(base, &latest, &manifest)?;
             }
             commit.complete(manifest)
         })
@@ -197,9 +206,9 @@ impl Commit {
     /// cells.
     ///
     /// # Errors
-    /// [`StoreError::Overlap`] if others changed the same since `base`; [`StoreError::Field`] if
+    /// [`StoreError::Overlap`] if others changed the same since `base`; [`StoreError::FieldMismatch`] if
     /// Gaussians were stored in another way than the twin's; otherwise as [`Commit::replace`].
-    pub fn change(self, base: u64, change: Change) -> Result<Version, StoreError> {
+    pub fn change(self, base: u64, change: VersionChange) -> Result<Version, StoreError> {
         change.check()?;
         self.check_clamped()?;
         let base = self.catalog.version(&self.name, Some(base))?;
@@ -210,7 +219,7 @@ impl Commit {
             Some(latest) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 let merged = commit.merge(latest.manifest.clone(), &change)?;
-                commit.check_apart(&base, &latest, &merged)?;
+                commit.check_overlap(&base, &latest, &merged)?;
                 commit.complete(merged)
             }
             _ => {
@@ -238,10 +247,14 @@ impl Commit {
     }
 
     /// A version with the cells that were put in place of its own, and the table that it had.
-    fn merge(&mut self, mut manifest: Manifest, change: &Change) -> Result<Manifest, StoreError> {
+    fn merge(
+        &mut self,
+        mut manifest: Manifest,
+        change: &VersionChange,
+    ) -> Result<Manifest, StoreError> {
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
-        let Change { profile, rig, trajectories, sky, provenance } = change.clone();
+        let VersionChange { profile, rig, trajectories, sky, provenance } = change.clone();
         if let Some(sky) = sky {
             manifest.sky = sky.map(|sky| sky.put(&mut self.staging)).transpose()?;
         }
@@ -258,7 +271,7 @@ impl Commit {
 
     /// Whether nothing that others changed from the base to the latest becomes something else by what
     /// is `new`. What they made the same is no loss, and may have been this commit's own first try.
-    fn check_apart(
+    fn check_overlap(
         &self,
         base: &Version,
         latest: &Version,
@@ -299,7 +312,7 @@ impl Commit {
         parent: Option<u64>,
         mut build: impl FnMut(&mut Self, Option<u64>) -> Result<Hashed, StoreError>,
     ) -> Result<Version, StoreError> {
-        self.staging.take_turn()?;
+        self.staging.lock_publishing()?;
         let mut tries = 1;
         loop {
             let latest = self.catalog.objects.numbers(&self.name)?.last().copied();
@@ -341,7 +354,7 @@ impl Commit {
         needed: T,
     ) -> Result<(), StoreError> {
         match stored {
-            Some(stored) if stored != needed => Err(StoreError::Field {
+            Some(stored) if stored != needed => Err(StoreError::FieldMismatch {
                 name: self.name.clone(),
                 field,
                 stored: stored.to_string(),
@@ -363,7 +376,7 @@ impl Commit {
     }
 }
 
-impl Settings {
+impl VersionSettings {
     /// # Errors
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {
@@ -372,7 +385,7 @@ impl Settings {
     }
 }
 
-impl Change {
+impl VersionChange {
     fn check(&self) -> Result<(), StoreError> {
         let trajectories = self.trajectories.as_deref().unwrap_or_default();
         check(self.profile.as_ref(), self.rig.as_ref(), trajectories)
@@ -390,7 +403,7 @@ fn check(
     for trajectory in trajectories {
         trajectory.check()?;
         if !names.insert(&*trajectory.name) {
-            return Err(StoreError::TrajectoryName { name: trajectory.name.clone() });
+            return Err(StoreError::DuplicateTrajectory { name: trajectory.name.clone() });
         }
     }
     Ok(())

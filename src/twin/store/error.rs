@@ -11,7 +11,7 @@ use wildcity_scene::rig::RigError;
 use wildcity_scene::trajectory::TrajectoryError;
 
 /// Why a twin could not be read or written. A failed commit leaves nothing behind, except
-/// [`StoreError::NotSynced`] and [`StoreError::Unsettled`].
+/// [`StoreError::NotSynced`] and [`StoreError::OutcomeUnknown`].
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The operating system refused.
@@ -54,7 +54,7 @@ pub enum StoreError {
     #[error(
         "version {number} of twin {name:?} was removed by `wildcity twin gc`: take a later one"
     )]
-    Collected {
+    GarbageCollected {
         /// The twin.
         name: String,
         /// The version asked for.
@@ -104,7 +104,7 @@ pub enum StoreError {
         "cell {cell:?} of twin {name:?} was put before: give all its Gaussians at once, or only \
          the cells that are new"
     )]
-    CellTwice {
+    DuplicateCell {
         /// The twin.
         name: String,
         /// Grid cell (x, y).
@@ -114,7 +114,7 @@ pub enum StoreError {
     #[error(
         "{field} is {stored}, but twin {name:?} has {needed}: store them so, or replace the whole twin"
     )]
-    Field {
+    FieldMismatch {
         /// The twin.
         name: String,
         /// `sh_degree` or `record`.
@@ -148,7 +148,7 @@ pub enum StoreError {
          import a twin of so many versions anew",
         path.display()
     )]
-    NoteSize {
+    SideFileSize {
         /// Where it would lie.
         path: PathBuf,
         /// Its size.
@@ -174,7 +174,7 @@ pub enum StoreError {
         "whether version {number} of twin {name:?} is in place is not known ({cause}): look with \
          `wildcity twin log`, and try again if it is not"
     )]
-    Unsettled {
+    OutcomeUnknown {
         /// The twin.
         name: String,
         /// The version.
@@ -220,7 +220,7 @@ pub enum StoreError {
     Trajectory(#[from] TrajectoryError),
     /// Two trajectories share a name.
     #[error("two trajectories are named {name:?}: rename one")]
-    TrajectoryName {
+    DuplicateTrajectory {
         /// The name.
         name: String,
     },

@@ -5,47 +5,47 @@ use std::collections::{BTreeMap, BTreeSet};
 use wildcity_scene::manifest::SkyRef;
 
 use super::catalog::check_name;
-use super::gc::Sum;
+use super::gc::ObjectTotals;
 use super::{Catalog, StoreError};
 
 /// What was found of a twin.
 #[derive(Debug)]
-pub struct Checked {
+pub struct FsckReport {
     /// The objects that versions name.
-    pub verified: Verified,
+    pub verified: VerifyReport,
     /// Numbers that the log leaves out.
     pub gaps: Vec<u64>,
     /// Records that cannot be read.
     pub records: Vec<(u64, StoreError)>,
     /// Versions whose objects garbage collection removed.
     pub collected: Vec<u64>,
-    /// Objects that no version names: garbage, or of a commit that runs.
-    pub unreferenced: Sum,
+    /// ObjectBackend that no version names: garbage, or of a commit that runs.
+    pub unreferenced: ObjectTotals,
     /// Whether there is staging of a commit that runs or was killed.
     pub staging: bool,
 }
 
 /// What was re-read.
 #[derive(Debug)]
-pub struct Verified {
-    /// Objects that were compared with their hashes.
+pub struct VerifyReport {
+    /// ObjectBackend that were compared with their hashes.
     pub objects: usize,
     /// Size of the chunks together, in bytes, as the manifests say.
     pub bytes: u64,
     /// The ones that are not what was committed.
-    pub damaged: Vec<Damage>,
+    pub damaged: Vec<DamagedObject>,
 }
 
 /// An object that is not what was committed.
 #[derive(Debug)]
-pub struct Damage {
+pub struct DamagedObject {
     /// Its name, 64 lower-case hex digits.
     pub object: String,
     /// What is wrong with it: missing, unreadable, or of another hash.
     pub error: StoreError,
 }
 
-impl Checked {
+impl FsckReport {
     /// Whether everything that was committed is there. Garbage and what is being made is no loss.
     pub fn is_sound(&self) -> bool {
         self.verified.damaged.is_empty() && self.gaps.is_empty() && self.records.is_empty()
@@ -57,15 +57,15 @@ impl Catalog {
     /// and what is left over. `progress` gets bytes done and bytes in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. Damage is no error: it
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. DamagedObject is no error: it
     /// is the answer.
     pub fn fsck(
         &self,
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
-    ) -> Result<Checked, StoreError> {
+    ) -> Result<FsckReport, StoreError> {
         check_name(name)?;
-        // Listed first, so that what is committed meanwhile is not taken for left over.
+        // ListedObject first, so that what is committed meanwhile is not taken for left over.
         let listed = self.objects.list(name)?;
         let numbers = self.numbers(name)?;
         let present: BTreeSet<u64> = numbers.iter().copied().collect();
@@ -81,17 +81,17 @@ impl Catalog {
             }
         }
         let (verified, named) = self.reread(name, &readable, progress)?;
-        let mut unreferenced = Sum::default();
+        let mut unreferenced = ObjectTotals::default();
         for object in listed.iter().filter(|object| !named.contains(&object.hash)) {
             unreferenced.add(object.bytes);
         }
-        Ok(Checked {
+        Ok(FsckReport {
             verified,
             gaps: gaps.collect(),
             records,
             collected: collected.into_iter().collect(),
             unreferenced,
-            staging: self.objects.begun()?.iter().any(|begun| begun == name),
+            staging: self.objects.unfinished_commits()?.iter().any(|begun| begun == name),
         })
     }
 
@@ -99,12 +99,12 @@ impl Catalog {
     /// and bytes in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error: it is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. DamagedObject is no error: it is the answer.
     pub fn verify(
         &self,
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
-    ) -> Result<Verified, StoreError> {
+    ) -> Result<VerifyReport, StoreError> {
         check_name(name)?;
         let collected = self.collected(name)?;
         let mut numbers = self.numbers(name)?;
@@ -119,7 +119,7 @@ impl Catalog {
         name: &str,
         numbers: &[u64],
         progress: &mut dyn FnMut(u64, u64),
-    ) -> Result<(Verified, BTreeSet<String>), StoreError> {
+    ) -> Result<(VerifyReport, BTreeSet<String>), StoreError> {
         // What the disk cache keeps may be lost where the twin is.
         let there = self.uncached();
         let mut damaged = Vec::new();
@@ -136,17 +136,17 @@ impl Catalog {
                     named.insert(table.clone());
                     if let Some(SkyRef { object, .. }) = manifest.sky.clone()
                         && named.insert(object.clone())
-                        && let Err(error) = there.objects.start(name, &object, 0)
+                        && let Err(error) = there.objects.read_start(name, &object, 0)
                     {
-                        damaged.push(Damage { object, error });
+                        damaged.push(DamagedObject { object, error });
                     }
                     // Without their table, chunks are still compared with their own hashes.
                     if let Err(error) = there.fill(&mut manifest) {
-                        damaged.push(Damage { object: table, error });
+                        damaged.push(DamagedObject { object: table, error });
                     }
                     chunks.extend(manifest.chunks.into_iter().map(|c| (c.object.clone(), c)));
                 }
-                Err(error) => damaged.push(Damage { object: hash, error }),
+                Err(error) => damaged.push(DamagedObject { object: hash, error }),
             }
         }
         let total = chunks.values().map(|chunk| chunk.bytes).sum();
@@ -154,17 +154,17 @@ impl Catalog {
         let mut done = 0;
         for (object, chunk) in chunks {
             let checked = if chunk.sections.is_empty() {
-                there.objects.start(name, &object, 0).map(|_| ())
+                there.objects.read_start(name, &object, 0).map(|_| ())
             } else {
                 there.check_chunk(name, &chunk)
             };
             if let Err(error) = checked {
-                damaged.push(Damage { object: object.clone(), error });
+                damaged.push(DamagedObject { object: object.clone(), error });
             }
             named.insert(object);
             done += chunk.bytes;
             progress(done, total);
         }
-        Ok((Verified { objects, bytes: total, damaged }, named))
+        Ok((VerifyReport { objects, bytes: total, damaged }, named))
     }
 }

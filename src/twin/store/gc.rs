@@ -14,13 +14,13 @@ use serde::Deserialize;
 use crate::limits;
 
 use super::catalog::check_name;
-use super::lease::Terms;
+use super::lease::LeaseRecord;
 use super::log::now_us;
 use super::{Catalog, StoreError};
 
 /// What is kept, and for how long.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Keep {
+pub struct Retention {
     /// How many of the latest versions are kept, at least 1.
     pub versions: usize,
     /// How long an object stays after it was first found to be garbage, and after it was written.
@@ -29,25 +29,25 @@ pub struct Keep {
 
 /// What a garbage collection found and did.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Collected {
+pub struct CollectionReport {
     /// Versions whose objects are kept, rising: the latest ones, and older ones in use.
     pub kept: Vec<u64>,
-    /// Objects that were removed.
-    pub removed: Sum,
-    /// Objects that are garbage, and may be removed after the grace period.
-    pub noted: Sum,
+    /// ObjectBackend that were removed.
+    pub removed: ObjectTotals,
+    /// ObjectBackend that are garbage, and may be removed after the grace period.
+    pub noted: ObjectTotals,
 }
 
 /// How many objects, and how large they are together.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Sum {
-    /// Objects.
+pub struct ObjectTotals {
+    /// ObjectBackend.
     pub objects: u64,
     /// Their bytes.
     pub bytes: u64,
 }
 
-/// Objects that are garbage, by hash, and when they were first found to be, in microseconds since 1970.
+/// ObjectBackend that are garbage, by hash, and when they were first found to be, in microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
 /// Where candidates are noted.
@@ -57,8 +57,8 @@ const COLLECTED: &str = "gc/collected";
 
 /// What a run would do.
 #[derive(Debug, Default)]
-struct Plan {
-    collected: Collected,
+struct CollectionPlan {
+    collected: CollectionReport,
     candidates: Candidates,
     remove: Vec<String>,
     /// Versions that lose objects.
@@ -72,10 +72,15 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read: then
     /// nobody knows what it names, and nothing is removed.
-    pub fn collect(&self, name: &str, keep: Keep, dry_run: bool) -> Result<Collected, StoreError> {
+    pub fn collect(
+        &self,
+        name: &str,
+        keep: Retention,
+        dry_run: bool,
+    ) -> Result<CollectionReport, StoreError> {
         check_name(name)?;
         let now_us = now_us();
-        let before: Candidates = self.read_note(name, CANDIDATES)?;
+        let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
             return Ok(plan.collected);
@@ -85,11 +90,11 @@ impl Catalog {
                 // Somebody may have published or leased since: looked at when nobody can publish, or just
                 // before.
                 plan = self.plan(name, keep, &before, now_us)?;
-                self.give_up(name, &plan.gone, now_us)?;
+                self.mark_collected(name, &plan.gone, now_us)?;
                 Ok(plan.remove.clone())
             })?;
         }
-        self.objects.put_note(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
+        self.objects.write_side_file(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
         for lease in self.leases(name)?.iter().filter(|lease| !lease.is_live(now_us)) {
             lease.remove(self, name)?;
         }
@@ -102,29 +107,34 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::Leased`] if somebody leased one in this moment. Who leases writes and then looks
     /// here, and this writes and then looks there, so that one of the two sees the other.
-    fn give_up(&self, name: &str, gone: &BTreeSet<u64>, now_us: i64) -> Result<(), StoreError> {
+    fn mark_collected(
+        &self,
+        name: &str,
+        gone: &BTreeSet<u64>,
+        now_us: i64,
+    ) -> Result<(), StoreError> {
         let before = self.collected(name)?;
         let after: BTreeSet<u64> = before.union(gone).copied().collect();
-        self.objects.put_note(name, COLLECTED, &self.encode(&after)?)?;
+        self.objects.write_side_file(name, COLLECTED, &self.encode(&after)?)?;
         let leases = self.leases(name)?;
-        let leased = |lease: &&Terms| lease.is_live(now_us) && gone.contains(&lease.version);
+        let leased = |lease: &&LeaseRecord| lease.is_live(now_us) && gone.contains(&lease.version);
         let Some(lease) = leases.iter().find(leased) else { return Ok(()) };
-        self.objects.put_note(name, COLLECTED, &self.encode(&before)?)?;
+        self.objects.write_side_file(name, COLLECTED, &self.encode(&before)?)?;
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
     }
 
     /// Versions whose objects were removed.
     pub(super) fn collected(&self, name: &str) -> Result<BTreeSet<u64>, StoreError> {
-        self.read_note(name, COLLECTED)
+        self.read_side_json(name, COLLECTED)
     }
 
     fn plan(
         &self,
         name: &str,
-        keep: Keep,
+        keep: Retention,
         before: &Candidates,
         now_us: i64,
-    ) -> Result<Plan, StoreError> {
+    ) -> Result<CollectionPlan, StoreError> {
         let numbers = self.numbers(name)?;
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
@@ -139,7 +149,7 @@ impl Catalog {
         }
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
-        let mut plan = Plan::default();
+        let mut plan = CollectionPlan::default();
         for object in self.objects.list(name)? {
             if named.contains(&object.hash) {
                 continue;
@@ -173,12 +183,12 @@ impl Catalog {
     }
 
     /// A note, or an empty one.
-    fn read_note<T: Default + for<'a> Deserialize<'a>>(
+    fn read_side_json<T: Default + for<'a> Deserialize<'a>>(
         &self,
         name: &str,
         note: &str,
     ) -> Result<T, StoreError> {
-        let Some(bytes) = self.objects.note(name, note)? else { return Ok(T::default()) };
+        let Some(bytes) = self.objects.read_side_file(name, note)? else { return Ok(T::default()) };
         serde_json::from_slice(&bytes).map_err(|error| StoreError::Damaged {
             path: self.objects.root().join(name).join(note),
             reason: error.to_string(),
@@ -186,7 +196,7 @@ impl Catalog {
     }
 }
 
-impl Sum {
+impl ObjectTotals {
     pub(super) fn add(&mut self, bytes: u64) {
         self.objects += 1;
         self.bytes += bytes;

@@ -13,13 +13,13 @@ pub struct Lease {
     catalog: Catalog,
     name: String,
     duration: Duration,
-    terms: Terms,
+    record: LeaseRecord,
 }
 
 /// What a lease says.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Terms {
+pub(super) struct LeaseRecord {
     pub(super) version: u64,
     holder: String,
     id: String,
@@ -47,10 +47,10 @@ impl Catalog {
             return Err(StoreError::NoVersion { name: name.to_owned(), number: version, latest });
         }
         let id = uuid::Uuid::now_v7().as_simple().to_string();
-        let terms = Terms { version, holder: holder.to_owned(), id, until_us: 0 };
+        let record = LeaseRecord { version, holder: holder.to_owned(), id, until_us: 0 };
         let (catalog, name) = (self.clone(), name.to_owned());
         catalog.check_not_collected(&name, version)?;
-        let mut lease = Lease { catalog, name, duration, terms };
+        let mut lease = Lease { catalog, name, duration, record };
         lease.renew()?;
         Ok(lease)
     }
@@ -58,19 +58,20 @@ impl Catalog {
     /// Whether a version's objects are not known to be removed.
     pub(super) fn check_not_collected(&self, name: &str, number: u64) -> Result<(), StoreError> {
         if self.collected(name)?.contains(&number) {
-            return Err(StoreError::Collected { name: name.to_owned(), number });
+            return Err(StoreError::GarbageCollected { name: name.to_owned(), number });
         }
         Ok(())
     }
 
     /// All leases of a twin, live or not.
-    pub(super) fn leases(&self, name: &str) -> Result<Vec<Terms>, StoreError> {
+    pub(super) fn leases(&self, name: &str) -> Result<Vec<LeaseRecord>, StoreError> {
         let mut leases = Vec::new();
-        for note in self.objects.notes(name, FOLDER)? {
-            let read = self.objects.note(name, &format!("{FOLDER}/{note}"))?;
+        for note in self.objects.list_side_files(name, FOLDER)? {
+            let read = self.objects.read_side_file(name, &format!("{FOLDER}/{note}"))?;
             // It ended meanwhile; or it is damaged, and holds nothing that anybody knows of.
-            let terms = read.and_then(|terms| serde_json::from_slice::<Terms>(&terms).ok());
-            leases.extend(terms.filter(|terms| terms.id == note));
+            let record =
+                read.and_then(|record| serde_json::from_slice::<LeaseRecord>(&record).ok());
+            leases.extend(record.filter(|record| record.id == note));
         }
         Ok(leases)
     }
@@ -80,33 +81,33 @@ impl Lease {
     /// Begins the duration again.
     ///
     /// # Errors
-    /// It cannot be written; it holds as long as it held before. [`StoreError::Collected`] if it had
+    /// It cannot be written; it holds as long as it held before. [`StoreError::GarbageCollected`] if it had
     /// ended, and the version's objects were removed.
     pub fn renew(&mut self) -> Result<(), StoreError> {
         let for_us = i64::try_from(self.duration.as_micros()).unwrap_or(i64::MAX);
-        self.terms.until_us = now_us().saturating_add(for_us);
-        let terms = self.catalog.encode(&self.terms)?;
-        self.catalog.objects.put_note(&self.name, &self.terms.note(), &terms)?;
+        self.record.until_us = now_us().saturating_add(for_us);
+        let record = self.catalog.encode(&self.record)?;
+        self.catalog.objects.write_side_file(&self.name, &self.record.note(), &record)?;
         // Garbage collection says what it removes and looks for leases then; here it is the other way
         // around, so that one of the two sees the other.
-        self.catalog.check_not_collected(&self.name, self.terms.version)
+        self.catalog.check_not_collected(&self.name, self.record.version)
     }
 }
 
 impl Drop for Lease {
     /// What cannot be removed ends by itself.
     fn drop(&mut self) {
-        let _ = self.terms.remove(&self.catalog, &self.name);
+        let _ = self.record.remove(&self.catalog, &self.name);
     }
 }
 
-impl Terms {
+impl LeaseRecord {
     pub(super) fn is_live(&self, now_us: i64) -> bool {
         self.until_us > now_us
     }
 
     pub(super) fn remove(&self, catalog: &Catalog, name: &str) -> Result<(), StoreError> {
-        catalog.objects.remove_note(name, &self.note())
+        catalog.objects.remove_side_file(name, &self.note())
     }
 
     fn note(&self) -> String {

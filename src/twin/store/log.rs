@@ -4,7 +4,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Catalog, Storage, StoreError, Version};
+use super::{Catalog, StorageOptions, StoreError, Version};
 
 /// One entry of a twin's log.
 #[derive(Clone, Debug, PartialEq)]
@@ -20,13 +20,13 @@ pub struct LogEntry {
     /// The version that it was made from: what a push changed, or what a rollback restored.
     pub parent: Option<u64>,
     /// How it came about.
-    pub kind: Kind,
+    pub kind: CommitKind,
 }
 
 /// How a version came about.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Kind {
+pub enum CommitKind {
     /// By an import, whole.
     #[default]
     Import,
@@ -36,7 +36,7 @@ pub enum Kind {
     Rollback,
 }
 
-impl std::fmt::Display for Kind {
+impl std::fmt::Display for CommitKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.pad(match self {
             Self::Import => "import",
@@ -58,12 +58,17 @@ pub(super) struct LogRecord {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) parent: Option<u64>,
     #[serde(default)]
-    pub(super) kind: Kind,
+    pub(super) kind: CommitKind,
 }
 
 impl LogRecord {
     /// A record of now.
-    pub(super) fn new(manifest: String, commit: &str, parent: Option<u64>, kind: Kind) -> Self {
+    pub(super) fn new(
+        manifest: String,
+        commit: &str,
+        parent: Option<u64>,
+        kind: CommitKind,
+    ) -> Self {
         let created_us = now_us();
         Self { manifest, created_us, commit: Some(commit.to_owned()), parent, kind }
     }
@@ -95,7 +100,7 @@ impl Catalog {
     pub fn rollback(&self, name: &str, number: u64) -> Result<Version, StoreError> {
         // Before anything is written for what cannot be; restoring it looks again, and closer.
         self.version(name, Some(number))?;
-        self.begin(name, Kind::Rollback, Storage::default())?.restore(number)
+        self.begin(name, CommitKind::Rollback, StorageOptions::default())?.restore(number)
     }
 }
 

@@ -15,7 +15,7 @@
 //! What begins with `.staging` is of directories alone; in an object store, objects are uploaded to
 //! where they stay.
 //!
-//! Objects come first and the log's record last, put only if absent, so that whatever happens in
+//! ObjectBackend come first and the log's record last, put only if absent, so that whatever happens in
 //! the middle leaves the old version or the new one.
 
 mod catalog;
@@ -28,21 +28,21 @@ mod gc;
 mod lease;
 mod local;
 mod log;
+mod new_version;
 mod objects;
 mod pack;
 mod recover;
 mod remote;
 mod sky;
-mod whole;
 
-pub use catalog::{CacheSettings, Catalog, Listing, Version};
-pub use commit::{Change, Commit, Settings, Storage, Stored};
+pub use catalog::{Catalog, DiskCacheSettings, TwinListing, Version};
+pub use commit::{Commit, StorageOptions, StoredCells, VersionChange, VersionSettings};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
-pub use fsck::{Checked, Damage, Verified};
-pub use gc::{Collected, Keep, Sum};
+pub use fsck::{DamagedObject, FsckReport, VerifyReport};
+pub use gc::{CollectionReport, ObjectTotals, Retention};
 pub use lease::Lease;
-pub use log::{Kind, LogEntry};
-pub use remote::{Patience, Traffic};
+pub use log::{CommitKind, LogEntry};
+pub use new_version::NewVersion;
+pub use remote::{RetryPolicy, Traffic};
 pub use sky::{NewSky, SkyBytes};
-pub use whole::NewVersion;

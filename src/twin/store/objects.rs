@@ -13,7 +13,7 @@ use super::local::staging::Staging as LocalStaging;
 use super::remote::staging::Staging as RemoteStaging;
 
 /// A place of twins. Names of twins are checked before they get here, and so are hashes.
-pub(super) trait Objects: Debug + Send + Sync {
+pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The directory, or the URL.
     fn root(&self) -> &Path;
 
@@ -30,17 +30,17 @@ pub(super) trait Objects: Debug + Send + Sync {
     ///
     /// # Errors
     /// [`StoreError::Damaged`] for one that is longer than `limit_bytes`, too.
-    fn whole(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError>;
+    fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError>;
 
     /// Reads an object whole, whatever its size, compares it with its hash, and returns its first
     /// bytes, at most `most_bytes`.
-    fn start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError>;
+    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError>;
 
     /// Reads a part of an object and compares it with a hash of its own.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if the object ends before the part does; nothing is allocated for it.
-    fn part(
+    fn read_range(
         &self,
         name: &str,
         object: &str,
@@ -49,7 +49,7 @@ pub(super) trait Objects: Debug + Send + Sync {
     ) -> Result<Vec<u8>, StoreError>;
 
     /// Reads an object to its end and keeps none of it. Returns how many bytes it has.
-    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError>;
+    fn read_and_discard(&self, name: &str, hash: &str) -> Result<u64, StoreError>;
 
     /// Whether an object is there, and as long as it should be; its bytes are not looked at.
     ///
@@ -61,18 +61,18 @@ pub(super) trait Objects: Debug + Send + Sync {
     fn stage(&self, name: &str, commit: &str) -> Result<Staging, StoreError>;
 
     /// Names of the twins with a commit that was begun and not ended: it runs, or it was killed.
-    fn begun(&self) -> Result<Vec<String>, StoreError>;
+    fn unfinished_commits(&self) -> Result<Vec<String>, StoreError>;
 
     /// Clears away what killed commits of a twin left: their staging, and objects they had placed
     /// and `named` does not name. Commits that run stay.
-    fn sweep(
+    fn remove_abandoned(
         &self,
         name: &str,
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError>;
 
     /// All objects of a twin, in order of their hashes.
-    fn list(&self, name: &str) -> Result<Vec<Listed>, StoreError>;
+    fn list(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
 
     /// Removes the objects that `which` names, while nobody publishes where that can be had: from
     /// before it is asked.
@@ -83,19 +83,19 @@ pub(super) trait Objects: Debug + Send + Sync {
     ) -> Result<(), StoreError>;
 
     /// Names of a twin's notes in a folder: what is not part of any version, as leases.
-    fn notes(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;
+    fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;
 
-    /// Reads a note of at most [`limits::NOTE_BYTES`]; none if there is none.
-    fn note(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError>;
+    /// Reads a note of at most [`limits::SIDE_FILE_BYTES`]; none if there is none.
+    fn read_side_file(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError>;
 
     /// Writes a note, in place of one of that name.
     ///
     /// # Errors
-    /// [`StoreError::NoteSize`] for one that could not be read again.
-    fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError>;
+    /// [`StoreError::SideFileSize`] for one that could not be read again.
+    fn write_side_file(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError>;
 
     /// Removes a note, if it is there.
-    fn remove_note(&self, name: &str, note: &str) -> Result<(), StoreError>;
+    fn remove_side_file(&self, name: &str, note: &str) -> Result<(), StoreError>;
 
     /// Where one log record lies.
     fn record_path(&self, name: &str, number: u64) -> PathBuf {
@@ -110,7 +110,7 @@ pub(super) trait Objects: Debug + Send + Sync {
 
 /// An object that is there.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Listed {
+pub(super) struct ListedObject {
     pub(super) hash: String,
     pub(super) bytes: u64,
     /// When it was last written, in microseconds since 1970.
@@ -119,12 +119,12 @@ pub(super) struct Listed {
 
 /// An object that was written: its hash as 64 hex digits, and its size.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Put {
+pub(super) struct StoredObject {
     pub(super) hash: String,
     pub(super) bytes: u64,
 }
 
-/// Objects of a commit that nobody sees yet.
+/// ObjectBackend of a commit that nobody sees yet.
 #[derive(Debug)]
 pub(super) enum Staging {
     Local(LocalStaging),
@@ -136,7 +136,7 @@ impl Staging {
     pub(super) fn put(
         &mut self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> Result<Put, StoreError> {
+    ) -> Result<StoredObject, StoreError> {
         match self {
             Self::Local(staging) => staging.put(write),
             Self::Remote(staging) => staging.put(write),
@@ -145,9 +145,9 @@ impl Staging {
 
     /// Waits until nobody else publishes a version of this twin, where that can be had, and then
     /// nobody does until this is dropped.
-    pub(super) fn take_turn(&mut self) -> Result<(), StoreError> {
+    pub(super) fn lock_publishing(&mut self) -> Result<(), StoreError> {
         match self {
-            Self::Local(staging) => staging.take_turn(),
+            Self::Local(staging) => staging.lock_publishing(),
             Self::Remote(_) => Ok(()),
         }
     }
@@ -221,10 +221,10 @@ pub(super) fn is_hash(text: &str) -> bool {
 /// Whether a note can be read again.
 ///
 /// # Errors
-/// [`StoreError::NoteSize`].
-pub(super) fn check_note(path: PathBuf, bytes: &[u8]) -> Result<(), StoreError> {
-    let (bytes, limit) = (bytes.len() as u64, limits::NOTE_BYTES);
-    if bytes > limit { Err(StoreError::NoteSize { path, bytes, limit }) } else { Ok(()) }
+/// [`StoreError::SideFileSize`].
+pub(super) fn check_side_file(path: PathBuf, bytes: &[u8]) -> Result<(), StoreError> {
+    let (bytes, limit) = (bytes.len() as u64, limits::SIDE_FILE_BYTES);
+    if bytes > limit { Err(StoreError::SideFileSize { path, bytes, limit }) } else { Ok(()) }
 }
 
 /// Whether bytes are those of a hash.

@@ -12,27 +12,27 @@ use wildcity_scene::manifest::ChunkEntry;
 use wildcity_scene::record::Clamped;
 use wildcity_scene::{Chunk, Gaussians, Record, lod};
 
-use super::chunk_file::{self, Packed};
+use super::chunk_file::{self, PackedSection};
 use super::objects::Staging;
-use super::{Storage, StoreError};
+use super::{StorageOptions, StoreError};
 
 /// Gaussians whose blocks are made at once, at least: enough for all cores, few beside a scene.
 const TOGETHER: usize = 1 << 16;
 
 /// Gaussians by cell, and how those cells are stored.
 #[derive(Debug)]
-pub(super) struct Cells<'a> {
+pub(super) struct CellPacker<'a> {
     gaussians: &'a Gaussians,
-    storage: Storage,
+    storage: StorageOptions,
     cells: Vec<CellRun>,
     order: Vec<u32>,
 }
 
-impl<'a> Cells<'a> {
+impl<'a> CellPacker<'a> {
     /// Sorts Gaussians into cells, and leaves out all but those that are asked for.
     pub(super) fn new(
         gaussians: &'a Gaussians,
-        storage: Storage,
+        storage: StorageOptions,
         only: Option<&BTreeSet<[i32; 2]>>,
     ) -> Self {
         let Partition { mut cells, order } = Partition::new(&gaussians.means_m);
@@ -94,8 +94,8 @@ impl<'a> Cells<'a> {
         cell: &CellRun,
         block: u8,
         order: &[u32],
-    ) -> io::Result<(Vec<Packed>, Clamped)> {
-        let Storage { record, levels } = self.storage;
+    ) -> io::Result<(Vec<PackedSection>, Clamped)> {
+        let StorageOptions { record, levels } = self.storage;
         let sh_degree = self.gaussians.sh_degree;
         let mut full = Chunk::new(cell.cell, cell.origin_m, sh_degree, order.len());
         for &index in order {
@@ -116,7 +116,7 @@ impl<'a> Cells<'a> {
         &self,
         staging: &mut Staging,
         cell: &CellRun,
-        packed: Vec<Packed>,
+        packed: Vec<PackedSection>,
     ) -> Result<ChunkEntry, StoreError> {
         let CellRun { cell, origin_m, ref run, .. } = *cell;
         let (sh_degree, record): (u8, Record) = (self.gaussians.sh_degree, self.storage.record);

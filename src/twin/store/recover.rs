@@ -9,9 +9,9 @@ use super::{Catalog, StoreError};
 ///
 /// Who may only read the directory leaves that to those who may write.
 pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
-    for name in catalog.objects.begun()? {
+    for name in catalog.objects.unfinished_commits()? {
         // With a damaged version nobody knows what it named, so every object stays.
-        match catalog.objects.sweep(&name, &|| named(catalog, &name).ok()) {
+        match catalog.objects.remove_abandoned(&name, &|| named(catalog, &name).ok()) {
             Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
             cleaned => cleaned?,
         }

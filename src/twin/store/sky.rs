@@ -73,7 +73,7 @@ impl Catalog {
     pub fn sky(&self, version: &Version) -> Result<Option<Sky>, StoreError> {
         let Some(named) = &version.manifest.sky else { return Ok(None) };
         let twin = &version.manifest.twin;
-        let bytes = self.objects.whole(twin, &named.object, limits::SKY_FILE_BYTES)?;
+        let bytes = self.objects.read_object(twin, &named.object, limits::SKY_FILE_BYTES)?;
         let damaged = |reason: String| {
             let path = self.objects.path(twin, &named.object);
             StoreError::Damaged { path, reason }

@@ -16,7 +16,9 @@ use crate::cli::{output, progress};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Encoding, EngineSettings, Opening, Outputs, RigChoice, Session, Start};
+use wildcity_session::{
+    Encoding, EngineSettings, Outputs, RigChoice, Session, SessionOptions, Start,
+};
 use wildcity_twin::residency::{Cache, Stats};
 
 use report::{Report, Row};
@@ -171,14 +173,14 @@ impl Drive {
         })
     }
 
-    fn opening(&self, manifest: &Manifest) -> Opening {
+    fn opening(&self, manifest: &Manifest) -> SessionOptions {
         let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = rig.map(|rig| cropped(rig, self.crop));
         let outputs = Outputs::colour(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY));
-        Opening {
+        SessionOptions {
             version: self.twin.number,
             rig: rig.map(RigChoice::Full),
-            ..Opening::twin(&self.twin.name, outputs)
+            ..SessionOptions::twin(&self.twin.name, outputs)
         }
     }
 }

@@ -5,7 +5,7 @@ use std::fmt;
 use anyhow::ensure;
 use serde::Serialize;
 
-use wildcity_render::compare::psnr::psnr_db_of_bytes;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::gpu::Roofline;
 
 /// The goal: a step of six full cameras, from asking to images on the host, at as many visible pairs.
@@ -66,7 +66,7 @@ impl Images {
         let (own, other) = (a.len(), b.len());
         ensure!(own == other && own > 0, "images of {own} and {other} bytes cannot be compared");
         let images_equal = a == b;
-        let psnr_db = (!images_equal).then(|| psnr_db_of_bytes(a.iter().zip(b)));
+        let psnr_db = (!images_equal).then(|| psnr_db_u8(a.iter().zip(b)));
         Ok(Self { images_equal, psnr_db })
     }
 }

@@ -33,7 +33,7 @@ impl Looks {
     /// `None` for OpenCV's polynomials of slopes, and for what is turned by a windshield as far as that fades.
     pub(in crate::cpu) fn of(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        let shutter = match view.still_to_come() {
+        let shutter = match view.shutter_motion() {
             None => None,
             Some(still) => Some(Shutter::of(&still)?),
         };

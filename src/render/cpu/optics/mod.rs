@@ -66,7 +66,7 @@ impl Optics {
     /// not describe, and cameras that turn as good as around in one exposure.
     pub(super) fn of(view: &View) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
-        let shutter = match view.still_to_come() {
+        let shutter = match view.shutter_motion() {
             None => None,
             Some(still) => Some(Shutter::of(&still)?),
         };
@@ -224,7 +224,7 @@ fn seen_rad(camera: &Camera) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Rolling;
+    use crate::RollingShutter;
     use fearless_simd::{Level, dispatch};
     use glam::{DMat3, DQuat, DVec2, DVec3};
     use wildcity_scene::Rig;
@@ -262,7 +262,13 @@ mod tests {
             rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
         };
         let direction = Rolls::BottomToTop;
-        [still, View { rolling: Some(Rolling { direction, world_from_camera_first }), ..still }]
+        [
+            still,
+            View {
+                rolling_shutter: Some(RollingShutter { direction, world_from_camera_first }),
+                ..still
+            },
+        ]
     }
 
     #[test]

@@ -4,7 +4,7 @@ use fearless_simd::{f32x16, mask32x16, prelude::*};
 
 use super::sines::sin;
 use crate::cpu::lanes::Vec3x16;
-use crate::view::StillToCome;
+use crate::view::ShutterMotion;
 
 /// A shutter that rolls while the camera moves, for many points.
 #[derive(Clone, Debug)]
@@ -27,8 +27,8 @@ impl Shutter {
     const MOST_RAD: f64 = 1.5;
 
     /// `None` if the camera turns farther than is accounted for.
-    pub(super) fn of(still: &StillToCome) -> Option<Self> {
-        let StillToCome { share, moved_world_m, moved_m, axis, turned_rad } = *still;
+    pub(super) fn of(still: &ShutterMotion) -> Option<Self> {
+        let ShutterMotion { share, moved_world_m, moved_m, axis, turned_rad } = *still;
         (turned_rad <= Self::MOST_RAD).then(|| Self {
             share: share.map(|value| value as f32),
             moved_world_m: moved_world_m.as_vec3().to_array(),

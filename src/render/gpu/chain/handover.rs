@@ -13,7 +13,7 @@ use crate::gpu::project::Work;
 use crate::gpu::read_back::{Drawn, ReadBack, TICKS_OFFSET};
 use crate::gpu::resolve::Wanted;
 use crate::layout::{Cutoffs, Splat};
-use crate::stage::{Between, Stage, Tiles};
+use crate::stage::{Stage, StageOutputs, TileLists};
 use crate::{Frame, FrameStats, RenderError};
 
 impl Chain {
@@ -23,7 +23,7 @@ impl Chain {
     /// The device fails, or the frame needs more than it can hold.
     pub(in crate::gpu) fn resume(
         &mut self,
-        between: &Between,
+        between: &StageOutputs,
         frame: &Frame<'_>,
         wanted: &Wanted,
     ) -> Result<Drawn, RenderError> {
@@ -32,7 +32,7 @@ impl Chain {
         let (mut gpu_frame, read_back) = self.begin(frame, wanted)?;
         let (tiles, mut stats) = (0..gpu_frame.tiles, FrameStats::default());
         let output = (planes, &tiles, read_back.tiles_per_page);
-        let source = Source::Between(between);
+        let source = Source::StageOutputs(between);
         let needs = self.draw_part(source, &mut gpu_frame, output, &read_back, &mut stats)?;
         self.check_room(needs)?;
         self.finish(read_back, &gpu_frame, stats)
@@ -46,15 +46,15 @@ impl Chain {
     pub(in crate::gpu) fn run_through(
         &mut self,
         frame: &Frame<'_>,
-        done: Option<&Between>,
+        done: Option<&StageOutputs>,
         last: Stage,
         cull: &ThreadPool,
-    ) -> Result<Between, RenderError> {
+    ) -> Result<StageOutputs, RenderError> {
         let work;
         let source = match done {
             Some(between) => {
                 self.expect(between)?;
-                Source::Between(between)
+                Source::StageOutputs(between)
             }
             None => {
                 cull.install(|| self.mirror.hold(&self.device, frame.scene))?;
@@ -88,7 +88,7 @@ impl Chain {
     }
 
     /// Makes sure that there will be room for what another backend did.
-    fn expect(&mut self, between: &Between) -> Result<(), RenderError> {
+    fn expect(&mut self, between: &StageOutputs) -> Result<(), RenderError> {
         let Counts { splats, instances, .. } = counts(between);
         let needs =
             Needs { splats: splats.into(), touches: 0, instances: instances.into(), crowd: 0 };
@@ -114,7 +114,7 @@ impl Chain {
     }
 
     /// Fills the buffers that the stages which are done would have filled.
-    pub(super) fn fill(&mut self, between: &Between) -> Counts {
+    pub(super) fn fill(&mut self, between: &StageOutputs) -> Counts {
         let Self { device, splats, bin, .. } = self;
         let shapes: Vec<SplatShape> = between.splats.iter().map(shape).collect();
         let colors: Vec<SplatColor> = between.splats.iter().map(color).collect();
@@ -129,7 +129,7 @@ impl Chain {
         };
         splats.keys[0].fill(device, bytemuck::cast_slice(&in_order(&places)));
         splats.places[0].fill(device, bytemuck::cast_slice(&places));
-        if let Some(Tiles { ranges, instances }) = &between.tiles {
+        if let Some(TileLists { ranges, instances }) = &between.tiles {
             bin.ranges.fill(device, bytemuck::cast_slice(ranges));
             bin.instances.fill(device, bytemuck::cast_slice(instances));
         }
@@ -143,7 +143,7 @@ impl Chain {
         counters: &Counters,
         tiles: u32,
         last: Stage,
-    ) -> Result<Between, RenderError> {
+    ) -> Result<StageOutputs, RenderError> {
         let Self { device, splats, bin, .. } = self;
         let (count, instances) = (u64::from(counters.splats), u64::from(counters.instances));
         let mut from: Vec<(&Buffer, u64)> = vec![
@@ -172,10 +172,10 @@ impl Chain {
 
         let (shapes, colors) = (values::<SplatShape>(page(0)), values::<SplatColor>(page(1)));
         let (keys, places) = (values::<u32>(page(2)), values::<u32>(page(3)));
-        let mut between = Between {
+        let mut between = StageOutputs {
             splats: shapes.iter().zip(&colors).map(splat).collect(),
             keys: vec![0; keys.len()],
-            ..Between::default()
+            ..StageOutputs::default()
         };
         for (key, place) in keys.into_iter().zip(&places) {
             // A sort that is wrong may name any place.
@@ -185,7 +185,7 @@ impl Chain {
         }
         between.order = (last >= Stage::Sort).then_some(places);
         between.tiles = (last >= Stage::Bin)
-            .then(|| Tiles { ranges: values(page(4)), instances: values(page(5)) });
+            .then(|| TileLists { ranges: values(page(4)), instances: values(page(5)) });
         Ok(between)
     }
 }
@@ -194,7 +194,7 @@ fn values<T: AnyBitPattern>(bytes: &[u8]) -> Vec<T> {
     bytes.chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect()
 }
 
-fn counts(between: &Between) -> Counts {
+fn counts(between: &StageOutputs) -> Counts {
     // More than 2^32 fit nowhere, and are refused as many.
     let count = |length: usize| u32::try_from(length).unwrap_or(u32::MAX);
     let instances = between.tiles.as_ref().map_or(0, |tiles| tiles.instances.len());

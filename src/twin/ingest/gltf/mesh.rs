@@ -14,10 +14,10 @@ use gltf::image::Source;
 use gltf::mesh::Mode;
 use image::{ImageReader, RgbaImage};
 
-use super::place::Placed;
-use super::{FORMAT, activated, bad};
+use super::instances::MeshInstance;
+use super::{FORMAT, activation, bad};
 use crate::ingest::IngestError;
-use crate::ingest::parts::Parts;
+use crate::ingest::scene_files::SceneFiles;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
@@ -38,9 +38,9 @@ const OPACITY: f64 = 0.97;
 /// Covers all triangles of the scene.
 pub(super) fn read(
     json: &[u8],
-    placed: &[Placed<'_>],
+    placed: &[MeshInstance<'_>],
     buffers: &[&[u8]],
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     let root = gltf::json::deserialize::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
     let document = gltf::Document::from_json(root).map_err(|e| bad("JSON", e.to_string()))?;
@@ -104,12 +104,12 @@ struct Triangle {
     /// Linear red, green, blue, and opacity at the corners, before the texture's.
     colors: [DVec4; 3],
     uv: [DVec2; 3],
-    paint: Paint,
+    material: Material,
 }
 
 /// What the corners do not say.
 #[derive(Clone)]
-struct Paint {
+struct Material {
     texture: Option<Texture>,
     /// Opacity below which nothing is there.
     cutoff: f64,
@@ -124,7 +124,7 @@ impl Triangle {
         if area_m2.is_finite() { area_m2 } else { 0.0 }
     }
 
-    /// Parts that are cut across the longest edge until it is short, or lies well within the triangle's
+    /// SceneFiles that are cut across the longest edge until it is short, or lies well within the triangle's
     /// own width.
     fn halved(self, longest_m: f64) -> Vec<Self> {
         let (mut whole, mut parts) = (vec![(self, 0)], Vec::new());
@@ -159,7 +159,7 @@ impl Triangle {
 
     fn cover(&self, cuts: u32, all: &mut Gaussians) {
         let Some((quat_wxyz, scales_m)) = self.shape(cuts) else { return };
-        let ln_scales = scales_m.map(activated::ln_scale);
+        let ln_scales = scales_m.map(activation::ln_scale);
         for i in 0..cuts {
             for j in 0..cuts - i {
                 let centre = |third: f64| [f64::from(i) + third, f64::from(j) + third];
@@ -175,8 +175,8 @@ impl Triangle {
                     all.means_m.push((a + u * (b - a) + v * (c - a)).to_array());
                     all.quats_wxyz.push(quat_wxyz);
                     all.ln_scales.push(ln_scales);
-                    all.logit_opacities.push(activated::logit(OPACITY * opacity));
-                    all.sh.extend(rgb.map(activated::dc));
+                    all.logit_opacities.push(activation::logit(OPACITY * opacity));
+                    all.sh.extend(rgb.map(activation::dc));
                 }
             }
         }
@@ -212,7 +212,7 @@ impl Triangle {
     fn color(&self, shares: [f64; 3]) -> ([f64; 3], f64) {
         let at = |values: [DVec4; 3]| (0..3).map(|k| shares[k] * values[k]).sum::<DVec4>();
         let mut color = at(self.colors);
-        if let Some(image) = &self.paint.texture {
+        if let Some(image) = &self.material.texture {
             let uv = (0..3).map(|k| shares[k] * self.uv[k]).sum::<DVec2>();
             let place = |share: f64, size: u32| {
                 // Repeated, as textures are unless they say otherwise.
@@ -223,7 +223,7 @@ impl Triangle {
             let [red, green, blue] = [red, green, blue].map(linear_from_display);
             color *= DVec4::new(red, green, blue, alpha);
         }
-        let opacity = if color.w >= self.paint.cutoff { color.w.clamp(0.0, 1.0) } else { 0.0 };
+        let opacity = if color.w >= self.material.cutoff { color.w.clamp(0.0, 1.0) } else { 0.0 };
         ([color.x, color.y, color.z].map(display_from_linear), opacity)
     }
 }
@@ -234,7 +234,7 @@ fn read_primitive(
     buffers: &[&[u8]],
     textures: &BTreeMap<usize, Texture>,
     place: &str,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Vec<Triangle>, IngestError> {
     let place = &format!("{place}, primitive {}", primitive.index());
     if primitive.mode() != Mode::Triangles {
@@ -280,7 +280,7 @@ fn read_primitive(
         gltf::material::AlphaMode::Mask => material.alpha_cutoff().unwrap_or(0.5).into(),
         _ => 0.0,
     };
-    let paint = Paint { texture: texture.filter(|_| uv.is_some()), cutoff };
+    let material = Material { texture: texture.filter(|_| uv.is_some()), cutoff };
     let corner = |index: usize| -> Option<(DVec3, DVec4, DVec2)> {
         let mut color =
             factor * colors.as_ref().map_or(Some(DVec4::ONE), |c| c.get(index).copied())?;
@@ -302,7 +302,7 @@ fn read_primitive(
             corners_m: [a.0, b.0, c.0],
             colors: [a.1, b.1, c.1],
             uv: [a.2, b.2, c.2],
-            paint: paint.clone(),
+            material: material.clone(),
         })
     };
     whole.iter().map(triangle).collect()
@@ -317,7 +317,7 @@ fn image_of<'a>(primitive: &gltf::Primitive<'a>) -> Option<gltf::Image<'a>> {
 fn decode(
     image: &gltf::Image<'_>,
     buffers: &[&[u8]],
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Texture, IngestError> {
     let place = &format!("image {}", image.index());
     let (file, fetched);
@@ -396,7 +396,7 @@ mod tests {
             corners_m: corners_m.map(DVec3::from_array),
             colors: [DVec4::new(1.0, 0.0, 0.0, 1.0), DVec4::Y, DVec4::Z].map(|c| c.with_w(1.0)),
             uv: [DVec2::ZERO; 3],
-            paint: Paint { texture: None, cutoff: 0.0 },
+            material: Material { texture: None, cutoff: 0.0 },
         }
     }
 
@@ -459,7 +459,7 @@ mod tests {
         let ([red, green, blue], opacity) = whole.color([0.5, 0.5, 0.0]);
         assert_eq!((red, blue, opacity), (green, 0.0, 1.0));
         assert!((red - 0.7354).abs() < 1e-4, "half the light, displayed: {red}");
-        whole.paint = Paint { texture: None, cutoff: 2.0 };
+        whole.material = Material { texture: None, cutoff: 2.0 };
         let mut parts = Gaussians::with_capacity(0, 0);
         whole.cover(3, &mut parts);
         assert_eq!(parts.len(), 0);

@@ -13,8 +13,8 @@
 
 mod accessor;
 mod document;
+mod instances;
 mod mesh;
-mod place;
 
 use std::collections::BTreeMap;
 
@@ -23,9 +23,9 @@ use data_encoding::BASE64;
 use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
-use super::parts::Parts;
+use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count};
+use super::{IngestError, activation, check_count};
 use accessor::Column;
 use document::{Document, Primitive};
 
@@ -49,7 +49,7 @@ pub(super) fn is_likely(json: &[u8]) -> bool {
 }
 
 /// Reads a binary glTF file, held whole.
-pub(super) fn read_glb(file: &[u8], parts: &mut dyn Parts) -> Result<Gaussians, IngestError> {
+pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussians, IngestError> {
     const JSON: u32 = u32::from_le_bytes(*b"JSON");
     const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
     let words: Vec<u32> =
@@ -88,7 +88,7 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn Parts) -> Result<Gaussians, 
 pub(super) fn read(
     json: &[u8],
     own_buffer: Option<&[u8]>,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
@@ -111,7 +111,7 @@ pub(super) fn read(
     }
     let mut all = Gaussians::default();
     let mut found = false;
-    let placed = place::meshes(&document)?;
+    let placed = instances::mesh_instances(&document)?;
     for placed in &placed {
         for (index, primitive) in placed.mesh.primitives.iter().enumerate() {
             if !primitive.extensions.contains_key(EXTENSION) {
@@ -133,7 +133,7 @@ pub(super) fn read(
 }
 
 /// The bytes of what is not in the GLB file.
-fn fetch(uri: &str, place: &str, parts: &mut dyn Parts) -> Result<Vec<u8>, IngestError> {
+fn fetch(uri: &str, place: &str, parts: &mut dyn SceneFiles) -> Result<Vec<u8>, IngestError> {
     if !uri.starts_with("data:") {
         return parts.read(uri, limits::SCENE_PART_BYTES);
     }
@@ -149,7 +149,7 @@ fn read_primitive(
     buffers: &[&[u8]],
     primitive: &Primitive,
     place: &str,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     if let Some(packed) = primitive.packed_by() {
         return Err(bad(place, format!("is packed by {packed}; export it without")));
@@ -193,13 +193,15 @@ fn read_primitive(
     // Of logarithms nearly all are negative; of standard deviations none, but for damage.
     let are_logarithms = (0..count).filter(is_negative).count() * 10 > count;
     g.ln_scales.extend((0..count).map(|i| {
-        scales.row::<3>(i).map(|s| if are_logarithms { s as f32 } else { activated::ln_scale(s) })
+        scales.row::<3>(i).map(|s| if are_logarithms { s as f32 } else { activation::ln_scale(s) })
     }));
-    g.logit_opacities.extend((0..count).map(|i| activated::logit(opacities.row::<1>(i)[0])));
+    g.logit_opacities.extend((0..count).map(|i| activation::logit(opacities.row::<1>(i)[0])));
     for i in 0..count {
         for colour in &colours {
             let rgb = colour.row::<3>(i);
-            g.sh.extend(rgb.map(|c| if sh_degree.is_some() { c as f32 } else { activated::dc(c) }));
+            g.sh.extend(
+                rgb.map(|c| if sh_degree.is_some() { c as f32 } else { activation::dc(c) }),
+            );
         }
     }
     Ok(g)

@@ -16,7 +16,7 @@ use half::f16;
 
 use wildcity_scene::{Gaussians, sh};
 
-use super::unpacked::{self, Budget};
+use super::unpack_budget::{self, UnpackBudget};
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
 use msgpack::Value;
@@ -25,8 +25,8 @@ const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
 /// Reads a payload.
-pub(super) fn read(payload: &[u8], budget: &mut Budget) -> Result<Gaussians, IngestError> {
-    let limit = unpacked::limit_bytes(payload.len() as u64);
+pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
+    let limit = unpack_budget::limit_bytes(payload.len() as u64);
     let mut bytes = Vec::new();
     let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;

@@ -11,7 +11,7 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::header::{Element, Header, Property, error};
 use super::{Body, degree, file_name};
-use crate::ingest::activated;
+use crate::ingest::activation;
 use crate::ingest::validate::{self, Field};
 use crate::ingest::{IngestError, Progress, check_count};
 
@@ -53,8 +53,8 @@ pub(super) fn read(
         let scale = between(3, unpack_11_10_11(word(&scale)));
         gaussians.ln_scales.push(scale.map(|ln| ln as f32));
         let [r, g, b, opacity] = word(&color).to_be_bytes().map(|byte| f64::from(byte) / 255.0);
-        gaussians.logit_opacities.push(activated::logit(opacity));
-        gaussians.sh.extend(between(6, [r, g, b]).map(activated::dc));
+        gaussians.logit_opacities.push(activation::logit(opacity));
+        gaussians.sh.extend(between(6, [r, g, b]).map(activation::dc));
         gaussians.sh.extend(std::iter::repeat_n(0.0, 3 * (coefficients - 1)));
     })?;
     if let Some(colour) = colour {
@@ -131,7 +131,7 @@ fn unpack_11_10_11(word: u32) -> [f64; 3] {
 /// The largest component is left out, so the others are within ±√½.
 fn unpack_rotation(word: u32) -> [f32; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word >> shift, 10) - 0.5) * 2f64.sqrt());
-    activated::quat_of_smallest_three((word >> 30) as usize, others)
+    activation::quat_of_smallest_three((word >> 30) as usize, others)
 }
 
 /// 8 bits over [-4, 4]: the ends exactly, the others at the middle of their step.

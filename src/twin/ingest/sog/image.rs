@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image_webp::WebPDecoder;
 
 use crate::ingest::IngestError;
-use crate::ingest::unpacked::Budget;
+use crate::ingest::unpack_budget::UnpackBudget;
 use wildcity_scene::sh;
 
 use super::{FORMAT, body};
@@ -23,7 +23,7 @@ impl Image {
     pub(super) fn decode(
         (name, file): (String, Vec<u8>),
         count: usize,
-        budget: &mut Budget,
+        budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
         // The decoder would not miss what pads the end.
         let promised = match file.as_slice() {
@@ -88,7 +88,7 @@ impl Palette {
         part: (String, Vec<u8>),
         entries: Option<u64>,
         bands: Option<u8>,
-        budget: &mut Budget,
+        budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
         let name = part.0.clone();
         let image = Image::decode(part, 0, budget)?;

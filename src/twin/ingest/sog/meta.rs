@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::ingest::activated;
+use crate::ingest::activation;
 use wildcity_scene::sh;
 
 /// What meta.json says; unknown keys are skipped.
@@ -108,7 +108,7 @@ impl Tables {
                     means,
                     scales: [codebook("scales", &meta.scales.codebook)?; 3],
                     colours: [codebook("sh0", &meta.sh0.codebook)?; 3],
-                    logits: std::array::from_fn(|byte| activated::logit(byte as f64 / 255.0)),
+                    logits: std::array::from_fn(|byte| activation::logit(byte as f64 / 255.0)),
                     higher: higher.transpose()?,
                 })
             }

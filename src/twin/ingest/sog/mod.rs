@@ -15,9 +15,9 @@ mod streamed;
 use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
-use super::parts::Parts;
+use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
-use super::{IngestError, activated, check_count};
+use super::{IngestError, activation, check_count};
 use image::Image;
 use meta::{Meta, Tables};
 
@@ -28,7 +28,7 @@ const FORMAT: &str = "SOG";
 pub(super) fn read(
     json: &[u8],
     folder: &str,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     match serde_json::from_slice::<Kind>(json) {
         Ok(Kind { lod_levels: Some(_), .. }) => streamed::read(json, folder, parts),
@@ -51,7 +51,7 @@ fn read_one(
     json: &[u8],
     name: &str,
     folder: &str,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     let meta: Meta = serde_json::from_slice(json).map_err(|e| bad(name, e.to_string()))?;
     let tables = Tables::of(&meta).map_err(|reason| bad(name, reason))?;
@@ -92,7 +92,7 @@ fn read_one(
         }
         let others = [r, g, b].map(|byte| (f64::from(byte) / 255.0 - 0.5) * 2f64.sqrt());
         let largest = usize::from(largest - 252);
-        gaussians.quats_wxyz.push(activated::quat_of_smallest_three(largest, others));
+        gaussians.quats_wxyz.push(activation::quat_of_smallest_three(largest, others));
     }
     let pick = |table: &[f32; 256], byte: u8| table[usize::from(byte)];
     for pixel in decode(scales)?.pixels(count) {

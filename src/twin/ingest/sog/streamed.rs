@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Deserialize;
 
-use crate::ingest::parts::Parts;
+use crate::ingest::scene_files::SceneFiles;
 use crate::ingest::{IngestError, check_count};
 use crate::limits;
 use wildcity_scene::Gaussians;
@@ -47,7 +47,7 @@ struct Place {
 pub(super) fn read(
     json: &[u8],
     folder: &str,
-    parts: &mut dyn Parts,
+    parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
     let meta: LodMeta = serde_json::from_slice(json).map_err(|e| bad(NAME, e.to_string()))?;
     if let Some(version) = meta.version.filter(|&version| version != 1) {
@@ -107,7 +107,11 @@ fn places_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<Place>>, IngestE
     Ok(places)
 }
 
-fn read_block(name: &str, folder: &str, parts: &mut dyn Parts) -> Result<Gaussians, IngestError> {
+fn read_block(
+    name: &str,
+    folder: &str,
+    parts: &mut dyn SceneFiles,
+) -> Result<Gaussians, IngestError> {
     let path = format!("{folder}{name}");
     let json = parts.read(&path, limits::SCENE_JSON_BYTES)?;
     let folder = path.rfind('/').map_or("", |slash| &path[..=slash]);

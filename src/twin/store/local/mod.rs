@@ -14,7 +14,7 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::objects::{self, Listed, Objects, Staging, is_hash, log_numbers};
+use super::objects::{self, ListedObject, ObjectBackend, Staging, is_hash, log_numbers};
 
 /// Bytes read or written at once.
 const BUFFER_BYTES: usize = 256 << 10;
@@ -32,7 +32,7 @@ pub(in crate::store) struct Local {
     root: PathBuf,
 }
 
-impl Objects for Local {
+impl ObjectBackend for Local {
     fn root(&self) -> &Path {
         &self.root
     }
@@ -57,7 +57,7 @@ impl Objects for Local {
         Ok(bytes)
     }
 
-    fn whole(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
+    fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
         let (path, mut file, size) = self.open(name, hash)?;
         if size > limit_bytes {
             let reason = format!("{size} bytes are above {limit_bytes}");
@@ -74,7 +74,7 @@ impl Objects for Local {
         }
     }
 
-    fn start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
+    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
         let (path, file, _) = self.open(name, hash)?;
         let failed = || StoreError::io("read", &path);
         let mut reader = Hashing { inner: file, hasher: blake3::Hasher::new() };
@@ -89,7 +89,7 @@ impl Objects for Local {
         Err(StoreError::Damaged { path, reason: format!("its bytes hash to {found}") })
     }
 
-    fn part(
+    fn read_range(
         &self,
         name: &str,
         object: &str,
@@ -112,7 +112,7 @@ impl Objects for Local {
         Err(StoreError::Damaged { path, reason: format!("its bytes hash to {}", found.to_hex()) })
     }
 
-    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
+    fn read_and_discard(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
         let (path, mut file, _) = self.open(name, hash)?;
         let (mut buffer, mut bytes) = (vec![0; BUFFER_BYTES], 0);
         loop {
@@ -135,7 +135,7 @@ impl Objects for Local {
         self.begin(name, commit).map(Staging::Local)
     }
 
-    fn begun(&self) -> Result<Vec<String>, StoreError> {
+    fn unfinished_commits(&self) -> Result<Vec<String>, StoreError> {
         let mut names = Vec::new();
         for entry in entries(&self.root.join(STAGING))? {
             let name = entry.split_once(OF).map(|(name, _)| name);
@@ -145,12 +145,12 @@ impl Objects for Local {
         Ok(names)
     }
 
-    fn sweep(
+    fn remove_abandoned(
         &self,
         name: &str,
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError> {
-        let (path, turn) = self.turn_file(name)?;
+        let (path, turn) = self.publish_lock_file(name)?;
         match turn.try_lock() {
             Ok(()) => {}
             // Somebody publishes or sweeps.
@@ -183,7 +183,7 @@ impl Objects for Local {
         Ok(())
     }
 
-    fn list(&self, name: &str) -> Result<Vec<Listed>, StoreError> {
+    fn list(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
         let objects = self.root.join(name).join("objects");
         let mut listed = Vec::new();
         for prefix in entries(&objects)? {
@@ -194,7 +194,7 @@ impl Objects for Local {
                 let since = written.duration_since(UNIX_EPOCH).unwrap_or_default();
                 if is_hash(&hash) {
                     let written_us = i64::try_from(since.as_micros()).unwrap_or(i64::MAX);
-                    listed.push(Listed { hash, bytes: found.len(), written_us });
+                    listed.push(ListedObject { hash, bytes: found.len(), written_us });
                 }
             }
         }
@@ -206,7 +206,7 @@ impl Objects for Local {
         name: &str,
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
-        let _turn = self.turn(name)?;
+        let _turn = self.lock_publishing(name)?;
         for hash in which()? {
             let path = self.path(name, &hash);
             fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
@@ -215,32 +215,32 @@ impl Objects for Local {
         Ok(())
     }
 
-    fn notes(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
+    fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
         let mut notes = entries(&self.root.join(name).join(folder))?;
         notes.retain(|note| !note.starts_with(WRITING));
         Ok(notes)
     }
 
-    fn note(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
+    fn read_side_file(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let path = self.root.join(name).join(note);
         let file = match File::open(&path) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
         };
         let mut bytes = Vec::new();
-        file.take(limits::NOTE_BYTES + 1)
+        file.take(limits::SIDE_FILE_BYTES + 1)
             .read_to_end(&mut bytes)
             .map_err(StoreError::io("read", &path))?;
-        if bytes.len() as u64 > limits::NOTE_BYTES {
-            let reason = format!("it is above {} bytes", limits::NOTE_BYTES);
+        if bytes.len() as u64 > limits::SIDE_FILE_BYTES {
+            let reason = format!("it is above {} bytes", limits::SIDE_FILE_BYTES);
             return Err(StoreError::Damaged { path, reason });
         }
         Ok(Some(bytes))
     }
 
-    fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
+    fn write_side_file(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
         let path = self.root.join(name).join(note);
-        objects::check_note(path.clone(), bytes)?;
+        objects::check_side_file(path.clone(), bytes)?;
         create_parent(&path)?;
         // A name of its own: threads of one process may write the same note.
         let id = uuid::Uuid::now_v7().as_simple().to_string();
@@ -253,7 +253,7 @@ impl Objects for Local {
         sync_parent(&path)
     }
 
-    fn remove_note(&self, name: &str, note: &str) -> Result<(), StoreError> {
+    fn remove_side_file(&self, name: &str, note: &str) -> Result<(), StoreError> {
         let path = self.root.join(name).join(note);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => {
@@ -280,7 +280,7 @@ impl Local {
     /// A directory of its own, locked for as long as the process lives.
     fn begin(&self, name: &str, commit: &str) -> Result<staging::Staging, StoreError> {
         // Whoever sweeps has the turn, and must not find the directory before its lock is taken.
-        let _turn = self.turn(name)?;
+        let _turn = self.lock_publishing(name)?;
         let dir = self.root.join(STAGING).join(format!("{name}{OF}{commit}"));
         fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;
         let path = dir.join(LOCK);
@@ -323,15 +323,15 @@ impl Local {
     }
 
     /// Waits until nobody else publishes a version of a twin.
-    fn turn(&self, name: &str) -> Result<File, StoreError> {
+    fn lock_publishing(&self, name: &str) -> Result<File, StoreError> {
         create_dirs(&self.root.join(STAGING))?;
-        let (path, turn) = self.turn_file(name)?;
+        let (path, turn) = self.publish_lock_file(name)?;
         turn.lock().map_err(StoreError::io("lock", &path))?;
         Ok(turn)
     }
 
     /// The file stays for ever: were it removed, two commits could lock two files of a name.
-    fn turn_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
+    fn publish_lock_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
         let file = File::options().create(true).append(true).open(&path);
         let file = file.map_err(StoreError::io("create", &path))?;
@@ -441,7 +441,7 @@ mod tests {
         let commit = |content: &[u8]| {
             let mut staging = objects.begin("street", "a")?;
             let put = staging.put(|out| out.write_all(content))?;
-            staging.take_turn()?;
+            staging.lock_publishing()?;
             staging.publish(&BTreeSet::from([&*put.hash]), 1, content).map(|()| put)
         };
         let first = commit(b"first").unwrap();
@@ -453,10 +453,10 @@ mod tests {
         assert!(matches!(error, StoreError::Conflict { number: 1, .. }), "{error}");
         assert_eq!(objects.record("street", 1).unwrap(), b"first");
         assert_eq!(objects.numbers("street").unwrap(), [1]);
-        objects.start("street", &first.hash, 0).unwrap();
+        objects.read_start("street", &first.hash, 0).unwrap();
         let lost = objects.path("street", &blake3::hash(b"second").to_hex());
         assert!(!lost.exists() && !lost.parent().unwrap().exists());
-        assert_eq!(objects.begun().unwrap(), [""; 0]);
+        assert_eq!(objects.unfinished_commits().unwrap(), [""; 0]);
     }
 
     #[test]
@@ -498,8 +498,8 @@ mod tests {
         killed.dir = dir.path().join("elsewhere");
         drop(killed);
         assert!(dir_of_b.join(LOCK).exists());
-        assert_eq!(objects.begun().unwrap(), ["avenue", "street"]);
-        objects.sweep("street", &|| None).unwrap();
+        assert_eq!(objects.unfinished_commits().unwrap(), ["avenue", "street"]);
+        objects.remove_abandoned("street", &|| None).unwrap();
         assert_eq!(staged(), ["avenue@c", "street@a"]);
         drop((running, other));
         assert_eq!(staged(), [""; 0]);

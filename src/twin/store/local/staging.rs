@@ -6,18 +6,18 @@ use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use crate::store::StoreError;
-use crate::store::objects::{Objects as _, Put};
+use crate::store::objects::{ObjectBackend as _, StoredObject};
 
 use super::{BUFFER_BYTES, Hashing, Local, create_parent, sync, sync_parent};
 
-/// Objects of a commit that nobody sees yet. Dropped before [`Staging::publish`] succeeds, it
+/// ObjectBackend of a commit that nobody sees yet. Dropped before [`Staging::publish`] succeeds, it
 /// leaves nothing behind.
 #[derive(Debug)]
 pub(in crate::store) struct Staging {
     pub(super) objects: Local,
     pub(super) name: String,
     pub(super) dir: PathBuf,
-    /// Objects that were not there before this commit put them.
+    /// ObjectBackend that were not there before this commit put them.
     pub(super) placed: Vec<PathBuf>,
     /// Held while publishing: others must not rely on an object that may be taken back.
     pub(super) turn: Option<File>,
@@ -35,7 +35,7 @@ impl Staging {
     pub(in crate::store) fn put(
         &mut self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> Result<Put, StoreError> {
+    ) -> Result<StoredObject, StoreError> {
         let path = self.dir.join("writing");
         let failed = || StoreError::io("write", &path);
         let file = File::create(&path).map_err(failed())?;
@@ -48,13 +48,13 @@ impl Staging {
         let (hash, bytes) = (hasher.finalize().to_hex().to_string(), hasher.count());
         let staged = self.dir.join(&hash);
         fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
-        Ok(Put { hash, bytes })
+        Ok(StoredObject { hash, bytes })
     }
 
     /// Waits until nobody else publishes a version of this twin, and then nobody does until this is
     /// dropped.
-    pub(in crate::store) fn take_turn(&mut self) -> Result<(), StoreError> {
-        self.turn = Some(self.objects.turn(&self.name)?);
+    pub(in crate::store) fn lock_publishing(&mut self) -> Result<(), StoreError> {
+        self.turn = Some(self.objects.lock_publishing(&self.name)?);
         Ok(())
     }
 

@@ -1,9 +1,9 @@
 //! Twins in an object store: S3, GCS, Azure. Only this folder names `object_store`.
 //!
-//! Objects are put where they stay, under their hashes: nobody sees them before a record names a
+//! ObjectBackend are put where they stay, under their hashes: nobody sees them before a record names a
 //! manifest that names them. What a killed commit left is removed by garbage collection alone.
 
-mod patience;
+mod retry;
 pub(super) mod staging;
 mod url;
 
@@ -24,11 +24,11 @@ use wildcity_scene::rig::is_name;
 use super::StoreError;
 use super::local::disk_cache::DiskCache;
 use super::objects::{
-    self, Listed, Objects, Staging, is_hash, log_numbers, object_key, record_key,
+    self, ListedObject, ObjectBackend, Staging, is_hash, log_numbers, object_key, record_key,
 };
 
-use patience::{Counted, Runner};
-pub use patience::{Patience, Traffic};
+use retry::{RequestCounter, RequestRunner};
+pub use retry::{RetryPolicy, Traffic};
 
 /// A place within an object store.
 #[derive(Clone, Debug)]
@@ -38,11 +38,11 @@ pub(super) struct Remote {
     /// What every key begins with.
     prefix: Key,
     store: Arc<dyn ObjectStore>,
-    runner: Arc<Runner>,
+    runner: Arc<RequestRunner>,
     cache: Option<DiskCache>,
 }
 
-impl Objects for Remote {
+impl ObjectBackend for Remote {
     fn root(&self) -> &Path {
         &self.root
     }
@@ -62,26 +62,26 @@ impl Objects for Remote {
     }
 
     fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
-        Ok(log_numbers(self.notes(name, "log")?))
+        Ok(log_numbers(self.list_side_files(name, "log")?))
     }
 
     fn record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
         self.get(&record_key(name, number), limits::LOG_RECORD_BYTES)
     }
 
-    fn whole(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
+    fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
         if let Some(bytes) = self.cache.as_ref().and_then(|cache| cache.get(hash)) {
             return Ok(bytes);
         }
         let key = object_key(name, hash);
-        let bytes = self.sound(&key, hash, || self.get(&key, limit_bytes))?;
+        let bytes = self.read_verified(&key, hash, || self.get(&key, limit_bytes))?;
         if let Some(cache) = &self.cache {
             cache.put(hash, &bytes);
         }
         Ok(bytes)
     }
 
-    fn start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
+    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
         let key = object_key(name, hash);
         let read = || {
             let (store, at) = (self.store.clone(), self.key(&key));
@@ -110,7 +110,7 @@ impl Objects for Remote {
         Err(self.damaged(&key, format!("its bytes hash to {found}")))
     }
 
-    fn part(
+    fn read_range(
         &self,
         name: &str,
         object: &str,
@@ -122,14 +122,14 @@ impl Objects for Remote {
             return Ok(bytes);
         }
         let key = object_key(name, object);
-        let part = self.sound(&key, &hash, || self.range(&key, bytes.clone()))?;
+        let part = self.read_verified(&key, &hash, || self.range(&key, bytes.clone()))?;
         if let Some(cache) = &self.cache {
             cache.put(&hash, &part);
         }
         Ok(part)
     }
 
-    fn skim(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
+    fn read_and_discard(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
         let key = object_key(name, hash);
         let (store, at) = (self.store.clone(), self.key(&key));
         self.run("read", &key, move || {
@@ -158,11 +158,11 @@ impl Objects for Remote {
         Ok(Staging::Remote(staging::Staging::new(self.clone(), name)))
     }
 
-    fn begun(&self) -> Result<Vec<String>, StoreError> {
+    fn unfinished_commits(&self) -> Result<Vec<String>, StoreError> {
         Ok(Vec::new())
     }
 
-    fn sweep(
+    fn remove_abandoned(
         &self,
         _name: &str,
         _named: &dyn Fn() -> Option<BTreeSet<String>>,
@@ -170,7 +170,7 @@ impl Objects for Remote {
         Ok(())
     }
 
-    fn list(&self, name: &str) -> Result<Vec<Listed>, StoreError> {
+    fn list(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
         let key = format!("{name}/objects");
         let (store, at) = (self.store.clone(), self.key(&key));
         let found: Vec<ObjectMeta> = self.run("list", &key, move || {
@@ -180,9 +180,9 @@ impl Objects for Remote {
         let listed = found.into_iter().filter_map(|found| {
             let hash = found.location.filename().filter(|name| is_hash(name))?.to_owned();
             let written_us = found.last_modified.timestamp_micros();
-            Some(Listed { hash, bytes: found.size, written_us })
+            Some(ListedObject { hash, bytes: found.size, written_us })
         });
-        let mut listed: Vec<Listed> = listed.collect();
+        let mut listed: Vec<ListedObject> = listed.collect();
         listed.sort_unstable_by(|a, b| a.hash.cmp(&b.hash));
         Ok(listed)
     }
@@ -195,7 +195,7 @@ impl Objects for Remote {
         which()?.iter().try_for_each(|hash| self.delete(&object_key(name, hash)))
     }
 
-    fn notes(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
+    fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
         let key = format!("{name}/{folder}");
         let (store, at) = (self.store.clone(), self.key(&key));
         let listed = self.run("list", &key, move || {
@@ -208,16 +208,16 @@ impl Objects for Remote {
         Ok(names)
     }
 
-    fn note(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
-        match self.get(&format!("{name}/{note}"), limits::NOTE_BYTES) {
+    fn read_side_file(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
+        match self.get(&format!("{name}/{note}"), limits::SIDE_FILE_BYTES) {
             Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => Ok(None),
             read => read.map(Some),
         }
     }
 
-    fn put_note(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
+    fn write_side_file(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
         let key = format!("{name}/{note}");
-        objects::check_note(self.root.join(&key), bytes)?;
+        objects::check_side_file(self.root.join(&key), bytes)?;
         let (store, at, payload) =
             (self.store.clone(), self.key(&key), PutPayload::from(bytes.to_vec()));
         self.run("write", &key, move || {
@@ -226,7 +226,7 @@ impl Objects for Remote {
         })
     }
 
-    fn remove_note(&self, name: &str, note: &str) -> Result<(), StoreError> {
+    fn remove_side_file(&self, name: &str, note: &str) -> Result<(), StoreError> {
         self.delete(&format!("{name}/{note}"))
     }
 }
@@ -238,7 +238,7 @@ impl Remote {
     /// Says what is wrong with the URL or the credentials.
     pub(super) fn at(url: &str, cache: Option<DiskCache>) -> Result<Self, StoreError> {
         let (store, prefix) = url::open(url)?;
-        Self::over(store, url, prefix.as_ref(), cache, Patience::default())
+        Self::over(store, url, prefix.as_ref(), cache, RetryPolicy::default())
     }
 
     /// A place within a store that is open already.
@@ -247,12 +247,13 @@ impl Remote {
         root: &str,
         prefix: &str,
         cache: Option<DiskCache>,
-        patience: Patience,
+        retry: RetryPolicy,
     ) -> Result<Self, StoreError> {
         let prefix = Key::parse(prefix)
             .map_err(|error| StoreError::Url { url: root.to_owned(), reason: error.to_string() })?;
         let root = PathBuf::from(root);
-        let runner = Runner::new(patience).map_err(StoreError::io("start threads for", &root))?;
+        let runner =
+            RequestRunner::new(retry).map_err(StoreError::io("start threads for", &root))?;
         Ok(Self { root, prefix, store, runner: Arc::new(runner), cache })
     }
 
@@ -294,7 +295,7 @@ impl Remote {
     /// Reads a part of an object. A part that is shorter than asked for is said to be so.
     fn range(&self, key: &str, bytes: Range<u64>) -> Result<Vec<u8>, StoreError> {
         let (store, at, wanted) = (self.store.clone(), self.key(key), bytes.clone());
-        let patience = self.runner.patience().of_sections();
+        let retry = self.runner.retry().for_sections();
         let request = move || {
             let (store, at) = (store.clone(), at.clone());
             let range = Some(GetRange::Bounded(wanted.clone()));
@@ -304,7 +305,7 @@ impl Remote {
                 found.bytes().await.map(Vec::from)
             }
         };
-        let read = self.runner.start(patience, request).wait();
+        let read = self.runner.start(retry, request).wait();
         let read = read.map_err(StoreError::io("read", &self.root.join(key)));
         let short = match &read {
             Ok(part) => (part.len() as u64) < bytes.end - bytes.start,
@@ -322,7 +323,7 @@ impl Remote {
     }
 
     /// Reads until the bytes have their hash: what was damaged on the way is not damaged there.
-    fn sound(
+    fn read_verified(
         &self,
         key: &str,
         hash: &str,
@@ -334,7 +335,7 @@ impl Remote {
             match objects::check_hash(&bytes, hash) {
                 Ok(()) => return Ok(bytes),
                 Err(_) if tries < limits::SOUND_TRIES => {
-                    self.runner.count(Counted::Retry);
+                    self.runner.count(RequestCounter::Retry);
                     tries += 1;
                 }
                 Err(reason) => return Err(self.damaged(key, reason)),
@@ -344,12 +345,12 @@ impl Remote {
 
     fn head(&self, key: &str) -> Result<ObjectMeta, StoreError> {
         let (store, at) = (self.store.clone(), self.key(key));
-        let patience = self.runner.patience().of_sections();
+        let retry = self.runner.retry().for_sections();
         let request = move || {
             let (store, at) = (store.clone(), at.clone());
             async move { store.head(&at).await }
         };
-        let found = self.runner.start(patience, request).wait();
+        let found = self.runner.start(retry, request).wait();
         found.map_err(StoreError::io("find", &self.root.join(key)))
     }
 

@@ -8,18 +8,18 @@ use object_store::{ObjectStoreExt, PutMode, PutOptions, PutPayload};
 
 use crate::limits;
 use crate::store::StoreError;
-use crate::store::objects::{Objects as _, Put, object_key, record_key};
+use crate::store::objects::{ObjectBackend as _, StoredObject, object_key, record_key};
 
 use super::Remote;
-use super::patience::{Counted, Running};
+use super::retry::{PendingRequest, RequestCounter};
 
-/// Objects of a commit that no record names yet.
+/// ObjectBackend of a commit that no record names yet.
 #[derive(Debug)]
 pub(in crate::store) struct Staging {
     remote: Remote,
     name: String,
     /// Uploads that run, oldest first, and their keys.
-    uploads: VecDeque<(String, Running<()>)>,
+    uploads: VecDeque<(String, PendingRequest<()>)>,
 }
 
 impl Staging {
@@ -39,7 +39,7 @@ impl Staging {
     pub(in crate::store) fn put(
         &mut self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> Result<Put, StoreError> {
+    ) -> Result<StoredObject, StoreError> {
         let mut object = Vec::new();
         write(&mut object).map_err(StoreError::io("make an object for", self.root()))?;
         let (hash, bytes) = (blake3::hash(&object).to_hex().to_string(), object.len() as u64);
@@ -49,12 +49,12 @@ impl Staging {
         let key = object_key(&self.name, &hash);
         let (store, at) = (self.remote.store.clone(), self.remote.key(&key));
         let payload = PutPayload::from(object);
-        let upload = self.remote.runner.start(self.remote.runner.patience(), move || {
+        let upload = self.remote.runner.start(self.remote.runner.retry(), move || {
             let (store, at, payload) = (store.clone(), at.clone(), payload.clone());
             async move { store.put(&at, payload).await.map(|_| ()) }
         });
         self.uploads.push_back((key, upload));
-        Ok(Put { hash, bytes })
+        Ok(StoredObject { hash, bytes })
     }
 
     /// Waits for all uploads.
@@ -74,7 +74,7 @@ impl Staging {
     /// no two commits have the same record.
     ///
     /// # Errors
-    /// [`StoreError::Conflict`]; [`StoreError::Unsettled`] if nobody can say what became of it.
+    /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if nobody can say what became of it.
     pub(in crate::store) fn publish(
         &mut self,
         number: u64,
@@ -82,7 +82,7 @@ impl Staging {
     ) -> Result<(), StoreError> {
         self.settle()?;
         let key = record_key(&self.name, number);
-        let mut backoff = self.remote.runner.patience().backoff;
+        let mut backoff = self.remote.runner.retry().backoff;
         let mut tries = 1;
         loop {
             let (store, at) = (self.remote.store.clone(), self.remote.key(&key));
@@ -103,17 +103,17 @@ impl Staging {
                 Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
                 Err(_) => return Err(self.unsettled(number, cause)),
             }
-            if tries >= self.remote.runner.patience().tries {
-                self.remote.runner.count(Counted::Failure);
+            if tries >= self.remote.runner.retry().tries {
+                self.remote.runner.count(RequestCounter::Failure);
                 return Err(self.unsettled(number, cause));
             }
-            self.remote.runner.count(Counted::Retry);
+            self.remote.runner.count(RequestCounter::Retry);
             std::thread::sleep(backoff);
             (tries, backoff) = (tries + 1, backoff.saturating_mul(2));
         }
     }
 
     fn unsettled(&self, number: u64, cause: io::Error) -> StoreError {
-        StoreError::Unsettled { name: self.name.clone(), number, cause }
+        StoreError::OutcomeUnknown { name: self.name.clone(), number, cause }
     }
 }

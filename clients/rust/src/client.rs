@@ -1,0 +1,416 @@
+//! The session client: one request, one answer, in lock step.
+
+use std::mem;
+use std::time::Duration;
+
+use wildcity_protocol::PROTOCOL;
+use wildcity_protocol::error::Code;
+use wildcity_protocol::limits::HELLO_TIMEOUT;
+use wildcity_protocol::message::{
+    Action, Answer, ClientInfo, Limits, Open, Opened, Pose, Request, ServerInfo, Start, Summary,
+    TimedPose, TwinInfo,
+};
+
+use crate::connection::{Connection, Endpoint, Incoming};
+use crate::error::ClientError;
+use crate::limits;
+use crate::observation::Observation;
+use crate::options::ConnectOptions;
+
+/// A connection to a server, and the session on it.
+///
+/// A request that was refused, or whose answer did not arrive, keeps its number. Make the same call again
+/// (after [`Client::reconnect`] if the connection was lost): the server carries it out only once. Dropping
+/// the future of a call before it completes closes the connection, because its answer could still come.
+///
+/// ```no_run
+/// use wildcity_client::{Client, ClientError, Open, Pose};
+///
+/// # async fn drive() -> Result<(), ClientError> {
+/// let mut client = Client::connect("ws://127.0.0.1:8080/v1/session", "my-agent").await?;
+/// client.open(Open::twin("street")).await?;
+/// let pose = Pose { xyz: [1.0, 0.0, 0.0], q: [1.0, 0.0, 0.0, 0.0] };
+/// let observation = match client.step(pose).await {
+///     Err(ClientError::Disconnected(_)) => {
+///         client.reconnect().await?;
+///         client.step(pose).await?
+///     }
+///     other => other?,
+/// };
+/// println!("step {}", observation.metadata().step);
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Debug)]
+pub struct Client {
+    endpoint: Endpoint,
+    /// Name of this client, for the server's log.
+    name: String,
+    /// None while a call is running, and after the connection was lost.
+    connection: Option<Connection>,
+    /// Why the connection was lost; empty if it was not, or if a call was dropped.
+    disconnect_reason: String,
+    welcome: Welcome,
+    /// Name of the open session.
+    session: Option<String>,
+    next_seq: u64,
+    answer_timeout: Duration,
+}
+
+/// How the ego moves in one step.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Movement {
+    /// To this pose, `world_from_rig`. Only with the dynamics `teleport`.
+    Pose(Pose),
+    /// Along these poses, in the rig's frame at the start of the step. With any dynamics.
+    Trajectory(Vec<TimedPose>),
+    /// With this acceleration and curvature. Only with the dynamics `kinematic` and `dynamic`.
+    Action(Action),
+}
+
+/// The server's answer to `hello`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Welcome {
+    /// The protocol version that the server chose.
+    pub protocol: String,
+    /// Name and version of the server.
+    pub server: ServerInfo,
+    /// The server's limits.
+    pub limits: Limits,
+    /// Name of the render backend.
+    pub backend: String,
+    /// The twins that can be opened.
+    pub twins: Vec<TwinInfo>,
+}
+
+/// The server's answer to `resume`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Resumed {
+    /// Number of the last request that the session carried out.
+    pub last_seq: u64,
+    /// Steps of the episode so far.
+    pub step: u64,
+    /// Simulated time since the start of the episode, in microseconds.
+    pub time_us: i64,
+}
+
+/// The server's answer to `switch_version`: the version that the session shows from the next step on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Switched {
+    /// Number of the version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of the version's render profile as JSON, in hex.
+    pub profile_hash: String,
+}
+
+impl Client {
+    /// Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`. `name` appears
+    /// in the server's log.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`] if the address is invalid or the server does not answer within 10 s. A server
+    /// that speaks another protocol gives [`ClientError::UnexpectedAnswer`].
+    pub async fn connect(url: &str, name: &str) -> Result<Self, ClientError> {
+        Self::connect_with(url, name, &ConnectOptions::default()).await
+    }
+
+    /// As [`Client::connect`], with a token or with additional root certificates.
+    ///
+    /// # Errors
+    /// As [`Client::connect`]. An unknown token gives [`ClientError::Connect`] with HTTP status 401 in its
+    /// reason, a token without the role `drive` 403.
+    pub async fn connect_with(
+        url: &str,
+        name: &str,
+        options: &ConnectOptions,
+    ) -> Result<Self, ClientError> {
+        let endpoint = Endpoint::new(url, options)?;
+        let mut connection = endpoint.connect().await?;
+        let welcome = hello(&mut connection, name).await?;
+        Ok(Self {
+            endpoint,
+            name: name.to_owned(),
+            connection: Some(connection),
+            disconnect_reason: String::new(),
+            welcome,
+            session: None,
+            next_seq: 1,
+            answer_timeout: limits::ANSWER_TIMEOUT,
+        })
+    }
+
+    /// Continues a session that another client opened, for example one in a process that ended. Call it
+    /// directly after connecting. `last_seq` is the number of the last answer that the other client received
+    /// (`metadata().seq` of an observation).
+    ///
+    /// # Errors
+    /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any error but that
+    /// one the connection is lost.
+    pub async fn resume(&mut self, session: &str, last_seq: u64) -> Result<Resumed, ClientError> {
+        self.session = Some(session.to_owned());
+        self.next_seq = last_seq.saturating_add(1);
+        self.resume_session(session, last_seq).await
+    }
+
+    /// Connects again after the connection was lost, and continues the session if one was open.
+    ///
+    /// Then repeat the call that failed. It keeps its number, so the server carries it out only once: if it
+    /// already did, it sends the same answer again, byte for byte.
+    ///
+    /// # Errors
+    /// As [`Client::connect`] and [`Client::resume`]. After [`Code::UnknownSession`] another session can be
+    /// opened.
+    pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
+        self.connection = None;
+        let mut connection = self.endpoint.connect().await?;
+        self.welcome = hello(&mut connection, &self.name).await?;
+        self.connection = Some(connection);
+        let Some(session) = self.session.clone() else {
+            self.next_seq = 1;
+            return Ok(None);
+        };
+        self.resume_session(&session, self.next_seq - 1).await.map(Some)
+    }
+
+    /// The server's answer to `hello`: its limits and its twins.
+    pub fn welcome(&self) -> &Welcome {
+        &self.welcome
+    }
+
+    /// Number of the next request.
+    pub fn next_seq(&self) -> u64 {
+        self.next_seq
+    }
+
+    /// Sets how long a call waits for its answer before it closes the connection. The default is
+    /// [`limits::ANSWER_TIMEOUT`], 90 s.
+    pub fn set_answer_timeout(&mut self, timeout: Duration) {
+        self.answer_timeout = timeout;
+    }
+
+    /// Opens a session on a twin. `open.seq` is ignored: the client sets it.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if the server refuses; see [`ClientError`] for lost connections.
+    pub async fn open(&mut self, open: Open) -> Result<Opened, ClientError> {
+        let request = Request::Open(Box::new(Open { seq: self.next_seq, ..open }));
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Opened(opened)) => {
+                self.session = Some(opened.session.clone());
+                Ok(*opened)
+            }
+            other => Err(self.unexpected_answer("opened", &other)),
+        }
+    }
+
+    /// Moves the ego to `pose` (`world_from_rig`), advances the simulated time by one step, and returns the
+    /// observation there. Only with the dynamics `teleport`, which is the default.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if the server refuses; see [`ClientError`] for lost connections.
+    pub async fn step(&mut self, pose: Pose) -> Result<Observation, ClientError> {
+        self.drive(Movement::Pose(pose), false).await
+    }
+
+    /// As [`Client::step`], and ends the episode with this step.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn last_step(&mut self, pose: Pose) -> Result<Observation, ClientError> {
+        self.drive(Movement::Pose(pose), true).await
+    }
+
+    /// Moves the ego by a pose, a trajectory or an action, advances the simulated time by one step, and
+    /// returns the observation there. `terminate` ends the episode with this step.
+    ///
+    /// # Errors
+    /// [`Code::SessionState`] if the session's dynamics do not accept this kind of movement; otherwise as
+    /// [`Client::step`].
+    pub async fn drive(
+        &mut self,
+        movement: Movement,
+        terminate: bool,
+    ) -> Result<Observation, ClientError> {
+        let seq = self.next_seq;
+        let request = match movement {
+            Movement::Pose(pose) => {
+                Request::Step { seq, pose: Some(pose), trajectory: None, action: None, terminate }
+            }
+            Movement::Trajectory(poses) => {
+                Request::Step { seq, pose: None, trajectory: Some(poses), action: None, terminate }
+            }
+            Movement::Action(action) => {
+                Request::Step { seq, pose: None, trajectory: None, action: Some(action), terminate }
+            }
+        };
+        self.exchange_for_observation(&request).await
+    }
+
+    /// Renders the cameras from `poses` (`world_from_rig`) without moving the ego or the time. The
+    /// observation has the images of all poses, pose by pose.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn observe(&mut self, poses: &[Pose]) -> Result<Observation, ClientError> {
+        let request = Request::Observe { seq: self.next_seq, poses: poses.to_vec() };
+        self.exchange_for_observation(&request).await
+    }
+
+    /// Asks the server to load what will be visible from `poses` (`world_from_rig`, in driving order) and
+    /// from the straight lines between them. Returns at once, without waiting until it is loaded.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn prefetch(&mut self, poses: &[Pose]) -> Result<(), ClientError> {
+        let request = Request::Prefetch { seq: self.next_seq, poses: poses.to_vec() };
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Ok { .. }) => Ok(()),
+            other => Err(self.unexpected_answer("ok", &other)),
+        }
+    }
+
+    /// Starts a new episode at `start`, or at the session's start if `start` is `None`.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn reset(
+        &mut self,
+        seed: u64,
+        start: Option<Start>,
+    ) -> Result<Observation, ClientError> {
+        let request = Request::Reset { seq: self.next_seq, seed, start };
+        self.exchange_for_observation(&request).await
+    }
+
+    /// Shows another version of the twin from the next step on; the latest one if `version` is `None`. The
+    /// episode continues.
+    ///
+    /// # Errors
+    /// [`Code::UnknownVersion`] if the twin has no such version; otherwise as [`Client::step`].
+    pub async fn switch_version(&mut self, version: Option<u64>) -> Result<Switched, ClientError> {
+        match self.exchange(&Request::SwitchVersion { seq: self.next_seq, version }).await? {
+            Incoming::Answer(Answer::Switched { version, version_hash, profile_hash, .. }) => {
+                Ok(Switched { version, version_hash, profile_hash })
+            }
+            other => Err(self.unexpected_answer("switched", &other)),
+        }
+    }
+
+    /// Ends the session. Another one can be opened on the same connection.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn close(&mut self) -> Result<Summary, ClientError> {
+        match self.exchange(&Request::Close { seq: self.next_seq }).await? {
+            Incoming::Answer(Answer::Closed { summary, .. }) => {
+                self.session = None;
+                Ok(summary)
+            }
+            other => Err(self.unexpected_answer("closed", &other)),
+        }
+    }
+
+    async fn exchange_for_observation(
+        &mut self,
+        request: &Request,
+    ) -> Result<Observation, ClientError> {
+        match self.exchange(request).await? {
+            Incoming::Observation(observation) => Ok(*observation),
+            other => Err(self.unexpected_answer("an observation", &other)),
+        }
+    }
+
+    /// Sends a request of the session and waits for its answer. The number is used up only if that answer
+    /// is not an error.
+    async fn exchange(&mut self, request: &Request) -> Result<Incoming, ClientError> {
+        let mut connection = self.take_connection()?;
+        let result = connection.exchange(request, self.next_seq, self.answer_timeout).await;
+        match &result {
+            Ok(_) => {
+                self.next_seq += 1;
+                self.connection = Some(connection);
+            }
+            Err(ClientError::Refused { fatal: false, .. }) => self.connection = Some(connection),
+            Err(error) => self.disconnect_reason = error.to_string(),
+        }
+        result
+    }
+
+    /// Continues a session on a new connection, on which `hello` had number 0 and this request has 1.
+    async fn resume_session(
+        &mut self,
+        session: &str,
+        last_seq: u64,
+    ) -> Result<Resumed, ClientError> {
+        let mut connection = self.take_connection()?;
+        let request = Request::Resume { seq: 1, session: session.to_owned(), last_seq };
+        let incoming = match connection.exchange(&request, 1, self.answer_timeout).await {
+            Ok(incoming) => incoming,
+            Err(error) => {
+                if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
+                    // The session is over. A new one can be opened on this connection, and its request
+                    // takes the number of this refused one.
+                    self.session = None;
+                    self.next_seq = 1;
+                    self.connection = Some(connection);
+                } else {
+                    self.disconnect_reason = error.to_string();
+                }
+                return Err(error);
+            }
+        };
+        match incoming {
+            // One request is under way at a time, so the session has carried out either the request with
+            // number `last_seq` or the one after it.
+            Incoming::Answer(Answer::Resumed { last_seq: session_seq, step, time_us, .. })
+                if session_seq == last_seq || Some(session_seq) == last_seq.checked_add(1) =>
+            {
+                self.connection = Some(connection);
+                Ok(Resumed { last_seq: session_seq, step, time_us })
+            }
+            other => Err(self.unexpected_answer("resumed, at most one request ahead", &other)),
+        }
+    }
+
+    /// Takes the connection for the time of a call. A call whose future is dropped does not give it back,
+    /// so the connection is closed.
+    fn take_connection(&mut self) -> Result<Connection, ClientError> {
+        self.connection.take().ok_or_else(|| {
+            let reason = mem::take(&mut self.disconnect_reason);
+            ClientError::Disconnected(if reason.is_empty() {
+                "a call was given up before its answer came".to_owned()
+            } else {
+                reason
+            })
+        })
+    }
+
+    fn unexpected_answer(&mut self, expected: &'static str, got: &Incoming) -> ClientError {
+        self.connection = None;
+        let error = ClientError::UnexpectedAnswer { expected, got: got.to_string() };
+        self.disconnect_reason = error.to_string();
+        error
+    }
+}
+
+async fn hello(connection: &mut Connection, name: &str) -> Result<Welcome, ClientError> {
+    let version = env!("CARGO_PKG_VERSION").to_owned();
+    let request = Request::Hello {
+        seq: 0,
+        client: ClientInfo { name: name.to_owned(), version },
+        protocols: vec![PROTOCOL.to_owned()],
+    };
+    match connection.exchange(&request, 0, HELLO_TIMEOUT).await? {
+        Incoming::Answer(Answer::Welcome { protocol, server, limits, backend, twins, .. })
+            if protocol == PROTOCOL =>
+        {
+            Ok(Welcome { protocol, server, limits, backend, twins })
+        }
+        other => Err(ClientError::UnexpectedAnswer {
+            expected: "welcome to wildcity.v1",
+            got: other.to_string(),
+        }),
+    }
+}

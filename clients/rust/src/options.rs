@@ -1,0 +1,44 @@
+//! What a client needs to know about a server beside its address.
+
+use std::fmt;
+
+/// How a client authenticates, and which certificates it trusts.
+///
+/// By default it sends no token and trusts the root certificates of the operating system.
+///
+/// ```
+/// use wildcity_client::ConnectOptions;
+///
+/// let options = ConnectOptions { token: Some("secret".into()), ..ConnectOptions::default() };
+/// // The token is never printed.
+/// assert!(!format!("{options:?}").contains("secret"));
+/// ```
+#[derive(Clone, Default)]
+pub struct ConnectOptions {
+    /// Bearer token, for a server that was started with tokens.
+    pub token: Option<String>,
+    /// Root certificates in PEM format that `wss://` and `https://` trust in addition to those of the
+    /// operating system, for example that of a private certificate authority.
+    pub root_certificates_pem: Vec<u8>,
+}
+
+impl ConnectOptions {
+    /// The default options with a token, if there is one.
+    pub fn with_token(token: Option<String>) -> Self {
+        Self { token, ..Self::default() }
+    }
+}
+
+/// Hides the token.
+impl fmt::Debug for ConnectOptions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let token = if self.token.is_some() { "hidden" } else { "none" };
+        f.debug_struct("ConnectOptions")
+            .field("token", &token)
+            .field(
+                "root_certificates_pem",
+                &format_args!("{} bytes", self.root_certificates_pem.len()),
+            )
+            .finish()
+    }
+}

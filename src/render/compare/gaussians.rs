@@ -1,0 +1,57 @@
+//! A few Gaussians, written by what they are and not by what is stored.
+
+use glam::{DQuat, DVec3};
+
+use crate::View;
+use crate::compare::images::view_along;
+use wildcity_scene::{Gaussians, Scene, sh};
+
+/// One Gaussian, by default an orange ball of 10 cm, 5 m ahead of [`ahead`].
+#[derive(Clone, Copy, Debug)]
+pub struct GaussianSpec {
+    /// Centre, in metres.
+    pub mean_m: DVec3,
+    /// Rotation of its own axes.
+    pub rotation: DQuat,
+    /// Standard deviation along each own axis, in metres.
+    pub sigma_m: DVec3,
+    /// Peak opacity, between 0 and 1.
+    pub opacity: f64,
+    /// Linear colour.
+    pub rgb: [f64; 3],
+}
+
+impl Default for GaussianSpec {
+    fn default() -> Self {
+        Self {
+            mean_m: DVec3::new(0.0, 0.0, 5.0),
+            rotation: DQuat::IDENTITY,
+            sigma_m: DVec3::splat(0.1),
+            opacity: 0.9,
+            rgb: [1.0, 0.6, 0.2],
+        }
+    }
+}
+
+/// The scene that they make.
+pub fn scene_of(blobs: &[GaussianSpec]) -> Scene {
+    Scene::from_gaussians(&gaussians_of(blobs))
+}
+
+/// Raw columns of SH degree 0.
+pub fn gaussians_of(blobs: &[GaussianSpec]) -> Gaussians {
+    let mut g = Gaussians::with_capacity(0, blobs.len());
+    for GaussianSpec { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
+        g.means_m.push(mean_m.to_array());
+        g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
+        g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
+        g.logit_opacities.push((opacity / (1.0 - opacity)).ln() as f32);
+        g.sh.extend(rgb.map(|c| ((c - 0.5) / sh::C0) as f32));
+    }
+    g
+}
+
+/// A camera at the origin that looks along +z, y down.
+pub fn forward_view(size_px: [u32; 2], focal_px: f64) -> View {
+    view_along(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
+}

@@ -1,0 +1,135 @@
+//! What an observation consists of, before it is named on the wire.
+
+use std::ops::Range;
+use std::time::Duration;
+
+use super::buffer::ObservationBuffer;
+use super::trust::Trust;
+
+/// A finished observation.
+#[derive(Debug)]
+pub struct Observation {
+    /// The bytes of all tensors, behind the reserved header.
+    pub buffer: ObservationBuffer,
+    /// What is where in the buffer, in order and without gaps.
+    pub tensors: Vec<Tensor>,
+    /// The images, pose by pose, camera by camera.
+    pub images: Vec<ImageInfo>,
+    /// Earlier frames of the same cameras, camera by camera, the newest first.
+    pub history: Vec<PastImageInfo>,
+    /// BLAKE3 of the images' hashes, 32 bytes each, in order.
+    pub frame_hash: blake3::Hash,
+    /// How many poses of the ego history were driven.
+    pub history_count: usize,
+    /// What it cost.
+    pub timings: Timings,
+    /// What of it had to be loaded.
+    pub residency: ResidencyStats,
+}
+
+/// Memory behind an observation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ResidencyStats {
+    /// Bytes of Gaussians in memory, of all twins.
+    pub held_bytes: u64,
+    /// Bytes that there may be.
+    pub limit_bytes: u64,
+    /// Sections that were not in memory when it was asked for.
+    pub waited_for: usize,
+    /// How long it took until they were.
+    pub waited: Duration,
+}
+
+/// One image of a [`Observation`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImageInfo {
+    /// Index of the camera among [`crate::Session::cameras`].
+    pub camera: usize,
+    /// Which of the request's poses.
+    pub pose: usize,
+    /// When it was taken, in microseconds since the episode's start.
+    pub time_us: i64,
+    /// BLAKE3 of the pixels, `[height, width, 3]`.
+    pub hash: blake3::Hash,
+    /// How far it may be believed, if that was asked for.
+    pub trust: Option<Trust>,
+}
+
+/// One image of a [`Observation`] that was taken before it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PastImageInfo {
+    /// Index of the camera among [`crate::Session::cameras`].
+    pub camera: usize,
+    /// How many frames of this camera ago, from 1.
+    pub back: usize,
+    /// When it was taken, in microseconds since the episode's start.
+    pub time_us: i64,
+    /// BLAKE3 of the pixels, `[height, width, 3]`.
+    pub hash: blake3::Hash,
+    /// How far it may be believed, if that was asked for.
+    pub trust: Option<Trust>,
+}
+
+/// One tensor of a [`Observation`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tensor {
+    /// What it holds.
+    pub kind: TensorKind,
+    /// Type of its elements.
+    pub dtype: DType,
+    /// Its shape, row-major.
+    pub shape: Vec<usize>,
+    /// Where its bytes are, from the end of the header.
+    pub bytes: Range<usize>,
+}
+
+/// What a tensor holds; images by their index in [`Observation::images`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TensorKind {
+    /// Positions of the ego history, in metres: `[16, 3]`.
+    HistoryXyz,
+    /// Rotations of the ego history: `[16, 3, 3]`.
+    HistoryRotation,
+    /// Expected camera z in metres: `[height, width]`.
+    Depth(usize),
+    /// Accumulated opacity: `[height, width]`.
+    Opacity(usize),
+    /// Unit normals in the camera's axes: `[height, width, 3]`.
+    Normals(usize),
+    /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
+    Rgb(usize),
+    /// Colour of an earlier frame, by its index in [`Observation::history`]: the same.
+    PastRgb(usize),
+}
+
+/// Type of a tensor's elements.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DType {
+    /// 32-bit float, little-endian.
+    F32,
+    /// Byte.
+    U8,
+}
+
+/// What an observation cost.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Timings {
+    /// Waiting for other sessions' frames.
+    pub queue: Duration,
+    /// Rendering, with the encoding that ran beside it.
+    pub render: Duration,
+    /// CPU time of encoding and hashing.
+    pub encode: Duration,
+    /// Wall time per render stage, in milliseconds, in the order of the chain.
+    pub stages_ms: Vec<(&'static str, f64)>,
+}
+
+impl DType {
+    /// Bytes of one.
+    pub(crate) fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::U8 => 1,
+        }
+    }
+}

@@ -1,0 +1,4 @@
+//! Loading ahead of the ego.
+
+pub(crate) mod forecast;
+pub(crate) mod latest_task;

@@ -1,0 +1,73 @@
+//! Drives a recorded episode again, command by command, and compares where that leads.
+
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::ego::Path;
+use wildcity_sim::{Command, Ego, Ground};
+
+use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
+use crate::episode::Episode;
+use crate::error::SessionError;
+
+/// A step whose command leads elsewhere than it did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DivergedStep {
+    /// Line of the episode's file, from 1.
+    pub line: usize,
+    /// The step.
+    pub step: u64,
+    /// `world_from_rig` as recorded.
+    pub recorded: Pose,
+    /// As it is now.
+    pub now: Pose,
+}
+
+/// An episode that is driven again.
+pub(crate) struct EgoReplay {
+    episode: Episode,
+}
+
+impl EgoReplay {
+    pub(crate) fn new(header: &EpisodeHeader) -> Self {
+        let EpisodeHeader { seed, dynamics, start, dt_us, .. } = *header;
+        Self { episode: Episode::new(seed, Ego::new(dynamics, start), dt_us) }
+    }
+
+    /// How far it is.
+    pub(crate) fn episode(&self) -> &Episode {
+        &self.episode
+    }
+
+    /// Does the step of a frame, if it is one. Poses are compared to the bit.
+    ///
+    /// # Errors
+    /// The recorded command is none for this ego.
+    pub(crate) fn follow(
+        &mut self,
+        frame: &FrameRecord,
+        line: usize,
+        ground: &Ground<'_>,
+    ) -> Result<Option<DivergedStep>, SessionError> {
+        // Others before it are of frames that a later observation shows.
+        let (FrameRequest::Step, Some(recorded)) = (frame.request, frame.poses.last()) else {
+            return Ok(None);
+        };
+        let command = match &frame.command {
+            None => Command::Pose(*recorded),
+            Some(RecordedCommand::Action(action)) => Command::Action(*action),
+            Some(RecordedCommand::Trajectory(poses)) => {
+                Command::Path(Path::checked(poses.clone()).map_err(SessionError::Ego)?)
+            }
+        };
+        self.episode = self.episode.stepped(&command, ground, false)?;
+        let (now, recorded) = (self.episode.world_from_rig(), *recorded);
+        Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))
+    }
+}
+
+impl std::fmt::Display for DivergedStep {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { line, step, recorded, now } = self;
+        let off_m = recorded.position_m.distance(now.position_m);
+        write!(f, "step {step} (line {line}): the command leads {off_m:e} m off")
+    }
+}

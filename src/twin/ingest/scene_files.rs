@@ -1,0 +1,85 @@
+//! The files of a scene that has several.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use crate::limits;
+
+use super::hash_reader::HashReader;
+use super::unpack_budget::UnpackBudget;
+use super::{FileError, IngestError, Progress, file};
+
+/// Where the files that a scene names are found.
+pub(super) trait SceneFiles {
+    /// A whole file of at most so many bytes; the name is relative to the file given first, with `/`.
+    fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError>;
+
+    /// What the scene may unpack.
+    fn budget(&mut self) -> &mut UnpackBudget;
+}
+
+/// The folder of the file given first.
+pub(super) struct Folder<'a> {
+    path: PathBuf,
+    /// Of every file read, in order.
+    hashes: Vec<String>,
+    read_bytes: u64,
+    progress: Progress<'a>,
+    budget: UnpackBudget,
+}
+
+impl<'a> Folder<'a> {
+    /// Of a file that was read, with its size and hash.
+    pub(super) fn new(first: &Path, bytes: u64, hash: String, progress: Progress<'a>) -> Self {
+        let path = first.parent().unwrap_or(Path::new("")).to_owned();
+        let mut folder = Self {
+            path,
+            hashes: vec![hash],
+            read_bytes: 0,
+            progress,
+            budget: UnpackBudget::default(),
+        };
+        folder.add(bytes);
+        folder
+    }
+
+    /// The hash of one file, or of the hashes of several.
+    pub(super) fn finish(self) -> String {
+        match &self.hashes[..] {
+            [one] => one.clone(),
+            several => {
+                let lines: String = several.iter().flat_map(|hash| [hash, "\n"]).collect();
+                blake3::hash(lines.as_bytes()).to_hex().to_string()
+            }
+        }
+    }
+
+    fn add(&mut self, bytes: u64) {
+        self.read_bytes += bytes;
+        self.budget.read(bytes);
+        (self.progress)(self.read_bytes, self.read_bytes);
+    }
+}
+
+impl SceneFiles for Folder<'_> {
+    fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError> {
+        let failed = |cause| IngestError::Part { name: name.into(), cause };
+        let is_below = name.split('/').all(|step| !["", ".", ".."].contains(&step));
+        if !is_below || Path::new(name).is_absolute() || name.contains(['\\', '\0']) {
+            return Err(failed(FileError::OutsideFolder));
+        }
+        if self.hashes.len() > limits::SCENE_PARTS {
+            return Err(failed(FileError::TooMany { limit: limits::SCENE_PARTS }));
+        }
+        let (file, _) = file::open(&self.path.join(name)).map_err(failed)?;
+        let mut input = HashReader::new(file);
+        let bytes = file::read_at_most(input.by_ref(), limit_bytes).map_err(failed)?;
+        self.hashes.push(input.finish());
+        self.add(bytes.len() as u64);
+        Ok(bytes)
+    }
+
+    fn budget(&mut self) -> &mut UnpackBudget {
+        &mut self.budget
+    }
+}

@@ -1,0 +1,71 @@
+//! A whole version in one call, for what is in memory anyway.
+
+use crate::ingest::IngestError;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::validate::{self, Field};
+use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
+
+use super::catalog::check_name;
+use super::sky::NewSky;
+use super::{Catalog, CommitKind, StorageOptions, StoreError, Version, VersionSettings};
+
+/// What a new version of a twin consists of.
+#[derive(Clone, Debug)]
+pub struct NewVersion<'a> {
+    /// The twin's name, `[a-z0-9._-]+`; a new one makes a new twin.
+    pub name: &'a str,
+    /// The Gaussians, in metres along the twin's axes.
+    pub gaussians: &'a Gaussians,
+    /// How they must be rendered.
+    pub profile: RenderProfile,
+    /// The vehicle that recorded them.
+    pub rig: Option<Rig>,
+    /// Recorded drives.
+    pub trajectories: Vec<Trajectory>,
+    /// What is behind them.
+    pub sky: Option<NewSky>,
+    /// Where they come from.
+    pub provenance: Provenance,
+    /// How they are stored.
+    pub storage: StorageOptions,
+}
+
+impl<'a> NewVersion<'a> {
+    /// Gaussians alone, rendered and stored by default.
+    pub fn of(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
+        Self {
+            name,
+            gaussians,
+            profile: RenderProfile::DEFAULT,
+            rig: None,
+            trajectories: Vec::new(),
+            sky: None,
+            provenance,
+            storage: StorageOptions::default(),
+        }
+    }
+}
+
+impl Catalog {
+    /// Writes a version and makes it the latest, all or nothing. The same content as the latest
+    /// version's is that version: no new one is made. `progress` gets Gaussians written and Gaussians
+    /// in all.
+    ///
+    /// # Errors
+    /// Names what cannot be accepted, before anything is written; or as [`super::Commit::replace`].
+    pub fn commit(
+        &self,
+        new: NewVersion<'_>,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<Version, StoreError> {
+        let NewVersion { name, gaussians, profile, rig, trajectories, sky, provenance, storage } =
+            new;
+        check_name(name)?;
+        validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
+        let settings = VersionSettings { profile, rig, trajectories, sky, provenance };
+        settings.check()?;
+        let mut commit = self.begin(name, CommitKind::Import, storage)?;
+        commit.put(gaussians, None, progress)?;
+        commit.replace(None, settings)
+    }
+}

@@ -1,0 +1,208 @@
+//! The Rust client against a server that follows a script.
+
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+use wildcity_client::{Client, ClientError};
+use wildcity_protocol::error::Code;
+use wildcity_protocol::message::{Open, Outcome, Pose, Request};
+
+use super::fake_server::{FakeServer, Reply, seq_of};
+use super::read;
+
+/// Whether an error is the right one.
+type Refusal = fn(&ClientError) -> bool;
+
+const HERE: Pose = Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] };
+
+const HELLO: Reply = Reply::Golden("welcome");
+const OPEN: Reply = Reply::Golden("opened");
+const SEEN: Reply = Reply::Observation(0);
+
+async fn opened(scripts: Vec<Vec<Reply>>) -> (FakeServer, Client) {
+    let server = FakeServer::start(scripts).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    client.open(Open::twin("street")).await.unwrap();
+    (server, client)
+}
+
+fn seqs(requests: &[Request]) -> Vec<u64> {
+    requests.iter().map(seq_of).collect()
+}
+
+#[tokio::test]
+async fn a_whole_conversation() {
+    let (ok, closed) = (Reply::Golden("ok"), Reply::Golden("closed"));
+    let (server, mut client) =
+        opened(vec![vec![HELLO, OPEN, SEEN, SEEN, SEEN, SEEN, ok, closed]]).await;
+    assert_eq!(client.welcome().twins[0].name, "street");
+    assert_eq!(client.reset(7, None).await.unwrap().metadata().seq, 2);
+    let seen = client.step(HERE).await.unwrap();
+    assert_eq!(seen.camera("rear").unwrap().rgb().unwrap().len(), 4 * 3 * 3);
+    assert!(seen.camera("left").is_none());
+    client.last_step(HERE).await.unwrap();
+    client.observe(&[HERE, HERE]).await.unwrap();
+    client.prefetch(&[HERE]).await.unwrap();
+    assert_eq!(client.close().await.unwrap().outcome, Outcome::OffModel);
+    drop(client);
+
+    let requests = server.requests().await.remove(0);
+    assert_eq!(seqs(&requests), [0, 1, 2, 3, 4, 5, 6, 7]);
+    assert!(matches!(requests[3], Request::Step { pose: Some(HERE), terminate: false, .. }));
+    assert!(matches!(requests[4], Request::Step { terminate: true, .. }));
+}
+
+#[tokio::test]
+async fn a_refused_request_keeps_its_number() {
+    let (server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Golden("error"), SEEN]]).await;
+    let Err(ClientError::Refused { code, field, fatal: false, .. }) = client.step(HERE).await
+    else {
+        panic!("the server refused");
+    };
+    assert_eq!((code, field.as_deref()), (Code::PoseNotFinite, Some("pose.q[2]")));
+    client.step(HERE).await.unwrap();
+    drop(client);
+    assert_eq!(seqs(&server.requests().await[0]), [0, 1, 2, 2]);
+}
+
+#[tokio::test]
+async fn a_fatal_error_ends_the_connection() {
+    let (_server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Golden("error_fatal")]]).await;
+    let refused = client.step(HERE).await;
+    assert!(matches!(refused, Err(ClientError::Refused { fatal: true, .. })), "{refused:?}");
+    let gone = client.step(HERE).await;
+    assert!(matches!(&gone, Err(ClientError::Disconnected(why)) if why.contains("ShuttingDown")));
+}
+
+/// The golden `resumed` says that request 4 was carried out.
+#[tokio::test]
+async fn a_lost_answer_is_fetched_after_reconnecting() {
+    let resumed = Reply::Golden("resumed");
+    let first = vec![HELLO, OPEN, SEEN, SEEN, Reply::HangUp];
+    let (server, mut client) = opened(vec![first, vec![HELLO, resumed, SEEN, SEEN]]).await;
+    client.reset(0, None).await.unwrap();
+    client.step(HERE).await.unwrap();
+    let lost = client.step(HERE).await;
+    assert!(matches!(lost, Err(ClientError::Disconnected(_))), "{lost:?}");
+
+    let resumed = client.reconnect().await.unwrap().unwrap();
+    assert_eq!((resumed.last_seq, resumed.step), (4, 2));
+    client.step(HERE).await.unwrap();
+    client.step(HERE).await.unwrap();
+    drop(client);
+    let requests = server.requests().await;
+    assert_eq!(seqs(&requests[0]), [0, 1, 2, 3, 4]);
+    assert_eq!(seqs(&requests[1]), [0, 1, 4, 5]);
+    let session = "run-17".to_owned();
+    assert_eq!(requests[1][1], Request::Resume { seq: 1, session, last_seq: 3 });
+}
+
+#[tokio::test]
+async fn a_new_session_can_follow_one_that_is_gone() {
+    let gone = r#"{"type":"error","seq":1,"code":"unknown_session","message":"","fatal":false}"#;
+    let second = vec![HELLO, Reply::Text(gone.into()), OPEN, SEEN];
+    let (server, mut client) = opened(vec![vec![HELLO, OPEN, SEEN, Reply::HangUp], second]).await;
+    client.step(HERE).await.unwrap();
+    client.step(HERE).await.unwrap_err();
+    let refused = client.reconnect().await;
+    assert!(
+        matches!(refused, Err(ClientError::Refused { code: Code::UnknownSession, .. })),
+        "{refused:?}"
+    );
+    client.open(Open::twin("street")).await.unwrap();
+    client.step(HERE).await.unwrap();
+    drop(client);
+    assert_eq!(seqs(&server.requests().await[1]), [0, 1, 1, 2]);
+}
+
+#[tokio::test]
+async fn another_client_can_take_a_session_over() {
+    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed"), SEEN]]).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let resumed = client.resume("run-17", 4).await.unwrap();
+    assert_eq!((resumed.last_seq, client.next_seq()), (4, 5));
+    assert_eq!(client.step(HERE).await.unwrap().metadata().seq, 5);
+}
+
+#[tokio::test]
+async fn numbers_have_an_end() {
+    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let result = client.resume("run-17", u64::MAX).await;
+    assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
+}
+
+/// Why a connection was lost is still known to the call after the failed `reconnect`.
+#[tokio::test]
+async fn a_refused_resume_says_why() {
+    let busy = r#"{"type":"error","seq":1,"code":"busy","message":"full","fatal":false}"#;
+    let first = vec![HELLO, OPEN, Reply::HangUp];
+    let (_server, mut client) = opened(vec![first, vec![HELLO, Reply::Text(busy.into())]]).await;
+    client.step(HERE).await.unwrap_err();
+    client.reconnect().await.unwrap_err();
+    let gone = client.step(HERE).await;
+    assert!(
+        matches!(&gone, Err(ClientError::Disconnected(why)) if why.contains("full")),
+        "{gone:?}"
+    );
+}
+
+#[tokio::test]
+async fn a_session_that_is_elsewhere_is_not_taken_over() {
+    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
+    let mut client = Client::connect(&server.url, "test").await.unwrap();
+    let result = client.resume("run-17", 2).await;
+    assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
+}
+
+#[tokio::test]
+async fn silence_ends_in_a_time_out() {
+    let (_server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Silence]]).await;
+    client.set_answer_timeout(Duration::from_millis(50));
+    let silent = client.step(HERE).await;
+    assert!(matches!(silent, Err(ClientError::TimedOut(_))), "{silent:?}");
+    // The answer may still come, so the connection cannot be used again.
+    assert!(matches!(client.step(HERE).await, Err(ClientError::Disconnected(_))));
+}
+
+#[tokio::test]
+async fn a_dropped_call_gives_the_connection_up() {
+    let (_server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Silence]]).await;
+    assert!(timeout(Duration::from_millis(50), client.step(HERE)).await.is_err());
+    let gone = client.step(HERE).await;
+    assert!(matches!(&gone, Err(ClientError::Disconnected(why)) if why.contains("given up")));
+}
+
+#[tokio::test]
+async fn what_is_no_answer_is_named() {
+    let damaged = read("vectors/damaged/overlap.bin");
+    let cases: [(Reply, Refusal); 5] = [
+        (Reply::Observation(1), |e| {
+            matches!(e, ClientError::SeqMismatch { expected: 2, got: Some(3) })
+        }),
+        (Reply::Golden("opened"), |e| matches!(e, ClientError::UnexpectedAnswer { .. })),
+        (Reply::Text("{\"type\":".into()), |e| matches!(e, ClientError::Answer(_))),
+        (Reply::Text("{\"type\":\"sing\",\"seq\":2}".into()), |e| {
+            matches!(e, ClientError::Answer(_))
+        }),
+        (Reply::Binary(damaged), |e| matches!(e, ClientError::Frame(_))),
+    ];
+    for (reply, expected) in cases {
+        let (_server, mut client) = opened(vec![vec![HELLO, OPEN, reply]]).await;
+        let error = client.step(HERE).await.unwrap_err();
+        assert!(expected(&error), "{error:?}");
+        assert!(matches!(client.step(HERE).await, Err(ClientError::Disconnected(_))));
+    }
+}
+
+#[tokio::test]
+async fn nobody_there_is_no_connection() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("ws://{}/v1/session", listener.local_addr().unwrap());
+    drop(listener);
+    for url in [url.as_str(), "ws://", "not a url"] {
+        let result = Client::connect(url, "test").await;
+        assert!(matches!(result, Err(ClientError::Connect { .. })), "{url}: {result:?}");
+    }
+}

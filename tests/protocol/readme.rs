@@ -1,0 +1,99 @@
+//! `protocol/README.md` shows messages and bytes that are really so.
+
+use schemars::schema_for;
+use serde::de::DeserializeOwned;
+use wildcity_protocol::error::Code;
+use wildcity_protocol::http;
+use wildcity_protocol::message::{Answer, Request};
+use wildcity_protocol::observation::ObservationMetadata;
+
+use super::read;
+
+#[test]
+fn every_json_example_is_a_message() {
+    let page = page();
+    let (page, http) = page.split_once("\n## HTTP\n").expect("a section on HTTP");
+    let kinds: [Kind; 3] = [
+        ("request", parses::<Request>),
+        ("answer", parses::<Answer>),
+        ("observation", parses::<ObservationMetadata>),
+    ];
+    // Each request but the two of `open` once, each answer once.
+    assert_eq!(counted(page, kinds), [12, 7, 1]);
+    let kinds: [Kind; 6] = [
+        ("new upload", parses::<http::NewUpload>),
+        ("upload", parses::<http::Upload>),
+        ("new push", parses::<http::NewPush>),
+        ("push", parses::<http::Push>),
+        ("rollback", parses::<http::Rollback>),
+        ("refusal", parses::<http::Refusal>),
+    ];
+    assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1]);
+}
+
+/// A kind of message, and what keeps a text from being one.
+type Kind = (&'static str, fn(&str) -> Option<String>);
+
+/// How many examples there are of each kind; every example is of exactly one.
+fn counted<const N: usize>(page: &str, kinds: [Kind; N]) -> [usize; N] {
+    let mut counts = [0; N];
+    for example in blocks(page, "json") {
+        let errors = kinds.map(|(kind, parses)| (kind, parses(example)));
+        let matches = errors.iter().filter(|(_, error)| error.is_none()).count();
+        assert_eq!(matches, 1, "{example}\n{errors:#?}");
+        for (count, (_, error)) in counts.iter_mut().zip(errors) {
+            *count += usize::from(error.is_none());
+        }
+    }
+    counts
+}
+
+#[test]
+fn the_hex_example_is_the_golden_frame() {
+    let (page, frame) = (page(), read("vectors/observations/raw.bin"));
+    let dump: Vec<&str> = blocks(&page, "hex").flat_map(str::lines).collect();
+    assert_eq!(dump.len(), 6);
+    for line in dump {
+        let (offset, bytes) = line.split_once(": ").expect(line);
+        let offset = usize::from_str_radix(offset, 16).unwrap();
+        let bytes: Vec<u8> =
+            bytes.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+        assert_eq!(frame[offset..offset + bytes.len()], bytes, "{line}");
+    }
+    assert!(page.contains("(3,384 bytes) has N = 0x928 = 2,344"));
+    assert_eq!((frame.len(), &frame[..8]), (3384, &2344_u64.to_le_bytes()[..]));
+}
+
+/// Every code is explained, and no other.
+#[test]
+fn every_error_code_has_its_row() {
+    let page = page();
+    let section = page.split("\n## Errors").nth(1).expect("a section on errors");
+    let section = section.split("\n## ").next().expect("split gives at least one");
+    let mut rows: Vec<&str> =
+        section.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+    let schema = serde_json::to_value(schema_for!(Code)).unwrap();
+    let variants = schema["oneOf"].as_array().expect("one variant per code");
+    let mut codes: Vec<&str> = variants.iter().map(|v| v["const"].as_str().unwrap()).collect();
+    codes.sort_unstable();
+    rows.sort_unstable();
+    assert_eq!(rows, codes);
+}
+
+fn page() -> String {
+    String::from_utf8(read("README.md")).unwrap()
+}
+
+/// The fenced blocks of a language.
+fn blocks<'a>(page: &'a str, language: &str) -> impl Iterator<Item = &'a str> {
+    let fence = format!("```{language}\n");
+    page.split("\n```")
+        .zip(page.split("\n```").skip(1))
+        .map(|(_, block)| block)
+        .filter_map(move |block| block.strip_prefix(&fence[3..]))
+}
+
+/// What keeps a text from being of a type.
+fn parses<T: DeserializeOwned>(text: &str) -> Option<String> {
+    serde_json::from_str::<T>(text).err().map(|error| error.to_string())
+}

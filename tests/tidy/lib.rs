@@ -1,0 +1,1 @@
+//! Nothing of its own: a package so that these tests compile without the program.

@@ -1,0 +1,138 @@
+//! The table of packages in `src/lib.rs` is what the manifests say, and crates that belong to one place
+//! are named there alone.
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use crate::root;
+use crate::source::{Package, packages, paths};
+
+/// Crates that only some files may name, by their path from the root of the repository.
+const CRATES: &[(&str, &[&str])] = &[
+    ("axum", &["src/server"]),
+    ("prometheus_client", &["src/server/metrics.rs"]),
+    ("bincode", &["src/twin/store/chunk_file.rs"]),
+    ("fearless_simd", &["src/render/cpu", "src/scene/sky"]),
+    ("wgpu", &["src/render/gpu"]),
+    ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
+    ("rustls", &["src/twin/store/remote", "clients/rust"]),
+    ("flate2", &["src/twin/ingest"]),
+    ("zip", &["src/twin/ingest/archive.rs"]),
+    ("image_webp", &["src/twin/ingest/sog"]),
+];
+
+/// Files that may open files: those of a twin only `store/local`; the others scenes and settings of the
+/// user, episodes, uploads, pictures, and how much memory there is.
+const FILES: &[&str] = &[
+    "src/twin/store/local",
+    "src/twin/residency/budget.rs",
+    "src/twin/ingest",
+    "src/session/record",
+    "src/server/lib.rs",
+    "src/server/config",
+    "src/server/spool.rs",
+    "src/push",
+    "clients/rust/src/upload.rs",
+    "src/cli",
+];
+
+/// The modules that open files.
+const FILE_MODULES: &[&[&str]] = &[&["std", "fs"], &["tokio", "fs"]];
+
+/// Within the server, only the converter knows the messages of the wire; its limits hold everywhere.
+const WIRE_IN_SERVER: &[&str] = &["src/server/convert"];
+
+#[test]
+fn the_table_of_packages_is_that_of_the_manifests() {
+    let lib = fs::read_to_string(root().join("src/lib.rs")).unwrap();
+    let wanted: BTreeMap<String, Vec<String>> = packages()
+        .into_iter()
+        .filter(|package| package.name != "wildcity")
+        .map(|package| (package.name, package.depends_on))
+        .collect();
+    assert_eq!(table(&lib), wanted);
+}
+
+#[test]
+fn crates_are_named_where_they_belong() {
+    let found: Vec<String> = packages().iter().flat_map(violations).collect();
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn a_planted_violation_is_found() {
+    for (folder, file, planted, reason) in [
+        ("src/session", "episode.rs", "use axum::Router;", "only src/server may name axum"),
+        (
+            "src/render",
+            "cpu/bin.rs",
+            "fn f() { wgpu::init(); }",
+            "only src/render/gpu may name wgpu",
+        ),
+        ("src/twin", "store/log.rs", "use bincode::Encode;", "chunk_file.rs may name bincode"),
+        ("src/twin", "store/log.rs", "use std::{fs, io};", "may name std::fs"),
+        (
+            "src/server",
+            "router.rs",
+            "use wildcity_protocol::message;",
+            "may name wildcity_protocol",
+        ),
+    ] {
+        let package = Package {
+            name: "planted".to_owned(),
+            depends_on: Vec::new(),
+            files: BTreeMap::from([(file.to_owned(), planted.to_owned())]),
+            folder: folder.to_owned(),
+        };
+        let found = violations(&package);
+        assert!(found.iter().any(|text| text.contains(reason)), "{planted:?}: {found:?}");
+    }
+}
+
+/// The rows ``//! | `wildcity-render` | what it is | scene |`` of the documentation.
+fn table(lib: &str) -> BTreeMap<String, Vec<String>> {
+    let rows = lib.lines().filter_map(|line| line.strip_prefix("//! | [`wildcity_"));
+    rows.map(|row| {
+        let cells: Vec<&str> = row.split('|').map(str::trim).collect();
+        let [name, _, depends_on, ""] = cells[..] else { panic!("{row}") };
+        let name = format!("wildcity-{}", name.trim_end_matches("`]"));
+        let depends_on = depends_on.split(", ").filter(|other| *other != "nothing of ours");
+        let mut depends_on: Vec<String> =
+            depends_on.map(|other| format!("wildcity-{other}")).collect();
+        depends_on.sort();
+        (name, depends_on)
+    })
+    .collect()
+}
+
+fn violations(package: &Package) -> Vec<String> {
+    let mut found = Vec::new();
+    for (file, text) in &package.files {
+        let place = format!("{}/{file}", package.folder);
+        for named in paths(file, text) {
+            let path: Vec<&str> = named.path.iter().map(String::as_str).collect();
+            if let Some(wrong) = wrong(&place, &path) {
+                found.push(format!("{place}:{}: {wrong}", named.line));
+            }
+        }
+    }
+    found
+}
+
+fn wrong(place: &str, path: &[&str]) -> Option<String> {
+    let only = |places: &[&str], what: &str| {
+        let is_within = places.iter().any(|allowed| {
+            place.strip_prefix(allowed).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+        });
+        (!is_within).then(|| format!("only {} may name {what}", places.join(", ")))
+    };
+    if FILE_MODULES.iter().any(|module| path.starts_with(module)) {
+        return only(FILES, &path[..2].join("::"));
+    }
+    let is_wire = path[0] == "wildcity_protocol" && path.get(1) != Some(&"limits");
+    if place.starts_with("src/server") && is_wire {
+        return only(WIRE_IN_SERVER, path[0]);
+    }
+    let (_, places) = CRATES.iter().find(|(name, _)| *name == path[0])?;
+    only(places, path[0])
+}

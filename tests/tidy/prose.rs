@@ -1,0 +1,128 @@
+//! Prose that reads at once: words for persons only where a person is meant, one binding per line.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use syn::visit::{self, Visit};
+
+use crate::root;
+use crate::source::rust_files;
+
+/// Words that mean persons. In this project something else is meant nearly always, and then "what", "which",
+/// "that" or the thing's name reads at once.
+const PERSONS: &[&str] =
+    &["who", "whom", "whose", "whoever", "nobody", "somebody", "everybody", "anybody"];
+
+/// Folders and files that people read.
+const READ: &[&str] = &[
+    "src",
+    "clients",
+    "protocol",
+    "shaders",
+    "scenes",
+    "tests",
+    "docs",
+    ".ci",
+    "README.md",
+    "ARCHITECTURE.md",
+    "BENCHMARKS.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+];
+
+const EXTENSIONS: &[&str] = &["rs", "md", "py", "wgsl", "toml", "yml"];
+
+/// Lines that mean a person, or name the words.
+const MEANT: &[&str] = &["tests/tidy/prose.rs"];
+
+#[test]
+fn words_for_persons_mean_persons() {
+    let found: Vec<String> = texts().iter().flat_map(|(file, text)| persons(file, text)).collect();
+    assert!(found.is_empty(), "{} lines:\n{}", found.len(), found.join("\n"));
+}
+
+#[test]
+fn a_planted_word_is_found() {
+    let text = "the thread\n/// Who loses tries again.\nwhole whom_i = 1;\n";
+    assert_eq!(persons("a.rs", text).len(), 1);
+}
+
+fn persons(file: &str, text: &str) -> Vec<String> {
+    let lines = text.lines().enumerate();
+    let is_person = |line: &str| {
+        let words = line.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == '-'));
+        words.map(str::to_lowercase).any(|word| PERSONS.contains(&&*word))
+    };
+    lines
+        .filter(|(_, line)| is_person(line))
+        .map(|(at, line)| format!("{file}:{}: {}", at + 1, line.trim()))
+        .collect()
+}
+
+fn texts() -> BTreeMap<String, String> {
+    let mut texts = BTreeMap::new();
+    let mut next: Vec<_> = READ.iter().map(|name| root().join(name)).collect();
+    while let Some(path) = next.pop() {
+        let name = path.strip_prefix(root()).unwrap().to_str().unwrap().to_owned();
+        let is_built = ["target", "node_modules", ".venv", "build"]
+            .contains(&path.file_name().unwrap().to_str().unwrap());
+        if path.is_dir() && !is_built {
+            next.extend(fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+        } else if is_text(&path) && !MEANT.contains(&&*name) {
+            texts.insert(name, fs::read_to_string(&path).unwrap());
+        }
+    }
+    assert!(texts.len() > 300, "only {} files", texts.len());
+    texts
+}
+
+fn is_text(path: &Path) -> bool {
+    let extension = path.extension().and_then(|extension| extension.to_str());
+    extension.is_some_and(|extension| EXTENSIONS.contains(&extension))
+}
+
+/// `let (a, b) = (x, y);` hides two bindings in a line.
+#[derive(Default)]
+struct TupleLets(usize);
+
+impl<'ast> Visit<'ast> for TupleLets {
+    fn visit_local(&mut self, local: &'ast syn::Local) {
+        let is_tuple = matches!(&local.pat, syn::Pat::Tuple(_));
+        let from_tuple =
+            local.init.as_ref().is_some_and(|init| matches!(&*init.expr, syn::Expr::Tuple(_)));
+        self.0 += usize::from(is_tuple && from_tuple);
+        visit::visit_local(self, local);
+    }
+}
+
+#[test]
+fn one_binding_stands_on_a_line() {
+    let mut found = Vec::new();
+    let mut lines = 0;
+    for folder in ["src", "protocol/src", "clients/rust"] {
+        for (file, text) in rust_files(&root().join(folder)) {
+            lines += text.lines().count();
+            let lets = tuple_lets(&text);
+            if lets > 0 {
+                found.push(format!("{folder}/{file}: {lets}"));
+            }
+        }
+    }
+    let count = found.len();
+    assert!(count * 1000 < lines, "{count} in {lines} lines:\n{}", found.join("\n"));
+}
+
+#[test]
+fn a_planted_tuple_is_found() {
+    assert_eq!(
+        tuple_lets("fn f() { let (a, b) = (1, 2); let (c, d) = pair(); let e = (1, 2); }"),
+        1
+    );
+}
+
+fn tuple_lets(text: &str) -> usize {
+    let mut lets = TupleLets::default();
+    lets.visit_file(&syn::parse_file(text).unwrap());
+    lets.0
+}
