@@ -126,7 +126,8 @@ impl BackendOptions {
         match (self.backend, device) {
             (BackendName::Auto, None) => {
                 let limits = self.hardware.memory_limits();
-                let Selection { backend, reason } = automatic::select(*threads, (*simd).into(), limits)?;
+                let Selection { backend, reason } =
+                    automatic::select(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }

@@ -4,7 +4,7 @@ use std::env;
 use std::path::PathBuf;
 
 use crate::cli::limits;
-use wildcity_twin::store::{DiskCacheSettings, Catalog};
+use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
 /// `--twins` and the disk cache, for every command that reads twins.
 #[derive(Debug, clap::Args)]

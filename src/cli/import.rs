@@ -134,7 +134,10 @@ impl Import {
         bar.finish_and_clear();
         if gaussians.is_empty() {
             let source = self.source.display();
-            writeln!(std::io::stderr(), "warning: {source} holds no Gaussians: the twin will be empty")?;
+            writeln!(
+                std::io::stderr(),
+                "warning: {source} holds no Gaussians: the twin will be empty"
+            )?;
         }
 
         // 3. The twin.

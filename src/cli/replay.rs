@@ -125,7 +125,9 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
             end.time_us as f64 * 1e-6,
             end.distance_m,
         ),
-        None => writeln!(out, "end         not recorded: the episode still runs, or was interrupted"),
+        None => {
+            writeln!(out, "end         not recorded: the episode still runs, or was interrupted")
+        }
     }
 }
 

@@ -10,9 +10,7 @@ use crate::cli::limits;
 use wildcity_render::gpu::Gpu;
 use wildcity_render::{Backend, RenderError};
 use wildcity_report::confidence::confidence_by_offset;
-use wildcity_report::measure::{
-    Benchmark, Measurement, ReferenceImages, normalize_machine_speed,
-};
+use wildcity_report::measure::{Benchmark, Measurement, ReferenceImages, normalize_machine_speed};
 use wildcity_report::recommend::{Goal, Recommendation, recommend};
 use wildcity_report::sample_points::{SamplePoint, Sampling, sample_points};
 use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};

@@ -123,7 +123,8 @@ const FEATURES: [Feature; 18] = [
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
         let direction = Rolls::TopToBottom;
-        step.view.rolling_shutter = Some(RollingShutter { direction, world_from_camera_first: first });
+        step.view.rolling_shutter =
+            Some(RollingShutter { direction, world_from_camera_first: first });
     }),
     feature("exposure", |step| {
         let matrix = [[1.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]];
@@ -200,7 +201,8 @@ fn sky_network() -> Model {
 /// A windshield that turns rays by some milliradians.
 fn windshield() -> Windshield {
     let plane = |field, coefficients: [f64; 3]| {
-        Bivariate::new(field, &coefficients).expect("three coefficients are a polynomial of order 1")
+        Bivariate::new(field, &coefficients)
+            .expect("three coefficients are a polynomial of order 1")
     };
     let horizontal = plane("horizontal", [-0.004, 1.002, 0.0]);
     let vertical = plane("vertical", [0.005, 0.0, 1.01]);

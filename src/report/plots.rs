@@ -104,10 +104,8 @@ pub(super) fn error_by_offset(all: &[&Measurement]) -> Result<String, ReportErro
     let min_db = all_db().fold(MAX_DB, f64::min);
     let max_db = all_db().fold(0.0, f64::max);
     plot(all.len(), |root| {
-        let mut chart = with_label_column(root).build_cartesian_2d(
-            0.0..OFFSETS_M[3] + 0.2,
-            (min_db - 3.0).floor()..max_db + 3.0,
-        )?;
+        let mut chart = with_label_column(root)
+            .build_cartesian_2d(0.0..OFFSETS_M[3] + 0.2, (min_db - 3.0).floor()..max_db + 3.0)?;
         draw_axes(&mut chart, OFFSET_AXIS, PSNR_AXIS)?;
         let mut labels = Vec::new();
         for m in all {
@@ -142,7 +140,8 @@ pub(super) fn trust_by_offset(all: &[Confidence]) -> Result<String, ReportError>
         chart.draw_series(means.iter().map(|at| Circle::new(*at, 4, own.filled())))?;
         let mut labels = Vec::new();
         if let Some(last) = all.last() {
-            for (value, text) in [(last.mean, "mean of all images"), (last.max, "lowest to highest")]
+            for (value, text) in
+                [(last.mean, "mean of all images"), (last.max, "lowest to highest")]
             {
                 let at_px = chart.backend_coord(&(last.offset_m, value));
                 labels.push(Label { at_px, text, color: own });

@@ -103,9 +103,8 @@ pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
         };
         all.iter().filter(is_comparable).any(dominates)
     };
-    let is_on_front = |m: &Measurement| {
-        is_comparable(&m) && !m.errors.psnr_db.is_nan() && !is_dominated(m)
-    };
+    let is_on_front =
+        |m: &Measurement| is_comparable(&m) && !m.errors.psnr_db.is_nan() && !is_dominated(m);
     all.iter().map(is_on_front).collect()
 }
 
@@ -174,9 +173,8 @@ fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candid
     let reaching = candidates.iter().copied();
     let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
     match goal {
-        Goal::AtLeastDb(_) => reaching.min_by(|a, b| {
-            a.measurement.cost.step_ms.total_cmp(&b.measurement.cost.step_ms)
-        }),
+        Goal::AtLeastDb(_) => reaching
+            .min_by(|a, b| a.measurement.cost.step_ms.total_cmp(&b.measurement.cost.step_ms)),
         Goal::AtMostMs(_) => {
             let worst_db =
                 |c: &Candidate<'_>| Goal::AtLeastDb(0.0).assess(c.measurement).selection_worst;

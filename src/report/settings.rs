@@ -338,7 +338,10 @@ impl<'a> ListBuilder<'a> {
 
     fn add_exact_rays(&mut self) {
         if !self.twin.has_non_pinhole {
-            self.skip("rays", "every camera is a pinhole at rest, for which splats need no correction");
+            self.skip(
+                "rays",
+                "every camera is a pinhole at rest, for which splats need no correction",
+            );
             return;
         }
         self.settings.push(Setting {

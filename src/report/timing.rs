@@ -44,11 +44,7 @@ struct StepRun {
 impl Step<'_> {
     /// Times the step `repeat` times, in turn with `baseline`. One more run of each comes first and is not
     /// counted: it allocates buffers.
-    pub(super) fn time(
-        &self,
-        baseline: &Step<'_>,
-        repeat: u32,
-    ) -> Result<StepTimes, ReportError> {
+    pub(super) fn time(&self, baseline: &Step<'_>, repeat: u32) -> Result<StepTimes, ReportError> {
         let mut times = StepTimes::default();
         let mut own_images = self.empty_images();
         let mut baseline_images = baseline.empty_images();

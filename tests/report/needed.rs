@@ -41,7 +41,7 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     let twin = TwinFeatures::new(manifest, None, &places[0].views);
     let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu", "gpu"]);
     let held_bytes = |name: &str, device: &dyn Fn() -> Option<Gpu>| {
-                let bench = Benchmark {
+        let bench = Benchmark {
             resident: &resident,
             backends: &backends,
             sample_points: &places,
@@ -78,7 +78,8 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         Gpu::new(&AdapterChoice::Best, 0).ok()
     };
     let rows = feature_costs::count_features(&cpu(), &open).unwrap();
-    rows.iter().for_each(|row| eprintln!("| {} | {} |", row.feature, row.counts.cells().join(" | ")));
+    rows.iter()
+        .for_each(|row| eprintln!("| {} | {} |", row.feature, row.counts.cells().join(" | ")));
     // Each on a device that drew nothing else.
     assert_eq!(opened.get(), rows.len());
     let of = |with: &str| rows.iter().find(|row| row.feature == with).unwrap().counts.device;

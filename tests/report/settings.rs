@@ -42,8 +42,13 @@ fn measured(
     let manifest = &resident.version.manifest;
     let places = sample_points(manifest, &rig.cameras, sampling);
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench =
-        Benchmark { resident, backends: &backends, sample_points: &places, repeat: 1, open_device: &|| None };
+    let bench = Benchmark {
+        resident,
+        backends: &backends,
+        sample_points: &places,
+        repeat: 1,
+        open_device: &|| None,
+    };
     let twin = TwinFeatures::new(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let SettingList { settings, skipped: left_out } = settings_to_compare(&twin, &["cpu"]);
     let truths = [Rays::Splats, Rays::Exact].map(|rays| {
@@ -62,7 +67,13 @@ fn measured(
 fn one(resident: &Arc<Resident>, places: &[SamplePoint], name: &str) -> Measurement {
     let manifest = &resident.version.manifest;
     let backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::new(2, Simd::Best).unwrap())];
-    let bench = Benchmark { resident, backends: &backends, sample_points: places, repeat: 1, open_device: &|| None };
+    let bench = Benchmark {
+        resident,
+        backends: &backends,
+        sample_points: places,
+        repeat: 1,
+        open_device: &|| None,
+    };
     let twin = TwinFeatures::new(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
     let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu"]);
     let setting = settings.iter().find(|setting| setting.name == name).unwrap();
@@ -131,7 +142,10 @@ fn errors_and_costs_go_the_way_they_must() {
         assert!(best.explanation().contains(&format!("{:.1} dB", encoded.min_db)), "{best:?}");
     }
     let chosen = of(&best.setting);
-    assert!(best.verification_worst >= 35.0 && best.selection_worst >= 35.0 + best.margin, "{best:?}");
+    assert!(
+        best.verification_worst >= 35.0 && best.selection_worst >= 35.0 + best.margin,
+        "{best:?}"
+    );
     assert_eq!(least_db(chosen, true), best.selection_worst);
     assert_eq!(least_db(chosen, false), best.verification_worst);
     assert!(chosen.setting.can_be_served() && chosen.setting.scale == 1.0);
@@ -569,7 +583,12 @@ fn the_base_pays_for_no_feature_of_others() {
     for row in &rows {
         let own = row.counts;
         let more = |is_more: bool, features: &[&str], what: &str| {
-            assert_eq!(is_more, features.contains(&row.feature), "{what} of {}: {own:?}", row.feature);
+            assert_eq!(
+                is_more,
+                features.contains(&row.feature),
+                "{what} of {}: {own:?}",
+                row.feature
+            );
         };
         let bytes = own.host_bytes_per_gaussian;
         more(bytes > base.host_bytes_per_gaussian + 1.0, &["SH degree 1", "SH degree 3"], "bytes");

@@ -17,7 +17,9 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
 use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
-use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, Version};
+use wildcity_twin::store::{
+    Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, Version,
+};
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
@@ -191,7 +193,11 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
 
 /// The demo street in the exact record format f32, under its own name.
 pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
-    demo_twin(twins, EXACT_TWIN, StorageOptions { record: Record::F32, ..StorageOptions::default() })
+    demo_twin(
+        twins,
+        EXACT_TWIN,
+        StorageOptions { record: Record::F32, ..StorageOptions::default() },
+    )
 }
 
 /// The demo twin in the user's directory. It is built on first use, and again if the generator changed or

@@ -6,7 +6,9 @@ use crate::cli::directories::Twins;
 
 /// List all twins with the number and hash of their latest versions.
 #[derive(Debug, clap::Args)]
-#[command(after_long_help = "Examples:\n  wildcity twin list\n  wildcity twin list --twins s3://fleet/twins --json")]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin list\n  wildcity twin list --twins s3://fleet/twins --json"
+)]
 pub(super) struct List {
     #[command(flatten)]
     twins: Twins,

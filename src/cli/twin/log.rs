@@ -8,7 +8,9 @@ use wildcity_twin::store::LogEntry;
 
 /// Show all versions of a twin, oldest first: when and how each was made, and from which version.
 #[derive(Debug, clap::Args)]
-#[command(after_long_help = "Examples:\n  wildcity twin log street\n  wildcity twin log street --json | jq .created_us")]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin log street\n  wildcity twin log street --json | jq .created_us"
+)]
 pub(super) struct Log {
     /// The twin's name.
     #[arg(value_name = "TWIN")]

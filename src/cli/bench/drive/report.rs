@@ -89,7 +89,7 @@ impl Row {
 impl Report {
     /// Statistics of each kilometre.
     fn kilometres(&self) -> Vec<(u64, Row)> {
-        let km = |step: &Step| (1e-3 * step.station_m) as u64;
+        let km = |step: &DriveStep| (1e-3 * step.station_m) as u64;
         let runs = self.steps.chunk_by(|a, b| km(a) == km(b));
         runs.map(|run| (km(&run[0]), Row::of(run))).collect()
     }
