@@ -17,7 +17,7 @@ pub(super) fn read_rig(path: &Path) -> anyhow::Result<Rig> {
     Ok(rig)
 }
 
-/// Reads several recorded drives, whose names must differ.
+/// Reads several recorded drives. Their names must differ.
 pub(super) fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
     let mut read: Vec<Trajectory> = Vec::with_capacity(paths.len());
     for path in paths {

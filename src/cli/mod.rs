@@ -4,7 +4,7 @@
 //! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
 //! failure, 2 for a command line that cannot be parsed.
 //!
-//! Each package has an error enum whose `Display` text says everything, down to the text of the operating
+//! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
 //! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
 //! belongs to. Numbers from outside are printed with `{:?}`, which writes 1e300 as such and not as 301
 //! digits.

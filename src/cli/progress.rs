@@ -12,7 +12,7 @@ pub(super) fn count(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {human_pos}/{human_len} {eta}")
 }
 
-/// A bar whose label is set to the item in progress.
+/// A bar with a label that names the item in progress.
 pub(super) fn state() -> ProgressBar {
     bar("waiting", "{msg:12} {wide_bar} {percent} %")
 }

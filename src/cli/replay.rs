@@ -15,7 +15,7 @@ use super::{output, progress};
 /// Show a recorded episode, or render it again and compare every image with the recording.
 ///
 /// Without --out and --verify, prints a summary of the recording. With either, renders it again and names
-/// the first step and camera whose pixels differ from the recorded ones.
+/// the first step and camera where pixels differ from the recorded ones.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Replay {

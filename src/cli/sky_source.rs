@@ -19,8 +19,8 @@ pub(super) struct SkySource {
     #[arg(long, value_name = "FILE")]
     sky: Option<PathBuf>,
 
-    /// Number of the training image whose appearance the sky gets, for a sky of a checkpoint [default: the
-    /// mean of all]
+    /// Training image that gives the sky its appearance, by its number, for a sky of a checkpoint [default:
+    /// the mean of all]
     #[arg(long, value_name = "INDEX", requires = "sky")]
     sky_image: Option<u32>,
 

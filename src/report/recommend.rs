@@ -96,9 +96,11 @@ const MAX_DB: f64 = 144.5;
 pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
     let is_comparable = |m: &&Measurement| m.setting.family != Family::Rays;
     let is_dominated = |m: &Measurement| {
-        let (own_ms, own_db) = (m.cost.step_ms, m.errors.psnr_db);
+        let own_ms = m.cost.step_ms;
+        let own_db = m.errors.psnr_db;
         let dominates = |other: &Measurement| {
-            let (ms, db) = (other.cost.step_ms, other.errors.psnr_db);
+            let ms = other.cost.step_ms;
+            let db = other.errors.psnr_db;
             (ms < own_ms && db >= own_db) || (ms <= own_ms && db > own_db)
         };
         all.iter().filter(is_comparable).any(dominates)

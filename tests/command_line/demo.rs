@@ -1,4 +1,4 @@
-//! The demo twin is built once, healed when it is damaged, and never put over somebody's own.
+//! The demo twin is built once, rebuilt when it is damaged, and never replaces a user's twin of that name.
 
 use std::fs;
 use std::path::Path;

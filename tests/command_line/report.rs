@@ -11,7 +11,7 @@ use wildcity_scene::{ProfileChanges, RenderProfile};
 
 use crate::reported::{commit, drive};
 
-/// A library that only some machines need is opened by whoever needs it.
+/// A library that only some backends need is loaded only by those.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {

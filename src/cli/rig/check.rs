@@ -6,7 +6,7 @@ use super::lookup::{rig_of, view_of};
 use crate::cli::backend_options::BackendOptions;
 use wildcity_render::compare::reprojection::ReprojectionErrors;
 
-/// Render points whose pixels are known, and check that each camera of a rig shows them there.
+/// Render points at known pixels, and check that each camera of a rig shows them there.
 ///
 /// A grid of small Gaussians stands before each camera, on the rays of the middles of pixels. The centroids
 /// of their images are compared with those pixels. Prints the largest distance for each camera; the exit

@@ -245,9 +245,8 @@ fn rss_bytes() -> anyhow::Result<Rss> {
         line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
     };
     let both = field("VmRSS:").zip(field("VmHWM:"));
-    let both = both.context("/proc/self/status does not say how much memory is used")?;
-    let (now, peak) = both;
-    Ok(Rss { now, peak })
+    let memory = both.map(|(now, peak)| Rss { now, peak });
+    memory.context("/proc/self/status does not say how much memory is used")
 }
 
 /// A temporary directory for the recorded episode.
