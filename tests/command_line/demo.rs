@@ -29,7 +29,7 @@ fn a_twin_of_the_same_name_is_left_alone() {
         said.contains("twin \"demo\" in ") && said.contains("is not the demo street"),
         "{said}"
     );
-    assert!(said.contains("give --twins another directory"), "{said}");
+    assert!(said.contains("give another directory with --twins"), "{said}");
     assert_eq!(Catalog::open(&twins).unwrap().version("demo", None).unwrap(), mine.unwrap());
 }
 
