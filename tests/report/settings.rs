@@ -1,4 +1,4 @@
-//! `wildcity report`: what is measured is so, and what is recommended holds.
+//! `wildcity report`: measurements are plausible, and recommended settings keep what they promise.
 
 use std::sync::Arc;
 
@@ -81,14 +81,14 @@ fn one(resident: &Arc<Resident>, places: &[SamplePoint], name: &str) -> Measurem
 }
 
 #[test]
-fn errors_and_costs_go_the_way_they_must() {
+fn coarser_settings_have_larger_errors_and_lower_costs() {
     let dir = tempfile::tempdir().unwrap();
     let (all, left_out) = measured(&commit(dir.path(), vec![drive()]), &rig(), &|_| true);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
     assert_eq!(left_out, ["tile size", "reach_m", "sky_error", "rays"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
-    // Full detail on the cpu backend is what the reference draws.
+    // At full detail the cpu backend agrees with the reference.
     assert!(db("as served") >= 70.0, "{:?}", of("as served").errors);
     for falling in [
         &["as served", "tau_px=2", "tau_px=4"][..],
@@ -104,7 +104,7 @@ fn errors_and_costs_go_the_way_they_must() {
             falling.iter().map(|name| db(name)).collect::<Vec<_>>()
         );
     }
-    // Rounding alone is uniform over a step: 20 log10(255 √12) is 58.9 dB.
+    // The error of rounding is uniform over a step of 1/255: 20 log10(255 √12) = 58.9 dB.
     assert!((db("8 bits") - 58.9).abs() < 1.5, "{}", db("8 bits"));
     assert!(of("tau_px=4").cost.gaussians < of("as served").cost.gaussians);
     assert!(of("jpeg 50").cost.sent_bytes < of("jpeg 90").cost.sent_bytes);
@@ -130,7 +130,7 @@ fn errors_and_costs_go_the_way_they_must() {
 
     let names = ["cpu".to_owned()];
     let best = recommend(Goal::AtLeastDb(35.0), &all, &names).unwrap();
-    // Beside it, what the encodings that it is not of lose and take.
+    // The recommendation also has the cost of each encoding, which its values do not include.
     let encoded: Vec<(&str, bool)> =
         best.encodings.iter().map(|e| (e.encoding.as_str(), e.is_default)).collect();
     let sent = ["8 bits", "jpeg 50", "jpeg 75", "jpeg 90", "jpeg 98"];
@@ -185,7 +185,7 @@ fn two(like: &[Measurement], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measur
 }
 
 #[test]
-fn the_margin_is_what_places_differ_by() {
+fn the_margin_is_the_spread_between_sample_points() {
     let names = ["cpu".to_owned()];
     let dir = tempfile::tempdir().unwrap();
     let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
@@ -194,26 +194,26 @@ fn the_margin_is_what_places_differ_by() {
         let all = two(&like, [60.0, 59.0, 62.0, 60.0, f64::INFINITY, 61.0], fast_db);
         recommend(Goal::AtLeastDb(35.0), &all, &names).map(|best| (best.setting, best.margin))
     };
-    // Alike everywhere: a decibel is enough.
+    // Similar everywhere: the least margin of 1 dB applies.
     assert_eq!(
         chosen([36.2, 35.5, 36.4, 35.1, 36.3, 36.0]).unwrap(),
         ("stop=0.016".to_owned(), 1.0)
     );
-    // 36 is 2 dB below the median of 38: others will have less than 35, and the slow one is taken.
+    // 36 is 2 dB below the median of 38, so other points may have less than 35: the slow one is selected.
     let (setting, margin) = chosen([36.0, 33.0, 38.0, 40.0, 44.0, 45.0]).unwrap();
     assert_eq!(setting, "as served");
-    // Of 60, 62 and "exact", which is no reason to trust it less.
+    // The points have 60, 62 dB and "exact"; that one is much better does not count against the setting.
     assert_eq!(margin, 2.0);
-    // What fails all the same is not recommended.
+    // A setting that fails the verification is not recommended.
     let refused = chosen([40.0, 41.0, 40.5, 34.9, 40.2, 40.0]).unwrap_err();
     assert!(matches!(refused, ReportError::NotVerified { verified: 34.9, .. }), "{refused}");
-    // The first was measured while the machine was twice as fast as with the second.
+    // The machine was twice as fast while the first setting was measured.
     let mut uneven = two(&like, [60.0; 6], [40.0; 6]);
     (uneven[0].baseline_ms, uneven[1].baseline_ms) = (15.0, 30.0);
     normalize_machine_speed(&mut uneven);
     let times = [0, 1].map(|i| (uneven[i].cost.step_ms, uneven[i].by_sample_point[0].p95_ms));
     assert_eq!(times, [(40.0, Some(40.0)), (10.0, Some(10.0))]);
-    // Times have a margin, too: 10 ms and a tenth.
+    // Times have a margin of at least a tenth: 10 ms and 1 ms.
     let all = two(&like, [60.0; 6], [40.0; 6]);
     let by_time = |ms: f64| recommend(Goal::AtMostMs(ms), &all, &names).unwrap().setting;
     assert_eq!(
@@ -224,13 +224,13 @@ fn the_margin_is_what_places_differ_by() {
 }
 
 #[test]
-fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
+fn of_equal_settings_the_first_is_selected_and_never_one_without_effect() {
     let names = ["cpu".to_owned()];
     let dir = tempfile::tempdir().unwrap();
     let tried = ["as served", "stop=0.004", "stop=0.016"];
     let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
     let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
-    // As exact as each other where it is asked, and each faster than the one before.
+    // Equally exact, and each faster than the one before.
     for (m, ms) in all.iter_mut().zip([30.0, 20.0, 10.0]) {
         m.cost.step_ms = ms;
         for place in &mut m.by_sample_point {
@@ -239,7 +239,7 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
     }
     let within = |all: &[Measurement], ms| recommend(Goal::AtMostMs(ms), all, &names).unwrap();
     assert_eq!([100.0, 25.0].map(|ms| within(&all, ms).setting), ["as served", "stop=0.004"]);
-    // One that draws what the twin as served draws seems to be the fastest of all.
+    // A setting that renders the same as the twin as served seems to be the fastest.
     let mut idle = all[0].clone();
     (idle.setting.name, idle.setting.family) = ("tau_px=4".to_owned(), Family::Detail);
     idle.cost.step_ms = 1.0;
@@ -252,14 +252,14 @@ fn of_equals_the_first_is_taken_and_never_what_changes_nothing() {
         assert!(recommend(Goal::AtMostMs(5.0), &all, &names).is_err());
         assert_eq!(at_least(&all).setting, "stop=0.016");
     }
-    // With fewer Gaussians it is no chance.
+    // With fewer Gaussians it has an effect, so its time is not by chance.
     idle.cost.gaussians -= 1;
     all.push(idle);
     assert_eq!(at_least(&all).setting, "tau_px=4");
 }
 
 #[test]
-fn what_a_reach_loses_is_seen() {
+fn the_error_of_a_draw_distance_is_measured() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit_reaching(dir.path(), vec![drive()], Some(2.0));
     let keep = |setting: &Setting| ["as served", "reach_m=none"].contains(&setting.name.as_str());
@@ -273,7 +273,7 @@ fn what_a_reach_loses_is_seen() {
 }
 
 #[test]
-fn a_place_is_as_good_as_its_worst_camera() {
+fn a_sample_point_is_as_good_as_its_worst_camera() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), vec![drive()]);
     let sampling = Sampling { stations: 2, window_px: [64, 48] };
@@ -300,7 +300,7 @@ fn a_place_is_as_good_as_its_worst_camera() {
         );
         assert!(least_db < psnr_db, "place {i}: {least_db} dB of {psnr_db} dB");
     }
-    // What one camera of a place lacks, the others do not make good; nor does a number make up for NaN.
+    // One bad camera is not compensated by the others, and NaN is not compensated by a number.
     let names = ["cpu".to_owned()];
     let keep = |setting: &Setting| ["as served", "stop=0.016"].contains(&setting.name.as_str());
     let (like, _) = measured(&resident, &rig(), &keep);
@@ -317,8 +317,8 @@ fn a_place_is_as_good_as_its_worst_camera() {
     assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
 }
 
-/// Where nothing was measured: stations in metres, and metres beside the drive. Settings are chosen and
-/// verified at 6.5, 19.5 and 32.5 m, on it and 1, 3 and 5 m beside.
+/// Poses at which nothing was measured: station, and distance to the left of the drive, in metres. Settings
+/// are selected and verified at stations of 6.5, 19.5 and 32.5 m, on the drive and 1, 3 and 5 m beside it.
 const ELSEWHERE_M: [[f64; 2]; 6] =
     [[2.0, 0.0], [11.0, 2.0], [15.0, -2.0], [24.0, 0.0], [28.0, 4.0], [36.0, -4.0]];
 
@@ -343,7 +343,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
     for wanted_db in [35.0, 45.0] {
         let (mut met, mut least_unmet_db) = (Vec::new(), f64::INFINITY);
         for fastest in &all {
-            // Whichever is the fastest is recommended, if it is good enough.
+            // Make one setting the fastest: it is recommended if it reaches the goal.
             let mut timed = all.clone();
             for m in &mut timed {
                 let is_fastest = m.setting.name == fastest.setting.name;
@@ -365,12 +365,12 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
             }
         }
         assert!(met.len() >= 3 && met.contains(&"as served".to_owned()), "{met:?}");
-        // Of those that are not recommended, some are indeed not good enough.
+        // At least one of the settings that are not recommended really misses the goal.
         assert!(least_unmet_db < wanted_db, "{least_unmet_db:.1} dB");
     }
 }
 
-/// A setting as a session asks for it, whatever it loses.
+/// The changes of a setting, in the form in which a session asks for them.
 fn changes(setting: &Setting) -> ProfileChanges {
     let field = |change: &String| {
         let (key, value) = change.split_once('=').unwrap();
@@ -379,8 +379,8 @@ fn changes(setting: &Setting) -> ProfileChanges {
     ProfileChanges::new(setting.profile.iter().map(field).collect())
 }
 
-/// What the rig's cameras see from poses by definition, of all Gaussians as they were generated: colours
-/// from 0 to 1.
+/// Reference images of the rig's cameras at some poses, of all Gaussians as they were generated: colours from
+/// 0 to 1.
 fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     let scene = Scene::from_gaussians(&wildcity_generate::canyon(30_000, &mut |_, _| {}));
     let at = |pose: &Pose| {
@@ -394,7 +394,7 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     poses.iter().flat_map(at).map(colours).collect()
 }
 
-/// Least PSNR of an image that an agent gets from any of the poses, in dB.
+/// Least PSNR of an image that an agent receives at any of the poses, in dB.
 async fn least_db_of_session(
     engine: &Arc<Engine>,
     profile: ProfileChanges,
@@ -423,7 +423,7 @@ async fn least_db_of_session(
 }
 
 #[test]
-fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
+fn a_setting_recommended_for_a_capture_is_verified_at_other_points() {
     let Some(path) = crate::data::real("scenes/skull/skull.ply") else { return };
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
@@ -438,7 +438,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
     let (all, _) = measured(&resident, &rig(), &keep);
     let names = ["cpu".to_owned()];
-    // One exact and slow, the others as fast as each other: whichever is taken must hold.
+    // One setting is fast and the others are slow; the selected one must pass the verification.
     let mut met = Vec::new();
     for fastest in tried {
         let mut all = all.clone();
@@ -458,7 +458,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
 }
 
 #[test]
-fn a_sky_and_lenses_have_rungs_of_their_own() {
+fn a_sky_and_lenses_add_settings() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
     let street = wildcity_generate::canyon(3_000, &mut |_, _| {});
@@ -489,7 +489,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
     assert!(db("as served") > db("sky_error=0.1"), "{:?}", of("sky_error=0.1").errors);
     assert!(of("as served").errors.max < 2.0 / 255.0, "{:?}", of("as served").errors);
     assert!(of("as served").cost.scene_bytes < of("sky_error=0.1").cost.scene_bytes);
-    // Another record has the same sky.
+    // Another record format has the same sky.
     assert!(db("record q24") > 48.0, "{:?}", of("record q24").errors);
     let rays = of("against every pixel's own ray");
     assert!((35.0..60.0).contains(&rays.errors.psnr_db), "{:?}", rays.errors);
@@ -499,7 +499,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
 }
 
 #[test]
-fn json_says_what_it_has_no_number_for() {
+fn json_writes_infinity_and_nan_as_words() {
     let errors = ImageErrors {
         psnr_db: f64::INFINITY,
         ssim: f64::NAN,
@@ -515,7 +515,7 @@ fn json_says_what_it_has_no_number_for() {
 }
 
 #[test]
-fn a_setting_is_beaten_by_what_is_faster_and_closer() {
+fn a_faster_and_closer_setting_dominates() {
     let dir = tempfile::tempdir().unwrap();
     let keep = |setting: &Setting| setting.family == Family::Detail;
     let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
@@ -524,13 +524,13 @@ fn a_setting_is_beaten_by_what_is_faster_and_closer() {
         (m.cost.step_ms, m.errors.psnr_db) = (ms, db);
     }
     assert_eq!(pareto_front(&all), [true, true, false, false]);
-    // Equals do not beat each other.
+    // Equal settings do not dominate each other.
     all[2].cost.step_ms = 2.0;
     assert_eq!(pareto_front(&all), [true, true, true, false]);
 }
 
 #[test]
-fn without_a_drive_a_twin_is_looked_at_from_around() {
+fn a_twin_without_a_drive_has_sample_points_around_it() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), Vec::new());
     let sampling = Sampling { stations: 4, window_px: [64, 48] };
@@ -549,7 +549,7 @@ fn without_a_drive_a_twin_is_looked_at_from_around() {
 }
 
 #[test]
-fn images_are_believed_less_beside_the_drive() {
+fn trust_falls_with_the_distance_from_the_drive() {
     let dir = tempfile::tempdir().unwrap();
     let resident = commit(dir.path(), vec![drive()]);
     let sampling = Sampling { stations: 2, window_px: [16, 16] };
@@ -572,12 +572,12 @@ fn images_are_believed_less_beside_the_drive() {
 }
 
 #[test]
-fn the_base_pays_for_no_feature_of_others() {
+fn the_base_scene_pays_for_no_feature() {
     let cpu = Cpu::new(2, Simd::Best).unwrap();
     let rows = feature_costs::count_features(&cpu, &|| None).unwrap();
     let of = |with: &str| rows.iter().find(|row| row.feature == with).unwrap().counts;
     let base = of("nothing else");
-    // 14 columns of 4 B, and no more than 1 % of ends of blocks and clusters.
+    // 14 columns of 4 B, and at most 1 % of padding at the ends of blocks and clusters.
     assert!((56.0..58.0).contains(&base.host_bytes_per_gaussian), "{base:?}");
     assert_eq!((base.other_host_bytes, base.host_bytes_per_pixel), (0, 3));
     for row in &rows {
@@ -596,7 +596,7 @@ fn the_base_pays_for_no_feature_of_others() {
         more(own.other_host_bytes > 0, &beside, "bytes beside");
         let planes = ["depth", "depth and opacity", "normals", "trust"];
         more(own.host_bytes_per_pixel > 3, &planes, "bytes of a pixel");
-        // What a Gaussian is, or where it lands, is evaluated otherwise; all else is not.
+        // Only features that change Gaussians or their projection change the evaluations.
         let shapes =
             ["levels of detail, 1 m", "antialiasing", "fisheye", "windshield", "rolling shutter"];
         more(own.evaluations != base.evaluations, &shapes, "evaluations");
