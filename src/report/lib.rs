@@ -2,9 +2,11 @@
 //! reports it as one HTML page, as JSON, and as CSV.
 //!
 //! ```text
+//! setting         one way to render a twin
 //! settings        the settings to compare, and those that cannot affect the twin
 //! sample_points   the poses to compare at: along the recorded drive, beside it, or around a capture
-//! measure         error of each setting against the f64 reference, and its cost
+//! measure         renders each setting and the f64 reference, and compares them
+//! measurement     the error of a setting, and its cost
 //! timing          how long a step takes, in turn with the twin as it is served
 //! recommend       the Pareto front, and the setting for a wanted error or time
 //! confidence      trust in the images, over the distance from the recorded drive
@@ -20,11 +22,13 @@ mod error;
 mod error_images;
 pub mod feature_costs;
 pub mod measure;
+pub mod measurement;
 pub mod page;
 mod plots;
 pub mod recommend;
 mod report;
 pub mod sample_points;
+pub mod setting;
 pub mod settings;
 mod statistics;
 mod timing;

@@ -4,10 +4,10 @@ use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::error_images::{ErrorImages, HEAT_RGB, HEAT_STEPS};
-use super::measure::Measurement;
+use super::measurement::Measurement;
 use super::recommend::{Goal, Recommendation, pareto_front};
 use super::sample_points::OFFSETS_M;
-use super::settings::Family;
+use super::setting::Family;
 use super::{Report, ReportError, feature_costs, plots};
 use wildcity_stress::Verdict;
 

@@ -5,10 +5,10 @@ use plotters::prelude::*;
 
 use super::ReportError;
 use super::confidence::Confidence;
-use super::measure::Measurement;
+use super::measurement::Measurement;
 use super::recommend::pareto_front;
 use super::sample_points::OFFSETS_M;
-use super::settings::Family;
+use super::setting::Family;
 
 /// Width of a plot including its labels, and its least height.
 const SIZE_PX: (u32, u32) = (1060, 520);

@@ -13,8 +13,8 @@
 use serde::Serialize;
 
 use super::ReportError;
-use super::measure::{Measurement, SampleResult};
-use super::settings::{Family, ImageEncoding};
+use super::measurement::{Measurement, SampleResult};
+use super::setting::{Family, ImageEncoding};
 use super::statistics::min;
 use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::confidence::Confidence;
 use super::feature_costs::FeatureCounts;
-use super::measure::Measurement;
+use super::measurement::Measurement;
 use super::recommend::{Goal, Recommendation, pareto_front};
 use super::sample_points::{OFFSETS_M, Sampling};
 use super::settings::Skipped;
@@ -17,7 +17,7 @@ use wildcity_stress::table::{Column, Table};
 pub struct Report {
     /// The twin, and how it is rendered.
     pub subject: Subject,
-    /// The backends; [`super::settings::Setting::backend`] is an index into them.
+    /// The backends; [`super::setting::Setting::backend`] is an index into them.
     pub backends: Vec<Column>,
     /// How many sample points there are, and how much is compared at each.
     pub sampling: Sampling,

@@ -3,14 +3,14 @@
 //! The speed of a machine changes while a report is made. Timed one after another, the last settings took
 //! twice as long as the first, because other programs had begun to compile. A step of the served twin right
 //! after each step of a setting tells how fast the machine was at that moment;
-//! [`super::measure::normalize_machine_speed`] scales all times to one speed.
+//! [`super::measurement::normalize_machine_speed`] scales all times to one speed.
 
 use std::time::Instant;
 
 use parking_lot::Mutex;
 
 use super::ReportError;
-use super::settings::ImageEncoding;
+use super::setting::ImageEncoding;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 

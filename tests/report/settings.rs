@@ -10,13 +10,12 @@ use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, View};
 use wildcity_report::confidence::confidence_by_offset;
-use wildcity_report::measure::normalize_machine_speed;
-use wildcity_report::measure::{Benchmark, Measurement, SampleResult};
+use wildcity_report::measure::Benchmark;
+use wildcity_report::measurement::{Measurement, SampleResult, normalize_machine_speed};
 use wildcity_report::recommend::{Goal, pareto_front, recommend};
 use wildcity_report::sample_points::{OFFSETS_M, SamplePoint, Sampling, sample_points};
-use wildcity_report::settings::{
-    Family, Setting, SettingList, Skipped, TwinFeatures, settings_to_compare,
-};
+use wildcity_report::setting::{Family, Setting};
+use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
 use wildcity_report::{ReportError, feature_costs};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
