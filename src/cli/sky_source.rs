@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use glam::DMat3;
 
-use wildcity_scene::sky::Model;
+use wildcity_scene::sky::SkyModel;
 use wildcity_twin::ingest::{Axes, sky};
 use wildcity_twin::store::SkyBytes;
 

@@ -17,9 +17,9 @@ use wildcity_render::gpu::{Gpu, GpuUsage};
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, RollingShutter, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::camera::{
-    Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference,
+    Bivariate, Fisheye, Lens, ShutterDirection, Windshield, WindshieldReference,
 };
-use wildcity_scene::sky::{CubeMap, Layer, Model, Network};
+use wildcity_scene::sky::{CubeMap, Layer, Network, SkyModel};
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// Counts of the street with one feature.
@@ -122,7 +122,7 @@ const FEATURES: [Feature; 18] = [
     feature("rolling shutter", |step| {
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
-        let direction = Rolls::TopToBottom;
+        let direction = ShutterDirection::TopToBottom;
         step.view.rolling_shutter =
             Some(RollingShutter { direction, world_from_camera_first: first });
     }),
@@ -286,7 +286,7 @@ impl Step {
             depth_m: depth_m.as_deref_mut(),
             opacity: opacity.as_deref_mut(),
             normals: normals.as_deref_mut(),
-            appearance: (!self.appearance.is_plain()).then_some(&self.appearance),
+            appearance: (!self.appearance.is_identity()).then_some(&self.appearance),
             ..Target::default()
         };
         let views = &[self.view];

@@ -22,8 +22,8 @@ use wildcity_render::compare::images::{RenderedImage, render_images};
 use wildcity_render::gpu::Gpu;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, RenderError, View};
-use wildcity_scene::record::recorded;
-use wildcity_scene::sky::Drawn;
+use wildcity_scene::record::round_trip;
+use wildcity_scene::sky::DrawableSky;
 use wildcity_scene::{Rays, RenderProfile, Scene};
 use wildcity_twin::residency::{PinnedScene, Resident};
 
@@ -289,10 +289,10 @@ impl CostTotals {
 
 /// Memory that the sky takes in the form in which a profile renders it, in bytes: 0 unless it is a map.
 pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, RenderError> {
-    let drawn = scene.sky.as_ref().map(|sky| sky.drawn(profile.sky_error));
+    let drawn = scene.sky.as_ref().map(|sky| sky.drawable(profile.sky_error));
     Ok(match drawn.transpose()? {
-        Some(Drawn::Map(map)) => map.bytes() as u64,
-        Some(Drawn::Exact(_)) | None => 0,
+        Some(DrawableSky::CubeMap(map)) => map.bytes() as u64,
+        Some(DrawableSky::Network(_)) | None => 0,
     })
 }
 

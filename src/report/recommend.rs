@@ -18,7 +18,7 @@ use super::setting::{Family, ImageEncoding};
 use super::statistics::min;
 use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 
 /// What the user wants of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::limits;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels};
@@ -29,7 +29,7 @@ pub struct SessionOptions {
     /// Cameras: else the twin's rig, else the preset `vehicle6`.
     pub rig: Option<RigChoice>,
     /// What of the twin's render profile is to be otherwise.
-    pub profile: ProfileChanges,
+    pub profile: ProfileOverrides,
     /// What each observation holds.
     pub outputs: Outputs,
     /// How the ego moves.
@@ -54,7 +54,7 @@ impl SessionOptions {
             seed: 0,
             start: None,
             rig: None,
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             outputs,
             dynamics: Dynamics::default(),
             dt_us: None,

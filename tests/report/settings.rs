@@ -20,7 +20,7 @@ use wildcity_report::{ReportError, feature_costs};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
+use wildcity_scene::{ProfileOverrides, Rays, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity_session::{
     Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
 };
@@ -375,7 +375,7 @@ fn changes(setting: &Setting) -> ProfileChanges {
         let (key, value) = change.split_once('=').unwrap();
         (key.to_owned(), serde_json::from_str(value).unwrap())
     };
-    ProfileChanges::new(setting.profile.iter().map(field).collect())
+    ProfileOverrides::new(setting.profile.iter().map(field).collect())
 }
 
 /// Reference images of the rig's cameras at some poses, of all Gaussians as they were generated: colours from
@@ -396,7 +396,7 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
 /// Least PSNR of an image that an agent receives at any of the poses, in dB.
 async fn least_db_of_session(
     engine: &Arc<Engine>,
-    profile: ProfileChanges,
+    profile: ProfileOverrides,
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
@@ -428,7 +428,7 @@ fn a_setting_recommended_for_a_capture_is_verified_at_other_points() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: StorageOptions { record: Record::F32, levels: false },
+        storage: StorageOptions { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -470,7 +470,7 @@ fn a_sky_and_lenses_add_settings() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: StorageOptions { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: RecordFormat::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

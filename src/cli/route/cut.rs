@@ -49,7 +49,8 @@ impl Cut {
         let mut index = Vec::new();
         for &length_m in &self.length_m {
             let before = index.len();
-            for cut in route::cuts(&route, length_m, self.stride_m.unwrap_or(length_m))? {
+            for cut in route::sub_trajectories(&route, length_m, self.stride_m.unwrap_or(length_m))?
+            {
                 let cut = cut?;
                 let name = &cut.trajectory.name;
                 output::write(&self.out.join(format!("{name}.json")), &to_json(&cut.trajectory)?)?;

@@ -235,7 +235,7 @@ impl Engine {
         profile: RenderProfile,
     ) -> Result<(), SessionError> {
         let Some(sky) = resident.sky().cloned() else { return Ok(()) };
-        let baked = tokio::task::spawn_blocking(move || sky.drawn(profile.sky_error));
+        let baked = tokio::task::spawn_blocking(move || sky.drawable(profile.sky_error));
         let drawn = baked.await.map_err(|_| SessionError::Crashed)?;
         drawn.map(|_| ()).map_err(SessionError::Sky)
     }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use crate::limits;
 use wildcity_render::{Backend, Frame as RenderFrame, MAX_VIEWS, Target, View};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::Field;
+use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::residency::Viewpoint;
@@ -132,7 +132,7 @@ impl ObservationLayout {
             return Err(SessionError::OutOfRange { field: "outputs.quality", must });
         }
         let seen = |RigCamera { camera, .. }: &RigCamera| {
-            Field::of(camera).map(|field| field.share(camera))
+            FieldMask::of(camera).map(|field| field.visible_share(camera))
         };
         let seen = cameras.iter().map(seen).collect();
         let layout = Self { cameras, seen, encoding, maps, schedule };

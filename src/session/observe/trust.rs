@@ -14,7 +14,7 @@ use wildcity_render::View;
 use wildcity_scene::Manifest;
 use wildcity_scene::chunk::{BLOCK_M, CELL_M};
 use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_scene::route::Boxes;
+use wildcity_scene::route::BoxIndex;
 
 /// Distance from the recorded places at which 1/e is left, in metres: half at 3.5 m, in the next lane.
 const FADES_M: f64 = 5.0;
@@ -63,7 +63,7 @@ pub struct Trust {
 #[derive(Debug)]
 pub struct TrainingCoverage {
     keyframes: Vec<Pose>,
-    boxes: Boxes,
+    boxes: BoxIndex,
     /// Lowest and highest content of every 16 m block of the map, in metres.
     columns: HashMap<[i64; 2], [f64; 2]>,
 }
@@ -78,7 +78,7 @@ impl TrainingCoverage {
             return None;
         }
         let point = |pose: &Pose| Bounds { min_m: pose.position_m, max_m: pose.position_m };
-        let boxes = Boxes::new(&keyframes.iter().map(point).collect::<Vec<_>>());
+        let boxes = BoxIndex::new(&keyframes.iter().map(point).collect::<Vec<_>>());
         let mut columns: HashMap<[i64; 2], [f64; 2]> = HashMap::new();
         for chunk in &manifest.chunks {
             for section in chunk.sections.iter().filter(|section| section.level == 0) {
@@ -114,7 +114,7 @@ impl TrainingCoverage {
             distance_m + METRES_PER_RAD * angle_rad
         };
         // There is one, and it is item 0 of none.
-        apart(self.boxes.cheapest(here_m, cost_m).map_or(0, |(index, _)| index))
+        apart(self.boxes.min_cost(here_m, cost_m).map_or(0, |(index, _)| index))
     }
 
     /// Shares of holes and of untrained ground among what is below the horizon; none if nothing is.

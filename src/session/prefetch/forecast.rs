@@ -6,7 +6,7 @@ use glam::DVec3;
 use crate::limits;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_scene::route::Boxes;
+use wildcity_scene::route::BoxIndex;
 use wildcity_twin::residency::Urgency;
 
 /// A recorded drive that the ego may follow.
@@ -16,7 +16,7 @@ pub(crate) struct RecordedDrive {
     /// Distance of each pose along the drive, in metres.
     stations_m: Vec<f64>,
     /// The ways from each pose to the next; of one pose, that pose.
-    ways: Boxes,
+    ways: BoxIndex,
 }
 
 /// What is known of where the ego goes.
@@ -141,7 +141,7 @@ impl RecordedDrive {
         };
         let count = poses.len().saturating_sub(1).max(poses.len().min(1));
         let ways: Vec<Bounds> = (0..count).map(way).collect();
-        Self { poses, stations_m, ways: Boxes::new(&ways) }
+        Self { poses, stations_m, ways: BoxIndex::new(&ways) }
     }
 
     /// The place along the drive that is nearest to a point, and how near: both in metres.
@@ -155,7 +155,7 @@ impl RecordedDrive {
             (t * way_m.length(), (to_point_m - t * way_m).length())
         };
         // No less than the distance to the way's box but for rounding, which may prefer an equal one.
-        let (index, distance_m) = self.ways.cheapest(point_m, |index| on_way(index).1)?;
+        let (index, distance_m) = self.ways.min_cost(point_m, |index| on_way(index).1)?;
         Some((self.stations_m[index] + on_way(index).0, distance_m))
     }
 

@@ -253,7 +253,7 @@ impl RecordedEpisode {
                 let recorded = (&*to.version_hash, &*to.profile_hash);
                 report.changes.extend(scene_changes(recorded, &resident, profile));
             }
-            let ground = Ground::of(&resident.version.manifest.trajectories);
+            let ground = Ground::from_drives(&resident.version.manifest.trajectories);
             let diverged = retrace
                 .follow(frame, index + lines_before, &ground)
                 .map_err(|cause| ReplayError::Ego { step: frame.step, cause: Box::new(cause) })?;

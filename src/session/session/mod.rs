@@ -11,7 +11,7 @@ use tokio::time::{Instant, timeout_at};
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{RigCamera, overlay_bytes};
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 use wildcity_twin::residency::{PinnedScene, Reservation, Resident, RigExtent, Urgency, Viewpoint};
 
@@ -42,7 +42,7 @@ pub struct Session {
     prefetching: LatestTask,
     name: String,
     /// What of every version's profile is otherwise, and the profile that comes of it.
-    changes: ProfileChanges,
+    changes: ProfileOverrides,
     profile: RenderProfile,
     profile_hash: blake3::Hash,
     rig_name: String,
@@ -168,7 +168,7 @@ impl Session {
         terminate: bool,
     ) -> Result<Observation, SessionError> {
         let command = command.into();
-        let ground = Ground::of(&self.resident().version.manifest.trajectories);
+        let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
         let mut next = self.episode.stepped(&command, &ground, terminate)?;
         let shots = self.layout.shots(&next, &self.album);
         let drawing = self.draw(&next, shots, Some(self.album.clone())).await?;
@@ -493,9 +493,9 @@ fn settled(
     dynamics: Dynamics,
 ) -> Result<Track, SessionError> {
     let mut track = resolve_start(resident, start, warm_up_us)?;
-    let ground = Ground::of(&resident.version.manifest.trajectories);
+    let ground = Ground::from_drives(&resident.version.manifest.trajectories);
     if let Some((_, start)) = track.last_mut() {
-        *start = dynamics.start(*start, &ground);
+        *start = dynamics.start_pose(*start, &ground);
     }
     Ok(track)
 }

@@ -1,7 +1,7 @@
-"""The conversation without the wire: numbers requests and matches answers.
+"""The client's side of the protocol without any I/O: it numbers requests and matches answers to them.
 
-Each method of `Conversation` is a generator that yields the text of one request, is sent the message that came back,
-and returns the answer. `sync` and `aio` only move messages.
+Each method of `SessionProtocol` is a generator. It yields the text of one request, receives the answering message
+through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Message = str | bytes
 Exchange = Generator[str, Message, T]
 
 
-class Conversation:
-    """One client's side. A number is used up only when its answer came and was no error."""
+class SessionProtocol:
+    """State of one client. A request uses its number up only if its answer came and is not an error."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -55,7 +55,7 @@ class Conversation:
         """Name of the open session."""
 
     def hello(self) -> Exchange[Welcome]:
-        """Begins a connection."""
+        """Starts a connection."""
         client = {"name": self.name, "version": version("wildcity")}
         fields = {"client": client, "protocols": [PROTOCOL]}
         welcome = yield from self._ask("hello", 0, Welcome, fields)
@@ -102,27 +102,27 @@ class Conversation:
         return opened
 
     def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
-        """Moves."""
+        """Moves the ego and advances the time by one step."""
         fields = {**_movement(movement), "terminate": terminate}
         return (yield from self._next("step", Observation, fields))
 
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
-        """Looks."""
+        """Renders images from poses without moving."""
         return (yield from self._next("observe", Observation, {"poses": encode(poses)}))
 
     def prefetch(self, poses: Sequence[Pose]) -> Exchange[None]:
-        """Says where it may go."""
+        """Announces where the ego may go next."""
         yield from self._next("prefetch", Ok, {"poses": encode(poses)})
 
     def reset(self, seed: int, start: Pose | Station | None) -> Exchange[Observation]:
-        """Begins an episode."""
+        """Starts a new episode."""
         fields: dict[str, Any] = {"seed": seed}
         if start is not None:
             fields["start"] = _start(start)
         return (yield from self._next("reset", Observation, fields))
 
     def switch_version(self, version: int | None) -> Exchange[Switched]:
-        """Sees another version."""
+        """Shows another version of the twin."""
         fields = {} if version is None else {"version": version}
         return (yield from self._next("switch_version", Switched, fields))
 
@@ -133,25 +133,29 @@ class Conversation:
         return closed.summary
 
     def resume(self, session: str, last_seq: int) -> Exchange[Resumed]:
-        """Continues a session on a new connection, where hello was 0 and this is 1."""
+        """Continues a session on a new connection, on which `hello` had number 0 and this request has 1."""
         fields = {"session": session, "last_seq": last_seq}
         try:
             resumed = yield from self._ask("resume", 1, Resumed, fields)
         except Refused as refused:
             if refused.code == "unknown_session":
-                # Gone for good; a new one can be opened here, with the number of this try.
-                self.session, self.next_seq = None, 1
+                # The session is over. A new one can be opened on this connection, and its request takes
+                # the number of this refused one.
+                self.session = None
+                self.next_seq = 1
             raise
-        # One request at a time: the session is where the client is, or one answer ahead.
+        # One request is under way at a time, so the session has carried out either request `last_seq` or
+        # the one after it.
         if resumed.last_seq not in (last_seq, last_seq + 1):
             raise ProtocolError(f"the session is at {resumed.last_seq}, not at {last_seq}")
-        self.session, self.next_seq = session, last_seq + 1
+        self.session = session
+        self.next_seq = last_seq + 1
         return resumed
 
     def resume_own(self) -> Exchange[Resumed]:
-        """As `resume`, for the session that was open here."""
+        """As `resume`, for the session that this client opened."""
         if self.session is None:
-            raise ProtocolError("no session is open to resume")
+            raise ProtocolError("this client has no open session to resume")
         return (yield from self.resume(self.session, self.next_seq - 1))
 
     def _next(self, kind: str, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
@@ -160,12 +164,12 @@ class Conversation:
         return result
 
     def _ask(self, kind: str, seq: int, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
-        # ValueError for NaN and infinity, which JSON cannot say.
+        # Raises ValueError for NaN and infinity, which JSON cannot represent.
         request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
         message = yield request
         got = Observation(message) if isinstance(message, bytes) else decode_answer(message)
         got_seq = got.metadata.seq if isinstance(got, Observation) else got.seq
-        # A request that could not be read has no number to answer with.
+        # An error has no number if the server could not read the request.
         if got_seq != seq and not (isinstance(got, Refusal) and got_seq is None):
             raise ProtocolError(f"expected an answer to request {seq}, got one to {got_seq}")
         if isinstance(got, Refusal):
@@ -175,32 +179,32 @@ class Conversation:
         return got
 
 
-DIAL: dict[str, Any] = {
+CONNECT_OPTIONS: dict[str, Any] = {
     "subprotocols": [Subprotocol(PROTOCOL)],
     "compression": None,
     "max_size": OBSERVATION_BYTES,
     "open_timeout": 10,
     "close_timeout": 1,
-    # Lock step: the answer's time-out says enough about the other side.
+    # The time-out of each answer already detects a dead server.
     "ping_interval": None,
     "proxy": None,
 }
-"""How both clients connect."""
+"""Options with which both clients connect."""
 
 
-def headers(token: str | None) -> dict[str, str]:
-    """What a client sends with its upgrade."""
+def authorization_headers(token: str | None) -> dict[str, str]:
+    """Additional headers of the WebSocket upgrade request."""
     return {} if token is None else {"Authorization": f"Bearer {token}"}
 
 
-def keeps_connection(error: BaseException) -> bool:
-    """Whether the next request may use the connection on which this one failed."""
+def can_reuse_connection(error: BaseException) -> bool:
+    """Whether the next request may use the connection on which a request failed with `error`."""
     return isinstance(error, Refused) and not error.fatal
 
 
-def translated(error: BaseException, timeout: float) -> WildCityError | None:
-    """What the transport raised, as an error of this package; None if it is another's."""
-    # Before 3.11 asyncio has a time-out of its own.
+def translate_error(error: BaseException, timeout: float) -> WildCityError | None:
+    """An error of the transport as an error of this package; None if it is not one of the transport."""
+    # Before Python 3.11 asyncio.TimeoutError is another class.
     if isinstance(error, (TimeoutError, asyncio.TimeoutError)):
         return TimedOut(f"no answer within {timeout} s")
     if isinstance(error, (ConnectionClosed, OSError)):
