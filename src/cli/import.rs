@@ -7,7 +7,7 @@ use anyhow::Context;
 
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{Record, RenderProfile};
+use wildcity_scene::{RecordFormat, RenderProfile};
 use wildcity_twin::ingest::{self, Axes};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
@@ -69,7 +69,7 @@ pub(super) struct Import {
     /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last three the
     /// number is the bytes per Gaussian at SH degree 1, before compression.
     #[arg(long, value_name = "FORMAT", default_value_t)]
-    record: Record,
+    record: RecordFormat,
 
     /// Make no levels of detail: everything is rendered at full detail, at any distance.
     #[arg(long)]

@@ -40,8 +40,8 @@ impl SkySource {
         let read = sky::read(path, self.sky_image);
         let read = read.with_context(|| format!("{}", path.display()))?;
         let default_axes = match read.model {
-            Model::Network(..) => network_axes,
-            Model::Cube(_) => IMAGE_AXES,
+            SkyModel::Network(..) => network_axes,
+            SkyModel::Cube(_) => IMAGE_AXES,
         };
         let axes: Axes = self.sky_axes.as_deref().unwrap_or(default_axes).parse()?;
         let sky_from_world: DMat3 = axes.file_from_twin();

@@ -108,7 +108,7 @@ const FEATURES: [Feature; 18] = [
     feature("antialiasing", |step| step.profile.antialiased = true),
     feature("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
     feature("sky of images", |step| {
-        step.set_sky(Model::cube(CubeMap::plain(DVec3::splat(0.5))));
+        step.set_sky(SkyModel::cube(CubeMap::uniform(DVec3::splat(0.5))));
     }),
     feature("sky, baked", |step| step.set_sky(sky_network())),
     feature("sky, exact", |step| {
@@ -188,14 +188,14 @@ fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
 }
 
 /// A sky network with three octaves and 16 neurons. It is smooth enough to be baked into a small map.
-fn sky_network() -> Model {
+fn sky_network() -> SkyModel {
     let layer = |outputs: usize, inputs: usize| {
         let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
         Layer { outputs, inputs, weight: numbers(outputs * inputs), bias: numbers(outputs) }
     };
     // Three octaves of sine and cosine of three coordinates, and the coordinates: 21 inputs.
     let layers = [layer(16, 21), layer(16, 16), layer(3, 16)];
-    Model::network(Network::new(layers, Vec::new()).expect("the sizes of the layers match"))
+    SkyModel::network(Network::new(layers, Vec::new()).expect("the sizes of the layers match"))
 }
 
 /// A windshield that turns rays by some milliradians.
@@ -235,7 +235,7 @@ impl Step {
         }
     }
 
-    fn set_sky(&mut self, model: Model) {
+    fn set_sky(&mut self, model: SkyModel) {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
 

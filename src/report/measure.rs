@@ -102,7 +102,7 @@ impl Benchmark<'_> {
             // The scene as this setting renders it: its images, its detail, its record format.
             let scaled_point = point.scaled(setting.scale)?;
             let pinned = self.scene(&scaled_point.views, &profile)?;
-            let converted = setting.record.map(|record| recorded(&pinned, record).scene);
+            let converted = setting.record.map(|record| round_trip(&pinned, record).scene);
             let scene: &Scene = converted.as_ref().unwrap_or(&pinned);
 
             // Errors, in the windows.

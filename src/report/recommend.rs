@@ -208,7 +208,7 @@ impl Recommendation {
     ///
     /// # Errors
     /// Names the change that cannot be made.
-    pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
+    pub fn changes(&self) -> Result<ProfileOverrides, ProfileError> {
         let bad =
             |field: &str, reason: String| ProfileError::Change { field: field.to_owned(), reason };
         // A profile with the changes, as JSON; then only the fields that were changed.
@@ -222,7 +222,7 @@ impl Recommendation {
             let value = value.ok_or_else(|| bad(key, "it is missing in the JSON".to_owned()))?;
             Ok((key.to_owned(), value.clone()))
         };
-        self.profile.iter().map(changed_field).collect::<Result<_, _>>().map(ProfileChanges::new)
+        self.profile.iter().map(changed_field).collect::<Result<_, _>>().map(ProfileOverrides::new)
     }
 
     /// The command that starts a server with this setting, where `profile` is the path of the profile file.

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::{Rays, Record, RenderProfile};
+use wildcity_scene::{Rays, RecordFormat, RenderProfile};
 
 /// One way to render a twin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -15,7 +15,7 @@ pub struct Setting {
     /// Index of the backend among those of the report.
     pub backend: usize,
     /// Record format of the Gaussians. None leaves the twin's own.
-    pub record: Option<Record>,
+    pub record: Option<RecordFormat>,
     /// Changes of the twin's render profile, as `field=value`.
     pub profile: Vec<String>,
     /// Width and height of the images, as a share of the cameras'.

@@ -11,8 +11,8 @@ use serde::Serialize;
 
 use super::setting::{Family, ImageEncoding, Setting};
 use wildcity_render::View;
-use wildcity_scene::sky::{Model, Sky};
-use wildcity_scene::{Manifest, Rays, Record, RenderProfile};
+use wildcity_scene::sky::{Sky, SkyModel};
+use wildcity_scene::{Manifest, Rays, RecordFormat, RenderProfile};
 
 /// Properties of a twin and its cameras that decide which settings can affect it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,7 +20,7 @@ pub struct TwinFeatures {
     /// The twin's render profile.
     pub profile: RenderProfile,
     /// Record format in which its Gaussians are stored.
-    pub record: Record,
+    pub record: RecordFormat,
     /// Whether it has levels of detail.
     pub has_levels: bool,
     /// What is behind its Gaussians.
@@ -188,8 +188,8 @@ impl<'a> ListBuilder<'a> {
     fn add_records(&mut self) {
         // Records are listed from exact to coarse.
         let own = self.twin.record;
-        let from_own = Record::ALL.into_iter().skip_while(|record| *record != own);
-        let coarser: Vec<Record> = from_own.skip(1).collect();
+        let from_own = RecordFormat::ALL.into_iter().skip_while(|record| *record != own);
+        let coarser: Vec<RecordFormat> = from_own.skip(1).collect();
         if coarser.is_empty() {
             self.skip("record", "the twin is stored in the coarsest record format");
         }
@@ -309,8 +309,8 @@ impl TwinFeatures {
             has_levels: sections.any(|section| section.level > 0),
             background: match sky.map(Sky::model) {
                 None => BackgroundKind::Plain,
-                Some(Model::Network(..)) => BackgroundKind::Network,
-                Some(Model::Cube(_)) => BackgroundKind::Images,
+                Some(SkyModel::Network(..)) => BackgroundKind::Network,
+                Some(SkyModel::Cube(_)) => BackgroundKind::Images,
             },
             has_non_pinhole: views.iter().any(|view| !view.is_static_pinhole()),
         }

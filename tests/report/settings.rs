@@ -370,7 +370,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
 }
 
 /// The changes of a setting, in the form in which a session asks for them.
-fn changes(setting: &Setting) -> ProfileChanges {
+fn changes(setting: &Setting) -> ProfileOverrides {
     let field = |change: &String| {
         let (key, value) = change.split_once('=').unwrap();
         (key.to_owned(), serde_json::from_str(value).unwrap())

@@ -27,7 +27,7 @@ pub(in crate::cli) struct Cut {
     drive: PathBuf,
 
     /// Lengths of the cuts, in metres.
-    #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::CUTS_M)]
+    #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::SUB_TRAJECTORY_LENGTHS_M)]
     length_m: Vec<f64>,
 
     /// Distance from the start of one cut to the start of the next, in metres [default: the length, so that
@@ -70,7 +70,7 @@ impl Cut {
     fn check_labels(&self) -> anyhow::Result<()> {
         let mut labels = BTreeSet::new();
         for &length_m in &self.length_m {
-            let label = route::label(length_m);
+            let label = route::length_label(length_m);
             let is_new = labels.insert(label.clone());
             anyhow::ensure!(
                 is_new,

@@ -19,7 +19,7 @@ pub(in crate::cli) struct Subsample {
     drive: PathBuf,
 
     /// Least straight-line distance between two kept poses, in metres.
-    #[arg(long, value_name = "M", default_value_t = route::KEYFRAME_M)]
+    #[arg(long, value_name = "M", default_value_t = route::KEYFRAME_SPACING_M)]
     step_m: f64,
 
     /// JSON file to write.
