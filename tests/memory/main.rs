@@ -1,5 +1,8 @@
 //! What importing and serving take: one test, alone in its process, so that the numbers are its own.
 
+#[path = "../support/scene_files.rs"]
+mod scene_files;
+
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -11,7 +14,7 @@ use wildcity_scene::RenderProfile;
 use wildcity_twin::residency::{Cache, Viewpoint};
 use wildcity_twin::store::Catalog;
 
-use crate::scene_files::{gaussians, inria_columns, ply, ply_header};
+use scene_files::{gaussians, inria_columns, ply, ply_header};
 
 /// The program itself, buffers and thread stacks.
 const CONSTANT_BYTES: u64 = 30 << 20;
