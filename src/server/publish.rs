@@ -89,8 +89,8 @@ async fn publish(
     // Where sessions drive on that twin now, whoever switches need not wait.
     let driving = server.sessions.list().into_iter().filter(|(_, about, _)| about.twin == ask.twin);
     let frames = driving.map(|(_, about, _)| about.eyes).collect();
-    let prepared = server.engine.prepare(&ask.twin, version.number, frames);
-    match timeout(wildcity_session::limits::PREFETCH_TIMEOUT, prepared).await {
+    let prepared = server.engine.preload(&ask.twin, version.number, frames);
+    match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}
         // It is committed and sound: whoever opens it waits, or is told why it does not fit.
         Ok(Err(error)) => tracing::warn!(twin = ask.twin, "not loaded ahead: {error}"),

@@ -205,7 +205,7 @@ async fn what_is_made_ready_takes_nothing_from_a_session_that_drives() {
     }
     let far = (0..8).map(|k| eyes(&views(demo().at(250.0 + 40.0 * f64::from(k))))).collect();
     assert!(crate::streaming::need_bytes(&all, demo().at(250.0)) > limit_bytes / 4);
-    bench.engine.prepare("demo", 1, far).await.unwrap();
+    bench.engine.preload("demo", 1, far).await.unwrap();
     let frame = driver.observe(vec![demo().at(6.0)]).await.unwrap();
     assert_eq!(frame.residency.waited_for, 0);
 
@@ -213,7 +213,7 @@ async fn what_is_made_ready_takes_nothing_from_a_session_that_drives() {
     source.break_section(later_section(), Fault::Hangs);
     let engine = bench.engine.clone();
     let far = vec![eyes(&views(demo().at(250.0)))];
-    let preparing = tokio::spawn(async move { engine.prepare("demo", 1, far).await });
+    let preparing = tokio::spawn(async move { engine.preload("demo", 1, far).await });
     for station_m in [9.0, 20.0, 40.0] {
         driver.step(demo().at(station_m), false).await.unwrap();
     }
