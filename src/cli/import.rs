@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use crate::cli::limits;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{Record, RenderProfile, Rig, Trajectory};
+use wildcity_scene::{RecordFormat, RenderProfile, Rig, Trajectory};
 use wildcity_twin::ingest::{self, Axes};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
@@ -70,7 +70,7 @@ pub(super) struct Import {
     /// In how many bits Gaussians are stored: f32 (exact), h52, q32, q24; the number is bytes at SH
     /// degree 1, before compression.
     #[arg(long, default_value_t)]
-    record: Record,
+    record: RecordFormat,
 
     /// Makes no levels of detail: everything is drawn in full, however far away.
     #[arg(long)]

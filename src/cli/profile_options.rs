@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use crate::cli::limits;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_twin::ingest;
 
 /// Changes of the render profile on the command line.
@@ -29,7 +29,7 @@ pub(super) struct ProfileOptions {
 /// The changes, read from the file and the command line.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LoadedProfile {
-    from_file: ProfileChanges,
+    from_file: ProfileOverrides,
     settings: Vec<String>,
 }
 
@@ -56,7 +56,7 @@ impl LoadedProfile {
 
 /// Reads the file of `--profile`, and checks that its fields exist and fit the default profile. Whether
 /// they fit a twin's profile shows when they are applied to it.
-pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
+pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileOverrides> {
     let text = path.display().to_string();
     anyhow::ensure!(
         path.exists() || !text.contains('='),
@@ -64,7 +64,7 @@ pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileChanges> {
     );
     let cannot = || format!("--profile {text}");
     let json = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
-    let changes: ProfileChanges = serde_json::from_slice(&json).with_context(cannot)?;
+    let changes: ProfileOverrides = serde_json::from_slice(&json).with_context(cannot)?;
     changes.apply(RenderProfile::default()).with_context(cannot)?;
     Ok(changes)
 }

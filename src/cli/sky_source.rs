@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use glam::DMat3;
 
-use wildcity_scene::sky::Model;
+use wildcity_scene::sky::SkyModel;
 use wildcity_twin::ingest::{Axes, sky};
 use wildcity_twin::store::SkyBytes;
 
@@ -39,8 +39,8 @@ impl SkySource {
         let read = sky::read(path, self.sky_image);
         let read = read.with_context(|| format!("{}", path.display()))?;
         let usual = match read.model {
-            Model::Network(..) => network_axes,
-            Model::Cube(_) => IMAGE_AXES,
+            SkyModel::Network(..) => network_axes,
+            SkyModel::Cube(_) => IMAGE_AXES,
         };
         let axes: Axes = self.sky_axes.as_deref().unwrap_or(usual).parse()?;
         let sky_from_world: DMat3 = axes.file_from_twin();

@@ -114,7 +114,7 @@ fn card_views() -> [View; 2] {
     [[717, 301], [90, 75]].map(|[width_px, height_px]: [u32; 2]| {
         let [cx, cy] = [width_px, height_px].map(|size| 0.5 * f64::from(size));
         let pinhole = Pinhole { fx: 1.2 * cx, fy: 1.2 * cx, cx, cy };
-        View::new(Camera::ideal(width_px, height_px, pinhole), Pose::IDENTITY)
+        View::new(Camera::from_pinhole(width_px, height_px, pinhole), Pose::IDENTITY)
     })
 }
 

@@ -23,8 +23,8 @@ use glam::{DMat3, DVec3};
 
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
-use wildcity_scene::geometry::camera::Field;
-use wildcity_scene::sky::{CubeMap, Drawn, SkyError};
+use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
 pub use view::{RollingShutter, View};
@@ -74,14 +74,14 @@ impl Target<'_> {
 
     /// Zeroes what a camera's lens does not see: nothing, where it is a pinhole.
     fn mask(&mut self, camera: &Camera) {
-        let Some(field) = Field::of(camera) else { return };
+        let Some(field) = FieldMask::of(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
-            field.clear(camera, 3, rgb8);
+            field.clear_outside(camera, 3, rgb8);
         }
         for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
         {
             if let Some(image) = image {
-                field.clear(camera, values, image);
+                field.clear_outside(camera, values, image);
             }
         }
     }
@@ -231,13 +231,13 @@ impl Frame<'_> {
     ///
     /// # Errors
     /// [`RenderError::Sky`].
-    pub fn background(&self) -> Result<Option<(Drawn, DMat3)>, RenderError> {
+    pub fn background(&self) -> Result<Option<(DrawableSky, DMat3)>, RenderError> {
         match &self.scene.sky {
-            Some(sky) => Ok(Some((sky.drawn(self.profile.sky_error)?, sky.sky_from_world()))),
+            Some(sky) => Ok(Some((sky.drawable(self.profile.sky_error)?, sky.sky_from_world()))),
             None if self.profile.background == [0.0; 3] => Ok(None),
             None => {
-                let map = CubeMap::plain(DVec3::from_array(self.profile.background));
-                Ok(Some((Drawn::Map(Arc::new(map)), DMat3::IDENTITY)))
+                let map = CubeMap::uniform(DVec3::from_array(self.profile.background));
+                Ok(Some((DrawableSky::CubeMap(Arc::new(map)), DMat3::IDENTITY)))
             }
         }
     }

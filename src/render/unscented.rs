@@ -10,7 +10,7 @@ use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::geometry::camera::{Cone, WIDEST_RAD};
+use wildcity_scene::geometry::camera::{FieldCone, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond its lens' field a centre may lie and still be drawn, in radians: as far as a pinhole
@@ -82,7 +82,8 @@ impl<'a> UnscentedView<'a> {
         );
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
-        let Cone { image_rad, least_px_per_rad, most_px_per_rad } = Cone::of(&view.camera);
+        let FieldCone { image_rad, least_px_per_rad, most_px_per_rad } =
+            FieldCone::of(&view.camera);
         let cull_bound = CullBound {
             widest_rad: max_center_angle_rad(&view.camera),
             image_rad,
@@ -124,7 +125,7 @@ impl<'a> UnscentedView<'a> {
         if !self.may_touch(at_end_m, 0.0, sigma_m) {
             return None;
         }
-        let center = self.view.project_beyond(mean_m, 1.0);
+        let center = self.view.project_extrapolated(mean_m, 1.0);
         let depth_m = self.view.camera.depth_m(center.point_m);
         let in_range = depth_m >= near_m
             && depth_m <= far_m
@@ -132,7 +133,7 @@ impl<'a> UnscentedView<'a> {
         if !in_range {
             return None;
         }
-        let land = |point_m: DVec3| self.view.project_beyond(point_m, center.fraction).at_px;
+        let land = |point_m: DVec3| self.view.project_extrapolated(point_m, center.fraction).at_px;
         let pairs = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(|axis_m| {
             let offset_m = 3.0_f64.sqrt() * axis_m;
             [land(mean_m + offset_m), land(mean_m - offset_m)]

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 
@@ -21,7 +21,7 @@ pub struct View {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingShutter {
     /// Which row or column is exposed first.
-    pub direction: Rolls,
+    pub direction: ShutterDirection,
     /// Where the camera stood then.
     pub world_from_camera_first: Pose,
 }
@@ -99,7 +99,7 @@ impl View {
 
     /// Whether it is a pinhole at rest, which a matrix projects.
     pub fn is_static_pinhole(&self) -> bool {
-        self.camera.is_ideal() && self.rolling_shutter.is_none()
+        self.camera.is_pinhole() && self.rolling_shutter.is_none()
     }
 
     /// Where the camera stands when a place of its image, in pixels, is exposed.
@@ -141,18 +141,18 @@ impl View {
 
     /// Where a point of the world lands, in pixels; `None` outside of the lens' field.
     pub fn project_world(&self, point_m: DVec3) -> Option<DVec2> {
-        self.camera.project(self.project_beyond(point_m, 1.0).point_m)
+        self.camera.project(self.project_extrapolated(point_m, 1.0).point_m)
     }
 
     /// Where a point of the world lands if the lens is continued beyond its field. With a rolling
     /// shutter the row decides where the camera stands, and that decides the row: found by going back
     /// and forth, from a first guess of when.
     #[inline(always)]
-    pub fn project_beyond(&self, world_m: DVec3, guess: f64) -> ProjectedPoint {
+    pub fn project_extrapolated(&self, world_m: DVec3, guess: f64) -> ProjectedPoint {
         let landing = |fraction: f64, world_from_camera: Pose| {
             let from_camera_m = world_m - world_from_camera.position_m;
             let point_m = world_from_camera.rotation.inverse() * from_camera_m;
-            let at_px = self.camera.project_beyond(point_m);
+            let at_px = self.camera.project_extrapolated(point_m);
             ProjectedPoint { at_px, fraction, world_from_camera, point_m }
         };
         let Some(rolling_shutter) = &self.rolling_shutter else {
@@ -194,13 +194,13 @@ impl View {
         let from_end =
             |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
         let share = match direction {
-            Rolls::TopToBottom => [0.0, rows[0], rows[1]],
-            Rolls::BottomToTop => {
+            ShutterDirection::TopToBottom => [0.0, rows[0], rows[1]],
+            ShutterDirection::BottomToTop => {
                 let [slope, start] = from_end(rows, height_px);
                 [0.0, slope, start]
             }
-            Rolls::LeftToRight => [columns[0], 0.0, columns[1]],
-            Rolls::RightToLeft => {
+            ShutterDirection::LeftToRight => [columns[0], 0.0, columns[1]],
+            ShutterDirection::RightToLeft => {
                 let [slope, start] = from_end(columns, width_px);
                 [slope, 0.0, start]
             }

@@ -16,9 +16,9 @@ use wildcity_render::gpu::{Gpu, GpuUsage};
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, RollingShutter, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::camera::{
-    Bivariate, Fisheye, Lens, Rolls, Windshield, WindshieldReference,
+    Bivariate, Fisheye, Lens, ShutterDirection, Windshield, WindshieldReference,
 };
-use wildcity_scene::sky::{CubeMap, Layer, Model, Network};
+use wildcity_scene::sky::{CubeMap, Layer, Network, SkyModel};
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
 /// One street with one feature.
@@ -93,7 +93,7 @@ const FEATURES: [Feature; 18] = [
     ("levels of detail, 1 m", |step| step.scene = coarser(&step.scene, 1.0)),
     ("antialiasing", |step| step.profile.antialiased = true),
     ("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
-    ("sky of images", |step| step.behind(Model::cube(CubeMap::plain(DVec3::splat(0.5))))),
+    ("sky of images", |step| step.behind(SkyModel::cube(CubeMap::uniform(DVec3::splat(0.5))))),
     ("sky, baked", |step| step.behind(network())),
     ("sky, exact", |step| {
         step.behind(network());
@@ -106,7 +106,7 @@ const FEATURES: [Feature; 18] = [
     ("rolling shutter", |step| {
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
-        let direction = Rolls::TopToBottom;
+        let direction = ShutterDirection::TopToBottom;
         step.view.rolling_shutter =
             Some(RollingShutter { direction, world_from_camera_first: first });
     }),
@@ -164,13 +164,13 @@ fn coarser(scene: &Scene, error_m: f32) -> Scene {
 }
 
 /// A sky of three octaves and 16 neurons, gentle enough to be baked coarsely.
-fn network() -> Model {
+fn network() -> SkyModel {
     let layer = |outputs: usize, inputs: usize| {
         let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
         Layer { outputs, inputs, weight: numbers(outputs * inputs), bias: numbers(outputs) }
     };
     let layers = [layer(16, 21), layer(16, 16), layer(3, 16)];
-    Model::network(Network::new(layers, Vec::new()).expect("layers that fit each other"))
+    SkyModel::network(Network::new(layers, Vec::new()).expect("layers that fit each other"))
 }
 
 /// One that turns rays by some milliradians.
@@ -205,7 +205,7 @@ impl Step {
         }
     }
 
-    fn behind(&mut self, model: Model) {
+    fn behind(&mut self, model: SkyModel) {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
 
@@ -254,7 +254,7 @@ impl Step {
             depth_m: depth_m.as_deref_mut(),
             opacity: opacity.as_deref_mut(),
             normals: normals.as_deref_mut(),
-            appearance: (!self.appearance.is_plain()).then_some(&self.appearance),
+            appearance: (!self.appearance.is_identity()).then_some(&self.appearance),
             ..Target::default()
         };
         let views = &[self.view];

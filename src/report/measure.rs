@@ -17,8 +17,8 @@ use wildcity_render::compare::json_numbers::{serialize_number, serialize_numbers
 use wildcity_render::gpu::Gpu;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, RenderError, View};
-use wildcity_scene::record::recorded;
-use wildcity_scene::sky::Drawn;
+use wildcity_scene::record::round_trip;
+use wildcity_scene::sky::DrawableSky;
 use wildcity_scene::{Rays, RenderProfile, Scene};
 use wildcity_twin::residency::{PinnedScene, Resident};
 
@@ -232,7 +232,7 @@ impl Benchmark<'_> {
         match setting.record {
             None => (None, manifest.record.bits(manifest.sh_degree) as f64 / 8.0),
             Some(record) => {
-                let coded = recorded(scene, record);
+                let coded = round_trip(scene, record);
                 let bytes = record.bits(manifest.sh_degree) as f64 / 8.0;
                 (Some(coded.scene), bytes)
             }
@@ -266,10 +266,10 @@ impl Measurement {
 
 /// Memory that the sky takes in the form in which a profile draws it, in bytes.
 pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, RenderError> {
-    let drawn = scene.sky.as_ref().map(|sky| sky.drawn(profile.sky_error));
+    let drawn = scene.sky.as_ref().map(|sky| sky.drawable(profile.sky_error));
     Ok(match drawn.transpose()? {
-        Some(Drawn::Map(map)) => map.bytes() as u64,
-        Some(Drawn::Exact(_)) | None => 0,
+        Some(DrawableSky::CubeMap(map)) => map.bytes() as u64,
+        Some(DrawableSky::Network(_)) | None => 0,
     })
 }
 

@@ -7,7 +7,7 @@ use super::measure::{Measurement, SampleResult, least};
 use super::settings::{Family, Sent};
 use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 
 /// What is wanted of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -155,7 +155,7 @@ impl Recommendation {
     ///
     /// # Errors
     /// Names the change that cannot be made.
-    pub fn changes(&self) -> Result<ProfileChanges, ProfileError> {
+    pub fn changes(&self) -> Result<ProfileOverrides, ProfileError> {
         let mut profile = RenderProfile::default();
         self.profile.iter().try_for_each(|change| profile.set(change))?;
         let bad =
@@ -167,7 +167,7 @@ impl Recommendation {
             let value = all.get(key).ok_or_else(|| bad(key, "it is not written".to_owned()))?;
             Ok((key.to_owned(), value.clone()))
         };
-        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileChanges::new)
+        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileOverrides::new)
     }
 
     /// What starts a server that draws so, with the profile in a file.

@@ -5,8 +5,8 @@ use serde::Serialize;
 use wildcity_render::View;
 use wildcity_scene::geometry::CameraError;
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::sky::{Model, Sky};
-use wildcity_scene::{Manifest, Rays, Record, RenderProfile};
+use wildcity_scene::sky::{Sky, SkyModel};
+use wildcity_scene::{Manifest, Rays, RecordFormat, RenderProfile};
 
 /// One way to draw a twin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -18,7 +18,7 @@ pub struct Setting {
     /// Index of the backend among those of the report.
     pub backend: usize,
     /// What Gaussians are stored in; as they are, if absent.
-    pub record: Option<Record>,
+    pub record: Option<RecordFormat>,
     /// Changes of the twin's own render profile, `key=value`.
     pub profile: Vec<String>,
     /// Sides of the images, as a share of the cameras'.
@@ -36,7 +36,7 @@ pub struct TwinFeatures {
     /// How the twin is drawn.
     pub profile: RenderProfile,
     /// How it is stored.
-    pub stored: Record,
+    pub stored: RecordFormat,
     /// Whether it has levels of detail.
     pub levels: bool,
     /// What is behind it.
@@ -215,8 +215,11 @@ pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingLis
         None => skipped.push(Skipped::new("reach_m", "the twin is drawn however far it goes")),
         Some(_) => all.push(changed(Family::Reach, &["reach_m=none".to_owned()])),
     }
-    let mut coarser =
-        Record::ALL.into_iter().skip_while(|record| *record != twin.stored).skip(1).peekable();
+    let mut coarser = RecordFormat::ALL
+        .into_iter()
+        .skip_while(|record| *record != twin.stored)
+        .skip(1)
+        .peekable();
     if coarser.peek().is_none() {
         skipped.push(Skipped::new("record", "the twin's own is the coarsest"));
     }
@@ -286,8 +289,8 @@ impl TwinFeatures {
             levels: sections.into_iter().any(|section| section.level > 0),
             behind: match sky.map(Sky::model) {
                 None => BackgroundKind::Nothing,
-                Some(Model::Network(..)) => BackgroundKind::Network,
-                Some(Model::Cube(_)) => BackgroundKind::Images,
+                Some(SkyModel::Network(..)) => BackgroundKind::Network,
+                Some(SkyModel::Cube(_)) => BackgroundKind::Images,
             },
             bent: views.iter().any(|view| !view.is_static_pinhole()),
         }

@@ -1,4 +1,7 @@
-//! What a camera makes of the light, and what of its own car it sees.
+//! How a camera's image differs from the scene: its exposure, and an overlay of its own vehicle.
+//!
+//! An overlay is part of the rig, as a PNG in the rig's JSON. So it travels on the wire, in the manifest and
+//! in recordings without any extra mechanism, and it is cropped and scaled together with its camera.
 
 use std::io::Cursor;
 use std::sync::Arc;
@@ -9,54 +12,54 @@ use image::imageops::{FilterType, resize};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Rgba, Rgba32FImage};
 use serde::{Deserialize, Serialize};
 
-/// How a camera's image differs from what is there.
+/// Per-camera changes to a rendered image: first the exposure, then the overlay.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Appearance {
-    /// What it makes of colours; nothing else than they are if absent.
+    /// Affine colour transform; `None` leaves colours unchanged.
     pub exposure: Option<Exposure>,
-    /// What is before everything: its own car's hood.
+    /// Image drawn over everything, such as the hood of the own vehicle.
     pub overlay: Option<Arc<Overlay>>,
 }
 
-/// Colours as they are recorded: `matrix * rgb + offset`, linear red, green, blue. It follows the sky and
-/// precedes the overlay, and is what street reconstructions train per camera.
+/// An affine colour transform, `matrix * rgb + offset`, on linear red, green, blue. It is applied after the
+/// sky and before the overlay. Street reconstructions train one per camera.
 ///
-/// In JSON `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` if its
-/// matrix is diagonal; an offset of 0 may be left away.
+/// JSON: `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` for a
+/// diagonal matrix. `offset` defaults to 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ExposureFields", into = "ExposureFields")]
 pub struct Exposure {
-    /// Row by row.
+    /// 3 x 3, row by row.
     pub matrix: [[f64; 3]; 3],
     /// Added to each channel.
     pub offset: [f64; 3],
 }
 
-/// An image of the camera's own size that is laid over it. In JSON it is a PNG with opacity, as
-/// `"data:image/png;base64,.."`.
+/// An image of the camera's size that is blended over the rendered image. JSON holds it as a PNG with an
+/// alpha channel: `"data:image/png;base64,.."`.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Overlay {
     width_px: u32,
     rgba8: Vec<u8>,
-    /// As it was read, so that it is written without another search for the shortest form.
+    /// The PNG as it was read, so that writing does not compress the pixels again.
     png: Vec<u8>,
 }
 
 /// Why an appearance was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum AppearanceError {
-    /// A number that leaves nothing of an image.
-    #[error("exposure.{field} is {value:?}; a number from -100 to 100 is")]
+    /// An exposure coefficient outside -100 to 100.
+    #[error("exposure.{field} is {value:?}; it must be a number from -100 to 100")]
     Exposure {
         /// `matrix` or `offset`.
         field: &'static str,
-        /// The number.
+        /// The refused value.
         value: f64,
     },
-    /// Two things that say the same, or nothing.
+    /// An exposure with both a matrix and a gain, or with neither.
     #[error("an exposure has either a matrix or a gain")]
-    Colours,
-    /// The overlay is of another size than the image.
+    MatrixOrGain,
+    /// The overlay and the camera's image differ in size.
     #[error(
         "the overlay is {} x {} pixels, and the camera's image {} x {}",
         overlay_px[0], overlay_px[1], camera_px[0], camera_px[1]
@@ -67,19 +70,19 @@ pub enum AppearanceError {
         /// Width and height of the image.
         camera_px: [u32; 2],
     },
-    /// The overlay is no image that can be read.
+    /// The overlay cannot be decoded, or has too many pixels.
     #[error("the overlay cannot be read: {reason}")]
     Overlay {
-        /// What is wrong with it.
+        /// What is wrong with the overlay.
         reason: String,
     },
 }
 
 impl Exposure {
-    /// Of a matrix, or of a gain per channel.
+    /// An exposure from a matrix, or from a gain per channel.
     ///
     /// # Errors
-    /// [`AppearanceError::Colours`] if both are given, or neither is.
+    /// [`AppearanceError::MatrixOrGain`] if both a matrix and a gain are given, or neither.
     pub fn new(
         matrix: Option<[[f64; 3]; 3]>,
         gain: Option<[f64; 3]>,
@@ -88,27 +91,27 @@ impl Exposure {
         let matrix = match (matrix, gain) {
             (Some(matrix), None) => matrix,
             (None, Some([r, g, b])) => [[r, 0.0, 0.0], [0.0, g, 0.0], [0.0, 0.0, b]],
-            _ => return Err(AppearanceError::Colours),
+            _ => return Err(AppearanceError::MatrixOrGain),
         };
         Ok(Self { matrix, offset })
     }
 }
 
 impl AppearanceError {
-    /// What of a camera it is about: `exposure` or `overlay`.
+    /// The camera field at fault: `exposure` or `overlay`.
     pub fn field(&self) -> &'static str {
         match self {
-            Self::Exposure { .. } | Self::Colours => "exposure",
+            Self::Exposure { .. } | Self::MatrixOrGain => "exposure",
             Self::Size { .. } | Self::Overlay { .. } => "overlay",
         }
     }
 }
 
 impl Appearance {
-    /// Of an exposure, and of an overlay as [`Overlay::from_data_uri`] reads it.
+    /// An appearance from an exposure and the data URI of an overlay.
     ///
     /// # Errors
-    /// As that.
+    /// As [`Overlay::from_data_uri`].
     pub fn new(
         exposure: Option<Exposure>,
         overlay: Option<&str>,
@@ -118,13 +121,15 @@ impl Appearance {
         Ok(Self { exposure, overlay: overlay.map(Arc::new) })
     }
 
-    /// Whether it changes nothing.
-    pub fn is_plain(&self) -> bool {
+    /// Whether images stay unchanged: neither exposure nor overlay.
+    pub fn is_identity(&self) -> bool {
         self.exposure.is_none() && self.overlay.is_none()
     }
 
+    /// Checks the appearance for a camera whose image has this width and height.
+    ///
     /// # Errors
-    /// A number is out of range, or the overlay is not of the image's size.
+    /// An exposure coefficient is out of range, or the overlay has another size than the image.
     pub fn check(&self, camera_px: [u32; 2]) -> Result<(), AppearanceError> {
         if let Some(Exposure { matrix, offset }) = &self.exposure {
             for (field, values) in [("matrix", matrix.as_flattened()), ("offset", offset)] {
@@ -144,11 +149,12 @@ impl Appearance {
 }
 
 impl Overlay {
-    /// Most pixels of all overlays of a rig, 67 MB: two 4K images, or twice those of six surround
-    /// cameras of 1440 x 928 px.
+    /// Limit of the pixels of all overlays of a rig together. 67 MB in memory: two 4K images, or twice the
+    /// pixels of six surround cameras of 1440 x 928 px.
     pub const MAX_PIXELS: u64 = 1 << 24;
 
-    /// From a PNG for an image of a size, which is compared before anything is unpacked.
+    /// Decodes a PNG for a camera's image of this width and height. The size in the PNG's header is
+    /// compared before any pixel is decompressed.
     ///
     /// # Errors
     /// [`AppearanceError::Size`], [`AppearanceError::Overlay`].
@@ -165,25 +171,26 @@ impl Overlay {
         Ok(Self { width_px, rgba8, png })
     }
 
-    /// From `"data:image/png;base64,.."`, likewise.
+    /// Decodes `"data:image/png;base64,.."`, as [`Overlay::from_png`].
     ///
     /// # Errors
     /// As [`Overlay::from_png`].
     pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
         let bytes = text.strip_prefix(DATA_URI);
-        let bytes = bytes.ok_or_else(|| refused("it does not begin as data:image/png;base64,"))?;
+        let bytes =
+            bytes.ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
         let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
         Self::from_png(png, camera_px)
     }
 
-    /// From `[height, width, 4]` of red, green, blue, not premultiplied, and opacity.
+    /// An overlay from pixels `[height, width, 4]`: red, green, blue (not premultiplied) and alpha.
     ///
     /// # Errors
-    /// [`AppearanceError::Overlay`]: that is not a whole number of rows, or more than is accepted.
+    /// [`AppearanceError::Overlay`] if the bytes are not a whole number of rows, or too many.
     pub fn new(width_px: u32, rgba8: Vec<u8>) -> Result<Self, AppearanceError> {
         let row = 4 * width_px as usize;
         if rgba8.is_empty() || row == 0 || !rgba8.len().is_multiple_of(row) {
-            return Err(refused("it is no whole number of rows"));
+            return Err(refused("it is not a whole number of rows"));
         }
         check_pixels(rgba8.len() as u64 / 4)?;
         let mut png = Vec::new();
@@ -194,23 +201,24 @@ impl Overlay {
         Ok(Self { width_px, rgba8, png })
     }
 
-    /// What lies over a part of the image, drawn at another size: a smaller one by a triangle that is two
-    /// of its pixels wide, weighted by opacity.
+    /// The part of the overlay whose first column and row are `at_px`, resized to `size_px`. Shrinking
+    /// filters with a triangle two output pixels wide, weighted by alpha. Sizes are `[width, height]`.
     ///
     /// # Errors
-    /// [`AppearanceError::Overlay`]: the part is not within it, or it becomes too large.
-    pub fn part(
+    /// [`AppearanceError::Overlay`] if the part is not within the overlay, or the result is too large.
+    pub fn cropped_and_resized(
         &self,
-        [left, top]: [u32; 2],
+        at_px: [u32; 2],
         part_px: [u32; 2],
         size_px: [u32; 2],
     ) -> Result<Self, AppearanceError> {
+        let [left, top] = at_px;
         let [width, height] = self.size_px();
         let [part_width, part_height] = part_px;
         let within = |from: u32, part: u32, of: u32| part > 0 && from <= of && part <= of - from;
         if !within(left, part_width, width) || !within(top, part_height, height) {
-            let of = "it is not within the overlay";
-            return Err(refused(&format!("{part_px:?} px at {left}, {top}: {of}")));
+            let reason = "the part is not within the overlay";
+            return Err(refused(&format!("{part_px:?} px at {left}, {top}: {reason}")));
         }
         let [to_width, to_height] = size_px;
         check_pixels(u64::from(to_width) * u64::from(to_height))?;
@@ -221,36 +229,37 @@ impl Overlay {
             };
             return Self::new(to_width, (0..part_height).flat_map(row).copied().collect());
         }
-        // Premultiplied, or colours of what is clear would leak into what is not.
+        // Filter premultiplied colours: otherwise colours of transparent pixels leak into opaque ones.
         let premultiplied = Rgba32FImage::from_fn(part_width, part_height, |x, y| {
             let at = 4 * ((top + y) as usize * width as usize + (left + x) as usize);
             let [r, g, b, a] = [0, 1, 2, 3].map(|c| f32::from(self.rgba8[at + c]) / 255.0);
             Rgba([r * a, g * a, b * a, a])
         });
-        let sized = resize(&premultiplied, to_width, to_height, FilterType::Triangle);
-        let straight = |&Rgba([r, g, b, a]): &Rgba<f32>| {
-            let over = if a > 0.0 { 1.0 / a } else { 0.0 };
-            [r * over, g * over, b * over, a].map(|v| (255.0 * v.clamp(0.0, 1.0)).round() as u8)
+        let resized = resize(&premultiplied, to_width, to_height, FilterType::Triangle);
+        let unpremultiplied = |&Rgba([r, g, b, a]): &Rgba<f32>| {
+            let scale = if a > 0.0 { 1.0 / a } else { 0.0 };
+            let rgba = [r * scale, g * scale, b * scale, a];
+            rgba.map(|value| (255.0 * value.clamp(0.0, 1.0)).round() as u8)
         };
-        Self::new(to_width, sized.pixels().flat_map(straight).collect())
+        Self::new(to_width, resized.pixels().flat_map(unpremultiplied).collect())
     }
 
-    /// Width and height.
+    /// Width and height, in pixels.
     pub fn size_px(&self) -> [u32; 2] {
         [self.width_px, (self.rgba8.len() / (4 * self.width_px as usize)) as u32]
     }
 
-    /// `[height, width, 4]`.
+    /// The pixels, `[height, width, 4]`: red, green, blue (not premultiplied) and alpha.
     pub fn rgba8(&self) -> &[u8] {
         &self.rgba8
     }
 
-    /// Memory that it takes, in bytes.
+    /// Memory of the pixels and the PNG, in bytes.
     pub fn bytes(&self) -> u64 {
         (self.rgba8.len() + self.png.len()) as u64
     }
 
-    /// As JSON has it.
+    /// The PNG as `data:image/png;base64,..`, the form in JSON.
     pub fn to_data_uri(&self) -> String {
         format!("{DATA_URI}{}", BASE64.encode(&self.png))
     }
@@ -300,7 +309,7 @@ impl From<Exposure> for ExposureFields {
     }
 }
 
-/// What stands before an overlay's bytes in JSON.
+/// Prefix of an overlay in JSON.
 const DATA_URI: &str = "data:image/png;base64,";
 
 #[cfg(test)]
@@ -308,7 +317,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_and_back() {
+    fn json_round_trips() {
         let overlay = Overlay::new(3, (0..24).collect()).unwrap();
         let text = overlay.to_data_uri();
         assert!(text.starts_with("data:image/png;base64,iVBOR"), "{text}");
@@ -322,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_appearance_is_refused() {
+    fn invalid_appearances_are_refused() {
         for exposure in [r#"{"offset": [1, 2, 3]}"#, r#"{"gain": [1, 1]}"#, r#"{"gamma": 2}"#] {
             assert!(serde_json::from_str::<Exposure>(exposure).is_err(), "{exposure}");
         }
@@ -330,7 +339,7 @@ mod tests {
         let error = serde_json::from_str::<Exposure>(both).unwrap_err().to_string();
         assert!(error.contains("either a matrix or a gain"), "{error}");
         for (overlay, wanted) in [
-            ("hood.png", "does not begin as data:image/png;base64,"),
+            ("hood.png", "does not begin with data:image/png;base64,"),
             ("data:image/png;base64,%%%", "it is not base64"),
             ("data:image/png;base64,aGVsbG8=", "the overlay cannot be read"),
         ] {
@@ -340,29 +349,32 @@ mod tests {
         let small = Overlay::new(3, vec![9; 24]).unwrap().to_data_uri();
         let size = AppearanceError::Size { overlay_px: [3, 2], camera_px: [2, 3] };
         assert_eq!(Overlay::from_data_uri(&small, [2, 3]), Err(size));
-        // A PNG of 100,000 x 100,000 pixels that says so in its first bytes.
+        // A PNG whose header declares 100,000 x 100,000 pixels.
         let mut png = Overlay::new(1, vec![0; 4]).unwrap().png;
         png[16..24].copy_from_slice(&[0, 1, 0x86, 0xA0, 0, 1, 0x86, 0xA0]);
         assert!(Overlay::from_png(png, [100_000; 2]).is_err());
     }
 
     #[test]
-    fn a_part_is_what_lies_there() {
-        // Four columns: clear, half clear, and two opaque ones; rows alike.
+    fn a_crop_keeps_its_pixels_and_shrinking_is_weighted_by_alpha() {
+        // Four columns: transparent, half transparent, and two opaque ones; all rows are the same.
         let row = [[200, 0, 0, 0], [0, 100, 0, 128], [10, 20, 30, 255], [50, 60, 70, 255]];
         let overlay = Overlay::new(4, [row; 4].as_flattened().as_flattened().to_vec()).unwrap();
-        assert_eq!(overlay.part([0, 0], [4, 4], [4, 4]).unwrap(), overlay);
-        let right = overlay.part([2, 1], [2, 3], [2, 3]).unwrap();
+        assert_eq!(overlay.cropped_and_resized([0, 0], [4, 4], [4, 4]).unwrap(), overlay);
+        let right = overlay.cropped_and_resized([2, 1], [2, 3], [2, 3]).unwrap();
         assert_eq!(right.size_px(), [2, 3]);
         assert_eq!(right.rgba8()[..8], [10, 20, 30, 255, 50, 60, 70, 255]);
-        // The colour of what is clear is nowhere to be seen.
-        let small = overlay.part([0, 0], [4, 4], [2, 2]).unwrap();
+        // The colour of the transparent column does not show.
+        let small = overlay.cropped_and_resized([0, 0], [4, 4], [2, 2]).unwrap();
         for pixel in small.rgba8().chunks(4).step_by(2) {
             assert!(pixel[0] <= 5 && pixel[1] > 50 && (30..120).contains(&pixel[3]), "{pixel:?}");
         }
         for (at, part) in [([3, 0], [2, 1]), ([0, 0], [0, 1]), ([u32::MAX, 0], [1, 1])] {
-            assert!(overlay.part(at, part, [1, 1]).is_err(), "{at:?} {part:?}");
+            assert!(overlay.cropped_and_resized(at, part, [1, 1]).is_err(), "{at:?} {part:?}");
         }
-        assert!(overlay.part([0, 0], [1, 1], [1 << 13, 1 << 12]).is_err(), "too large");
+        assert!(
+            overlay.cropped_and_resized([0, 0], [1, 1], [1 << 13, 1 << 12]).is_err(),
+            "too large"
+        );
     }
 }

@@ -1,10 +1,15 @@
 //! Chunks: Gaussians that share an origin, activated and laid out for the renderer.
 //!
-//! A twin's chunk is one level of detail of a square of 16 m within a cell of 64 m (`lod`); a scene
-//! file's is a whole cell. A chunk keeps 16 Gaussians side by side, one column of 16 floats per
-//! parameter, so that a vector instruction treats 16 at once and culled ones cost three columns of
-//! reads.
-//! 256 Gaussians in Morton order form a cluster with a box, which is culled as one.
+//! A chunk of a twin is one *section*: one level of detail of one block of 16 m x 16 m within a cell of
+//! 64 m x 64 m ([`crate::lod`]). It is read, decoded and drawn as a unit, so the renderer needs to know
+//! nothing of levels of detail. A chunk of a scene file is a whole cell. A sparse cell, such as one of a
+//! skyline, is a single block: as 3,000 blocks of three Gaussians each, the demo street's skyline took
+//! 9 ms of every frame.
+//!
+//! A chunk stores Gaussians in *lane groups* of 16: one column of 16 floats per parameter. A vector
+//! instruction processes 16 Gaussians at once, and Gaussians that are culled by their position cost only
+//! three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box, which is
+//! culled as a unit.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -17,49 +22,52 @@ use super::{Gaussians, Sky, sh};
 
 /// Edge of a cell, in metres.
 pub const CELL_M: f64 = 64.0;
-/// Edge of a block, which has one level of detail at a time, in metres.
+/// Edge of a block, in metres. A block is drawn at one level of detail at a time.
 pub const BLOCK_M: f64 = 16.0;
-/// Blocks along the edge of a cell.
+/// Number of blocks along the edge of a cell.
 pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
-/// A cell of fewer Gaussians is one block: a cluster for each would be more than there is, and every
-/// chunk costs a frame some work. A skyline's and a sky's cells have a few each.
+/// A cell with fewer Gaussians than this is a single block. Split into 16 blocks it would not even fill
+/// one cluster per block, and every chunk costs each frame some work. Cells of a skyline or a sky have only
+/// a few Gaussians each.
 pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
-/// Gaussians side by side: one AVX-512 register of f32, two of AVX2, four of SSE.
+/// Gaussians in a lane group: one AVX-512 register of f32, two of AVX2, four of SSE.
 pub const LANES: usize = 16;
 /// Gaussians in a cluster, the unit of frustum culling.
 pub const CLUSTER: usize = 256;
 
-/// One parameter of the 16 Gaussians of a block.
+/// One parameter of the 16 Gaussians of a lane group.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub struct Lanes(pub [f32; LANES]);
 
-/// Columns of a block, in order. SH follows: coefficient-major, then red, green, blue.
+/// Indices of the columns of a lane group. The SH coefficients come last: coefficient-major, then red,
+/// green, blue.
 pub mod column {
-    /// Centre relative to the chunk's origin, in metres: x, y, z.
+    /// Mean relative to the chunk's origin, in metres: three columns x, y, z.
     pub const MEAN: usize = 0;
-    /// Standard deviation along each own axis, in metres: three columns.
+    /// Standard deviation along each principal axis, in metres: three columns.
     pub const SCALE: usize = 3;
-    /// Unit quaternion (w, x, y, z), world from own axes: four columns.
+    /// Unit quaternion (w, x, y, z) that takes principal axes to world axes: four columns.
     pub const QUAT: usize = 6;
-    /// Base-2 logarithm of the peak opacity; minus infinity in lanes without a Gaussian. Above 0
-    /// only for merged Gaussians, which cover more than they are high.
+    /// Base-2 logarithm of the peak opacity; minus infinity in empty lanes. Only merged Gaussians have a
+    /// positive one, where several overlapped. The renderer adds this value to its exponent.
     pub const LOG2_OPACITY: usize = 10;
-    /// First colour coefficient.
+    /// First SH coefficient of the colour.
     pub const SH: usize = 11;
 }
 
-/// Floats of one Gaussian of an SH degree: 11 and three per coefficient (23, 92 B, at degree 1).
+/// Number of columns at an SH degree: 11, and 3 per SH coefficient. 23 columns, 92 B per Gaussian, at
+/// degree 1.
 pub const fn columns(sh_degree: u8) -> usize {
     column::SH + 3 * sh::coefficients(sh_degree)
 }
 
-/// One raw Gaussian relative to its chunk's origin: what an F32 record holds.
+/// One Gaussian as a trainer wrote it, before activation, relative to its chunk's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RawRecord<'a> {
-    /// Centre relative to the chunk's origin, in metres.
+pub struct RawGaussian<'a> {
+    /// Mean relative to the chunk's origin, in metres.
     pub mean_m: [f32; 3],
-    /// Rotation (w, x, y, z), of any length but zero.
+    /// Rotation (w, x, y, z), of any length except zero.
     pub quat_wxyz: [f32; 4],
     /// Natural logarithm of the standard deviations, of metres.
     pub ln_scale: [f32; 3],
@@ -71,10 +79,10 @@ pub struct RawRecord<'a> {
 
 /// One Gaussian as the renderer reads it, relative to its chunk's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ActiveRecord<'a> {
-    /// Centre relative to the chunk's origin, in metres.
+pub struct ActivatedGaussian<'a> {
+    /// Mean relative to the chunk's origin, in metres.
     pub mean_m: [f32; 3],
-    /// Standard deviation along each own axis, in metres.
+    /// Standard deviation along each principal axis, in metres.
     pub scale_m: [f32; 3],
     /// Unit quaternion (w, x, y, z).
     pub quat_wxyz: [f32; 4],
@@ -84,19 +92,19 @@ pub struct ActiveRecord<'a> {
     pub sh: &'a [f32],
 }
 
-/// What bounds the Gaussians of a cluster.
+/// Bounds of the Gaussians of a cluster.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cluster {
-    /// Smallest centre, relative to the chunk's origin, in metres.
+    /// Smallest mean per axis, relative to the chunk's origin, in metres.
     pub min_m: Vec3,
-    /// Largest centre, relative to the chunk's origin, in metres.
+    /// Largest mean per axis, relative to the chunk's origin, in metres.
     pub max_m: Vec3,
     /// Largest standard deviation along any axis, in metres.
     pub sigma_m: f32,
 }
 
 impl Cluster {
-    /// Contains nothing and is seen by nobody.
+    /// Contains nothing; always culled.
     const EMPTY: Self = Self { min_m: Vec3::INFINITY, max_m: Vec3::NEG_INFINITY, sigma_m: 0.0 };
 
     fn add(&mut self, mean_m: [f32; 3], scale_m: [f32; 3]) {
@@ -107,31 +115,52 @@ impl Cluster {
     }
 }
 
-/// The Gaussians of one cell, ready to be rendered.
+/// The Gaussians of one section of a twin, or of one cell of a scene file, ready to be rendered.
+///
+/// ```
+/// use glam::DVec3;
+/// use wildcity_scene::Chunk;
+/// use wildcity_scene::chunk::{RawGaussian, column};
+///
+/// let mut chunk = Chunk::new([0, 0], DVec3::ZERO, 0, 1);
+/// chunk.push(&RawGaussian {
+///     mean_m: [1.0, 2.0, 0.5],
+///     quat_wxyz: [1.0, 0.0, 0.0, 0.0],
+///     ln_scale: [0.0; 3],
+///     logit_opacity: 0.0,
+///     sh: &[0.5; 3],
+/// });
+/// assert_eq!(chunk.len(), 1);
+/// assert_eq!(chunk.value(0, column::SCALE), 1.0);
+/// assert_eq!(chunk.value(0, column::LOG2_OPACITY), -1.0); // sigmoid(0) is one half
+/// ```
 #[derive(Clone, Debug)]
 pub struct Chunk {
     cell: [i32; 2],
     origin_m: DVec3,
     sh_degree: u8,
     count: usize,
+    /// `lanes[group * columns(sh_degree) + column]`.
     lanes: Vec<Lanes>,
     clusters: Vec<Cluster>,
 }
 
 impl Chunk {
-    /// An empty chunk with room for `capacity` Gaussians, to be filled with [`Chunk::push`].
+    /// An empty chunk with capacity for `capacity` Gaussians, to be filled with [`Chunk::push`]. `origin_m`
+    /// is in world axes.
     pub fn new(cell: [i32; 2], origin_m: DVec3, sh_degree: u8, capacity: usize) -> Self {
         let lanes = Vec::with_capacity(capacity.div_ceil(LANES) * columns(sh_degree));
         let clusters = Vec::with_capacity(capacity.div_ceil(CLUSTER));
         Self { cell, origin_m, sh_degree, count: 0, lanes, clusters }
     }
 
-    /// A chunk whose columns are already laid out, as `lanes[block * columns(sh_degree) + column]`.
+    /// A chunk from columns that are already laid out, as `lanes[group * columns(sh_degree) + column]`.
     ///
-    /// Lanes past `count` are made empty, and so is what cannot be drawn, as by [`Chunk::push_active`].
+    /// Lanes after `count` are emptied, and so are Gaussians that cannot be drawn, as by
+    /// [`Chunk::push_activated`].
     ///
     /// # Panics
-    /// If there are not as many lanes as `count` Gaussians of the degree take.
+    /// If `lanes` does not have exactly the length that `count` Gaussians of this degree need.
     pub fn from_lanes(
         cell: [i32; 2],
         origin_m: DVec3,
@@ -142,18 +171,18 @@ impl Chunk {
         let width = columns(sh_degree);
         assert_eq!(lanes.len(), count.div_ceil(LANES) * width, "lanes of another count");
         let mut clusters = vec![Cluster::EMPTY; count.div_ceil(CLUSTER)];
-        for (index, block) in lanes.chunks_exact_mut(width).enumerate() {
+        for (index, group) in lanes.chunks_exact_mut(width).enumerate() {
             let cluster = &mut clusters[index * LANES / CLUSTER];
             for lane in 0..LANES {
-                let values = block.iter().map(|lanes| lanes.0[lane]);
+                let values = group.iter().map(|lanes| lanes.0[lane]);
                 if index * LANES + lane < count && is_drawable(values) {
                     cluster.add(
-                        [0, 1, 2].map(|axis| block[column::MEAN + axis].0[lane]),
-                        [0, 1, 2].map(|axis| block[column::SCALE + axis].0[lane]),
+                        [0, 1, 2].map(|axis| group[column::MEAN + axis].0[lane]),
+                        [0, 1, 2].map(|axis| group[column::SCALE + axis].0[lane]),
                     );
                 } else {
-                    block.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
-                    block[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
+                    group.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
+                    group[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
                 }
             }
         }
@@ -162,14 +191,14 @@ impl Chunk {
 
     /// Activates one Gaussian and appends it.
     ///
-    /// The gate at import keeps everything finite. What slips past it becomes an empty lane: it
-    /// keeps its place, is never drawn, and its neighbours do not notice.
+    /// Import accepts only finite values. A Gaussian that is invalid nevertheless becomes an empty lane: it
+    /// keeps its index and is never drawn, and its neighbours are not affected.
     ///
     /// # Panics
-    /// If the record's colour is not of the chunk's degree.
-    pub fn push(&mut self, record: &RawRecord<'_>) {
+    /// If the number of SH coefficients is not that of the chunk's degree.
+    pub fn push(&mut self, record: &RawGaussian<'_>) {
         let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
-        self.push_active(&ActiveRecord {
+        self.push_activated(&ActivatedGaussian {
             mean_m: record.mean_m,
             scale_m: record.ln_scale.map(|ln| f64::from(ln).exp() as f32),
             quat_wxyz: record.quat_wxyz.map(|q| (f64::from(q) / length) as f32),
@@ -178,32 +207,33 @@ impl Chunk {
         });
     }
 
-    /// Appends one Gaussian that is activated already; one that is not finite, or whose colour is beyond
-    /// all bounds, as an empty lane.
+    /// Appends one activated Gaussian. One with a value that is not finite, or with an SH coefficient far
+    /// out of range, becomes an empty lane.
     ///
     /// # Panics
-    /// If the record's colour is not of the chunk's degree.
-    pub fn push_active(&mut self, record: &ActiveRecord<'_>) {
+    /// If the number of SH coefficients is not that of the chunk's degree.
+    pub fn push_activated(&mut self, record: &ActivatedGaussian<'_>) {
         let width = columns(self.sh_degree);
         assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
-        let (slot, lane) = (self.count / LANES * width, self.count % LANES);
+        let first_column = self.count / LANES * width;
+        let lane = self.count % LANES;
         if lane == 0 {
-            self.lanes.resize(slot + width, Lanes([0.0; LANES]));
-            self.lanes[slot + column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
+            self.lanes.resize(first_column + width, Lanes([0.0; LANES]));
+            self.lanes[first_column + column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
         }
         if self.count.is_multiple_of(CLUSTER) {
             self.clusters.push(Cluster::EMPTY);
         }
         self.count += 1;
 
-        let ActiveRecord { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
+        let ActivatedGaussian { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
         let geometry = mean_m.iter().chain(scale_m).chain(quat_wxyz);
         if !is_drawable(geometry.chain([log2_opacity]).chain(*sh).copied()) {
             return;
         }
-        let block = &mut self.lanes[slot..slot + width];
+        let group = &mut self.lanes[first_column..first_column + width];
         let mut set = |first: usize, values: &[f32]| {
-            for (column, &value) in block[first..].iter_mut().zip(values) {
+            for (column, &value) in group[first..].iter_mut().zip(values) {
                 column.0[lane] = value;
             }
         };
@@ -222,7 +252,7 @@ impl Chunk {
         self.cell
     }
 
-    /// Where the chunk's zero lies in the world, in metres.
+    /// The chunk's origin in the world, in metres. Means are relative to it.
     pub fn origin_m(&self) -> DVec3 {
         self.origin_m
     }
@@ -232,12 +262,12 @@ impl Chunk {
         self.sh_degree
     }
 
-    /// How many Gaussians.
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.count
     }
 
-    /// Whether there is none.
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
@@ -247,16 +277,18 @@ impl Chunk {
         &self.clusters
     }
 
-    /// The columns of block `k`, which holds Gaussians `16 k` to `16 k + 15`.
-    pub fn block(&self, block: usize) -> &[Lanes] {
+    /// The columns of lane group `group`, which holds Gaussians `16 group` to `16 group + 15`.
+    pub fn lane_group(&self, group: usize) -> &[Lanes] {
         let width = columns(self.sh_degree);
-        &self.lanes[block * width..(block + 1) * width]
+        &self.lanes[group * width..(group + 1) * width]
     }
 
-    /// Half-size of the box around 3 standard deviations of one Gaussian, in metres: per axis
-    /// `3 sqrt(cov_ii)`, where `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of row i of
+    /// Half-size of the axis-aligned box around the 3-sigma ellipsoid of one Gaussian, in metres along world
+    /// axes.
+    ///
+    /// Per axis it is `3 sqrt(cov_ii)` with `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of row i of
     /// `R S`.
-    pub fn reach_m(&self, index: usize) -> DVec3 {
+    pub fn half_extent_m(&self, index: usize) -> DVec3 {
         let value = |column| f64::from(self.value(index, column));
         let [w, x, y, z] = [0, 1, 2, 3].map(|i| value(column::QUAT + i));
         let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
@@ -265,44 +297,43 @@ impl Chunk {
         3.0 * DVec3::new(rows.x_axis.length(), rows.y_axis.length(), rows.z_axis.length())
     }
 
-    /// One parameter of one Gaussian, by its column.
+    /// One parameter of one Gaussian; `column` is an index as in [`column`].
     pub fn value(&self, index: usize, column: usize) -> f32 {
-        self.block(index / LANES)[column].0[index % LANES]
+        self.lane_group(index / LANES)[column].0[index % LANES]
     }
 
-    /// Memory that a chunk of so many Gaussians will hold, in bytes.
+    /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes.
     pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
-        let blocks = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
+        let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
         let clusters = count.div_ceil(CLUSTER as u64);
-        blocks.saturating_mul(size_of::<Lanes>() as u64) + clusters * size_of::<Cluster>() as u64
+        lanes.saturating_mul(size_of::<Lanes>() as u64) + clusters * size_of::<Cluster>() as u64
     }
 
-    /// Memory held, in bytes.
+    /// Memory that this chunk has allocated, in bytes.
     pub fn bytes(&self) -> usize {
         self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()
     }
 }
 
-/// Whether a Gaussian's columns, in order, are what the renderer can draw.
+/// Whether the renderer can draw a Gaussian with these columns, given in order.
 fn is_drawable(columns: impl Iterator<Item = f32>) -> bool {
     columns.enumerate().all(|(column, value)| match column {
-        // Minus infinity is an opacity: it is never drawn.
+        // Minus infinity is opacity 0: valid, never drawn.
         column::LOG2_OPACITY => value.is_finite() || value == f32::NEG_INFINITY,
-        // Twice the gate's bound, which a record may round over. The gpu shares one scale of colours
-        // among 256 neighbours, who would notice a larger one.
+        // Twice the bound of import, since a record format may round beyond that bound. The gpu backend
+        // shares one colour scale among 256 Gaussians: a larger value would coarsen its neighbours.
         column::SH.. => value.abs() <= 2.0 * sh::MAX_COEFFICIENT,
         _ => value.is_finite(),
     })
 }
 
-/// `log2(1 / (1 + exp(-x)))`, for any x but NaN without overflow or cancellation.
+/// `log2(1 / (1 + exp(-x)))` without overflow or cancellation, for every x that is not NaN.
 fn log2_sigmoid(logit: f32) -> f32 {
     let x = f64::from(logit);
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
 }
 
-/// Where each Gaussian of a file goes: its cell, its 16 m block of the cell, and its place in Morton
-/// order within.
+/// An order of a file's Gaussians by cell, then by 16 m block, then by Morton code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Partition {
     /// Cells in order of (y, x).
@@ -316,18 +347,18 @@ pub struct Partition {
 pub struct CellRun {
     /// Grid cell (x, y); its square is centred on (64 x, 64 y) m.
     pub cell: [i32; 2],
-    /// The chunk's zero in the world, in metres: the cell's centre, at a height that is a multiple
-    /// of 64 m. Subtracting it from an f32 mean near the world's origin is exact.
+    /// The chunk's origin in the world, in metres: the cell's centre, at a height that is a multiple of
+    /// 64 m. Subtracting it from an f32 mean near the world's origin is exact.
     pub origin_m: DVec3,
-    /// Its part of [`Partition::order`].
+    /// The cell's range of [`Partition::order`].
     pub run: Range<usize>,
-    /// Its blocks that are not empty, by number, and their parts of [`Partition::order`]. All of a
-    /// sparse cell counts as its first block with anything in it.
+    /// The number of every block that is not empty, and its range of [`Partition::order`]. A sparse cell
+    /// (below [`SPARSE_CELL`]) is one block, with the number of its first block that is not empty.
     pub blocks: Vec<(u8, Range<usize>)>,
 }
 
 impl Partition {
-    /// Sorts centres, in metres, into cells. Ties keep the order of the file.
+    /// Sorts means, in world metres, into cells and blocks. Ties keep the order of the file.
     pub fn new(means_m: &[[f64; 3]]) -> Self {
         let mut keys: Vec<([i32; 2], u8, u64, u32)> = means_m
             .par_iter()
@@ -361,10 +392,10 @@ impl Partition {
 }
 
 impl CellRun {
-    /// Reads one Gaussian relative to this cell's origin.
-    pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawRecord<'a> {
+    /// One Gaussian of the file, relative to this cell's origin.
+    pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawGaussian<'a> {
         let mean = DVec3::from_array(gaussians.means_m[index]) - self.origin_m;
-        RawRecord {
+        RawGaussian {
             mean_m: mean.as_vec3().to_array(),
             quat_wxyz: gaussians.quats_wxyz[index],
             ln_scale: gaussians.ln_scales[index],
@@ -374,17 +405,17 @@ impl CellRun {
     }
 }
 
-/// The grid cell (x, y) of a centre, in metres.
+/// The grid cell (x, y) of a mean in world metres.
 pub fn cell_at(mean_m: &[f64; 3]) -> [i32; 2] {
     [cell_of(mean_m[0]), cell_of(mean_m[1])]
 }
 
-/// The cell index along one axis; the gate keeps coordinates below 1e8 m, far inside i32.
+/// The cell index along one axis. Import accepts coordinates up to 1e8 m, so the index fits an i32.
 fn cell_of(coordinate_m: f64) -> i32 {
     (coordinate_m / CELL_M).round() as i32
 }
 
-/// The block of a centre within its cell (y, x): 4 y + x, from the south-west.
+/// The number of a mean's block within its cell (y, x): 4 y + x, counted from the south-west corner.
 fn block_of(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
     let step = |m: f64, cell: i32| {
         let from_edge_m = m - CELL_M * (f64::from(cell) - 0.5);
@@ -393,7 +424,7 @@ fn block_of(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
     BLOCKS as u8 * step(mean_m[1], y) + step(mean_m[0], x)
 }
 
-/// Interleaves the bits of a position at 1/1024 of a cell, modulo 128 km.
+/// Morton code of a position: interleaves the bits of x, y, z in steps of 1/1024 of a cell, modulo 128 km.
 fn morton(mean_m: &[f64; 3]) -> u64 {
     mean_m.iter().enumerate().fold(0, |code, (axis, &m)| {
         let steps = (m * (1024.0 / CELL_M)).floor() as i64 as u64 & 0x1F_FFFF;
@@ -401,7 +432,7 @@ fn morton(mean_m: &[f64; 3]) -> u64 {
     })
 }
 
-/// Moves bit `i` of a 21-bit number to bit `3 i`.
+/// Moves bit `i` of a 21-bit number to bit `3 i`, by the usual halving masks for Morton codes.
 fn spread(x: u64) -> u64 {
     let x = (x | x << 32) & 0x001F_0000_0000_FFFF;
     let x = (x | x << 16) & 0x001F_0000_FF00_00FF;
@@ -410,17 +441,34 @@ fn spread(x: u64) -> u64 {
     (x | x << 2) & 0x1249_2492_4924_9249
 }
 
-/// The chunks that a frame draws. Global ids count through them in order.
+/// The chunks that a frame draws, and the sky behind them. The global id of a Gaussian is its index when
+/// counting through all chunks in order.
+///
+/// ```
+/// use wildcity_scene::{Gaussians, Scene};
+///
+/// let gaussians = Gaussians {
+///     sh_degree: 0,
+///     means_m: vec![[1.0, 0.0, 0.5], [70.0, 0.0, 0.5]],
+///     quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+///     ln_scales: vec![[-3.0; 3]; 2],
+///     logit_opacities: vec![2.0; 2],
+///     sh: vec![0.5; 6],
+/// };
+/// let scene = Scene::from_gaussians(&gaussians);
+/// assert_eq!(scene.gaussians(), 2);
+/// assert_eq!(scene.chunks[1].cell(), [1, 0]); // cells are 64 m wide
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
-    /// What is behind them; black, or the profile's background, if there is none.
+    /// The sky; without one, the background colour of the render profile is drawn (black by default).
     pub sky: Option<Arc<Sky>>,
 }
 
 impl Scene {
-    /// Activates a whole file in memory.
+    /// Sorts all Gaussians into cells and activates them. The result has no sky.
     pub fn from_gaussians(gaussians: &Gaussians) -> Self {
         let partition = Partition::new(&gaussians.means_m);
         let chunk = |cell: &CellRun| {
@@ -434,7 +482,7 @@ impl Scene {
         Self { chunks: partition.cells.par_iter().map(chunk).collect(), sky: None }
     }
 
-    /// Gaussians in all chunks.
+    /// Number of Gaussians in all chunks.
     pub fn gaussians(&self) -> usize {
         self.chunks.iter().map(|chunk| chunk.len()).sum()
     }
@@ -444,7 +492,7 @@ impl Scene {
         self.chunks.first().map_or(0, |chunk| chunk.sh_degree())
     }
 
-    /// Memory held by the chunks, in bytes.
+    /// Memory that the chunks have allocated, in bytes.
     pub fn bytes(&self) -> usize {
         self.chunks.iter().map(|chunk| chunk.bytes()).sum()
     }
@@ -466,7 +514,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_go_to_the_cell_around_them() {
+    fn gaussians_are_sorted_into_the_cell_around_them() {
         let scene = Scene::from_gaussians(&three());
         let cells: Vec<_> = scene.chunks.iter().map(|chunk| chunk.cell()).collect();
         assert_eq!(cells, [[0, 0], [1, 0], [0, 1]]);
@@ -487,16 +535,16 @@ mod tests {
         assert!((-1e-40..=0.0).contains(&full), "sigmoid(100) is 1 - exp(-100), not {full:e}");
         // sigmoid(-100) = exp(-100) to 43 digits.
         assert!((value(2, column::LOG2_OPACITY) + 100.0 * std::f32::consts::LOG2_E).abs() < 1e-5);
-        let unused = &scene.chunks[0].block(0)[column::LOG2_OPACITY].0[1..];
+        let unused = &scene.chunks[0].lane_group(0)[column::LOG2_OPACITY].0[1..];
         assert_eq!(unused, [f32::NEG_INFINITY; LANES - 1]);
     }
 
-    /// Appended or laid out, what cannot be drawn is an empty lane, and its neighbour stays.
+    /// `push_activated` and `from_lanes` both empty the lane of an invalid Gaussian and keep its neighbour.
     #[test]
-    fn both_ways_into_a_chunk_keep_the_same_out() {
+    fn both_constructors_empty_the_lanes_of_invalid_gaussians() {
         let mut cell = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
         for _ in 0..2 {
-            cell.push(&RawRecord {
+            cell.push(&RawGaussian {
                 mean_m: [1.0; 3],
                 quat_wxyz: [1.0, 0.0, 0.0, 0.0],
                 ln_scale: [0.0; 3],
@@ -513,13 +561,13 @@ mod tests {
             (column::SH, 1e6),
             (column::SH + 2, f32::NEG_INFINITY),
         ] {
-            let mut lanes = cell.block(0).to_vec();
+            let mut lanes = cell.lane_group(0).to_vec();
             lanes[column].0[0] = value;
             let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, 2, lanes.clone());
             let one = |i: usize, column: usize| lanes[column].0[i];
             let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
             for i in 0..2 {
-                pushed.push_active(&ActiveRecord {
+                pushed.push_activated(&ActivatedGaussian {
                     mean_m: [0, 1, 2].map(|k| one(i, column::MEAN + k)),
                     scale_m: [0, 1, 2].map(|k| one(i, column::SCALE + k)),
                     quat_wxyz: [0, 1, 2, 3].map(|k| one(i, column::QUAT + k)),

@@ -6,17 +6,34 @@ use super::sh;
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
-/// Activation (Kerbl et al. 2023): `scale = exp(ln_scale)`, `opacity = sigmoid(logit)`, the
-/// quaternion normalised; the covariance is `R S Sᵀ Rᵀ`.
+/// Activation (Kerbl et al. 2023, section 5.1): `scale = exp(ln_scale)`, `opacity = sigmoid(logit)`, and the
+/// quaternion is normalised. The covariance is `R S Sᵀ Rᵀ`, where `R` is the rotation and `S` the diagonal
+/// matrix of the scales.
+///
+/// ```
+/// use wildcity_scene::Gaussians;
+///
+/// let mut gaussians = Gaussians::with_capacity(0, 1);
+/// gaussians.means_m.push([1.0, 2.0, 0.5]);
+/// gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+/// gaussians.ln_scales.push([-3.0; 3]);
+/// gaussians.logit_opacities.push(2.0);
+/// gaussians.sh.extend([0.5, 0.4, 0.3]); // one coefficient: red, green, blue
+/// assert_eq!(gaussians.sh_of(0), [0.5, 0.4, 0.3]);
+///
+/// gaussians.raise_sh_degree(1);
+/// assert_eq!(gaussians.sh_of(0).len(), 3 * 4); // (1 + 1)² coefficients
+/// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     /// Spherical-harmonic degree of the colour, 0 to 3.
     pub sh_degree: u8,
-    /// Centres, in metres along the axes of the file or twin. f64: a twin may lie at 4.5e6 m.
+    /// Means, in metres along the axes of the file or twin. They are f64 because the coordinates of a twin
+    /// may be as large as 4.5e6 m.
     pub means_m: Vec<[f64; 3]>,
-    /// Rotations (w, x, y, z), of any length but zero.
+    /// Rotations (w, x, y, z) that take principal axes to world axes; of any length except zero.
     pub quats_wxyz: Vec<[f32; 4]>,
-    /// Natural logarithm of the standard deviation along each own axis, of metres.
+    /// Natural logarithm of the standard deviation in metres along each principal axis.
     pub ln_scales: Vec<[f32; 3]>,
     /// Opacity before the sigmoid.
     pub logit_opacities: Vec<f32>,
@@ -116,7 +133,7 @@ impl Gaussians {
         }
     }
 
-    /// Colour coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
+    /// SH coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]

@@ -1,4 +1,14 @@
-//! What a city twin is made of: Gaussians in chunks and levels of detail, a rig, recorded trajectories, a manifest.
+//! The data of a city twin: Gaussians in chunks and levels of detail, cameras and rigs, recorded
+//! trajectories, skies, render profiles, and the manifest that ties them to one version.
+//!
+//! Everything here is pure: no files, no clock, no network. The same input gives the same bytes at any
+//! thread count.
+//!
+//! # Coordinates
+//! A mean lies in a grid cell of 64 m ([`chunk::CELL_M`]). Cells are centred on multiples of 64 m, so that
+//! the mean of a capture near the world's origin minus the origin of its chunk is exact in f32, and the
+//! `f32` record format loses nothing. Means are f64 until they are relative to their chunk; the renderer
+//! subtracts the camera in f64 once per chunk and frame.
 
 pub mod appearance;
 pub mod chunk;
@@ -18,8 +28,8 @@ pub mod validate;
 pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;
-pub use profile::{ProfileChanges, Rays, RenderProfile};
-pub use record::Record;
+pub use profile::{ProfileOverrides, Rays, RenderProfile};
+pub use record::RecordFormat;
 pub use rig::Rig;
 pub use sky::Sky;
 pub use trajectory::Trajectory;

@@ -1,95 +1,100 @@
-//! The manifest: everything one version of a twin consists of.
+//! The manifest: lists everything that one version of a twin consists of.
+//!
+//! The *table* of sections is an object of its own: at 78 bytes a section, 100,000 sections would be 25 MB as
+//! JSON in the manifest. Each object repeats its own part of the table, so that it can be read without the
+//! manifest; `verify` compares the two.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Bounds;
 
-use super::{Record, RenderProfile, Rig, Trajectory};
+use super::{RecordFormat, RenderProfile, Rig, Trajectory};
 
-/// One immutable version of a twin. Its canonical JSON bytes are its identity (BLAKE3).
+/// One immutable version of a twin. Its identity is the BLAKE3 hash of its canonical JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// Version of this layout.
+    /// Version of the manifest's layout: [`Manifest::FORMAT`].
     pub format: u32,
     /// The twin's name, `[a-z0-9._-]+`.
     pub twin: String,
-    /// How it must be rendered.
+    /// How the twin is rendered unless a session overrides it.
     pub profile: RenderProfile,
     /// Spherical-harmonic degree of every chunk.
     pub sh_degree: u8,
-    /// How Gaussians are stored.
-    pub record: Record,
-    /// The object that holds [`ChunkEntry::sections`] of all chunks.
+    /// How Gaussians are encoded in the objects.
+    pub record: RecordFormat,
+    /// The object that holds the [`ChunkEntry::sections`] of all chunks.
     pub table: ObjectRef,
-    /// The chunks in order of (cell y, cell x): the order of global ids.
+    /// The cells in order of (cell y, cell x): the order of global ids.
     pub chunks: Vec<ChunkEntry>,
-    /// The vehicle that recorded it, if known.
+    /// The rig of the vehicle that recorded the twin, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<Rig>,
-    /// Recorded drives.
+    /// RoundTrip drives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trajectories: Vec<Trajectory>,
-    /// What is behind everything, if it has a sky.
+    /// The twin's sky, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sky: Option<SkyRef>,
-    /// Where it comes from.
+    /// Where the version comes from.
     pub provenance: Provenance,
 }
 
-/// One chunk of the table: a 64 m cell.
+/// One entry of the manifest's chunks: a 64 m cell and the object that stores it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ChunkEntry {
     /// Grid cell (x, y); cell (i, j) is centred on (64 i, 64 j) m.
     pub cell: [i32; 2],
-    /// BLAKE3 of the object that holds it, 64 lower-case hex digits.
+    /// BLAKE3 of the object that holds the cell, 64 lower-case hex digits.
     pub object: String,
-    /// Gaussians in it at full detail.
+    /// Gaussians in the cell at full detail.
     pub count: u64,
     /// Size of the object, in bytes.
     pub bytes: u64,
-    /// Box of the Gaussians' 3-sigma boxes, in metres.
+    /// Union of the Gaussians' 3-sigma boxes in the world, in metres.
     pub bounds: Bounds,
-    /// Where the chunk's zero lies in the world, in metres.
+    /// Origin of the cell in the world, in metres: means in the object are relative to it.
     pub origin_m: DVec3,
-    /// What the object consists of, in order of (block, level). A route of 20 km has 100,000 of them
-    /// and more: they travel in [`Manifest::table`], 78 bytes each, not in the manifest's JSON.
+    /// The sections of the object, in order of (block, level). A route of 20 km has 100,000 and more, so
+    /// they are stored in [`Manifest::table`], 78 bytes each, and not in the manifest's JSON.
     #[serde(skip)]
     pub sections: Vec<Section>,
 }
 
-/// One level of detail of one 16 m block of a cell: what is read, decoded and drawn as one.
+/// One level of detail of one 16 m block of a cell: the unit that is read, decoded and drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Section {
-    /// The block within the cell: 4 y + x, from the south-west.
+    /// The block within the cell: 4 y + x, counted from the south-west corner.
     pub block: u8,
-    /// Level of detail: 0 is everything, higher ones are coarser.
+    /// Level of detail: 0 is full detail, higher levels are coarser.
     pub level: u8,
-    /// Gaussians in it.
+    /// Number of Gaussians.
     pub count: u32,
-    /// How far anything was moved or cut short, at most, in metres; rising with the level.
+    /// Upper bound of the geometric error, in metres ([`crate::lod::Level::error_m`]). It rises with the
+    /// level.
     pub error_m: f32,
     /// Smallest corner of the 3-sigma boxes relative to the chunk's origin, in metres.
     pub min_m: [f32; 3],
     /// Largest corner of the 3-sigma boxes relative to the chunk's origin, in metres.
     pub max_m: [f32; 3],
-    /// Where it lies in the object, in bytes from the start.
+    /// Offset in the object, in bytes.
     pub offset_bytes: u64,
-    /// How long it is there, in bytes.
+    /// Length in the object, in bytes.
     pub bytes: u32,
-    /// BLAKE3 of those bytes.
+    /// BLAKE3 of these bytes of the object.
     pub hash: [u8; 32],
 }
 
-/// An object of the store.
+/// A reference to an object of the store.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectRef {
-    /// Its BLAKE3, 64 lower-case hex digits.
+    /// BLAKE3 of the object, 64 lower-case hex digits.
     pub object: String,
-    /// Its size, in bytes.
+    /// Size of the object, in bytes.
     pub bytes: u64,
 }
 
@@ -97,31 +102,31 @@ pub struct ObjectRef {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SkyRef {
-    /// BLAKE3 of the object that holds it, 64 lower-case hex digits.
+    /// BLAKE3 of the object that holds the sky, 64 lower-case hex digits.
     pub object: String,
-    /// Its size, in bytes.
+    /// Size of the object, in bytes.
     pub bytes: u64,
-    /// Index of the image whose appearance it is seen with; the mean of all if absent.
+    /// Index of the training image whose appearance embedding is used; the mean of all if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<u32>,
-    /// Rows of the matrix that takes directions in the world to the sky's own axes; orthonormal.
+    /// Rows of the orthonormal matrix that takes directions in world axes to the sky's axes.
     pub sky_from_world: [[f64; 3]; 3],
 }
 
-/// Where a version comes from. No clock in it: the same import gives the same identity.
+/// Where a version comes from. It holds no time, so that the same import gives the same identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// BLAKE3 of the source file, or the generator's name and settings.
     pub source: String,
-    /// What built it, as `wildcity 0.1.0`.
+    /// The program that built the version, such as `wildcity 0.1.0`.
     pub builder: String,
-    /// Options of the import in the order given, as `axes=y-down-z-forward`.
+    /// Options of the import in the order given, such as `axes=y-down-z-forward`.
     pub options: Vec<String>,
 }
 
 impl Provenance {
-    /// Something that this build makes of a source, without options.
+    /// The provenance of an import of `source` by this build, without options.
     pub fn of(source: String) -> Self {
         let builder = concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned();
         Self { source, builder, options: Vec::new() }
@@ -129,28 +134,28 @@ impl Provenance {
 }
 
 impl Manifest {
-    /// The layout that this build writes.
+    /// The layout version that this build writes.
     pub const FORMAT: u32 = 1;
 
-    /// Gaussians in all chunks at full detail.
+    /// Number of Gaussians in all chunks at full detail.
     pub fn gaussians(&self) -> u64 {
         self.chunks.iter().map(|chunk| chunk.count).sum()
     }
 
-    /// Bytes of all objects but the manifest itself.
+    /// Size of all objects without the manifest itself, in bytes.
     pub fn stored_bytes(&self) -> u64 {
         let sky = self.sky.as_ref().map_or(0, |sky| sky.bytes);
         self.table.bytes + sky + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
     }
 
-    /// Box of everything; empty without chunks.
+    /// Union of the bounds of all chunks, in world metres; empty without chunks.
     pub fn bounds(&self) -> Bounds {
         self.chunks.iter().fold(Bounds::EMPTY, |all, chunk| all.union(&chunk.bounds))
     }
 }
 
 impl ChunkEntry {
-    /// A section's box of 3-sigma boxes in the world, in metres.
+    /// Union of a section's 3-sigma boxes in the world, in metres.
     pub fn section_bounds(&self, section: &Section) -> Bounds {
         let world_m = |corner: [f32; 3]| self.origin_m + DVec3::from_array(corner.map(f64::from));
         Bounds { min_m: world_m(section.min_m), max_m: world_m(section.max_m) }

@@ -67,7 +67,7 @@ impl Default for RenderProfile {
 /// Fields of a profile that somebody wants otherwise, by their names: JSON as `{"tau_px": 2.0}`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct ProfileChanges(Map<String, Value>);
+pub struct ProfileOverrides(Map<String, Value>);
 
 /// Why a profile was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -229,7 +229,7 @@ impl RenderProfile {
     }
 }
 
-impl ProfileChanges {
+impl ProfileOverrides {
     /// What a JSON object says, which need not fit a profile yet.
     pub fn new(fields: Map<String, Value>) -> Self {
         Self(fields)
@@ -269,7 +269,7 @@ mod tests {
 
     #[test]
     fn changes_are_of_named_fields_and_are_checked() {
-        let changes = |json: &str| serde_json::from_str::<ProfileChanges>(json).unwrap();
+        let changes = |json: &str| serde_json::from_str::<ProfileOverrides>(json).unwrap();
         let own = RenderProfile { near: 0.2, ..Default::default() };
         let both = changes(r#"{"tau_px": 2}"#).or(&changes(r#"{"tau_px": 4, "reach_m": 90.0}"#));
         let changed = both.apply(own).unwrap();

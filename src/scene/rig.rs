@@ -62,7 +62,7 @@ impl RigCamera {
         let mut appearance = self.appearance.clone();
         if let Some(overlay) = &mut appearance.overlay {
             let size_px = [camera.width_px, camera.height_px];
-            let part = overlay.part(at_px, part_px, size_px);
+            let part = overlay.cropped_and_resized(at_px, part_px, size_px);
             *overlay = Arc::new(part.map_err(|cause| self.looks_wrong(cause))?);
         }
         Ok(Self { camera, appearance, ..self.clone() })
@@ -329,7 +329,7 @@ mod tests {
 
     fn camera(name: &str) -> RigCamera {
         let pinhole = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 40.0 };
-        RigCamera::new(name, Camera::ideal(100, 80, pinhole), Pose::IDENTITY)
+        RigCamera::new(name, Camera::from_pinhole(100, 80, pinhole), Pose::IDENTITY)
     }
 
     #[test]
@@ -380,7 +380,7 @@ mod tests {
         ] {
             let read = rig(more).unwrap();
             assert_eq!(read.check(), Ok(()), "{more}");
-            assert!(!read.cameras[0].camera.is_ideal());
+            assert!(!read.cameras[0].camera.is_pinhole());
             let text = serde_json::to_string(&read).unwrap();
             assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), read, "{text}");
         }
@@ -397,7 +397,7 @@ mod tests {
         let half = read.cameras[0].cropped([50, 0], [50, 80]).unwrap().scaled(25, 40).unwrap();
         assert_eq!(half.appearance.overlay.map(|overlay| overlay.size_px()), Some([25, 40]));
         let zeros = r#""fx":50,"fy":50,"lens":{"model":"opencv","k":[0,0,0,0,0,0]}"#;
-        assert!(rig(zeros).unwrap().cameras[0].camera.is_ideal(), "a pinhole by another name");
+        assert!(rig(zeros).unwrap().cameras[0].camera.is_pinhole(), "a pinhole by another name");
         let refused = |more: &str| match rig(more) {
             Err(error) => error.to_string(),
             Ok(rig) => rig.check().unwrap_err().to_string(),

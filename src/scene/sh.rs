@@ -73,13 +73,13 @@ pub fn basis(direction: DVec3) -> [f64; 16] {
 /// polynomial of degree 6 at most; 4 Gauss-Legendre heights by 8 azimuths integrate degree 7
 /// exactly, so B has the accuracy of f64.
 #[derive(Clone, Debug)]
-pub struct Turn {
+pub struct ShRotation {
     /// `B`, of which the first `coefficients(degree)` rows and columns are used.
     matrix: [[f64; 16]; 16],
     count: usize,
 }
 
-impl Turn {
+impl ShRotation {
     /// For an orthogonal matrix, mirrors included, and colours of a degree.
     pub fn new(turned_from_plain: DMat3, degree: u8) -> Self {
         // Abscissae and weights of the 4-point rule on [-1, 1] (Abramowitz & Stegun, table 25.4).
@@ -127,7 +127,7 @@ mod tests {
     /// The constants and signs once more, by another road: the basis must be orthonormal.
     #[test]
     fn the_basis_is_orthonormal() {
-        let matrix = Turn::new(DMat3::IDENTITY, 3).matrix;
+        let matrix = ShRotation::new(DMat3::IDENTITY, 3).matrix;
         for (j, row) in matrix.iter().enumerate() {
             for (k, entry) in row.iter().enumerate() {
                 let wanted = if j == k { 1.0 } else { 0.0 };
@@ -145,7 +145,7 @@ mod tests {
                 let count = coefficients(degree);
                 let plain: Vec<f32> = (0..3 * count).map(|i| (i as f32 * 0.7).sin()).collect();
                 let mut turned = plain.clone();
-                Turn::new(matrix, degree).apply(&mut turned);
+                ShRotation::new(matrix, degree).apply(&mut turned);
                 for step in 0..50 {
                     let t = f64::from(step);
                     let d = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());

@@ -1,4 +1,4 @@
-//! Recorded trajectories: the log's poses at their times.
+//! Recorded trajectories: timed poses of the rig along a drive.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,23 +6,40 @@ use crate::geometry::Pose;
 
 use super::rig::is_name;
 
-/// One recorded pose of the rig.
+/// One recorded pose of the rig, with its time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Keyframe {
     /// Time since the trajectory's start, in microseconds.
     pub time_us: i64,
-    /// Where the rig was.
+    /// Pose of the rig in the world.
     pub world_from_rig: Pose,
 }
 
 /// A recorded drive: keyframes in order of time.
+///
+/// ```
+/// use glam::DVec3;
+/// use wildcity_scene::Trajectory;
+/// use wildcity_scene::geometry::Pose;
+/// use wildcity_scene::trajectory::Keyframe;
+///
+/// let keyframe = |seconds: i64| Keyframe {
+///     time_us: seconds * 1_000_000,
+///     world_from_rig: Pose { position_m: 10.0 * seconds as f64 * DVec3::X, ..Pose::IDENTITY },
+/// };
+/// let drive = Trajectory { name: "log".into(), keyframes: (0..=3).map(keyframe).collect() };
+/// drive.check()?;
+/// assert_eq!(drive.length_m(), 30.0);
+/// assert_eq!(drive.at_station(12.0).position_m, DVec3::new(12.0, 0.0, 0.0));
+/// # Ok::<(), wildcity_scene::trajectory::TrajectoryError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Trajectory {
     /// Name within the twin, `[a-z0-9._-]+`.
     pub name: String,
-    /// Poses in strictly increasing time; at least one.
+    /// At least one keyframe, with strictly increasing times.
     pub keyframes: Vec<Keyframe>,
 }
 
@@ -31,34 +48,36 @@ pub struct Trajectory {
 pub enum TrajectoryError {
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error(
-        "{name:?} is not a name of a trajectory: 1 to 64 of a-z 0-9 . _ - are, not starting with ."
+        "{name:?} cannot name a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
     Name {
         /// The refused name.
         name: String,
     },
-    /// There is nothing to drive along.
+    /// There are no keyframes.
     #[error("trajectory {name:?} has no keyframes")]
     Empty {
         /// The trajectory.
         name: String,
     },
-    /// Times must increase strictly.
+    /// Times do not increase strictly.
     #[error("keyframes[{index}].time_us is {time_us}, not after the one before it ({before_us})")]
     Time {
-        /// Which keyframe.
+        /// Index of the keyframe.
         index: usize,
         /// Its time, in microseconds.
         time_us: i64,
-        /// The time before it, in microseconds.
+        /// Time of the keyframe before it, in microseconds.
         before_us: i64,
     },
 }
 
 impl Trajectory {
+    /// Checks name, number and times of the keyframes.
+    ///
     /// # Errors
-    /// The name is none, or there is nothing to drive along; else names the first keyframe that
-    /// breaks the order of time.
+    /// The name is invalid, there are no keyframes, or times do not increase; then the error names the first
+    /// keyframe out of order.
     pub fn check(&self) -> Result<(), TrajectoryError> {
         if !is_name(&self.name) {
             return Err(TrajectoryError::Name { name: self.name.clone() });
@@ -78,12 +97,12 @@ impl Trajectory {
         Ok(())
     }
 
-    /// Length along the keyframes, in metres.
+    /// Length of the polyline through the keyframes, in metres.
     pub fn length_m(&self) -> f64 {
         self.keyframes.windows(2).map(|pair| segment_m(&pair[0], &pair[1])).sum()
     }
 
-    /// The pose at a distance along the route, clamped to its ends, in metres from the start.
+    /// The pose at a distance along the trajectory, in metres from its start, clamped to its ends.
     pub fn at_station(&self, station_m: f64) -> Pose {
         let mut start_m = 0.0;
         for pair in self.keyframes.windows(2) {

@@ -45,7 +45,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 
 use wildcity_render::Backend;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_session::{Engine, EngineSettings, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings, StoreError};
@@ -74,7 +74,7 @@ pub struct Config {
     /// What renders.
     pub backend: Arc<dyn Backend>,
     /// What of every twin's render profile is otherwise, unless a session says more.
-    pub profile: ProfileChanges,
+    pub profile: ProfileOverrides,
     /// How long the server waits, and for how many.
     pub limits: Limits,
 }
@@ -192,7 +192,7 @@ struct Server {
     /// Becomes true when the server stops.
     stopping: tokio::sync::watch::Receiver<bool>,
     limits: Limits,
-    profile: ProfileChanges,
+    profile: ProfileOverrides,
     tokens: Option<Tokens>,
     /// Or why there is none.
     spool: Result<Arc<Spool>, String>,

@@ -11,7 +11,7 @@ use axum::{Extension, Json};
 use tokio::sync::Semaphore;
 
 use crate::limits;
-use wildcity_scene::Record;
+use wildcity_scene::RecordFormat;
 use wildcity_scene::geometry::Pose;
 use wildcity_twin::ingest::Axes;
 use wildcity_twin::store::{Catalog, StoreError};
@@ -35,7 +35,7 @@ pub(super) struct Ask {
     pub(super) files: Vec<AskedFile>,
     pub(super) base: Option<u64>,
     pub(super) cells: AskedCells,
-    pub(super) record: Option<Record>,
+    pub(super) record: Option<RecordFormat>,
     pub(super) levels: bool,
     /// Each as `near=0.2`.
     pub(super) profile: Vec<String>,

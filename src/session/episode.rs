@@ -44,7 +44,7 @@ pub enum Outcome {
     /// The agent closed the session or terminated the episode.
     Completed,
     /// The same, but the ego left what was recorded: the trust of an observation fell below
-    /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations come with a trust.
+    /// [`limits::OFF_MODEL_TRUST`]. Only where observations come with a trust.
     OffModel,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
@@ -86,7 +86,7 @@ pub struct EgoHistory {
 }
 
 impl Episode {
-    /// An episode whose ego is at its start, at time zero. `dt_us` is above zero.
+    /// An episode with the ego at its start, at time zero. `dt_us` is above zero.
     pub fn new(seed: u64, ego: Ego, dt_us: i64) -> Self {
         Self::with_warm_up(seed, ego, &[], dt_us)
     }
@@ -273,7 +273,7 @@ mod tests {
     use super::*;
     use glam::{DQuat, DVec3};
     use wildcity_scene::geometry::Camera;
-    use wildcity_scene::geometry::camera::{Pinhole, Rolls, Shutter};
+    use wildcity_scene::geometry::camera::{Pinhole, Shutter, ShutterDirection};
     use wildcity_sim::Dynamics;
 
     fn at(x_m: f64, yaw_rad: f64) -> Pose {
@@ -285,7 +285,7 @@ mod tests {
     }
 
     fn moved(episode: &Episode, pose: Pose, terminate: bool) -> Result<Episode, SessionError> {
-        episode.stepped(&Command::Pose(pose), &Ground::of(&[]), terminate)
+        episode.stepped(&Command::Pose(pose), &Ground::from_drives(&[]), terminate)
     }
 
     fn driven(steps: u32, dt_us: i64, metres_per_step: f64) -> Episode {
@@ -338,11 +338,12 @@ mod tests {
             episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), true)
         };
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
-        let mut camera = RigCamera::new("front", Camera::ideal(8, 6, pinhole), at(1.5, 0.2));
+        let mut camera = RigCamera::new("front", Camera::from_pinhole(8, 6, pinhole), at(1.5, 0.2));
         let still = begun(at(0.0, 0.0), 100_000);
         let driven = driven(3, 100_000, 3.0);
         assert_eq!(views(&driven, &camera, 9.0)[0].rolling_shutter, None, "global");
-        camera.shutter = Some(Shutter { direction: Rolls::TopToBottom, duration_us: 30_000 });
+        camera.shutter =
+            Some(Shutter { direction: ShutterDirection::TopToBottom, duration_us: 30_000 });
         assert_eq!(views(&still, &camera, 0.0)[0].rolling_shutter, None, "it stands");
         // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
         for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {

@@ -29,7 +29,7 @@ pub struct PsnrPreview {
     pub psnr_db: f64,
 }
 
-/// A change that a push proposes: a version, some of whose cells get other Gaussians.
+/// A change that a push proposes: a version with other Gaussians in some of its cells.
 pub struct ProposedChange {
     /// The version as it is.
     pub before: Arc<Version>,

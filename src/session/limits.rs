@@ -60,7 +60,7 @@ pub const DT_MIN_US: i64 = 1_000;
 pub const DT_MAX_US: i64 = 10_000_000;
 
 /// Frames that may wait for the renderer. A session waits for one at a time, and may leave an abandoned
-/// one in the queue whose deadline has passed: hence twice the sessions.
+/// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
@@ -68,7 +68,7 @@ pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 /// depth and opacity (88 MB each), or for JPEGs to every session.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
-/// Largest image, in bytes of RGB, whose buffer a render thread keeps for the next frame: 3840x2160.
+/// A render thread keeps the buffers of images up to this size for the next frame, in bytes of RGB: 3840x2160.
 /// 16 of them are 400 MB.
 pub const SCRATCH_IMAGE_BYTES: usize = 3 * (8 << 20);
 
@@ -92,7 +92,7 @@ pub const LEASE_RENEWAL: Duration = Duration::from_secs(300);
 /// percentile of the load times. 1 s, for a local disk, is 30 m at 30 m/s; 5 s cover a slow remote store.
 pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(5));
 
-/// Steps whose exact poses are prefetched: a second at 10 Hz.
+/// How many of the next steps are prefetched at their exact poses: a second at 10 Hz.
 pub const IMMINENT_STEPS: usize = 10;
 
 /// Distance between two prefetched poses beyond those steps, in metres. Beside the path of the next steps

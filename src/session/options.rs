@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
@@ -24,7 +24,7 @@ pub struct SessionOptions {
     /// Cameras; if absent, the twin's rig, or the preset `vehicle6`.
     pub rig: Option<RigChoice>,
     /// Fields of the twin's render profile to override.
-    pub profile: ProfileChanges,
+    pub profile: ProfileOverrides,
     /// What each observation holds.
     pub outputs: Outputs,
     /// How the ego moves.
@@ -34,8 +34,8 @@ pub struct SessionOptions {
     /// Time between two decisions of the agent, in microseconds; one step if absent. Only observations at
     /// decisions have images.
     pub decision_us: Option<i64>,
-    /// Length of the warm-up in microseconds: the part of the recorded drive before the start whose poses
-    /// and frames the first observations hold.
+    /// Length of the warm-up in microseconds. The warm-up is the part of the recorded drive before the
+    /// start; the first observations hold its poses and frames.
     pub warm_up_us: i64,
     /// How long one answer may take.
     pub deadline: Option<Duration>,
@@ -50,7 +50,7 @@ impl SessionOptions {
             seed: 0,
             start: None,
             rig: None,
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             outputs,
             dynamics: Dynamics::default(),
             dt_us: None,

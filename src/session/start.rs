@@ -40,8 +40,8 @@ impl EpisodeStart {
             }
             None => Self::at_first_drive(drives, warm_up_us)?,
         };
-        let ground = Ground::of(drives);
-        resolved.world_from_rig = dynamics.start(resolved.world_from_rig, &ground);
+        let ground = Ground::from_drives(drives);
+        resolved.world_from_rig = dynamics.start_pose(resolved.world_from_rig, &ground);
         Ok(resolved)
     }
 

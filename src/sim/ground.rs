@@ -24,7 +24,7 @@ struct Plane {
 
 impl<'a> Ground<'a> {
     /// Of recorded drives.
-    pub fn of(drives: &'a [Trajectory]) -> Self {
+    pub fn from_drives(drives: &'a [Trajectory]) -> Self {
         Self { drives }
     }
 
@@ -34,9 +34,9 @@ impl<'a> Ground<'a> {
     /// The nearest drive counts, in space and not in the plane: a bridge is not the street below it.
     /// Between keyframes the plane is between theirs. Every keyframe is looked at: 170,000 take a
     /// millisecond.
-    pub fn settle(&self, world_from_rig: Pose) -> Pose {
+    pub fn place(&self, world_from_rig: Pose) -> Pose {
         match self.under(world_from_rig.position_m) {
-            Some(plane) => plane.settle(world_from_rig),
+            Some(plane) => plane.place(world_from_rig),
             None => world_from_rig,
         }
     }
@@ -65,7 +65,7 @@ impl<'a> Ground<'a> {
 }
 
 impl Plane {
-    fn settle(&self, world_from_rig: Pose) -> Pose {
+    fn place(&self, world_from_rig: Pose) -> Pose {
         let Self { point_m, up } = *self;
         // A drive on its side, or upside down, is no ground.
         if up.z < limits::GROUND_UP {
@@ -112,7 +112,7 @@ mod tests {
     fn the_rig_stands_level_on_the_slope_beside_the_drive() {
         let drives = drives();
         let at = |position_m| Pose { position_m, rotation: DQuat::from_rotation_z(0.3) };
-        let settled = Ground::of(&drives).settle(at(DVec3::new(12.0, 3.0, 9.0)));
+        let settled = Ground::from_drives(&drives).place(at(DVec3::new(12.0, 3.0, 9.0)));
         assert!((settled.position_m - DVec3::new(12.0, 3.0, 9.2)).length() < 1e-12, "{settled:?}");
         let up = settled.rotation * DVec3::Z;
         let wanted = DVec3::new(-0.1, 0.0, 1.0).normalize();
@@ -120,7 +120,7 @@ mod tests {
         let forward = settled.rotation * DVec3::X;
         assert!((forward.y.atan2(forward.x) - 0.3).abs() < 0.01, "{forward}");
         // Settled again it stays: what a step leaves is what the next begins with.
-        let again = Ground::of(&drives).settle(settled);
+        let again = Ground::from_drives(&drives).place(settled);
         assert!((again.position_m - settled.position_m).length() < 1e-12);
     }
 
@@ -129,7 +129,7 @@ mod tests {
         let drives = drives();
         let height_m = |z_m| {
             let position_m = DVec3::new(25.0, 0.0, z_m);
-            Ground::of(&drives).settle(Pose { position_m, ..Pose::IDENTITY }).position_m.z
+            Ground::from_drives(&drives).place(Pose { position_m, ..Pose::IDENTITY }).position_m.z
         };
         assert!((height_m(9.0) - 10.5).abs() < 1e-12 && height_m(1.0).abs() < 1e-12);
     }
@@ -138,7 +138,7 @@ mod tests {
     fn far_from_every_drive_nothing_is_known() {
         let drives = drives();
         let far = Pose { position_m: DVec3::new(0.0, 500.0, 3.0), ..Pose::IDENTITY };
-        assert_eq!(Ground::of(&drives).settle(far), far);
-        assert_eq!(Ground::of(&[]).settle(far), far);
+        assert_eq!(Ground::from_drives(&drives).place(far), far);
+        assert_eq!(Ground::from_drives(&[]).place(far), far);
     }
 }

@@ -6,5 +6,5 @@ pub mod ego;
 pub mod ground;
 pub mod limits;
 
-pub use ego::{Command, Dynamics, Ego, EgoError, Model};
+pub use ego::{Command, Dynamics, Ego, EgoError, EgoModel};
 pub use ground::Ground;

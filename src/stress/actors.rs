@@ -62,7 +62,7 @@ fn actor() -> Gaussians {
 /// The same Gaussians turned about the origin, colours included.
 fn turned(actor: &Gaussians, turn: DQuat) -> Gaussians {
     let mut turned = actor.clone();
-    let colours = sh::Turn::new(DMat3::from_quat(turn), 3);
+    let colours = sh::ShRotation::new(DMat3::from_quat(turn), 3);
     for mean in &mut turned.means_m {
         *mean = (turn * DVec3::from_array(*mean)).to_array();
     }

@@ -8,7 +8,7 @@ use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
 use wildcity_render::compare::images::crop_view;
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::{RenderError, RollingShutter, View};
-use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
+use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
 
@@ -29,7 +29,7 @@ fn wide() -> (Camera, GaussianSpec) {
         sigma_m: DVec3::new(0.2, 0.12, 0.25),
         ..GaussianSpec::default()
     };
-    (Camera { lens, ..Camera::ideal(160, 120, pinhole) }, blob)
+    (Camera { lens, ..Camera::from_pinhole(160, 120, pinhole) }, blob)
 }
 
 fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
@@ -67,7 +67,7 @@ fn sampled(camera: &Camera, blob: &GaussianSpec) -> (DVec2, [f64; 3]) {
     let point = |i: usize| {
         let [a, b, c, d, e, f] = evenly(i);
         let unit = DVec3::new(normal(a, b), normal(c, d), normal(e, f));
-        (1.0, camera.project_beyond(blob.mean_m + blob.rotation * (blob.sigma_m * unit)))
+        (1.0, camera.project_extrapolated(blob.mean_m + blob.rotation * (blob.sigma_m * unit)))
     };
     moments((0..POINTS).map(point))
 }
@@ -92,7 +92,7 @@ pub(super) const T23: Case = Case {
 fn t23(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
-    let camera = Camera { lens, ..Camera::ideal(120, 100, pinhole) };
+    let camera = Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) };
     let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
     let ball = |mean_m: DVec3| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
 
@@ -121,7 +121,7 @@ fn folded(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let k3 = -1.0 / (7.0 * FOLD.powi(6));
     let lens = OpenCv::new([0.0, 0.0, k3, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: FOCAL_PX, fy: FOCAL_PX, cx: 80.0, cy: 60.0 };
-    let camera = Camera { lens: Lens::opencv(lens), ..Camera::ideal(160, 120, pinhole) };
+    let camera = Camera { lens: Lens::opencv(lens), ..Camera::from_pinhole(160, 120, pinhole) };
     let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
     let ball = |slope: f64, around: f64| GaussianSpec {
         mean_m: 5.0 * DVec3::new(slope * around.cos(), slope * around.sin(), 1.0),
@@ -155,11 +155,11 @@ pub(super) const T24: Case = Case {
 fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     const SIZE_PX: [u32; 2] = [96, 64];
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 48.0, cy: 32.0 };
-    let camera = Camera::ideal(SIZE_PX[0], SIZE_PX[1], pinhole);
+    let camera = Camera::from_pinhole(SIZE_PX[0], SIZE_PX[1], pinhole);
     let profile = RenderProfile::DEFAULT;
     let exact = RenderProfile { rays: Rays::Exact, ..profile };
     let balls = balls();
-    for direction in [Rolls::TopToBottom, Rolls::BottomToTop] {
+    for direction in [ShutterDirection::TopToBottom, ShutterDirection::BottomToTop] {
         let world_from_camera_first = Pose {
             position_m: DVec3::new(-0.05, 0.0, -0.9),
             rotation: DQuat::from_rotation_y(-0.01),
@@ -214,7 +214,7 @@ mod tests {
         let scale = 3.0 * alpha * alpha;
         let (w0, w) = ((scale - 3.0) / scale, 0.5 / scale);
         let land = |unit: DVec3| {
-            camera.project_beyond(blob.mean_m + blob.rotation * (blob.sigma_m * unit))
+            camera.project_extrapolated(blob.mean_m + blob.rotation * (blob.sigma_m * unit))
         };
         let side = |i: usize| if i.is_multiple_of(2) { scale.sqrt() } else { -scale.sqrt() };
         let center_px = land(DVec3::ZERO);

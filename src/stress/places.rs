@@ -7,8 +7,8 @@ use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
 use wildcity_scene::chunk::column;
-use wildcity_scene::record::recorded;
-use wildcity_scene::{Record, RenderProfile, Scene};
+use wildcity_scene::record::round_trip;
+use wildcity_scene::{RecordFormat, RenderProfile, Scene};
 
 pub(super) const T4: Case = Case {
     number: "T4",
@@ -127,18 +127,18 @@ pub(super) const T10: Case = Case {
 };
 
 fn t10(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    through(trial, Record::Q32)
+    through(trial, RecordFormat::Q32)
 }
 
 /// A street through a record.
-fn through(trial: &mut CaseRun<'_>, record: Record) -> Result<(), RenderError> {
+fn through(trial: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), RenderError> {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
     let away = DVec3::new(64.0 * 15_625.0, 64.0 * 15_625.0, 0.0);
     for mean in &mut street.means_m {
         *mean = (DVec3::from_array(*mean) + away).to_array();
     }
     let scene = Scene::from_gaussians(&street);
-    let coded = recorded(&scene, record).scene;
+    let coded = round_trip(&scene, record).scene;
     let mut off_m = 0.0_f32;
     for (chunk, again) in scene.chunks.iter().zip(&coded.chunks) {
         for (index, axis) in (0..chunk.len()).flat_map(|i| [0, 1, 2].map(|axis| (i, axis))) {
@@ -172,7 +172,7 @@ mod tests {
     #[test]
     fn a_coarser_record_misses_the_bound_of_centres() {
         let mut trial = CaseRun::new(&Reference);
-        through(&mut trial, Record::Q24).unwrap();
+        through(&mut trial, RecordFormat::Q24).unwrap();
         let missed: Vec<String> =
             trial.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();
         assert!(missed.contains(&"centres off by m".to_owned()), "{missed:?}");

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use serde_json::json;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits};
 
 use crate::episodes::{drive, lines, tamper};
@@ -29,7 +29,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         uploads: twins.path().join(".uploads"),
         tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
-        profile: ProfileChanges::default(),
+        profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };
     let running = wildcity_server::start(config).await.unwrap();

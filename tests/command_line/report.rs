@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 use wildcity_report::sample_points::OFFSETS_M;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 
 use crate::reported::{commit, drive};
 
@@ -142,7 +142,7 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     assert_eq!(report["believed"].as_array().unwrap().len(), OFFSETS_M.len());
     assert!(page.contains("data:image/jpeg;base64,") && page.contains("Not compared"));
 
-    let profile: ProfileChanges = serde_json::from_str(&read("profile.json")).unwrap();
+    let profile: ProfileOverrides = serde_json::from_str(&read("profile.json")).unwrap();
     profile.apply(RenderProfile::default()).unwrap();
 
     let bad = dir.path().join("bad.json");

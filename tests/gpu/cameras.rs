@@ -7,7 +7,7 @@ use wildcity_render::compare::reprojection::ReprojectionErrors;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
 use wildcity_render::{RenderError, RollingShutter, View};
-use wildcity_scene::geometry::camera::{Rolls, Windshield, WindshieldReference};
+use wildcity_scene::geometry::camera::{ShutterDirection, Windshield, WindshieldReference};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{RenderProfile, Rig, Scene};
 
@@ -34,10 +34,10 @@ pub(crate) fn bent_views() -> Vec<View> {
     let pose = straight().world_from_camera;
     let still = lenses.iter().map(|(_, camera)| View::new(*camera, pose));
     let rolling_shutter = [
-        driven(straight().camera, pose, Rolls::TopToBottom),
-        driven(camera("opencv"), pose, Rolls::BottomToTop),
-        driven(behind, pose, Rolls::LeftToRight),
-        driven(camera("f-theta by pixels"), pose, Rolls::RightToLeft),
+        driven(straight().camera, pose, ShutterDirection::TopToBottom),
+        driven(camera("opencv"), pose, ShutterDirection::BottomToTop),
+        driven(behind, pose, ShutterDirection::LeftToRight),
+        driven(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
     ];
     still.chain(rolling_shutter).collect()
 }
@@ -81,8 +81,8 @@ fn the_demo_street_through_lenses_and_shutters() {
         lens(0),
         lens(1),
         lens(2),
-        roll(views[0], Rolls::TopToBottom),
-        roll(lens(2), Rolls::LeftToRight),
+        roll(views[0], ShutterDirection::TopToBottom),
+        roll(lens(2), ShutterDirection::LeftToRight),
     ];
     let profile = RenderProfile::default();
     let truths = render(&cpu(), &scene, &profile, &views);

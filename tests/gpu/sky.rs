@@ -10,7 +10,7 @@ use wildcity_render::{Backend, RenderError, View};
 use wildcity_scene::appearance::{Appearance, Overlay};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Lens, OpenCv, Pinhole};
-use wildcity_scene::sky::{CubeMap, Model};
+use wildcity_scene::sky::{CubeMap, SkyModel};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::cameras::bent_views;
@@ -62,7 +62,7 @@ fn an_evaluated_sky_is_that_of_the_definition() {
     for (identity, octaves, appearance, skip) in
         [(true, 3, 4, true), (false, 6, 0, false), (true, 0, 0, true), (true, 10, 3, false)]
     {
-        let model = Model::network(network(identity, octaves, appearance, skip));
+        let model = SkyModel::network(network(identity, octaves, appearance, skip));
         let scene = empty(Arc::new(Sky::new(model, SKY_FROM_WORLD)));
         let off = off_truth(&scene, &EXACT, &all_around());
         eprintln!("{octaves} octaves: off by {off:e}");
@@ -83,7 +83,7 @@ fn a_sky_behind_lenses_and_shutters() {
     // Where Newton's steps alone, from the middle or the end, would lead nowhere.
     let far = OpenCv::new([0.75, -0.27, -0.096, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: 33.0, fy: 33.0, cx: 50.0, cy: 50.0 };
-    let far = Camera { lens: Lens::opencv(far), ..Camera::ideal(100, 100, pinhole) };
+    let far = Camera { lens: Lens::opencv(far), ..Camera::from_pinhole(100, 100, pinhole) };
     views.push(View::new(far, views[0].world_from_camera));
     for (what, scene) in [("small", empty(sky())), ("demo", demo)] {
         let exact = off_truth(&scene, &EXACT, &views);
@@ -116,7 +116,7 @@ fn images_and_a_background() {
             rgb8.extend((away * 120.0 + 128.0).to_array().map(|c| c as u8));
         }
     }
-    let model = Model::cube(CubeMap::from_faces(9, &rgb8).unwrap());
+    let model = SkyModel::cube(CubeMap::from_faces(9, &rgb8).unwrap());
     let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     assert!(difference(&scene, &RenderProfile::DEFAULT) < 5e-3);
     let background = RenderProfile { background: [0.2, 0.4, 0.9], ..RenderProfile::DEFAULT };

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::DVec3;
 use image::{ImageFormat, Rgb, RgbImage};
-use wildcity_scene::sky::{CubeMap, Model, Network};
+use wildcity_scene::sky::{CubeMap, Network, SkyModel};
 use wildcity_twin::ingest::sky::{self, decode};
 
 use crate::scene_files::{Tensor, safetensors};
@@ -36,17 +36,17 @@ fn read(bytes: &[u8], image: Option<u32>) -> Result<sky::SkyFile, String> {
     sky::read(&path, image).map_err(|error| error.to_string())
 }
 
-fn network(model: &Model) -> &Network {
+fn network(model: &SkyModel) -> &Network {
     match model {
-        Model::Network(network, _) => network,
-        Model::Cube(_) => panic!("it is no network"),
+        SkyModel::Network(network, _) => network,
+        SkyModel::Cube(_) => panic!("it is no network"),
     }
 }
 
-fn map(model: &Model) -> &CubeMap {
+fn map(model: &SkyModel) -> &CubeMap {
     match model {
-        Model::Cube(map) => map,
-        Model::Network(..) => panic!("it is no image"),
+        SkyModel::Cube(map) => map,
+        SkyModel::Network(..) => panic!("it is no image"),
     }
 }
 

@@ -6,7 +6,7 @@ use wildcity_render::View;
 use wildcity_scene::chunk::{Partition, column};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_scene::{Chunk, Gaussians, Record, Scene, lod};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, Scene, lod};
 use wildcity_twin::store::{Catalog, StorageOptions};
 
 use crate::{commit, decibels, eyes, stored, streets, tau};
@@ -40,7 +40,7 @@ fn moments(chunk: &Chunk) -> Vec<(DVec3, f64, f64)> {
 #[test]
 fn tau_zero_is_level_zero_everywhere() {
     let (scene, views) = streets::demo_street();
-    let resident = stored(&scene, Record::F32, true);
+    let resident = stored(&scene, RecordFormat::F32, true);
     let drawn = resident.scene(&eyes(&views), &tau(0.0));
     assert_eq!(drawn.gaussians(), scene.len());
     let db = decibels(&drawn, &Scene::from_gaussians(&scene), &views);
@@ -54,7 +54,7 @@ fn a_pixel_of_error_is_hardly_seen_on_the_street() {
     let (scene, _) = streets::demo_street();
     let views = quarter_rig();
     let truth = Scene::from_gaussians(&scene);
-    let resident = stored(&scene, Record::F32, true);
+    let resident = stored(&scene, RecordFormat::F32, true);
     let mut before = scene.len();
     for (tau_px, wanted_db) in [(1.0, 45.0), (2.0, 41.0), (4.0, 37.0), (8.0, 33.0)] {
         let drawn = resident.scene(&eyes(&views), &tau(tau_px));

@@ -20,7 +20,7 @@ use std::sync::Arc;
 
 use wildcity_render::View;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{Gaussians, Record, RenderProfile, Scene};
+use wildcity_scene::{Gaussians, RecordFormat, RenderProfile, Scene};
 use wildcity_twin::residency::{Cache, PinnedScene, Resident, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoreError, Version};
 
@@ -43,7 +43,7 @@ struct Stored {
     _dir: tempfile::TempDir,
 }
 
-fn stored(gaussians: &Gaussians, record: Record, levels: bool) -> Stored {
+fn stored(gaussians: &Gaussians, record: RecordFormat, levels: bool) -> Stored {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), gaussians, StorageOptions { record, levels }).unwrap();
     let resident = Cache::new(Catalog::open(dir.path()).unwrap()).open("street", None).unwrap();

@@ -1,14 +1,18 @@
 use wildcity_render::View;
 use wildcity_scene::chunk::{CellRun, Partition, column, columns};
 use wildcity_scene::record::Clamped;
-use wildcity_scene::{Chunk, Gaussians, Record, Scene};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, Scene};
 use wildcity_twin::store::{StorageOptions, StoreError};
 
 use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
 
 /// What each record must keep of an image, in dB.
-const WANTED_DB: [(Record, f64); 4] =
-    [(Record::F32, f64::INFINITY), (Record::H52, 75.0), (Record::Q32, 60.0), (Record::Q24, 45.0)];
+const WANTED_DB: [(RecordFormat, f64); 4] = [
+    (RecordFormat::F32, f64::INFINITY),
+    (RecordFormat::H52, 75.0),
+    (RecordFormat::Q32, 60.0),
+    (RecordFormat::Q24, 45.0),
+];
 
 /// Stores a scene in every record, and compares what these views see of it.
 fn every_record_keeps(scene: &Gaussians, views: &[View], what: &str) {
@@ -48,20 +52,20 @@ fn every_record_keeps_a_capture() {
 #[test]
 fn records_take_the_bits_of_their_names() {
     for (record, degree_1, degree_3) in [
-        (Record::F32, 8 * 92, 8 * 236),
-        (Record::H52, 8 * 52, 8 * 124),
-        (Record::Q32, 8 * 32 - 1, 543),
-        (Record::Q24, 8 * 24, 372),
+        (RecordFormat::F32, 8 * 92, 8 * 236),
+        (RecordFormat::H52, 8 * 52, 8 * 124),
+        (RecordFormat::Q32, 8 * 32 - 1, 543),
+        (RecordFormat::Q24, 8 * 24, 372),
     ] {
         assert_eq!((record.bits(1), record.bits(3)), (degree_1, degree_3), "{record}");
-        assert_eq!(record.name().parse::<Record>().unwrap(), record);
+        assert_eq!(record.name().parse::<RecordFormat>().unwrap(), record);
     }
-    let said = "q16".parse::<Record>().unwrap_err();
+    let said = "q16".parse::<RecordFormat>().unwrap_err();
     assert!(said.contains("the records are f32, h52, q32, q24"), "{said}");
 }
 
 /// One block that was coded and decoded.
-fn coded(scene: &Gaussians, record: Record) -> (Chunk, Chunk, Clamped) {
+fn coded(scene: &Gaussians, record: RecordFormat) -> (Chunk, Chunk, Clamped) {
     let Partition { cells, order } = Partition::new(&scene.means_m);
     let cell: &CellRun = &cells[0];
     let mut chunk = Chunk::new(cell.cell, cell.origin_m, scene.sh_degree, cell.run.len());
@@ -71,7 +75,7 @@ fn coded(scene: &Gaussians, record: Record) -> (Chunk, Chunk, Clamped) {
     let mut clamped = Clamped::default();
     let part = record.encode(&chunk, 0..chunk.len(), &mut clamped);
     assert_eq!(part.len(), record.part_bytes(scene.sh_degree, chunk.len()));
-    let lanes = (0..chunk.len().div_ceil(16)).flat_map(|block| chunk.block(block));
+    let lanes = (0..chunk.len().div_ceil(16)).flat_map(|block| chunk.lane_group(block));
     // Garbage, so that what is not decoded is seen.
     let mut lanes: Vec<_> =
         lanes.map(|lanes| wildcity_scene::chunk::Lanes(lanes.0.map(|_| 7.0))).collect();
@@ -90,7 +94,7 @@ fn zero_stays_zero_and_flat_stays_flat() {
             *sh = 0.0;
         }
     }
-    for record in Record::ALL {
+    for record in RecordFormat::ALL {
         let (chunk, again, clamped) = coded(&scene, record);
         assert_eq!(clamped.worst().map_or(0, |(_, count)| count), 0);
         let mut zeros = 0;
@@ -109,7 +113,7 @@ fn zero_stays_zero_and_flat_stays_flat() {
 #[test]
 fn values_are_off_by_half_a_step_at_most() {
     let scene = scene_files::gaussians(1_000, 1, 6.0, 1);
-    let (chunk, again, _) = coded(&scene, Record::Q32);
+    let (chunk, again, _) = coded(&scene, RecordFormat::Q32);
     let off = |column: usize, measure: fn(f32) -> f32| {
         let of = |index: usize| {
             measure(chunk.value(index, column)) - measure(again.value(index, column))
@@ -141,7 +145,7 @@ fn values_are_off_by_half_a_step_at_most() {
 fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = scene_files::gaussians(20_000, 1, 20.0, 1);
-    let storage = StorageOptions { record: Record::Q32, levels: false };
+    let storage = StorageOptions { record: RecordFormat::Q32, levels: false };
     // Two of 20,000 are 0.01 %: as many as may be.
     (scene.sh[5], scene.sh[12 + 4]) = (900.0, -900.0);
     commit(dir.path(), &scene, storage).unwrap();
@@ -156,18 +160,19 @@ fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
         wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number,
         1
     );
-    commit(dir.path(), &scene, StorageOptions { record: Record::H52, levels: false }).unwrap();
+    commit(dir.path(), &scene, StorageOptions { record: RecordFormat::H52, levels: false })
+        .unwrap();
 }
 
 #[test]
 fn a_part_of_another_size_is_refused() {
     let scene = scene_files::gaussians(100, 1, 6.0, 1);
-    let (chunk, ..) = coded(&scene, Record::Q24);
-    let part = Record::Q24.encode(&chunk, 0..100, &mut Clamped::default());
-    let mut lanes = chunk.block(0).to_vec();
+    let (chunk, ..) = coded(&scene, RecordFormat::Q24);
+    let part = RecordFormat::Q24.encode(&chunk, 0..100, &mut Clamped::default());
+    let mut lanes = chunk.lane_group(0).to_vec();
     lanes.resize(lanes.len() * 7, lanes[0]);
     for wrong in [&part[1..], &[part.as_slice(), &[0]].concat()[..], &[]] {
-        let said = Record::Q24.decode(wrong, 1, 100, &mut lanes).unwrap_err();
+        let said = RecordFormat::Q24.decode(wrong, 1, 100, &mut lanes).unwrap_err();
         assert!(said.starts_with("100 Gaussians take "), "{said}");
     }
 }

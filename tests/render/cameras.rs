@@ -7,7 +7,7 @@ use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference::Reference;
 use wildcity_render::unscented::UnscentedView;
 use wildcity_render::{Backend, RenderError, RollingShutter, Target, View};
-use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, Rolls};
+use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
 
@@ -61,9 +61,10 @@ fn the_cpu_backend_draws_lenses_as_they_are_defined() {
 #[test]
 fn zero_distortion_draws_the_bytes_of_a_pinhole() {
     let (street, pose) = street_scene();
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let none = Lens::opencv(OpenCv::new([0.0; 6], [0.0; 2], [0.0; 4]));
-    let still = RollingShutter { direction: Rolls::TopToBottom, world_from_camera_first: pose };
+    let still =
+        RollingShutter { direction: ShutterDirection::TopToBottom, world_from_camera_first: pose };
     let same = View::new(Camera { lens: none, ..ideal }, pose);
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &street, &profile, View::new(ideal, pose));
@@ -87,7 +88,7 @@ fn zero_distortion_draws_the_bytes_of_a_pinhole() {
 fn beyond_half() -> Camera {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
-    Camera { lens, ..Camera::ideal(120, 100, pinhole) }
+    Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) }
 }
 
 #[test]
@@ -211,16 +212,20 @@ fn t18_a_part_of_a_lens_image_is_the_image_of_the_part() {
 #[test]
 fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
     let (street, pose) = street_scene();
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let profile = RenderProfile::default();
     let fisheye = lenses()[1].1;
     for (name, camera) in [("pinhole", ideal), ("fisheye", fisheye)] {
-        for direction in
-            [Rolls::TopToBottom, Rolls::BottomToTop, Rolls::LeftToRight, Rolls::RightToLeft]
-        {
+        for direction in [
+            ShutterDirection::TopToBottom,
+            ShutterDirection::BottomToTop,
+            ShutterDirection::LeftToRight,
+            ShutterDirection::RightToLeft,
+        ] {
             let view = driven(camera, pose, direction);
             let image = render_one(&cpu(), &street, &profile, view);
-            let across = matches!(direction, Rolls::LeftToRight | Rolls::RightToLeft);
+            let across =
+                matches!(direction, ShutterDirection::LeftToRight | ShutterDirection::RightToLeft);
             // Each row alone, from where the camera then stands, with every pixel's own ray.
             let rows: u32 = if across { 160 } else { 100 };
             let mut truth = vec![0.0_f32; 4 * 160 * 100];
@@ -265,13 +270,13 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
 fn the_cpu_backend_rolls_as_it_is_defined() {
     let (street, pose) = street_scene();
     for camera in [lenses()[0].1, lenses()[2].1] {
-        let view = driven(camera, pose, Rolls::TopToBottom);
+        let view = driven(camera, pose, ShutterDirection::TopToBottom);
         let truth = render_one(&Reference, &street, &RenderProfile::default(), view);
         let image = render_one(&cpu(), &street, &RenderProfile::default(), view);
         agree(&image, &truth).unwrap();
     }
     // A point is seen by the row that it lands on, from where the camera stands then.
-    let view = driven(lenses()[0].1, Pose::IDENTITY, Rolls::BottomToTop);
+    let view = driven(lenses()[0].1, Pose::IDENTITY, ShutterDirection::BottomToTop);
     let point_m = DVec3::new(0.4, -0.3, 2.0);
     let at_px = view.project_world(point_m).unwrap();
     let pose = view.world_from_camera_at(at_px);
@@ -285,8 +290,8 @@ fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
     let view = passing();
     for step in 0..200 {
         let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
-        let landed = view.project_beyond(point_m, 1.0);
-        let exposed = Rolls::LeftToRight.fraction(landed.at_px, &view.camera);
+        let landed = view.project_extrapolated(point_m, 1.0);
+        let exposed = ShutterDirection::LeftToRight.fraction(landed.at_px, &view.camera);
         assert!((exposed - landed.fraction).abs() < 1e-6, "{point_m}: {landed:?}");
     }
     let balls: Vec<GaussianSpec> = (0..5)
@@ -326,7 +331,7 @@ fn t22_six_points_scatter_as_a_million() {
     let samples: Vec<DVec2> = (0..200_000)
         .map(|_| {
             let unit = DVec3::new(normal(), normal(), normal());
-            camera.project_beyond(mean_m + axes_m * unit)
+            camera.project_extrapolated(mean_m + axes_m * unit)
         })
         .collect();
     let count = samples.len() as f64;
@@ -360,7 +365,7 @@ fn exact_rays_are_for_the_reference_alone() {
 #[test]
 fn exact_rays_of_a_pinhole_are_its_splats_but_for_the_linearisation() {
     let (street, pose) = street_scene();
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let view = View::new(ideal, pose);
     let truth = render_one(&Reference, &street, &exact(), view);
     let drawn = render_one(&Reference, &street, &RenderProfile::default(), view);
@@ -372,7 +377,7 @@ fn exact_rays_of_a_pinhole_are_its_splats_but_for_the_linearisation() {
 #[test]
 fn lenses_and_pinholes_share_a_frame() {
     let (street, pose) = street_scene();
-    let ideal = Camera::ideal(90, 70, Pinhole { fx: 60.0, fy: 60.0, cx: 45.0, cy: 35.0 });
+    let ideal = Camera::from_pinhole(90, 70, Pinhole { fx: 60.0, fy: 60.0, cx: 45.0, cy: 35.0 });
     let views: Vec<View> =
         [lenses()[2].1, ideal, beyond_half()].map(|c| View::new(c, pose)).to_vec();
     let backend = cpu();

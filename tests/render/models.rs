@@ -6,7 +6,7 @@ use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
 use wildcity_render::{Backend, View};
 use wildcity_scene::geometry::camera::{
-    Bivariate, FTheta, Field, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
+    Bivariate, FTheta, FThetaReference, FieldMask, Fisheye, Lens, OpenCv, Pinhole, Windshield,
     WindshieldReference,
 };
 use wildcity_scene::geometry::{Camera, CameraError, Pose};
@@ -31,7 +31,7 @@ fn every_pixel_comes_back_to_where_it_was() {
                     let off_px = back_px.distance(at_px);
                     assert!(off_px < 1e-8, "{name} at {at_px}: {off_px:e} px off");
                 }
-                let beyond_px = camera.project_beyond(direction);
+                let beyond_px = camera.project_extrapolated(direction);
                 assert!(beyond_px.distance(at_px) < 1e-8, "{name} at {at_px}, continued");
                 seen += 1;
             }
@@ -72,8 +72,8 @@ fn each_model_is_its_formula() {
                 let polynomial =
                     |t: f64| (0..6).map(|i| lens.polynomial()[i] * t.powi(i as i32)).sum::<f64>();
                 let radius_px = match lens.reference() {
-                    Reference::AngleToPixel => polynomial(theta),
-                    Reference::PixelToAngle => {
+                    FThetaReference::AngleToPixel => polynomial(theta),
+                    FThetaReference::PixelToAngle => {
                         let (mut low, mut high) = (0.0, 200.0);
                         for _ in 0..100 {
                             let middle = 0.5 * (low + high);
@@ -148,7 +148,7 @@ fn zero_distortion_is_a_pinhole_by_another_name() {
 #[test]
 fn a_lens_ends_before_it_folds_back() {
     let wide = Pinhole { fx: 40.0, fy: 40.0, cx: 80.0, cy: 50.0 };
-    let ideal = Camera::ideal(160, 100, wide);
+    let ideal = Camera::from_pinhole(160, 100, wide);
     // θ - θ³/6 turns at √2 rad; x (1 - 0.3 r²) at r = 1.05, and is 0.8 at 0.82.
     let fisheye = Fisheye::new([-1.0 / 6.0, 0.0, 0.0, 0.0], None);
     let fisheye = Camera { lens: Lens::Fisheye(fisheye), ..ideal };
@@ -164,7 +164,7 @@ fn a_lens_ends_before_it_folds_back() {
         assert!(camera.project(DVec3::new(sin, 0.0, cos)).is_some(), "within");
         assert_eq!(camera.project(DVec3::NEG_Z), None, "behind");
         assert_eq!(camera.unproject(DVec2::new(1.0, 1.0)), None, "the corner");
-        let field = Field::of(&camera).expect("a part of the image");
+        let field = FieldMask::of(&camera).expect("a part of the image");
         for (row, [first, end]) in field.columns.iter().enumerate() {
             for column in 0..camera.width_px {
                 let at_px = DVec2::new(f64::from(column) + 0.5, row as f64 + 0.5);
@@ -172,15 +172,15 @@ fn a_lens_ends_before_it_folds_back() {
                 assert_eq!(seen, camera.unproject(at_px).is_some(), "{at_px}");
             }
         }
-        let share = field.share(&camera);
+        let share = field.visible_share(&camera);
         assert!((0.1..0.8).contains(&share), "{share}");
     }
-    assert_eq!(Field::of(&ideal), None);
+    assert_eq!(FieldMask::of(&ideal), None);
 }
 
 #[test]
 fn absurd_coefficients_are_refused_with_the_reason() {
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 90.0, cx: 80.0, cy: 50.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 90.0, cx: 80.0, cy: 50.0 });
     let refused = |lens| {
         let error = Camera { lens, ..ideal }.check().unwrap_err();
         assert!(error.to_string().contains(error.field()), "{error}");
@@ -189,8 +189,9 @@ fn absurd_coefficients_are_refused_with_the_reason() {
     let opencv = |k| Lens::opencv(OpenCv::new(k, [0.0; 2], [0.0; 4]));
     let skewed = |p, s| Lens::opencv(OpenCv::new([0.0; 6], p, s));
     let fisheye = |k, most| Lens::Fisheye(Fisheye::new(k, most));
-    let ftheta =
-        |polynomial, cde| Lens::FTheta(FTheta::new(Reference::AngleToPixel, polynomial, cde, 1.2));
+    let ftheta = |polynomial, cde| {
+        Lens::FTheta(FTheta::new(FThetaReference::AngleToPixel, polynomial, cde, 1.2))
+    };
     for (lens, field, reason) in [
         (opencv([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens.k", "finite"),
         (opencv([1e12, 0.0, 0.0, 0.0, 0.0, 0.0]), "lens.k", "1e9"),
@@ -229,7 +230,7 @@ fn absurd_coefficients_are_refused_with_the_reason() {
 /// An OpenCV lens with its axis in the middle of an image.
 fn distorted([width, height]: [u32; 2], f: f64, lens: OpenCv) -> Camera {
     let pinhole = Pinhole { fx: f, fy: f, cx: f64::from(width) / 2.0, cy: f64::from(height) / 2.0 };
-    Camera { lens: Lens::opencv(lens), ..Camera::ideal(width, height, pinhole) }
+    Camera { lens: Lens::opencv(lens), ..Camera::from_pinhole(width, height, pinhole) }
 }
 
 /// A direction, by how far off the axis and along it, and its azimuth.
@@ -376,7 +377,7 @@ fn a_lens_shows_all_of_its_field() {
 fn behind(windshield: Windshield, max_angle_rad: f64) -> Camera {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(max_angle_rad)));
     let pinhole = Pinhole { fx: 55.0, fy: 55.0, cx: 100.0, cy: 100.0 };
-    Camera { lens, windshield: Some(windshield), ..Camera::ideal(200, 200, pinhole) }
+    Camera { lens, windshield: Some(windshield), ..Camera::from_pinhole(200, 200, pinhole) }
 }
 
 #[test]
@@ -428,7 +429,8 @@ fn windshields_neither_fold_nor_lose_what_is_behind_them() {
             let (right, down) = outside.any_orthonormal_pair();
             let [x, y] = [right, down].map(|across| {
                 let beside = 1e-5 * across;
-                camera.project_beyond(outside + beside) - camera.project_beyond(outside - beside)
+                camera.project_extrapolated(outside + beside)
+                    - camera.project_extrapolated(outside - beside)
             });
             assert!(x.perp_dot(y) * outside.dot(right.cross(down)) > 0.0, "{camera:?}: {at_px}");
         }

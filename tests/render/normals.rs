@@ -5,7 +5,7 @@ use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, RenderError, RollingShutter, Target, View};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::Rolls;
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::cpu;
@@ -67,7 +67,7 @@ fn a_wall_faces_where_it_does() {
     let scene = scene_of(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
     let rolling_shutter =
-        RollingShutter { direction: Rolls::TopToBottom, world_from_camera_first: way };
+        RollingShutter { direction: ShutterDirection::TopToBottom, world_from_camera_first: way };
     let mut views: Vec<(&str, View)> = lenses()
         .into_iter()
         .map(|(name, camera)| (name, View::new(camera, Pose::IDENTITY)))

@@ -6,7 +6,7 @@ use glam::{DMat3, DVec2, DVec3};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
-use wildcity_scene::sky::{CubeMap, Drawn, Model, SKY_CUT, SkyError};
+use wildcity_scene::sky::{CubeMap, DrawableSky, SKY_CUT, SkyError, SkyModel};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 
 use crate::images::{agree, cpu, max_difference, render, render_one, view_along};
@@ -30,10 +30,10 @@ fn anywhere(random: &mut Random) -> DVec3 {
     }
 }
 
-fn map_of(drawn: Drawn) -> Arc<CubeMap> {
+fn map_of(drawn: DrawableSky) -> Arc<CubeMap> {
     match drawn {
-        Drawn::Map(map) => map,
-        Drawn::Exact(_) => panic!("it is not baked"),
+        DrawableSky::CubeMap(map) => map,
+        DrawableSky::Network(_) => panic!("it is not baked"),
     }
 }
 
@@ -89,7 +89,7 @@ fn networks_of_every_shape() {
         (true, 7, 16, true),
         (true, 10, 3, false),
     ] {
-        let model = Model::network(network(identity, octaves, appearance, skip));
+        let model = SkyModel::network(network(identity, octaves, appearance, skip));
         let scene = empty(Arc::new(Sky::new(model, DMat3::IDENTITY)));
         let [image, truth] =
             [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &EXACT, view));
@@ -106,7 +106,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
     let mut edges = Vec::new();
     for wanted in [0.05, 0.005, 0.0005] {
         let sky = sky();
-        let map = map_of(sky.drawn(wanted).unwrap());
+        let map = map_of(sky.drawable(wanted).unwrap());
         assert!(map.error() <= wanted, "{} for {wanted}", map.error());
         let mut worst: f64 = 0.0;
         for _ in 0..100_000 {
@@ -118,7 +118,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
         // A bound that is never approached would cost memory for nothing.
         assert!(worst > 0.1 * map.error(), "{worst}, stated {}", map.error());
         edges.push(map.edge());
-        assert!(Arc::ptr_eq(&map, &map_of(sky.drawn(wanted).unwrap())), "baked once");
+        assert!(Arc::ptr_eq(&map, &map_of(sky.drawable(wanted).unwrap())), "baked once");
     }
     assert!(edges.is_sorted() && edges[0] < edges[2], "{edges:?}");
 }
@@ -129,24 +129,24 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
 fn every_error_keeps_its_map() {
     let sky = sky();
     let wanted = [0.05, 0.0005, 0.005];
-    let maps = wanted.map(|wanted| map_of(sky.drawn(wanted).unwrap()));
+    let maps = wanted.map(|wanted| map_of(sky.drawable(wanted).unwrap()));
     let bytes = sky.bytes();
     for (wanted, map) in wanted.into_iter().zip(&maps) {
-        assert!(Arc::ptr_eq(&map_of(sky.drawn(wanted).unwrap()), map), "{wanted}");
+        assert!(Arc::ptr_eq(&map_of(sky.drawable(wanted).unwrap()), map), "{wanted}");
     }
     // What a coarser map is good enough for is it, whoever asked first.
-    let coarsest = map_of(sky.drawn(1.0).unwrap());
+    let coarsest = map_of(sky.drawable(1.0).unwrap());
     assert_eq!(coarsest.edge(), 129);
     assert!(coarsest.error() <= 0.05 && Arc::ptr_eq(&coarsest, &maps[0]));
     assert_eq!(sky.bytes(), bytes);
     let fresh = Sky::new(sky.model().clone(), sky.sky_from_world());
-    assert!(*map_of(fresh.drawn(0.005).unwrap()) == *maps[2], "whatever was asked for before");
+    assert!(*map_of(fresh.drawable(0.005).unwrap()) == *maps[2], "whatever was asked for before");
 }
 
 #[test]
 fn the_demo_sky_is_within_the_default_bound() {
     let sky = Sky::new(demo_model(None), DMat3::IDENTITY);
-    let map = map_of(sky.drawn(RenderProfile::DEFAULT.sky_error).unwrap());
+    let map = map_of(sky.drawable(RenderProfile::DEFAULT.sky_error).unwrap());
     let mut random = Random(9);
     let mut worst: f64 = 0.0;
     for _ in 0..20_000 {
@@ -165,8 +165,8 @@ fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     let mut layers = network(true, 7, 0, false).layers().clone();
     layers[0].weight.iter_mut().for_each(|weight| *weight *= 40.0);
     let sharp = wildcity_scene::sky::Network::new(layers, Vec::new()).unwrap();
-    let sky = Arc::new(Sky::new(Model::network(sharp), DMat3::IDENTITY));
-    let error = sky.drawn(1e-4).unwrap_err();
+    let sky = Arc::new(Sky::new(SkyModel::network(sharp), DMat3::IDENTITY));
+    let error = sky.drawable(1e-4).unwrap_err();
     assert!(matches!(error, SkyError::Coarse { edge: 1025, .. }), "{error}");
     assert!(error.to_string().contains("set sky_error to"), "{error}");
     let scene = empty(sky);
@@ -258,7 +258,7 @@ fn images_are_their_own_map() {
             rgb8.extend([40 * face, 8 * (k % side) as u8, 8 * (k / side) as u8]);
         }
     }
-    let sky = Sky::new(Model::cube(CubeMap::from_faces(side, &rgb8).unwrap()), DMat3::IDENTITY);
+    let sky = Sky::new(SkyModel::cube(CubeMap::from_faces(side, &rgb8).unwrap()), DMat3::IDENTITY);
     let scene = empty(Arc::new(sky));
     for forward in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::new(0.5, -0.7, 0.9)] {
         let view = view_along([64, 48], 24.0, DVec3::ZERO, forward, DVec3::new(0.11, 0.13, -1.0));

@@ -11,7 +11,7 @@ use wildcity_report::sample_points::{Sampling, sample_points};
 use wildcity_report::settings::{SettingList, TwinFeatures, settings_to_compare};
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{Rays, Record, RenderProfile, Scene};
+use wildcity_scene::{Rays, RecordFormat, RenderProfile, Scene};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
@@ -29,7 +29,7 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let scene = street(20_000, 1, 5);
     let new = NewVersion {
-        storage: StorageOptions { record: Record::F32, levels: false },
+        storage: StorageOptions { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

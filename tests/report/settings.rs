@@ -21,7 +21,7 @@ use wildcity_report::{ReportError, feature_costs};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileChanges, Rays, Record, RenderProfile, Rig, Scene};
+use wildcity_scene::{ProfileOverrides, Rays, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity_session::{
     Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
 };
@@ -355,12 +355,12 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
 }
 
 /// A setting as a session asks for it, whatever it loses.
-fn changes(setting: &Setting) -> ProfileChanges {
+fn changes(setting: &Setting) -> ProfileOverrides {
     let field = |change: &String| {
         let (key, value) = change.split_once('=').unwrap();
         (key.to_owned(), serde_json::from_str(value).unwrap())
     };
-    ProfileChanges::new(setting.profile.iter().map(field).collect())
+    ProfileOverrides::new(setting.profile.iter().map(field).collect())
 }
 
 /// What the rig's cameras see from poses by definition, of all Gaussians as they were generated: colours
@@ -381,7 +381,7 @@ fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
 /// Least PSNR of an image that an agent gets from any of the poses, in dB.
 async fn least_db_of_session(
     engine: &Arc<Engine>,
-    profile: ProfileChanges,
+    profile: ProfileOverrides,
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
@@ -413,7 +413,7 @@ fn of_a_capture_too_what_is_recommended_holds_where_it_was_not_chosen() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
-        storage: StorageOptions { record: Record::F32, levels: false },
+        storage: StorageOptions { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -455,7 +455,7 @@ fn a_sky_and_lenses_have_rungs_of_their_own() {
             image: None,
             sky_from_world: DMat3::IDENTITY,
         })),
-        storage: StorageOptions { record: Record::Q32, levels: false },
+        storage: StorageOptions { record: RecordFormat::Q32, levels: false },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

@@ -3,7 +3,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use glam::{DQuat, DVec3};
-use wildcity_scene::route::{Pair, Route, RouteError, associate};
+use wildcity_scene::route::{Route, RouteError, TimePair, associate};
 
 use super::{drive, straight};
 
@@ -14,33 +14,33 @@ fn jittered_times_find_their_own() {
     let poses_us: Vec<i64> = (0..1000).map(|i| 10_000 * i + 3_000 + jitter_us(i)).collect();
     let images_us: Vec<i64> = (0..100).map(|i| 100_000 * i).collect();
     let found = associate(&images_us, &poses_us, 6_000).unwrap();
-    assert!(found.alone.is_empty());
+    assert!(found.unmatched.is_empty());
     for (number, pair) in found.pairs.iter().enumerate() {
         assert_eq!((pair.first, pair.second), (number, 10 * number));
         assert_eq!(pair.residual_us, 3_000 + jitter_us(10 * number as i64));
     }
     // Below the lag there is nothing.
     let none = associate(&images_us, &poses_us, 0).unwrap();
-    assert_eq!((none.pairs.len(), none.alone.len()), (0, 100));
+    assert_eq!((none.pairs.len(), none.unmatched.len()), (0, 100));
 }
 
 #[test]
 fn nothing_is_used_twice() {
     // Two images want the pose at 100; the nearer one has it.
     let found = associate(&[90, 104], &[0, 100], 20).unwrap();
-    assert_eq!(found.pairs, [Pair { first: 1, second: 1, residual_us: -4 }]);
-    assert_eq!(found.alone, [0]);
+    assert_eq!(found.pairs, [TimePair { first: 1, second: 1, residual_us: -4 }]);
+    assert_eq!(found.unmatched, [0]);
     // Equally near: the earlier one.
     let found = associate(&[100], &[90, 110], 20).unwrap();
-    assert_eq!(found.pairs, [Pair { first: 0, second: 0, residual_us: -10 }]);
+    assert_eq!(found.pairs, [TimePair { first: 0, second: 0, residual_us: -10 }]);
     // On the tolerance is within it.
     assert_eq!(associate(&[0], &[20], 20).unwrap().pairs.len(), 1);
     assert_eq!(associate(&[0], &[20], 19).unwrap().pairs.len(), 0);
     let nothing = associate(&[], &[1], 5).unwrap();
-    assert_eq!((nothing.pairs.len(), nothing.alone.len()), (0, 0));
-    assert_eq!(associate(&[1], &[], 5).unwrap().alone, [0]);
+    assert_eq!((nothing.pairs.len(), nothing.unmatched.len()), (0, 0));
+    assert_eq!(associate(&[1], &[], 5).unwrap().unmatched, [0]);
     // Clocks at both ends of time.
-    assert_eq!(associate(&[i64::MIN], &[i64::MAX], i64::MAX).unwrap().alone, [0]);
+    assert_eq!(associate(&[i64::MIN], &[i64::MAX], i64::MAX).unwrap().unmatched, [0]);
 }
 
 #[test]

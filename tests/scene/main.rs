@@ -10,7 +10,7 @@ use std::f64::consts::{PI, TAU};
 use drives::{drive, straight};
 use glam::DVec3;
 use wildcity_scene::Trajectory;
-use wildcity_scene::route::{CUTS_M, Route, RouteError, cuts};
+use wildcity_scene::route::{Route, RouteError, SUB_TRAJECTORY_LENGTHS_M, sub_trajectories};
 
 #[test]
 fn stations_of_a_circle_are_its_arc() {
@@ -60,7 +60,7 @@ fn stations_clamp_and_standing_still_is_no_distance() {
     let route = Route::new(&stood).unwrap();
     assert_eq!((route.length_m(), route.chunks().len()), (0.0, 1));
     assert_eq!(route.at(1.0).world_from_rig.position_m, east(5.0));
-    assert_eq!(cuts(&route, 50.0, 50.0).unwrap().count(), 0);
+    assert_eq!(sub_trajectories(&route, 50.0, 50.0).unwrap().count(), 0);
 }
 
 #[test]
@@ -109,9 +109,9 @@ fn pieces_are_as_long_as_asked_and_meet() {
     // Keyframes of 0.3 m, which no length is a multiple of; the world far from the origin.
     let log = drive((0..20_000).map(|i| (30_000 * i, DVec3::new(4e4, 0.3 * i as f64, 10.0))));
     let route = Route::new(&log).unwrap();
-    for (length_m, count) in CUTS_M.into_iter().zip([119, 23, 11, 5, 2, 1]) {
+    for (length_m, count) in SUB_TRAJECTORY_LENGTHS_M.into_iter().zip([119, 23, 11, 5, 2, 1]) {
         let pieces: Vec<_> =
-            cuts(&route, length_m, length_m).unwrap().map(Result::unwrap).collect();
+            sub_trajectories(&route, length_m, length_m).unwrap().map(Result::unwrap).collect();
         assert_eq!(pieces.len(), count, "of {length_m} m");
         for (number, piece) in pieces.iter().enumerate() {
             let keyframes = &piece.trajectory.keyframes;
@@ -130,14 +130,16 @@ fn pieces_are_as_long_as_asked_and_meet() {
         }
     }
     let named = |length_m| {
-        let last = cuts(&route, length_m, length_m).unwrap().last().unwrap().unwrap();
+        let last = sub_trajectories(&route, length_m, length_m).unwrap().last().unwrap().unwrap();
         last.trajectory.name
     };
     assert_eq!([named(250.0), named(2500.0)], ["log-250m-0022", "log-2.5km-0001"]);
 
     // With a stride they overlap.
-    let starts: Vec<f64> =
-        cuts(&route, 5000.0, 400.0).unwrap().map(|piece| piece.unwrap().stations_m[0]).collect();
+    let starts: Vec<f64> = sub_trajectories(&route, 5000.0, 400.0)
+        .unwrap()
+        .map(|piece| piece.unwrap().stations_m[0])
+        .collect();
     assert_eq!(starts, [0.0, 400.0, 800.0]);
 }
 
@@ -149,7 +151,8 @@ fn what_is_no_length_is_refused() {
         RouteError::Value { field, .. } => field,
         other => panic!("{other}"),
     };
-    let cut = |length_m, stride_m| cuts(&route, length_m, stride_m).map(Iterator::count);
+    let cut =
+        |length_m, stride_m| sub_trajectories(&route, length_m, stride_m).map(Iterator::count);
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         assert_eq!(field(cut(bad, 50.0).unwrap_err()), "length_m");
         assert_eq!(field(cut(50.0, bad).unwrap_err()), "stride_m");
@@ -162,6 +165,6 @@ fn what_is_no_length_is_refused() {
     unsorted.keyframes.swap(3, 4);
     assert!(matches!(Route::new(&unsorted), Err(RouteError::Trajectory(_))));
     let long = Trajectory { name: "a".repeat(60), ..straight(100) };
-    let error = cuts(&Route::new(&long).unwrap(), 50.0, 50.0).unwrap().next().unwrap();
+    let error = sub_trajectories(&Route::new(&long).unwrap(), 50.0, 50.0).unwrap().next().unwrap();
     assert!(matches!(error, Err(RouteError::Trajectory(_))), "{error:?}");
 }

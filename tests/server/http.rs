@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits, ServerError};
 
 use crate::support::{PATIENCE, TestServer};
@@ -111,7 +111,7 @@ async fn public_addresses_are_refused() {
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
         backend: server.painter.clone(),
-        profile: ProfileChanges::default(),
+        profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };
     let refused = wildcity_server::start(config.clone()).await.unwrap_err();

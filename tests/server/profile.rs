@@ -13,7 +13,7 @@ use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes};
 
 use crate::support::{TestServer, refused, rig};
 
-fn changes(json: Value) -> wildcity_scene::ProfileChanges {
+fn changes(json: Value) -> wildcity_scene::ProfileOverrides {
     serde_json::from_value(json).unwrap()
 }
 

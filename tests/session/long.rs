@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_session::Episode;
-use wildcity_sim::ego::{Action, Model};
+use wildcity_sim::ego::{Action, EgoModel};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEPS: u64 = 100_000;
@@ -15,7 +15,7 @@ const STEP_US: i64 = 100_000;
 /// twice that of theirs, and round themselves: 9 epsilons.
 const SKEWNESS: f64 = 2e-15;
 
-fn episode(model: Model, start: Pose, speed_m_s: f64) -> Episode {
+fn episode(model: EgoModel, start: Pose, speed_m_s: f64) -> Episode {
     let dynamics = Dynamics::checked(model, speed_m_s, false).unwrap();
     Episode::new(7, Ego::new(dynamics, start), STEP_US)
 }
@@ -36,10 +36,11 @@ fn a_thousand_laps_end_where_they_began() {
     for (away_m, bound_m) in [(0.0, 1e-9), (1e5, 1e-6)] {
         let rotation = DQuat::from_euler(glam::EulerRot::ZYX, 0.7, 0.05, -0.02);
         let start = Pose { position_m: DVec3::new(away_m, -away_m, 30.0), rotation };
-        let mut driven = episode(Model::Kinematic, start, 10.0);
+        let mut driven = episode(EgoModel::Kinematic, start, 10.0);
         let mut worst_m = 0.0f64;
         for step in 1..=STEPS {
-            driven = driven.stepped(&Command::Action(action), &Ground::of(&[]), false).unwrap();
+            driven =
+                driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
             let pose = driven.world_from_rig();
             assert!(skewness(&pose) < SKEWNESS, "step {step}: {pose:?}");
             if step % 100 == 0 {
@@ -59,7 +60,7 @@ fn a_thousand_laps_end_where_they_began() {
 #[test]
 fn a_dynamic_car_driven_twice_is_the_same_to_the_bit() {
     let drive = || {
-        let mut driven = episode(Model::Dynamic, Pose::IDENTITY, 5.0);
+        let mut driven = episode(EgoModel::Dynamic, Pose::IDENTITY, 5.0);
         let mut hasher = blake3::Hasher::new();
         for step in 0..STEPS {
             // Stops, starts and turns, again and again.
@@ -68,7 +69,8 @@ fn a_dynamic_car_driven_twice_is_the_same_to_the_bit() {
                 acceleration_m_s2: 6.0 * (phase / 70.0).sin(),
                 curvature_1_m: 0.05 * (phase / 31.0).sin(),
             };
-            driven = driven.stepped(&Command::Action(action), &Ground::of(&[]), false).unwrap();
+            driven =
+                driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
             let pose = driven.world_from_rig();
             assert!(skewness(&pose) < SKEWNESS, "step {step}: {pose:?}");
             let speed_m_s = driven.ego().velocity_m_s().dot(pose.rotation * DVec3::X);

@@ -10,7 +10,7 @@ use wildcity_render::View;
 use wildcity_render::cpu::Cpu;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{Gaussians, Record, RenderProfile, Rig, Scene};
+use wildcity_scene::{Gaussians, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity_session::{TrainingCoverage, Trust};
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
@@ -120,7 +120,7 @@ fn pair() -> Pair {
     let dir = tempfile::tempdir().unwrap();
     let new = NewVersion {
         trajectories: vec![street.trajectory.clone()],
-        storage: StorageOptions { record: Record::F32, levels: false },
+        storage: StorageOptions { record: RecordFormat::F32, levels: false },
         ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();

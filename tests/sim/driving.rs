@@ -4,7 +4,7 @@ use glam::{DQuat, DVec2, DVec3};
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_sim::ego::{Action, Model, Path, SingleTrack, TimedPose, Told, Vehicle};
+use wildcity_sim::ego::{Action, EgoModel, Path, Setpoint, SingleTrackState, TimedPose, Vehicle};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEP_US: i64 = 100_000;
@@ -23,10 +23,10 @@ fn uphill() -> Trajectory {
 #[test]
 fn a_car_is_lifted_and_pitched_by_the_ground() {
     let drives = [uphill()];
-    let ground = Ground::of(&drives);
-    for model in [Model::Kinematic, Model::Dynamic] {
+    let ground = Ground::from_drives(&drives);
+    for model in [EgoModel::Kinematic, EgoModel::Dynamic] {
         let dynamics = Dynamics::checked(model, 5.0, false).unwrap();
-        let start = dynamics.start(Pose::IDENTITY, &ground);
+        let start = dynamics.start_pose(Pose::IDENTITY, &ground);
         let mut ego = Ego::new(dynamics, start);
         let turn = Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.03 });
         for step in 0..60 {
@@ -50,8 +50,9 @@ fn a_car_is_lifted_and_pitched_by_the_ground() {
 fn a_step_through_standstill_is_its_parts() {
     let car = Vehicle::DEFAULT;
     for (speed_m_s, acceleration_m_s2) in [(1.0, -2.0), (-1.0, 2.0), (0.01, -3.0), (-0.3, 0.5)] {
-        let told = Told { acceleration_m_s2, steering_rad: 0.2 };
-        let begun = SingleTrack { speed_m_s, steering_rad: -0.1, ..SingleTrack::default() };
+        let told = Setpoint { acceleration_m_s2, steering_rad: 0.2 };
+        let begun =
+            SingleTrackState { speed_m_s, steering_rad: -0.1, ..SingleTrackState::default() };
         let bounds_m_s = [-5.0, 5.0];
         let whole = begun.after(&car, told, 2.0, bounds_m_s);
         let parts = (0..200).fold(begun, |now, _| now.after(&car, told, 0.01, bounds_m_s));
@@ -71,7 +72,7 @@ fn a_path_is_followed_backwards() {
         let position_m = DVec3::new(20.0 * angle_rad.sin(), 20.0 * (1.0 - angle_rad.cos()), 0.0);
         Pose { position_m, rotation: DQuat::from_rotation_z(angle_rad) }
     };
-    for model in [Model::Kinematic, Model::Dynamic] {
+    for model in [EgoModel::Kinematic, EgoModel::Dynamic] {
         let dynamics = Dynamics::checked(model, -2.0, true).unwrap();
         let mut ego = Ego::new(dynamics, Pose::IDENTITY);
         for step in 0..60 {
@@ -81,9 +82,9 @@ fn a_path_is_followed_backwards() {
                 start_from_rig: ego.world_from_rig().inverse() * place(now_s + 0.1 * k as f64),
             };
             let path = Path::checked((1..=20).map(timed).collect()).unwrap();
-            ego = ego.stepped(&Command::Path(path), STEP_US, &Ground::of(&[])).unwrap();
+            ego = ego.stepped(&Command::Path(path), STEP_US, &Ground::from_drives(&[])).unwrap();
             let off_m = ego.world_from_rig().position_m.distance(place(now_s + 0.1).position_m);
-            let allowed_m = if model == Model::Kinematic { 0.001 } else { 0.1 };
+            let allowed_m = if model == EgoModel::Kinematic { 0.001 } else { 0.1 };
             assert!(off_m < allowed_m, "{model:?}, step {step}: {off_m} m off");
         }
     }

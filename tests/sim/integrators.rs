@@ -2,12 +2,12 @@
 
 use differential_equations::prelude::*;
 use glam::DVec2;
-use wildcity_sim::ego::{SingleTrack, Told, Vehicle};
+use wildcity_sim::ego::{Setpoint, SingleTrackState, Vehicle};
 
 /// Newton's law for linear tyres, wheel by wheel, as a differential equation of
 /// (x, y, yaw, speed, lateral, yaw rate, steering, acceleration).
 pub(crate) struct Law {
-    pub(crate) told: Told,
+    pub(crate) told: Setpoint,
 }
 
 impl ODE<f64, [f64; 8]> for Law {
@@ -41,7 +41,7 @@ impl Law {
 }
 
 /// The car after a step at one speed or another, but not through standstill, where the law divides by 0.
-pub(crate) fn reference(from: &SingleTrack, told: Told, step_s: f64) -> SingleTrack {
+pub(crate) fn reference(from: &SingleTrackState, told: Setpoint, step_s: f64) -> SingleTrackState {
     // Its order is 5: a thousand steps leave 1e-14. Its own control of the error, which takes a relative
     // tolerance to the power of 2/3, left 1e-7.
     let method = ImplicitRungeKutta::radau5()
@@ -55,7 +55,7 @@ pub(crate) fn reference(from: &SingleTrack, told: Told, step_s: f64) -> SingleTr
     unpacked(*solved.expect("a solution").y.last().expect("an end"))
 }
 
-pub(crate) fn packed(car: &SingleTrack) -> [f64; 8] {
+pub(crate) fn packed(car: &SingleTrackState) -> [f64; 8] {
     [
         car.position_m.x,
         car.position_m.y,
@@ -68,10 +68,10 @@ pub(crate) fn packed(car: &SingleTrack) -> [f64; 8] {
     ]
 }
 
-pub(crate) fn unpacked(state: [f64; 8]) -> SingleTrack {
+pub(crate) fn unpacked(state: [f64; 8]) -> SingleTrackState {
     let [x, y, yaw_rad, speed_m_s, lateral_m_s, yaw_rate_rad_s, steering_rad, acceleration_m_s2] =
         state;
-    SingleTrack {
+    SingleTrackState {
         position_m: DVec2::new(x, y),
         yaw_rad,
         speed_m_s,
@@ -83,7 +83,7 @@ pub(crate) fn unpacked(state: [f64; 8]) -> SingleTrack {
 }
 
 /// The largest difference, in m, rad, m/s, rad/s.
-fn difference(a: &SingleTrack, b: &SingleTrack) -> f64 {
+fn difference(a: &SingleTrackState, b: &SingleTrackState) -> f64 {
     let parts = packed(a).into_iter().zip(packed(b));
     parts.fold(0.0, |worst, (a, b)| worst.max((a - b).abs()))
 }
@@ -92,11 +92,11 @@ const SPEEDS_M_S: [f64; 14] =
     [0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 13.34, 20.0, 40.0, 60.0];
 
 /// A second of it: steering out and back, as an agent does.
-fn second(from: SingleTrack, accelerations_m_s2: [f64; 2], bounds: [f64; 2]) -> f64 {
+fn second(from: SingleTrackState, accelerations_m_s2: [f64; 2], bounds: [f64; 2]) -> f64 {
     let (mut car, mut worst) = (from, 0.0f64);
     for step in 0..10 {
         let steering_rad = [0.05, -0.03][step / 5];
-        let told = Told { acceleration_m_s2: accelerations_m_s2[step / 5], steering_rad };
+        let told = Setpoint { acceleration_m_s2: accelerations_m_s2[step / 5], steering_rad };
         let next = car.after(&Vehicle::DEFAULT, told, 0.1, bounds);
         worst = worst.max(difference(&next, &reference(&car, told, 0.1)));
         car = next;
@@ -107,7 +107,7 @@ fn second(from: SingleTrack, accelerations_m_s2: [f64; 2], bounds: [f64; 2]) -> 
 #[test]
 fn constant_speed_is_exact() {
     for speed_m_s in SPEEDS_M_S.into_iter().chain([-0.001, -0.1, -1.0, -5.0, -10.0]) {
-        let car = SingleTrack { speed_m_s, ..SingleTrack::default() };
+        let car = SingleTrackState { speed_m_s, ..SingleTrackState::default() };
         let error = second(car, [0.0; 2], [-10.0, 60.0]);
         assert!(error < 1e-9, "{speed_m_s} m/s: {error}");
     }
@@ -119,7 +119,7 @@ fn changing_speed_is_as_good() {
     let backwards = [-0.001, -0.1, -5.0].map(|speed| (speed, vec![[-2.0, -4.0]]));
     for (speed_m_s, pairs) in forwards.into_iter().chain(backwards) {
         for accelerations in pairs {
-            let car = SingleTrack { speed_m_s, ..SingleTrack::default() };
+            let car = SingleTrackState { speed_m_s, ..SingleTrackState::default() };
             let error = second(car, accelerations, [-100.0, 200.0]);
             assert!(error < 1e-9, "{speed_m_s} m/s, {accelerations:?}: {error}");
         }

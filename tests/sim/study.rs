@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use wildcity_sim::ego::{SingleTrack, Told, Vehicle};
+use wildcity_sim::ego::{Setpoint, SingleTrackState, Vehicle};
 
 use crate::integrators::{Law, packed, reference, unpacked};
 
@@ -78,9 +78,9 @@ fn at_speed(speed_m_s: f64) -> Vec<Sample> {
     // As tight as the tyres of a real car would hold, 4 m/s², and no tighter than 50 m.
     let curvature = (4.0 / (speed_m_s * speed_m_s)).min(0.02);
     let steering_rad = car.steering_rad(curvature, speed_m_s);
-    let told = Told { acceleration_m_s2: 0.0, steering_rad };
-    let start = SingleTrack { speed_m_s, ..SingleTrack::default() };
-    let tenth = |from: SingleTrack, _| reference(&from, told, 0.1 * DRIVEN_S);
+    let told = Setpoint { acceleration_m_s2: 0.0, steering_rad };
+    let start = SingleTrackState { speed_m_s, ..SingleTrackState::default() };
+    let tenth = |from: SingleTrackState, _| reference(&from, told, 0.1 * DRIVEN_S);
     let right = (0..10).fold(start, tenth);
     let mut samples = Vec::new();
     for way in WAYS {
@@ -105,7 +105,7 @@ fn at_speed(speed_m_s: f64) -> Vec<Sample> {
     samples
 }
 
-fn stepped(way: Way, from: &SingleTrack, told: Told, step_s: f64) -> SingleTrack {
+fn stepped(way: Way, from: &SingleTrackState, told: Setpoint, step_s: f64) -> SingleTrackState {
     let law = Law { told };
     let state = packed(from);
     let rate = |state: &[f64; 8]| match way {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Trajectory};
+use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
 use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
     Version, VersionChange, VersionSettings,
@@ -11,7 +11,7 @@ use wildcity_twin::store::{
 use crate::scene_files::gaussians;
 use crate::support::{commit, files, street, turn};
 
-const EXACT: StorageOptions = StorageOptions { record: Record::F32, levels: false };
+const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels: false };
 
 /// VersionSettings as `street` has them.
 fn settings() -> VersionSettings {

@@ -121,7 +121,7 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
         ),
         (
             NewVersion { trajectories: vec![still("A B")], ..street(&good) },
-            "\"A B\" is not a name of a trajectory",
+            "\"A B\" cannot name a trajectory",
         ),
     ];
     for (new, wanted) in cases {

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use glam::{DMat3, DVec3};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::sky::Model;
+use wildcity_scene::sky::SkyModel;
 use wildcity_twin::ingest;
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{
@@ -19,7 +19,7 @@ use crate::support::{commit, street};
 
 fn sky_bytes(seed: usize) -> SkyBytes {
     let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
-    assert!(matches!(read.model, Model::Network(..)));
+    assert!(matches!(read.model, SkyModel::Network(..)));
     SkyBytes { bytes: read.bytes.into(), image: None, sky_from_world: DMat3::IDENTITY }
 }
 

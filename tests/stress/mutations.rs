@@ -8,11 +8,11 @@ use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::compare::images::{crop_rgba, crop_view, render_images};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
-use wildcity_scene::chunk::{ActiveRecord, column, columns};
+use wildcity_scene::chunk::{ActivatedGaussian, column, columns};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::Lens;
-use wildcity_scene::record::recorded;
-use wildcity_scene::{Chunk, Record, RenderProfile, Scene};
+use wildcity_scene::record::round_trip;
+use wildcity_scene::{Chunk, RecordFormat, RenderProfile, Scene};
 use wildcity_stress::table::{self, Candidate};
 use wildcity_stress::{CASES, Case, Check, Verdict};
 
@@ -136,7 +136,7 @@ impl Backend for Faulty<'_> {
             Fault::Blur => profile.blur *= 1.2,
             Fault::Near => profile.near *= 0.5,
             Fault::Rules => (profile.alpha_cap, profile.stop) = (0.995, 2.0 * profile.stop),
-            Fault::Places => scene = recorded(&scene, Record::Q24).scene,
+            Fault::Places => scene = round_trip(&scene, RecordFormat::Q24).scene,
             Fault::Mirror => views.iter_mut().for_each(|view| {
                 let turned = DQuat::from_rotation_y(std::f64::consts::PI);
                 view.world_from_camera.rotation *= turned;
@@ -213,7 +213,7 @@ fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Sce
         let (cell, origin_m) = (chunk.cell(), chunk.origin_m());
         let mut again = Chunk::new(cell, origin_m, chunk.sh_degree(), rows.len());
         for row in &rows {
-            again.push_active(&ActiveRecord {
+            again.push_activated(&ActivatedGaussian {
                 mean_m: row[column::MEAN..][..3].try_into().unwrap(),
                 scale_m: row[column::SCALE..][..3].try_into().unwrap(),
                 quat_wxyz: row[column::QUAT..][..4].try_into().unwrap(),

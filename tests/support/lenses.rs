@@ -6,8 +6,8 @@ use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
 use wildcity_render::{Backend, RollingShutter, View};
 use wildcity_scene::geometry::camera::{
-    Bivariate, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Rolls, Windshield,
-    WindshieldReference,
+    Bivariate, FTheta, FThetaReference, Fisheye, Lens, OpenCv, Pinhole, ShutterDirection,
+    Windshield, WindshieldReference,
 };
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Scene};
@@ -17,7 +17,7 @@ use crate::streets::street;
 
 /// A camera of each model at moderate distortion, 160 x 100 px, and one bent windshield.
 pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
-    let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let with = |lens| Camera { lens, ..ideal };
     let opencv = OpenCv::new(
         [-0.12, 0.03, -0.002, 0.01, 0.002, 0.0005],
@@ -37,10 +37,10 @@ pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
     vec![
         ("opencv", with(Lens::opencv(opencv))),
         ("fisheye", with(Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None)))),
-        ("f-theta", ftheta(Reference::AngleToPixel, [0.0, 85.0, -1.8, 4.8, -7.7, 2.7])),
+        ("f-theta", ftheta(FThetaReference::AngleToPixel, [0.0, 85.0, -1.8, 4.8, -7.7, 2.7])),
         (
             "f-theta by pixels",
-            ftheta(Reference::PixelToAngle, [0.0, 1.0 / 85.0, 3e-6, -9e-8, 2e-9, -8e-12]),
+            ftheta(FThetaReference::PixelToAngle, [0.0, 1.0 / 85.0, 3e-6, -9e-8, 2e-9, -8e-12]),
         ),
         ("pinhole behind a windshield", Camera { windshield: Some(windshield), ..ideal }),
         (
@@ -61,7 +61,7 @@ pub(crate) fn street_scene() -> (Scene, Pose) {
 }
 
 /// A camera that came 0.9 m and 0.01 rad during the exposure: 30 m/s for 30 ms, in a curve.
-pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
+pub(crate) fn driven(camera: Camera, pose: Pose, direction: ShutterDirection) -> View {
     let world_from_camera_first = Pose {
         position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
         rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
@@ -73,10 +73,10 @@ pub(crate) fn driven(camera: Camera, pose: Pose, direction: Rolls) -> View {
 /// A camera to the side at 30 m/s, whose columns are exposed in 100 ms against the way that things pass: what
 /// is 1.5 m away moves by more than the image meanwhile.
 pub(crate) fn passing() -> View {
-    let camera = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+    let camera = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let first = Pose { position_m: DVec3::new(-3.0, 0.0, 0.0), ..Pose::IDENTITY };
     let rolling_shutter =
-        RollingShutter { direction: Rolls::LeftToRight, world_from_camera_first: first };
+        RollingShutter { direction: ShutterDirection::LeftToRight, world_from_camera_first: first };
     View { rolling_shutter: Some(rolling_shutter), ..View::new(camera, Pose::IDENTITY) }
 }
 

@@ -9,7 +9,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_scene::{Record, RenderProfile, Rig};
+use wildcity_scene::{RecordFormat, RenderProfile, Rig};
 use wildcity_twin::residency::{Cache, Resident};
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
@@ -31,7 +31,7 @@ pub(crate) fn commit_reaching(
         profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,
-        storage: StorageOptions { record: Record::F32, levels: true },
+        storage: StorageOptions { record: RecordFormat::F32, levels: true },
         ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();

@@ -18,7 +18,7 @@ use tokio_tungstenite::tungstenite::{Bytes, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::Gaussians;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
@@ -146,7 +146,7 @@ pub(crate) fn rig() -> Rig {
             position_m: DVec3::new(0.5, 0.0, 1.5),
             rotation: DQuat::from_rotation_z(yaw_rad) * forward,
         };
-        RigCamera::new(name, Camera::ideal(width_px, height_px, pinhole), rig_from_camera)
+        RigCamera::new(name, Camera::from_pinhole(width_px, height_px, pinhole), rig_from_camera)
     };
     let cameras = vec![camera("front", 8, 6, 0.0), camera("rear", 5, 4, std::f64::consts::PI)];
     Rig { name: "pair".to_owned(), cameras }
@@ -180,7 +180,7 @@ impl TestServer {
             uploads: twins.path().join(".uploads"),
             tokens: None,
             backend: painter.clone(),
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };
         change(&mut config);

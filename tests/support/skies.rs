@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DMat3, DVec3};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
-use wildcity_scene::sky::{Layer, Model, Network};
+use wildcity_scene::sky::{Layer, Network, SkyModel};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 use wildcity_twin::ingest;
 
@@ -28,7 +28,7 @@ pub(crate) fn demo_sky() -> PathBuf {
 }
 
 /// It, with the appearance of an image or of all.
-pub(crate) fn demo_model(image: Option<u32>) -> Model {
+pub(crate) fn demo_model(image: Option<u32>) -> SkyModel {
     ingest::sky::read(&demo_sky(), image).unwrap().model
 }
 
@@ -53,7 +53,7 @@ pub(crate) fn network(identity: bool, octaves: usize, appearance: usize, skip: b
 
 /// A sky of such a network, in axes of its own.
 pub(crate) fn sky() -> Arc<Sky> {
-    Arc::new(Sky::new(Model::network(network(true, 3, 4, true)), SKY_FROM_WORLD))
+    Arc::new(Sky::new(SkyModel::network(network(true, 3, 4, true)), SKY_FROM_WORLD))
 }
 
 /// Nothing but a sky.

@@ -5,12 +5,12 @@
 use std::path::{Path, PathBuf};
 
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{Gaussians, Record};
+use wildcity_scene::{Gaussians, RecordFormat};
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoreError, Version};
 
 /// A version of twin "street" with nothing but Gaussians.
 pub(crate) fn street(gaussians: &Gaussians) -> NewVersion<'_> {
-    let storage = StorageOptions { record: Record::F32, levels: false };
+    let storage = StorageOptions { record: RecordFormat::F32, levels: false };
     let provenance = Provenance::of("test".into());
     NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }

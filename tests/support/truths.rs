@@ -32,7 +32,7 @@ pub(crate) fn gsplat() -> Option<Truth> {
     let pinhole = Pinhole { fx: 0.5 * w, fy: 0.5 * w, cx: 0.5 * w, cy: 0.5 * h };
     let at = DVec3::new(0.123, 0.456, -8.0);
     let view = View {
-        camera: Camera::ideal(width_px, height_px, pinhole),
+        camera: Camera::from_pinhole(width_px, height_px, pinhole),
         ..view_along([width_px, height_px], 0.5 * w, at, DVec3::Z, DVec3::Y)
     };
     let rgba = out.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));

@@ -14,7 +14,7 @@ use serde_json::json;
 use wildcity_client::{Client, Observation, Open, Pose};
 use wildcity_generate::StreetSettings;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileChanges, Record, Rig, Trajectory};
+use wildcity_scene::{ProfileOverrides, RecordFormat, Rig, Trajectory};
 use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{
@@ -78,7 +78,7 @@ impl Demo {
             uploads: self.out.join("uploads"),
             tokens: None,
             backend: Arc::from(self.backend.backend()?),
-            profile: ProfileChanges::default(),
+            profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
@@ -193,7 +193,7 @@ pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
     demo_twin(
         twins,
         EXACT_TWIN,
-        StorageOptions { record: Record::F32, ..StorageOptions::default() },
+        StorageOptions { record: RecordFormat::F32, ..StorageOptions::default() },
     )
 }
 

@@ -46,7 +46,7 @@ impl Associate {
         });
         let report = json!({
             "pairs": pairs.collect::<Vec<_>>(),
-            "alone_us": found.alone.iter().map(|&at| times_us[at]).collect::<Vec<_>>(),
+            "alone_us": found.unmatched.iter().map(|&at| times_us[at]).collect::<Vec<_>>(),
             "residual_us_median": residuals_us.get(residuals_us.len() / 2),
             "residual_us_largest": residuals_us.iter().map(|us| us.unsigned_abs()).max(),
         });

@@ -22,7 +22,7 @@ pub(in crate::cli) struct Cut {
     drive: PathBuf,
 
     /// Lengths, in metres.
-    #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::CUTS_M)]
+    #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::SUB_TRAJECTORY_LENGTHS_M)]
     length_m: Vec<f64>,
 
     /// From the start of one to the start of the next, in metres [default: the length, so that they
@@ -41,7 +41,7 @@ impl Cut {
         let route = Route::new(&trajectory)?;
         let mut labels = BTreeSet::new();
         for &length_m in &self.length_m {
-            let label = route::label(length_m);
+            let label = route::length_label(length_m);
             let once = labels.insert(label.clone());
             anyhow::ensure!(
                 once,
@@ -52,7 +52,8 @@ impl Cut {
         let mut index = Vec::new();
         for length_m in self.length_m {
             let before = index.len();
-            for cut in route::cuts(&route, length_m, self.stride_m.unwrap_or(length_m))? {
+            for cut in route::sub_trajectories(&route, length_m, self.stride_m.unwrap_or(length_m))?
+            {
                 let cut = cut?;
                 let name = &cut.trajectory.name;
                 output::write(&self.out.join(format!("{name}.json")), &to_json(&cut.trajectory)?)?;

@@ -16,7 +16,7 @@ pub(in crate::cli) struct Subsample {
     drive: PathBuf,
 
     /// Least distance between two poses, in metres, as the crow flies.
-    #[arg(long, value_name = "M", default_value_t = route::KEYFRAME_M)]
+    #[arg(long, value_name = "M", default_value_t = route::KEYFRAME_SPACING_M)]
     step_m: f64,
 
     /// What to write.

@@ -75,7 +75,7 @@ pub fn view_along(
         cy: 0.5 * f64::from(height_px),
     };
     let world_from_camera = Pose { position_m, rotation: DQuat::from_mat3(&axes).normalize() };
-    View::new(Camera::ideal(width_px, height_px, pinhole), world_from_camera)
+    View::new(Camera::from_pinhole(width_px, height_px, pinhole), world_from_camera)
 }
 
 /// A part of a view's image, as a view of its own. It may begin before the image, and reach beyond.

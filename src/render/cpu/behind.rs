@@ -11,7 +11,7 @@ use super::resolve::TileSums;
 use crate::constants::BLOCK_PX;
 use crate::{Frame, RenderError, View};
 use wildcity_scene::chunk::LANES;
-use wildcity_scene::sky::{CubeMap, Drawn, SKY_CUT, Scratch};
+use wildcity_scene::sky::{CubeMap, DrawableSky, SKY_CUT, Scratch};
 
 /// Blocks of a tile.
 const BLOCKS: usize = 16;
@@ -19,7 +19,7 @@ const BLOCKS: usize = 16;
 /// What is behind the Gaussians of one view.
 #[derive(Debug)]
 pub(super) struct Behind {
-    drawn: Drawn,
+    drawn: DrawableSky,
     looks: Looks,
 }
 
@@ -57,8 +57,8 @@ impl Behind {
     /// What evaluating a network needs, where one is evaluated.
     pub(super) fn scratch(&self) -> Option<Scratch> {
         match &self.drawn {
-            Drawn::Exact(network) => Some(network.scratch()),
-            Drawn::Map(_) => None,
+            DrawableSky::Network(network) => Some(network.scratch()),
+            DrawableSky::CubeMap(_) => None,
         }
     }
 
@@ -110,14 +110,14 @@ fn add_sky<S: Simd>(
         }
     };
     let rgb = match (&behind.drawn, scratch) {
-        (Drawn::Map(map), _) => look_up(simd, map, away),
-        (Drawn::Exact(network), Some(scratch)) => {
+        (DrawableSky::CubeMap(map), _) => look_up(simd, map, away),
+        (DrawableSky::Network(network), Some(scratch)) => {
             let unit = away.scale(splat(1.0) / away.dot(away).sqrt());
             let rgb = network.rgb(simd, [unit.x, unit.y, unit.z], scratch);
             [0, 1, 2].map(|c: usize| f32x16::load_array_ref(simd, &rgb[c]))
         }
         // `scratch` is made for every network.
-        (Drawn::Exact(_), None) => return,
+        (DrawableSky::Network(_), None) => return,
     };
     let weight = shows.select(transmittance, splat(0.0));
     for (sum, colour) in sums.rgb.iter_mut().zip(rgb) {
@@ -162,7 +162,7 @@ fn look_up<S: Simd>(simd: S, map: &Arc<CubeMap>, away: Vec3x16<S>) -> [f32x16<S>
     let choose = |k: usize| is_x.select(of_x[k], is_y.select(of_y[k], of_z[k]));
     let [face, right, down, ahead] = [choose(0), choose(1), choose(2), choose(3)];
 
-    let [scale, offset] = map.look_up();
+    let [scale, offset] = map.lookup_scale_offset();
     let (half, middle) = (splat(0.5 * scale as f32), splat((0.5 * scale + offset) as f32));
     let (u, v) = ((right / ahead).mul_add(half, middle), (down / ahead).mul_add(half, middle));
     let last = splat(map.edge() as f32 - 2.0);

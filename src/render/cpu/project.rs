@@ -190,7 +190,7 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
         }
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
-            let columns = job.chunk.block(block);
+            let columns = job.chunk.lane_group(block);
             let degree = job.chunk.sh_degree();
             let lanes = match &job.sight {
                 Sight::Straight { chunk_view, .. } => {

@@ -54,7 +54,7 @@ impl Band<'_> {
 pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>> {
     let (width, height) = (view.camera.width_px as usize, view.camera.height_px as usize);
     let pixels = width * TILE_PX as usize;
-    let appearance = target.appearance.filter(|appearance| !appearance.is_plain());
+    let appearance = target.appearance.filter(|appearance| !appearance.is_identity());
     let mut rgba = target.rgba.as_mut().map(|b| b.chunks_mut(4 * pixels));
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));

@@ -18,7 +18,7 @@ use super::resolve::Planes;
 use super::shaders::Shaders;
 use crate::{Frame, MAX_VIEWS, RenderError, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
-use wildcity_scene::sky::{Drawn, Folded};
+use wildcity_scene::sky::{DrawableSky, InferenceNetwork};
 
 /// What is behind the Gaussians of the frame at hand.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ pub(super) struct Behind {
     seen: Growing,
     overlays: Growing,
     /// What the device holds of skies, and of overlays, one behind the other.
-    held: Option<Drawn>,
+    held: Option<DrawableSky>,
     held_overlays: Vec<Arc<Overlay>>,
     /// Which of the variants the frame takes.
     variant: usize,
@@ -72,7 +72,7 @@ impl Behind {
         &mut self,
         device: &Device,
         frame: &Frame<'_>,
-        (drawn, axes): (Drawn, DMat3),
+        (drawn, axes): (DrawableSky, DMat3),
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
         let mut behind = layout::Behind::zeroed();
@@ -84,12 +84,12 @@ impl Behind {
             *slot = rows.map(|[a, b, c]| [a, b, c, 0.0]);
         }
         match &drawn {
-            Drawn::Map(map) => {
-                let [scale, offset] = map.look_up();
+            DrawableSky::CubeMap(map) => {
+                let [scale, offset] = map.lookup_scale_offset();
                 (behind.scale, behind.offset) = (scale as f32, offset as f32);
                 behind.edge = map.edge() as u32;
             }
-            Drawn::Exact(network) => set_network(&mut behind, network),
+            DrawableSky::Network(network) => set_network(&mut behind, network),
         }
         let limit = device.binding_bytes();
         if drawn.bytes() as u64 > limit {
@@ -97,12 +97,14 @@ impl Behind {
             return Err(RenderError::TooMany { what, limit });
         }
         let has_bent = !frame.views.iter().all(View::is_static_pinhole);
-        let has_network = matches!(drawn, Drawn::Exact(_));
+        let has_network = matches!(drawn, DrawableSky::Network(_));
         self.variant = usize::from(has_network) + 2 * usize::from(has_bent);
-        if !self.held.as_ref().is_some_and(|held| held.is(&drawn)) {
+        if !self.held.as_ref().is_some_and(|held| held.ptr_eq(&drawn)) {
             match &drawn {
-                Drawn::Map(map) => self.values.fill(device, bytemuck::cast_slice(map.texels())),
-                Drawn::Exact(network) => {
+                DrawableSky::CubeMap(map) => {
+                    self.values.fill(device, bytemuck::cast_slice(map.texels()))
+                }
+                DrawableSky::Network(network) => {
                     self.values.fill(device, bytemuck::cast_slice(&network.weights()));
                 }
             }
@@ -174,7 +176,7 @@ impl Behind {
     pub(super) fn iterations(&self) -> u64 {
         let look = if self.is_bent() { 4 * (1 + 40 + 26) } else { 0 };
         let sky = match &self.held {
-            Some(Drawn::Exact(network)) => {
+            Some(DrawableSky::Network(network)) => {
                 let (width, encoded) = (network.width() as u64, network.encoded() as u64);
                 let rows = width.div_ceil(64);
                 let hidden = rows * (2 + encoded.div_ceil(4) + (width + encoded).div_ceil(4));
@@ -191,7 +193,7 @@ impl Behind {
     }
 }
 
-fn set_network(behind: &mut layout::Behind, network: &Folded) {
+fn set_network(behind: &mut layout::Behind, network: &InferenceNetwork) {
     let sizes = [network.width(), network.octaves(), network.encoded()];
     [behind.width, behind.octaves, behind.encoded] = sizes.map(|size| size as u32);
     (behind.identity, behind.skip) = (network.identity().into(), network.skip().into());

@@ -13,7 +13,8 @@ use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
 use wildcity_scene::geometry::camera::{
-    self, FTheta, Fisheye, OpenCv, Reference, Rising, Windshield, WindshieldReference,
+    self, FTheta, FThetaReference, Fisheye, MonotonePolynomial, OpenCv, Windshield,
+    WindshieldReference,
 };
 
 /// The views' lenses on the device.
@@ -58,10 +59,10 @@ impl Lens {
             ..Self::zeroed()
         };
         match &camera.lens {
-            camera::Lens::Pinhole => lens.set_end(camera.straight_slope()),
+            camera::Lens::Pinhole => lens.set_end(camera.extrapolation_slope()),
             camera::Lens::OpenCv(of) => {
                 lens.set_opencv(of);
-                lens.set_end(camera.straight_slope().min(of.limit_slope()));
+                lens.set_end(camera.extrapolation_slope().min(of.limit_slope()));
             }
             camera::Lens::Fisheye(of) => lens.set_fisheye(of),
             camera::Lens::FTheta(of) => lens.set_ftheta(of),
@@ -92,15 +93,15 @@ impl Lens {
 
     fn set_ftheta(&mut self, lens: &FTheta) {
         self.model = match lens.reference() {
-            Reference::AngleToPixel => 2,
-            Reference::PixelToAngle => 3,
+            FThetaReference::AngleToPixel => 2,
+            FThetaReference::PixelToAngle => 3,
         };
         self.linear = columns(lens.linear());
         self.set_rising(lens.rising());
     }
 
     /// In shares of the end no power of a distance in pixels leaves f32.
-    fn set_rising(&mut self, rising: &Rising) {
+    fn set_rising(&mut self, rising: &MonotonePolynomial) {
         let end = rising.end();
         self.end = end as f32;
         self.end_value = rising.at(end) as f32;

@@ -357,7 +357,7 @@ mod tests {
         let mut gpu = Gpu::new(&AdapterChoice::Best, 1)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
-        let views = [View::new(Camera::ideal(16, 16, pinhole), Pose::IDENTITY)];
+        let views = [View::new(Camera::from_pinhole(16, 16, pinhole), Pose::IDENTITY)];
         let (scene, profile) = (Scene::default(), RenderProfile::default());
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         let render = |gpu: &Gpu| {

@@ -24,7 +24,7 @@ use super::resolve::Planes;
 use super::shaders::Shaders;
 use crate::{Frame, RenderError};
 use wildcity_scene::appearance::Appearance;
-use wildcity_scene::sky::{CubeMap, Drawn};
+use wildcity_scene::sky::{CubeMap, DrawableSky};
 
 /// The stage on the device, and its output.
 #[derive(Debug)]
@@ -73,8 +73,9 @@ impl Rasterize {
     ) -> Result<(), RenderError> {
         let behind = match frame.background()? {
             None if !appearances.is_empty() => {
-                let black = self.black.get_or_insert_with(|| Arc::new(CubeMap::plain(DVec3::ZERO)));
-                Some((Drawn::Map(black.clone()), DMat3::IDENTITY))
+                let black =
+                    self.black.get_or_insert_with(|| Arc::new(CubeMap::uniform(DVec3::ZERO)));
+                Some((DrawableSky::CubeMap(black.clone()), DMat3::IDENTITY))
             }
             behind => behind,
         };

@@ -36,7 +36,7 @@ impl Wanted {
     pub(super) fn of(targets: &[Target<'_>]) -> Self {
         let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
         let appearances: Vec<Appearance> = appearances.collect();
-        let all_plain = appearances.iter().all(Appearance::is_plain);
+        let all_plain = appearances.iter().all(Appearance::is_identity);
         let appearances = if all_plain { Vec::new() } else { appearances };
         Self { planes: Planes::of(targets), appearances }
     }

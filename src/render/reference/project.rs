@@ -130,7 +130,7 @@ fn straight(
 
 /// By a lens or a rolling shutter: the mean and the scatter of six points, each with weight 1/6.
 fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) -> Option<Seen> {
-    let center = view.project_beyond(mean_world, 1.0);
+    let center = view.project_extrapolated(mean_world, 1.0);
     let depth_m = view.camera.depth_m(center.point_m);
     let off_axis_rad = center.point_m.angle_between(DVec3::Z);
     let in_range = depth_m >= profile.near
@@ -143,7 +143,7 @@ fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) 
     for (i, point_px) in points_px.iter_mut().enumerate() {
         let side = if i % 2 == 0 { 1.0 } else { -1.0 };
         let point = mean_world + side * 3.0_f64.sqrt() * axes_m.col(i / 2);
-        *point_px = view.project_beyond(point, 1.0).at_px;
+        *point_px = view.project_extrapolated(point, 1.0).at_px;
     }
     let mean_px = points_px.iter().sum::<DVec2>() / 6.0;
     let off_px = points_px.map(|point_px| (point_px - mean_px) / 6.0_f64.sqrt());

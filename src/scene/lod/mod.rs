@@ -9,7 +9,7 @@ mod merge;
 
 use glam::DVec3;
 
-use super::chunk::{ActiveRecord, Chunk, column};
+use super::chunk::{ActivatedGaussian, Chunk, column};
 use super::sh;
 
 use merge::{Node, cost, joined};
@@ -260,7 +260,7 @@ impl Merging {
         let mut chunk = Chunk::new(block.cell(), block.origin_m(), block.sh_degree(), count);
         for (node, sh) in self.nodes.iter().zip(self.sh.chunks_exact(self.stride)) {
             let opacity = node.opacity();
-            chunk.push_active(&ActiveRecord {
+            chunk.push_activated(&ActivatedGaussian {
                 mean_m: node.mean_m.as_vec3().to_array(),
                 scale_m: node.scale_m.as_vec3().to_array(),
                 quat_wxyz: node.quat_wxyz().map(|q| q as f32),

@@ -1,6 +1,6 @@
 //! Records: in how many bits a Gaussian is stored, field by field.
 //!
-//! A part of a section, up to [`PART`] Gaussians, is first the grids of its quantised fields (the
+//! A part of a section, up to [`PART_GAUSSIANS`] Gaussians, is first the grids of its quantised fields (the
 //! smallest step number as i32 and the step as f32, little-endian, in the order of the table), and
 //! then byte planes: column after column, first the lowest byte of all values, then the next. What
 //! changes slowly ends up side by side, where a byte-wise compressor finds it, and no bit straddles
@@ -9,8 +9,8 @@
 //! Ranges are those of the part's own values, and every grid has zero on it: what is grey, flat on
 //! the ground or independent of the direction stays exactly so.
 
-mod code;
-mod recorded;
+mod codec;
+mod round_trip;
 
 use std::ops::Range;
 
@@ -19,18 +19,18 @@ use serde::{Deserialize, Serialize};
 use super::chunk::{Chunk, LANES, Lanes, column, columns};
 use super::sh;
 
-use code::{Code, Measure};
+use codec::{Code, Measure};
 
-pub use recorded::{Recorded, recorded};
+pub use round_trip::{RoundTrip, round_trip};
 
 /// Gaussians that share ranges, at most: raw, 65,536 of Q32 at degree 3 are 7.9 MB, of F32 15 MB.
 /// A multiple of a cluster.
-pub const PART: usize = 1 << 16;
+pub const PART_GAUSSIANS: usize = 1 << 16;
 
 /// How a twin's Gaussians are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Record {
+pub enum RecordFormat {
     /// What the renderer reads, bit by bit: activated f32, 92 bytes at degree 1.
     F32,
     /// Centres in f32, everything else in f16: 52 bytes at degree 1.
@@ -56,7 +56,7 @@ struct Field {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Clamped(Vec<(&'static str, u64)>);
 
-impl Record {
+impl RecordFormat {
     /// Every record, the most exact first.
     pub const ALL: [Self; 4] = [Self::F32, Self::H52, Self::Q32, Self::Q24];
 
@@ -206,7 +206,7 @@ impl Record {
     }
 }
 
-impl std::str::FromStr for Record {
+impl std::str::FromStr for RecordFormat {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -216,7 +216,7 @@ impl std::str::FromStr for Record {
     }
 }
 
-impl std::fmt::Display for Record {
+impl std::fmt::Display for RecordFormat {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(self.name())
     }

@@ -7,14 +7,14 @@ use crate::geometry::Pose;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Association {
     /// What belongs together, in order of time.
-    pub pairs: Vec<Pair>,
+    pub pairs: Vec<TimePair>,
     /// Places of the first clock's times that found nothing.
-    pub alone: Vec<usize>,
+    pub unmatched: Vec<usize>,
 }
 
 /// Two times that belong together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Pair {
+pub struct TimePair {
     /// Place among the first clock's times.
     pub first: usize,
     /// Place among the second clock's times.
@@ -41,7 +41,7 @@ pub fn associate(
         let (field, value) = ("tolerance_us", tolerance_us as f64);
         return Err(RouteError::Value { field, value, must: "a tolerance is 0 µs or more" });
     }
-    let (mut pairs, mut alone) = (Vec::new(), Vec::new());
+    let (mut pairs, mut unmatched) = (Vec::new(), Vec::new());
     for (first, &time_us) in first_us.iter().enumerate() {
         let mutual = nearest(second_us, time_us)
             .filter(|&second| nearest(first_us, second_us[second]) == Some(first))
@@ -50,12 +50,12 @@ pub fn associate(
             Some(second) => {
                 // Within the tolerance, hence within i64.
                 let residual_us = second_us[second].saturating_sub(time_us);
-                pairs.push(Pair { first, second, residual_us });
+                pairs.push(TimePair { first, second, residual_us });
             }
-            None => alone.push(first),
+            None => unmatched.push(first),
         }
     }
-    Ok(Association { pairs, alone })
+    Ok(Association { pairs, unmatched })
 }
 
 impl Route<'_> {

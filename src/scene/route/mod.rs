@@ -1,26 +1,26 @@
-//! Routes: what follows from a recorded drive's keyframes alone.
+//! Routes: what follows from a recorded drive's keyframes unmatched.
 //!
 //! Distances are along the keyframes, `s_0 = 0` and `s_k = s_{k-1} + |p_k - p_{k-1}|`, in metres.
 
+mod box_index;
 mod clock;
-mod cut;
-mod near;
+mod sub_trajectory;
 
 use std::ops::Range;
 
 use super::Trajectory;
 use super::trajectory::{Keyframe, TrajectoryError};
 
-pub use clock::{Association, Pair, associate};
-pub use cut::{Cut, MAX_CUTS, cuts, label};
-pub use near::Boxes;
+pub use box_index::BoxIndex;
+pub use clock::{Association, TimePair, associate};
+pub use sub_trajectory::{MAX_SUB_TRAJECTORIES, SubTrajectory, length_label, sub_trajectories};
 
 /// Distance between keyframes of a route, in metres.
-pub const KEYFRAME_M: f64 = 0.5;
+pub const KEYFRAME_SPACING_M: f64 = 0.5;
 /// Length of a chunk of a route, in metres.
-pub const CHUNK_M: f64 = 5_000.0;
+pub const ROUTE_CHUNK_LENGTH_M: f64 = 5_000.0;
 /// Lengths of sub-trajectories, in metres.
-pub const CUTS_M: [f64; 6] = [50.0, 250.0, 500.0, 1_000.0, 2_500.0, 5_000.0];
+pub const SUB_TRAJECTORY_LENGTHS_M: [f64; 6] = [50.0, 250.0, 500.0, 1_000.0, 2_500.0, 5_000.0];
 
 /// A recorded drive and how far along it each keyframe lies.
 #[derive(Clone, Debug)]
@@ -127,7 +127,7 @@ impl<'a> Route<'a> {
 
     /// The drive in chunks of 5 km, those without a keyframe left out.
     pub fn chunks(&self) -> Vec<RouteChunk> {
-        let number = |s_m: f64| (s_m / CHUNK_M).floor() as u64;
+        let number = |s_m: f64| (s_m / ROUTE_CHUNK_LENGTH_M).floor() as u64;
         let mut first = 0;
         let runs = self.stations_m.chunk_by(|a, b| number(*a) == number(*b));
         runs.map(|run| {

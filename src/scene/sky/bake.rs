@@ -18,7 +18,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use fearless_simd::{Level as Simd, dispatch, f32x16, prelude::*};
 use rayon::prelude::*;
 
-use super::{CubeMap, FACES, Folded, SkyError};
+use super::{CubeMap, FACES, InferenceNetwork, SkyError};
 use crate::chunk::LANES;
 
 /// Values along an edge of the first grid.
@@ -47,7 +47,11 @@ impl Maps {
     ///
     /// # Errors
     /// [`SkyError::Coarse`] if the finest one is worse.
-    pub(super) fn get(&self, network: &Folded, wanted: f64) -> Result<Arc<CubeMap>, SkyError> {
+    pub(super) fn get(
+        &self,
+        network: &InferenceNetwork,
+        wanted: f64,
+    ) -> Result<Arc<CubeMap>, SkyError> {
         if let Ok(answer) = self.known(wanted) {
             return answer;
         }
@@ -113,7 +117,7 @@ struct Grid {
 }
 
 impl Grid {
-    fn new(level: Simd, network: &Folded, edge: usize) -> Self {
+    fn new(level: Simd, network: &InferenceNetwork, edge: usize) -> Self {
         let mut rgb = vec![[0.0; 3]; FACES * edge * edge];
         rgb.par_chunks_mut(edge).enumerate().for_each_init(
             || network.scratch(),

@@ -83,7 +83,7 @@ impl CubeMap {
     }
 
     /// The same colour everywhere.
-    pub fn plain(rgb: DVec3) -> Self {
+    pub fn uniform(rgb: DVec3) -> Self {
         let texels = vec![packed(rgb); FACES * 4];
         Self { edge: 2, scale: 1.0, offset: 0.0, error: Self::STEP, texels }
     }
@@ -130,7 +130,7 @@ impl CubeMap {
     }
 
     /// `[scale, offset]` of the look-up.
-    pub fn look_up(&self) -> [f64; 2] {
+    pub fn lookup_scale_offset(&self) -> [f64; 2] {
         [self.scale, self.offset]
     }
 

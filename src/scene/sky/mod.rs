@@ -7,7 +7,7 @@
 
 mod bake;
 mod cube;
-mod folded;
+mod inference;
 mod network;
 
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use glam::{DMat3, DVec3};
 use self::bake::Maps;
 
 pub use cube::{CubeMap, FACES};
-pub use folded::{Folded, Scratch};
+pub use inference::{InferenceNetwork, Scratch};
 pub use network::{Layer, Network};
 
 /// Where the background shows by less than this, the sky is left away: it would add at most one step of
@@ -27,7 +27,7 @@ pub const SKY_CUT: f64 = 1.0 / 255.0;
 /// A sky, ready to be looked at.
 #[derive(Debug)]
 pub struct Sky {
-    model: Model,
+    model: SkyModel,
     /// Takes world axes to the model's: a rotation, perhaps with a mirror.
     sky_from_world: DMat3,
     /// What was baked so far.
@@ -36,28 +36,28 @@ pub struct Sky {
 
 /// What a sky is made of.
 #[derive(Clone, Debug)]
-pub enum Model {
+pub enum SkyModel {
     /// Weights, and the same for fast evaluation.
-    Network(Arc<Network>, Arc<Folded>),
+    Network(Arc<Network>, Arc<InferenceNetwork>),
     /// Six images.
     Cube(Arc<CubeMap>),
 }
 
 /// A sky in the form in which a backend draws it.
 #[derive(Clone, Debug)]
-pub enum Drawn {
+pub enum DrawableSky {
     /// The network, pixel by pixel.
-    Exact(Arc<Folded>),
+    Network(Arc<InferenceNetwork>),
     /// A cube map.
-    Map(Arc<CubeMap>),
+    CubeMap(Arc<CubeMap>),
 }
 
-impl Drawn {
+impl DrawableSky {
     /// Whether it is the very same.
-    pub fn is(&self, other: &Self) -> bool {
+    pub fn ptr_eq(&self, other: &Self) -> bool {
         match (self, other) {
-            (Self::Exact(own), Self::Exact(other)) => Arc::ptr_eq(own, other),
-            (Self::Map(own), Self::Map(other)) => Arc::ptr_eq(own, other),
+            (Self::Network(own), Self::Network(other)) => Arc::ptr_eq(own, other),
+            (Self::CubeMap(own), Self::CubeMap(other)) => Arc::ptr_eq(own, other),
             _ => false,
         }
     }
@@ -65,8 +65,8 @@ impl Drawn {
     /// Memory of what is looked up or multiplied, in bytes.
     pub fn bytes(&self) -> usize {
         match self {
-            Self::Exact(network) => network.bytes(),
-            Self::Map(map) => map.bytes(),
+            Self::Network(network) => network.bytes(),
+            Self::CubeMap(map) => map.bytes(),
         }
     }
 }
@@ -138,7 +138,7 @@ pub enum SkyError {
 
 impl Sky {
     /// A sky whose model has axes of its own: `sky_from_world` is orthonormal.
-    pub fn new(model: Model, sky_from_world: DMat3) -> Self {
+    pub fn new(model: SkyModel, sky_from_world: DMat3) -> Self {
         Self { model, sky_from_world, baked: Maps::default() }
     }
 
@@ -146,18 +146,18 @@ impl Sky {
     pub fn rgb(&self, direction_world: DVec3) -> DVec3 {
         let direction = self.sky_from_world * direction_world;
         match &self.model {
-            Model::Network(network, _) => network.rgb(direction),
-            Model::Cube(map) => map.rgb(direction),
+            SkyModel::Network(network, _) => network.rgb(direction),
+            SkyModel::Cube(map) => map.rgb(direction),
         }
     }
 
-    /// Takes directions in world axes to the axes of what [`Sky::drawn`] gives.
+    /// Takes directions in world axes to the axes of what [`Sky::drawable`] gives.
     pub fn sky_from_world(&self) -> DMat3 {
         self.sky_from_world
     }
 
     /// What it is made of.
-    pub fn model(&self) -> &Model {
+    pub fn model(&self) -> &SkyModel {
         &self.model
     }
 
@@ -167,11 +167,15 @@ impl Sky {
     ///
     /// # Errors
     /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] is close enough.
-    pub fn drawn(&self, sky_error: f64) -> Result<Drawn, SkyError> {
+    pub fn drawable(&self, sky_error: f64) -> Result<DrawableSky, SkyError> {
         match &self.model {
-            Model::Cube(map) => Ok(Drawn::Map(map.clone())),
-            Model::Network(_, folded) if sky_error == 0.0 => Ok(Drawn::Exact(folded.clone())),
-            Model::Network(_, folded) => self.baked.get(folded, sky_error).map(Drawn::Map),
+            SkyModel::Cube(map) => Ok(DrawableSky::CubeMap(map.clone())),
+            SkyModel::Network(_, folded) if sky_error == 0.0 => {
+                Ok(DrawableSky::Network(folded.clone()))
+            }
+            SkyModel::Network(_, folded) => {
+                self.baked.get(folded, sky_error).map(DrawableSky::CubeMap)
+            }
         }
     }
 
@@ -179,16 +183,16 @@ impl Sky {
     pub fn bytes(&self) -> usize {
         self.baked.bytes()
             + match &self.model {
-                Model::Network(network, _) => 2 * network.bytes(),
-                Model::Cube(map) => map.bytes(),
+                SkyModel::Network(network, _) => 2 * network.bytes(),
+                SkyModel::Cube(map) => map.bytes(),
             }
     }
 }
 
-impl Model {
+impl SkyModel {
     /// A network.
     pub fn network(network: Network) -> Self {
-        let folded = Arc::new(Folded::new(&network));
+        let folded = Arc::new(InferenceNetwork::new(&network));
         Self::Network(Arc::new(network), folded)
     }
 

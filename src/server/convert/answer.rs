@@ -21,7 +21,7 @@ use wildcity_session::{
     self, DType, Encoding, EpisodeSummary, HEADER_PREFIX_BYTES, Outcome, PastImageInfo, PixelMaps,
     Session, TensorKind, TrajectorySummary, TwinSummary,
 };
-use wildcity_sim::{Dynamics, Model};
+use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::SUBPROTOCOL;
@@ -361,9 +361,9 @@ fn trust(trust: wildcity_session::Trust) -> Trust {
 fn dynamics(dynamics: Dynamics) -> message::Dynamics {
     let Dynamics { model, speed_m_s, reverse } = dynamics;
     let model = match model {
-        Model::Teleport => message::DynamicsModel::Teleport,
-        Model::Kinematic => message::DynamicsModel::Kinematic,
-        Model::Dynamic => message::DynamicsModel::Dynamic,
+        EgoModel::Teleport => message::DynamicsModel::Teleport,
+        EgoModel::Kinematic => message::DynamicsModel::Kinematic,
+        EgoModel::Dynamic => message::DynamicsModel::Dynamic,
     };
     message::Dynamics { model, speed: speed_m_s, reverse }
 }

@@ -4,7 +4,7 @@ use wildcity_protocol::camera as wire;
 use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::camera::{
-    Camera, CameraError, Reference, Rolls, Shutter, WindshieldReference,
+    Camera, CameraError, FThetaReference, Shutter, ShutterDirection, WindshieldReference,
 };
 
 /// Wire to lens.
@@ -14,8 +14,8 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
         wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                wire::FthetaReference::AngleToPixel => Reference::AngleToPixel,
-                wire::FthetaReference::PixelToAngle => Reference::PixelToAngle,
+                wire::FthetaReference::AngleToPixel => FThetaReference::AngleToPixel,
+                wire::FthetaReference::PixelToAngle => FThetaReference::PixelToAngle,
             };
             LensFields::Ftheta { reference, polynomial, linear_cde, max_angle }
         }
@@ -52,10 +52,10 @@ pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposu
 pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        wire::ShutterDirection::TopToBottom => Rolls::TopToBottom,
-        wire::ShutterDirection::BottomToTop => Rolls::BottomToTop,
-        wire::ShutterDirection::LeftToRight => Rolls::LeftToRight,
-        wire::ShutterDirection::RightToLeft => Rolls::RightToLeft,
+        wire::ShutterDirection::TopToBottom => ShutterDirection::TopToBottom,
+        wire::ShutterDirection::BottomToTop => ShutterDirection::BottomToTop,
+        wire::ShutterDirection::LeftToRight => ShutterDirection::LeftToRight,
+        wire::ShutterDirection::RightToLeft => ShutterDirection::RightToLeft,
     };
     let shutter = Shutter { direction, duration_us };
     shutter.check().map(|()| shutter)
@@ -71,10 +71,10 @@ pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Winds
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {
-        Rolls::TopToBottom => wire::ShutterDirection::TopToBottom,
-        Rolls::BottomToTop => wire::ShutterDirection::BottomToTop,
-        Rolls::LeftToRight => wire::ShutterDirection::LeftToRight,
-        Rolls::RightToLeft => wire::ShutterDirection::RightToLeft,
+        ShutterDirection::TopToBottom => wire::ShutterDirection::TopToBottom,
+        ShutterDirection::BottomToTop => wire::ShutterDirection::BottomToTop,
+        ShutterDirection::LeftToRight => wire::ShutterDirection::LeftToRight,
+        ShutterDirection::RightToLeft => wire::ShutterDirection::RightToLeft,
     };
     wire::Shutter { direction, duration_us }
 }
@@ -85,8 +85,8 @@ fn lens_to(lens: LensFields) -> wire::Lens {
         LensFields::Fisheye { k, max_angle } => wire::Lens::Fisheye { k, max_angle },
         LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
             let reference = match reference {
-                Reference::AngleToPixel => wire::FthetaReference::AngleToPixel,
-                Reference::PixelToAngle => wire::FthetaReference::PixelToAngle,
+                FThetaReference::AngleToPixel => wire::FthetaReference::AngleToPixel,
+                FThetaReference::PixelToAngle => wire::FthetaReference::PixelToAngle,
             };
             wire::Lens::Ftheta { reference, polynomial, linear_cde, max_angle }
         }

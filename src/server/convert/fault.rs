@@ -145,7 +145,7 @@ mod tests {
     use std::io;
 
     use super::*;
-    use wildcity_scene::Record;
+    use wildcity_scene::RecordFormat;
 
     /// Only what lies in the push itself is refused for good.
     #[test]
@@ -158,7 +158,7 @@ mod tests {
         let (name, number, cells) = ("city".to_owned(), 2, vec![[0, 0]]);
         let (base, latest, settings) = (1, 2, Vec::new());
         let (url, reason) = ("s3://x".to_owned(), "no credentials".to_owned());
-        let (record, field, count, gaussians) = (Record::default(), "mean", 1, 2);
+        let (record, field, count, gaussians) = (RecordFormat::default(), "mean", 1, 2);
         for (error, refused, code) in [
             (io(io::ErrorKind::StorageFull), false, Code::StorageFull),
             (io(io::ErrorKind::QuotaExceeded), false, Code::StorageFull),

@@ -7,7 +7,7 @@ use serde::Deserialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::{self, Request};
 use wildcity_protocol::unknown_field;
-use wildcity_scene::ProfileChanges;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::json::Intrinsics;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlays, is_name};
@@ -15,7 +15,7 @@ use wildcity_session::{
     Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
-use wildcity_sim::{Dynamics, Model};
+use wildcity_sim::{Dynamics, EgoModel};
 
 use super::SUBPROTOCOL;
 use super::camera::{appearance_of, lens_of, shutter_of, windshield_of};
@@ -247,7 +247,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         seed: open.seed,
         start: open.start.map(start_of).transpose()?,
         rig,
-        profile: ProfileChanges::new(open.profile),
+        profile: ProfileOverrides::new(open.profile),
         outputs: Outputs {
             cameras,
             images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
@@ -274,9 +274,9 @@ fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
         }
     };
     let model = match model {
-        message::DynamicsModel::Teleport => Model::Teleport,
-        message::DynamicsModel::Kinematic => Model::Kinematic,
-        message::DynamicsModel::Dynamic => Model::Dynamic,
+        message::DynamicsModel::Teleport => EgoModel::Teleport,
+        message::DynamicsModel::Kinematic => EgoModel::Kinematic,
+        message::DynamicsModel::Dynamic => EgoModel::Dynamic,
     };
     Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }

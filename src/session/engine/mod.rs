@@ -214,7 +214,7 @@ impl Engine {
         profile: RenderProfile,
     ) -> Result<(), SessionError> {
         let Some(sky) = resident.sky().cloned() else { return Ok(()) };
-        let baked = run_blocking(move || sky.drawn(profile.sky_error).map(|_| ())).await?;
+        let baked = run_blocking(move || sky.drawable(profile.sky_error).map(|_| ())).await?;
         baked.map_err(SessionError::Sky)
     }
 

@@ -34,7 +34,7 @@ struct KeptFrame {
 }
 
 impl FrameHistory {
-    /// Adds a frame, whose bytes count against the budget until no history holds it.
+    /// Adds a frame. Its bytes count against the budget until no history holds it.
     pub(crate) fn add(
         &mut self,
         budget: &AnswerBudget,

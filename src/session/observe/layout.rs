@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::Field;
+use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::{Rig, RigCamera};
 
 use super::encode::Encoding;
@@ -94,7 +94,7 @@ impl ObservationLayout {
             return Err(SessionError::OutOfRange { field: "outputs.quality", must });
         }
         let visible_share = |RigCamera { camera, .. }: &RigCamera| {
-            Field::of(camera).map(|field| field.share(camera))
+            FieldMask::of(camera).map(|field| field.visible_share(camera))
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
         let layout = Self { cameras, visible_shares, encoding, maps, schedule };

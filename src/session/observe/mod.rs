@@ -1,16 +1,15 @@
 //! Observations: which images are rendered, and how they become the bytes of one message.
 //!
-//! An observation travels as a safetensors file, whose header comes before the pixels but holds their
-//! hashes and the timings. So the buffer is laid out first, with padding for the header:
+//! An observation travels as a safetensors file. Its header comes before the pixels but holds their hashes
+//! and the timings, so the buffer is laid out first, with padding for the header:
 //!
 //! ```text
 //! | header | ego.history_xyz, ego.history_rot | depth, opacity, normals per image | colour per image |
 //! | colour of earlier frames |
 //! ```
 //!
-//! The renderer writes depth, opacity, normals and raw colour straight into the message. JPEG and PNG
-//! files, whose length is only known once they are encoded, are appended. Every image is encoded and hashed
-//! in the renderer's `finished` callback while other cameras are still rendered. The frame hash is the
+//! The renderer writes depth, opacity, normals and raw colour straight into the message. JPEG and PNG files
+//! are appended, since their length is only known after encoding. Every image is encoded and hashed in the renderer's `finished` callback while other cameras are still rendered. The frame hash is the
 //! hash of the images' hashes, so that it needs no second pass over the pixels. `server` writes the header
 //! last. Floats come before bytes, so that every float tensor starts at a multiple of 4.
 //!

@@ -21,7 +21,7 @@ use wildcity_render::View;
 use wildcity_scene::Manifest;
 use wildcity_scene::chunk::{BLOCK_M, CELL_M};
 use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_scene::route::Boxes;
+use wildcity_scene::route::BoxIndex;
 
 /// Distance from the recorded poses at which the trust is 1/e, in metres; it is half at 3.5 m, in the next
 /// lane.
@@ -72,7 +72,7 @@ pub struct Trust {
 #[derive(Debug)]
 pub struct TrainingCoverage {
     keyframes: Vec<Pose>,
-    boxes: Boxes,
+    boxes: BoxIndex,
     /// Lowest and highest content of each 16 m block of the map, in metres.
     heights_m: HashMap<[i64; 2], [f64; 2]>,
 }
@@ -101,7 +101,7 @@ impl TrainingCoverage {
             return None;
         }
         let point = |pose: &Pose| Bounds { min_m: pose.position_m, max_m: pose.position_m };
-        let boxes = Boxes::new(&keyframes.iter().map(point).collect::<Vec<_>>());
+        let boxes = BoxIndex::new(&keyframes.iter().map(point).collect::<Vec<_>>());
         let mut heights_m: HashMap<[i64; 2], [f64; 2]> = HashMap::new();
         for chunk in &manifest.chunks {
             for section in chunk.sections.iter().filter(|section| section.level == 0) {
@@ -141,7 +141,7 @@ impl TrainingCoverage {
             distance_m + METRES_PER_RAD * angle_rad
         };
         // There is at least one keyframe, so the search finds one; 0 is never used.
-        let nearest = self.boxes.cheapest(here_m, cost_m).map_or(0, |(index, _)| index);
+        let nearest = self.boxes.min_cost(here_m, cost_m).map_or(0, |(index, _)| index);
         deviation_from(nearest)
     }
 

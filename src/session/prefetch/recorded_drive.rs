@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_scene::route::Boxes;
+use wildcity_scene::route::BoxIndex;
 
 /// A recorded drive as a polyline. Its trajectory has at least one keyframe.
 #[derive(Debug)]
@@ -13,7 +13,7 @@ pub(crate) struct RecordedDrive {
     /// Distance of each pose along the drive, in metres.
     stations_m: Vec<f64>,
     /// The boxes of the segments from each pose to the next; of a single pose, the box of that pose.
-    segments: Boxes,
+    segments: BoxIndex,
 }
 
 /// The point of a drive that is nearest to another point.
@@ -45,7 +45,7 @@ impl RecordedDrive {
         };
         let count = poses.len().saturating_sub(1).max(poses.len().min(1));
         let segments: Vec<Bounds> = (0..count).map(segment).collect();
-        Self { poses, stations_m, segments: Boxes::new(&segments) }
+        Self { poses, stations_m, segments: BoxIndex::new(&segments) }
     }
 
     /// The point of the drive that is nearest to `point_m`; `None` if the drive has no poses.
@@ -66,7 +66,7 @@ impl RecordedDrive {
         // The distance to a segment is not below that to its box, except for rounding: among equally near
         // segments, rounding may decide.
         let distance_to = |index: usize| on_segment(index).distance_m;
-        let (index, distance_m) = self.segments.cheapest(point_m, distance_to)?;
+        let (index, distance_m) = self.segments.min_cost(point_m, distance_to)?;
         let station_m = self.stations_m[index] + on_segment(index).station_m;
         Some(NearestPoint { station_m, distance_m })
     }

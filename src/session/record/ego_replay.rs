@@ -8,7 +8,7 @@ use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
 use crate::episode::Episode;
 use crate::error::SessionError;
 
-/// A step whose command leads to another pose than the recorded one.
+/// A step at which the command leads to another pose than the recorded one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DivergedStep {
     /// Line of the episode's file, from 1.

@@ -115,7 +115,7 @@ impl<'a> Replay<'a> {
 
     /// Drives the step of a frame, if it is one.
     fn drive(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
-        let ground = Ground::of(&self.resident.version.manifest.trajectories);
+        let ground = Ground::from_drives(&self.resident.version.manifest.trajectories);
         let diverged = self
             .ego
             .drive(frame, index + self.first_line, &ground)

@@ -18,7 +18,7 @@ pub struct ReplayReport {
     pub images: u64,
     /// What differs from when the episode was recorded and may explain differing images.
     pub changes: Vec<ProvenanceChange>,
-    /// The first step whose command leads to another pose than the recorded one.
+    /// The first step at which the command leads to another pose than the recorded one.
     pub diverged: Option<DivergedStep>,
     /// The first image that differs.
     pub difference: Option<ImageDifference>,

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::{ProfileChanges, RenderProfile};
+use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::Dynamics;
 use wildcity_twin::residency::{Reservation, Resident, Viewpoint};
 
@@ -48,7 +48,7 @@ pub struct Session {
     prefetch_task: LatestTask,
     name: String,
     /// Fields that override the profile of each version of the twin.
-    profile_overrides: ProfileChanges,
+    profile_overrides: ProfileOverrides,
     /// The version's profile with the overrides.
     profile: RenderProfile,
     profile_hash: blake3::Hash,

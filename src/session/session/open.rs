@@ -224,7 +224,7 @@ fn select_cameras(
     Ok(Rig { name: rig.name, cameras: selected })
 }
 
-/// The same rig whose cameras have the requested crops and sizes.
+/// The same rig with the requested crops and sizes.
 fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> {
     let refused = |must: String| SessionError::OutOfRange { field: "outputs.images", must };
     // Check the overlays' sizes before any of them is scaled up.

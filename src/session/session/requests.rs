@@ -38,7 +38,7 @@ impl Session {
         terminate: bool,
     ) -> Result<Observation, SessionError> {
         let command = command.into();
-        let ground = Ground::of(&self.resident().version.manifest.trajectories);
+        let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
         let mut next = self.episode.stepped(&command, &ground, terminate)?;
 
         let captures = self.layout.captures(&next, &self.frame_history);

@@ -8,7 +8,7 @@ use std::sync::LazyLock;
 
 use glam::DVec2;
 
-use super::vehicle::Tyres;
+use super::vehicle::LateralDynamics;
 
 /// Points of a piece.
 pub(super) const POINTS: usize = 5;
@@ -48,7 +48,7 @@ static DERIVATIVES: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
 /// Lateral velocity (m/s) and yaw rate (rad/s) at the points of a piece that begins with `sideways` and
 /// lasts `piece_s`, by the speeds (m/s, of one sign) and steering angles (rad) there.
 pub(super) fn solve(
-    tyres: &Tyres,
+    tyres: &LateralDynamics,
     piece_s: f64,
     speeds_m_s: &[f64; POINTS],
     angles_rad: &[f64; POINTS],

@@ -6,12 +6,12 @@
 //! some speed. The last two move in the plane of the rig; the [`Ground`] lifts and tilts that.
 
 mod collocation;
-mod held;
+mod constant_speed;
+mod kinematic;
 mod path;
 mod single_track;
 mod speed;
 mod tracker;
-mod unicycle;
 mod vehicle;
 
 use glam::{DQuat, DVec2, DVec3};
@@ -23,13 +23,13 @@ use wildcity_scene::geometry::Pose;
 use super::Ground;
 
 pub use path::{Path, TimedPose};
-pub use single_track::{SingleTrack, Told};
+pub use single_track::{Setpoint, SingleTrackState};
 pub use vehicle::Vehicle;
 
 /// How an ego moves.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Model {
+pub enum EgoModel {
     /// To the pose that it is told.
     #[default]
     Teleport,
@@ -44,7 +44,7 @@ pub enum Model {
 #[serde(deny_unknown_fields)]
 pub struct Dynamics {
     /// The model.
-    pub model: Model,
+    pub model: EgoModel,
     /// Speed at the start of an episode, in m/s along the rig; 0 of a teleport.
     pub speed_m_s: f64,
     /// Whether the car goes backwards when it brakes beyond standstill; else it stands.
@@ -88,7 +88,7 @@ pub struct Ego {
     acceleration_m_s2: DVec3,
     yaw_rate_rad_s: f64,
     /// In the frame of the rig as it is now: its place and heading are zero.
-    car: SingleTrack,
+    car: SingleTrackState,
     moved: bool,
 }
 
@@ -163,7 +163,7 @@ impl EgoError {
     }
 }
 
-impl Model {
+impl EgoModel {
     /// Its name, as on the wire.
     pub fn name(self) -> &'static str {
         match self {
@@ -179,11 +179,11 @@ impl Dynamics {
     ///
     /// # Errors
     /// The speed is none that the car can have.
-    pub fn checked(model: Model, speed_m_s: f64, reverse: bool) -> Result<Self, EgoError> {
+    pub fn checked(model: EgoModel, speed_m_s: f64, reverse: bool) -> Result<Self, EgoError> {
         let dynamics = Self { model, speed_m_s, reverse };
         let [least, most] = match model {
-            Model::Teleport => [0.0, 0.0],
-            Model::Kinematic | Model::Dynamic => dynamics.bounds_m_s(),
+            EgoModel::Teleport => [0.0, 0.0],
+            EgoModel::Kinematic | EgoModel::Dynamic => dynamics.bounds_m_s(),
         };
         in_range("dynamics.speed", speed_m_s, [least, most])?;
         Ok(dynamics)
@@ -191,10 +191,10 @@ impl Dynamics {
 
     /// Where an episode starts that is to start at a pose (`world_from_rig`): there, and on the ground
     /// unless it is a teleport.
-    pub fn start(&self, world_from_rig: Pose, ground: &Ground<'_>) -> Pose {
+    pub fn start_pose(&self, world_from_rig: Pose, ground: &Ground<'_>) -> Pose {
         match self.model {
-            Model::Teleport => world_from_rig,
-            Model::Kinematic | Model::Dynamic => ground.settle(world_from_rig),
+            EgoModel::Teleport => world_from_rig,
+            EgoModel::Kinematic | EgoModel::Dynamic => ground.place(world_from_rig),
         }
     }
 
@@ -228,9 +228,9 @@ fn in_range(field: &'static str, value: f64, [least, most]: [f64; 2]) -> Result<
 }
 
 impl Ego {
-    /// An ego at its start (`world_from_rig`), as [`Dynamics::start`] gives it.
+    /// An ego at its start (`world_from_rig`), as [`Dynamics::start_pose`] gives it.
     pub fn new(dynamics: Dynamics, world_from_rig: Pose) -> Self {
-        let car = SingleTrack { speed_m_s: dynamics.speed_m_s, ..SingleTrack::default() };
+        let car = SingleTrackState { speed_m_s: dynamics.speed_m_s, ..SingleTrackState::default() };
         Self {
             dynamics,
             world_from_rig,
@@ -259,11 +259,11 @@ impl Ego {
         }
         let step_s = step_us as f64 * 1e-6;
         match (self.dynamics.model, command) {
-            (Model::Teleport, Command::Pose(pose)) => Ok(self.moved_to(*pose, step_s)),
-            (Model::Teleport, Command::Path(path)) => {
+            (EgoModel::Teleport, Command::Pose(pose)) => Ok(self.moved_to(*pose, step_s)),
+            (EgoModel::Teleport, Command::Path(path)) => {
                 Ok(self.moved_to(self.world_from_rig * path.at(step_us), step_s))
             }
-            (_, Command::Action(action)) if self.dynamics.model != Model::Teleport => {
+            (_, Command::Action(action)) if self.dynamics.model != EgoModel::Teleport => {
                 Ok(self.driven(self.advanced(&self.car, *action, step_s), step_s, ground))
             }
             (_, Command::Path(path)) => {
@@ -309,7 +309,7 @@ impl Ego {
 
     /// Angle of the front wheels, in radians, to the left; none of a teleport, which has no wheels.
     pub fn steering_rad(&self) -> Option<f64> {
-        (self.dynamics.model != Model::Teleport).then_some(self.car.steering_rad)
+        (self.dynamics.model != EgoModel::Teleport).then_some(self.car.steering_rad)
     }
 
     fn moved_to(&self, world_from_rig: Pose, step_s: f64) -> Self {
@@ -331,7 +331,7 @@ impl Ego {
     }
 
     /// A car that moved in the plane of the rig, as an ego in the world.
-    fn driven(&self, car: SingleTrack, step_s: f64, ground: &Ground<'_>) -> Self {
+    fn driven(&self, car: SingleTrackState, step_s: f64, ground: &Ground<'_>) -> Self {
         let start_from_rig = Pose {
             position_m: car.position_m.extend(0.0),
             rotation: DQuat::from_rotation_z(car.yaw_rad),
@@ -339,7 +339,7 @@ impl Ego {
         // Who stands stays to the bit: the product would be normalised once more.
         let world_from_rig = match start_from_rig == Pose::IDENTITY {
             true => self.world_from_rig,
-            false => ground.settle(self.world_from_rig * start_from_rig),
+            false => ground.place(self.world_from_rig * start_from_rig),
         };
         let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
         let velocity_m_s = world_from_rig.rotation * DVec3::new(car.speed_m_s, rear_m_s, 0.0);
@@ -349,35 +349,35 @@ impl Ego {
             velocity_m_s,
             acceleration_m_s2: (velocity_m_s - self.velocity_m_s) / step_s,
             yaw_rate_rad_s: car.yaw_rate_rad_s,
-            car: SingleTrack { position_m: DVec2::ZERO, yaw_rad: 0.0, ..car },
+            car: SingleTrackState { position_m: DVec2::ZERO, yaw_rad: 0.0, ..car },
             moved: true,
         }
     }
 
-    fn advanced(&self, car: &SingleTrack, action: Action, step_s: f64) -> SingleTrack {
+    fn advanced(&self, car: &SingleTrackState, action: Action, step_s: f64) -> SingleTrackState {
         let (vehicle, bounds_m_s) = (Vehicle::DEFAULT, self.dynamics.bounds_m_s());
-        if self.dynamics.model == Model::Kinematic {
-            return unicycle::rolled(car, &vehicle, action, step_s, bounds_m_s);
+        if self.dynamics.model == EgoModel::Kinematic {
+            return kinematic::rolled(car, &vehicle, action, step_s, bounds_m_s);
         }
         let steering_rad = vehicle.steering_rad(action.curvature_1_m, car.speed_m_s);
         let most_rad = limits::EGO_STEERING_RAD;
-        let told = Told {
+        let told = Setpoint {
             acceleration_m_s2: action.acceleration_m_s2,
             steering_rad: steering_rad.clamp(-most_rad, most_rad),
         };
         car.after(&vehicle, told, step_s, bounds_m_s)
     }
 
-    fn tracked(&self, path: &Path, step_us: i64) -> SingleTrack {
-        let wishes = path.wishes();
+    fn tracked(&self, path: &Path, step_us: i64) -> SingleTrackState {
+        let reference = path.reference();
         let lag_s = match self.dynamics.model {
-            Model::Dynamic => Vehicle::DEFAULT.lag_s,
-            Model::Teleport | Model::Kinematic => 0.0,
+            EgoModel::Dynamic => Vehicle::DEFAULT.lag_s,
+            EgoModel::Teleport | EgoModel::Kinematic => 0.0,
         };
         let ticks = (step_us as u64).div_ceil(limits::TRACKER_TICK_US);
         let tick_s = step_us as f64 * 1e-6 / ticks as f64;
         (0..ticks).fold(self.car, |car, tick| {
-            let action = tracker::track(&wishes, tick as f64 * tick_s, lag_s, &car);
+            let action = tracker::track(&reference, tick as f64 * tick_s, lag_s, &car);
             self.advanced(&car, action, tick_s)
         })
     }

@@ -26,7 +26,7 @@ pub struct Path {
 
 /// What the path wants at a time, in the plane of the rig as it is when the step starts.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Wanted {
+pub(super) struct ReferenceState {
     /// Where, in metres.
     pub(super) position_m: DVec2,
     /// Heading, in radians.
@@ -41,8 +41,8 @@ pub(super) struct Wanted {
 
 /// The path's poses in the plane, with the speeds that they imply.
 #[derive(Debug)]
-pub(super) struct Wishes {
-    knots: Vec<(f64, Wanted)>,
+pub(super) struct ReferenceTrajectory {
+    knots: Vec<(f64, ReferenceState)>,
 }
 
 impl Path {
@@ -95,7 +95,7 @@ impl Path {
 
     /// What it wants in the plane, by its own poses: where the rig is counts only beside a single one. Else
     /// a rig that is behind would find a path that begins fast and brakes.
-    pub(super) fn wishes(&self) -> Wishes {
+    pub(super) fn reference(&self) -> ReferenceTrajectory {
         let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
         let start = (self.poses.len() == 1).then_some(start);
         let places: Vec<(f64, DVec2, f64)> = start
@@ -121,16 +121,25 @@ impl Path {
             let (time_s, position_m, yaw_rad) = places[k];
             let (speed_m_s, yaw_rate_rad_s) = moves[k];
             let acceleration_m_s2 = (moves[to].0 - moves[from].0) / (places[to].0 - places[from].0);
-            (time_s, Wanted { position_m, yaw_rad, speed_m_s, acceleration_m_s2, yaw_rate_rad_s })
+            (
+                time_s,
+                ReferenceState {
+                    position_m,
+                    yaw_rad,
+                    speed_m_s,
+                    acceleration_m_s2,
+                    yaw_rate_rad_s,
+                },
+            )
         };
-        Wishes { knots: (0..places.len()).map(knot).collect() }
+        ReferenceTrajectory { knots: (0..places.len()).map(knot).collect() }
     }
 }
 
-impl Wishes {
+impl ReferenceTrajectory {
     /// What is wanted at a time in seconds: before the first pose as it would have come there, after the
     /// last what is wanted there.
-    pub(super) fn at(&self, time_s: f64) -> Wanted {
+    pub(super) fn at(&self, time_s: f64) -> ReferenceState {
         let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
         let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };
         let Some((from_s, from)) = after.checked_sub(1).map(|before| &self.knots[before]) else {
@@ -138,7 +147,7 @@ impl Wishes {
         };
         let t = (time_s - from_s) / (to_s - from_s);
         let between = |from: f64, to: f64| from + t * (to - from);
-        Wanted {
+        ReferenceState {
             position_m: from.position_m.lerp(to.position_m, t),
             yaw_rad: from.yaw_rad + t * wrapped(to.yaw_rad - from.yaw_rad),
             speed_m_s: between(from.speed_m_s, to.speed_m_s),
@@ -148,7 +157,7 @@ impl Wishes {
     }
 }
 
-impl Wanted {
+impl ReferenceState {
     /// The same some seconds earlier, at constant acceleration and yaw rate.
     fn before(&self, seconds: f64) -> Self {
         let speed_m_s = self.speed_m_s - seconds * self.acceleration_m_s2;

@@ -3,13 +3,13 @@
 use glam::DVec2;
 
 use super::collocation::{INTEGRALS, NODES, POINTS, solve};
-use super::held::{Held, Steering};
+use super::constant_speed::{ConstantSpeed, Steering};
 use super::speed::{Drive, Phase};
-use super::vehicle::{Tyres, Vehicle};
+use super::vehicle::{LateralDynamics, Vehicle};
 
 /// A car in the plane.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct SingleTrack {
+pub struct SingleTrackState {
     /// Where the middle of the rear axle is, in metres.
     pub position_m: DVec2,
     /// Where the car heads, in radians from the x axis, to the left.
@@ -28,7 +28,7 @@ pub struct SingleTrack {
 
 /// What steering and drive are told, constant over a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Told {
+pub struct Setpoint {
     /// Acceleration along the car, in m/s².
     pub acceleration_m_s2: f64,
     /// Angle of the front wheels, in radians.
@@ -46,24 +46,24 @@ const LONGEST_LAGS: f64 = 0.25;
 /// `v² δ' / 178²` or 3e-9 m/s at most, for 6 µs.
 const CRAWL_M_S: f64 = 1e-3;
 
-impl SingleTrack {
+impl SingleTrackState {
     /// The car after a step in seconds, its speed within bounds that 0 lies in (m/s).
     ///
     /// Exact at constant speed. While speed changes, sliding and turning are collocated in pieces, with
     /// an error below 1e-9 (m, rad, m/s) of a step of 0.1 s at every speed; so is, in either case, the
     /// integral of the way, whose rule is exact to degree 8.
     #[must_use]
-    pub fn after(&self, car: &Vehicle, told: Told, step_s: f64, bounds_m_s: [f64; 2]) -> Self {
+    pub fn after(&self, car: &Vehicle, told: Setpoint, step_s: f64, bounds_m_s: [f64; 2]) -> Self {
         let tyres = car.tyres();
         let drive = Drive {
             speed_m_s: self.speed_m_s,
             acceleration_m_s2: self.acceleration_m_s2,
-            told_m_s2: told.acceleration_m_s2,
+            target_m_s2: told.acceleration_m_s2,
             lag_s: car.lag_s,
         };
         let steering = Steering {
             angle_rad: self.steering_rad,
-            told_rad: told.steering_rad,
+            target_rad: told.steering_rad,
             lag_s: car.lag_s,
         };
         let (phases, acceleration_m_s2) = drive.phases(step_s, bounds_m_s);
@@ -80,7 +80,7 @@ impl SingleTrack {
     fn after_phase(
         mut self,
         car: &Vehicle,
-        tyres: &Tyres,
+        tyres: &LateralDynamics,
         phase: &Phase,
         steering: Steering,
     ) -> Self {
@@ -140,11 +140,11 @@ struct Point {
 }
 
 impl Piece {
-    fn points(&self, tyres: &Tyres, phase: &Phase) -> [Point; POINTS] {
+    fn points(&self, tyres: &LateralDynamics, phase: &Phase) -> [Point; POINTS] {
         let Self { begun_s, length_s, steering, sideways } = *self;
         if phase.held {
             let speed_m_s = phase.drive.speed_m_s;
-            let held = Held::new(tyres, speed_m_s, steering, sideways);
+            let held = ConstantSpeed::new(tyres, speed_m_s, steering, sideways);
             return NODES.map(|node| {
                 let (sideways, turned_rad) = held.after(node * length_s);
                 Point { speed_m_s, sideways, turned_rad }

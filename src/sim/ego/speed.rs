@@ -21,7 +21,7 @@ pub(super) struct Drive {
     /// What the drive gives, in m/s²; at a bound of speed more than happens.
     pub(super) acceleration_m_s2: f64,
     /// What it is told to give, in m/s².
-    pub(super) told_m_s2: f64,
+    pub(super) target_m_s2: f64,
     /// Its lag, in seconds.
     pub(super) lag_s: f64,
 }
@@ -32,14 +32,14 @@ impl Drive {
         // The integral of a(t) = told + (a - told) e^(-t / lag).
         let lagging = self.lag_s * -(-time_s / self.lag_s).exp_m1();
         self.speed_m_s
-            + self.told_m_s2 * time_s
-            + (self.acceleration_m_s2 - self.told_m_s2) * lagging
+            + self.target_m_s2 * time_s
+            + (self.acceleration_m_s2 - self.target_m_s2) * lagging
     }
 
     /// What the drive gives after a time in seconds, in m/s².
     pub(super) fn acceleration_after(&self, time_s: f64) -> f64 {
-        let lacking = self.acceleration_m_s2 - self.told_m_s2;
-        self.told_m_s2 + lacking * (-time_s / self.lag_s).exp()
+        let lacking = self.acceleration_m_s2 - self.target_m_s2;
+        self.target_m_s2 + lacking * (-time_s / self.lag_s).exp()
     }
 
     /// Cuts a step into phases; also what the drive gives at its end. `bounds_m_s` hold the speed, 0 lies
@@ -52,7 +52,7 @@ impl Drive {
             let turns_s = self.turns_after().unwrap_or(f64::INFINITY);
             // At rest it begins as it is told.
             let pushes = match self.acceleration_m_s2 {
-                0.0 => self.told_m_s2,
+                0.0 => self.target_m_s2,
                 given => given,
             };
             let [low, high] = bounds_m_s;
@@ -76,8 +76,8 @@ impl Drive {
     /// When the drive changes from braking to pushing or back, in seconds, if it does.
     fn turns_after(&self) -> Option<f64> {
         // told + (a - told) e^(-t / lag) = 0.
-        let opposed = self.acceleration_m_s2 * self.told_m_s2 < 0.0;
-        let ratio = (self.told_m_s2 - self.acceleration_m_s2) / self.told_m_s2;
+        let opposed = self.acceleration_m_s2 * self.target_m_s2 < 0.0;
+        let ratio = (self.target_m_s2 - self.acceleration_m_s2) / self.target_m_s2;
         opposed.then(|| self.lag_s * ratio.ln()).filter(|time_s| *time_s > 0.0)
     }
 
@@ -115,8 +115,8 @@ impl Drive {
 mod tests {
     use super::*;
 
-    fn drive(speed_m_s: f64, acceleration_m_s2: f64, told_m_s2: f64) -> Drive {
-        Drive { speed_m_s, acceleration_m_s2, told_m_s2, lag_s: 0.1 }
+    fn drive(speed_m_s: f64, acceleration_m_s2: f64, target_m_s2: f64) -> Drive {
+        Drive { speed_m_s, acceleration_m_s2, target_m_s2, lag_s: 0.1 }
     }
 
     #[test]

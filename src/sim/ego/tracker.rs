@@ -5,8 +5,8 @@ use glam::DVec2;
 use crate::limits;
 
 use super::Action;
-use super::path::{Wanted, Wishes, wrapped};
-use super::single_track::SingleTrack;
+use super::path::{ReferenceState, ReferenceTrajectory, wrapped};
+use super::single_track::SingleTrackState;
 use super::vehicle::Vehicle;
 
 /// How stiffly the car is pulled along the path, in 1/s: an error of place and speed decays as
@@ -29,8 +29,13 @@ const TURNS_M_S: f64 = 0.1;
 /// `a = a* + 4 (v* - v) + 4 Δs`, across it `κ = κ* + Δy / l² + 2 Δψ / l`, whose errors decay as
 /// `(1 + s / l) e^(-s / l)` over the way s; Δψ is to where the car goes, not to where it heads. Both are cut to
 /// what an action may be.
-pub(super) fn track(wishes: &Wishes, time_s: f64, lag_s: f64, car: &SingleTrack) -> Action {
-    let (now, soon) = (wishes.at(time_s), wishes.at(time_s + lag_s));
+pub(super) fn track(
+    reference: &ReferenceTrajectory,
+    time_s: f64,
+    lag_s: f64,
+    car: &SingleTrackState,
+) -> Action {
+    let (now, soon) = (reference.at(time_s), reference.at(time_s + lag_s));
     let ahead_m = DVec2::from_angle(-now.yaw_rad).rotate(now.position_m - car.position_m);
     let off_rad = wrapped(now.yaw_rad - car.yaw_rad - drift_rad(car));
     let acceleration_m_s2 = soon.acceleration_m_s2
@@ -48,12 +53,12 @@ pub(super) fn track(wishes: &Wishes, time_s: f64, lag_s: f64, car: &SingleTrack)
     }
 }
 
-fn curvature(wanted: &Wanted) -> f64 {
+fn curvature(wanted: &ReferenceState) -> f64 {
     if wanted.speed_m_s.abs() < TURNS_M_S { 0.0 } else { wanted.yaw_rate_rad_s / wanted.speed_m_s }
 }
 
 /// By how much the car moves to the left of its heading, in radians: in a turn its rear axle slips.
-fn drift_rad(car: &SingleTrack) -> f64 {
+fn drift_rad(car: &SingleTrackState) -> f64 {
     let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
     if car.speed_m_s.abs() < TURNS_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }
 }

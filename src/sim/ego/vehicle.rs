@@ -31,7 +31,7 @@ pub struct Vehicle {
 /// It is Newton's law for linear tyres, whose force is stiffness times slip, `(u - v δ) / |v|` for a
 /// wheel with the lateral velocity u, times |v|: so nothing is divided by v, and at v = 0 it says z = 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Tyres {
+pub(super) struct LateralDynamics {
     grip: DMat2,
     pub(super) steer: DVec2,
 }
@@ -60,13 +60,13 @@ impl Vehicle {
         curvature_1_m * (wheelbase_m + understeer_s2_m * speed_m_s * speed_m_s.abs())
     }
 
-    pub(super) fn tyres(&self) -> Tyres {
+    pub(super) fn tyres(&self) -> LateralDynamics {
         let (front, rear) = (2.0 * self.front_wheel_n_rad, 2.0 * self.rear_wheel_n_rad);
         let (rear_m, front_m) = (self.rear_to_cg_m, self.wheelbase_m - self.rear_to_cg_m);
         let (mass, inertia) = (self.mass_kg, self.inertia_kg_m2);
         let moment = front_m * front - rear_m * rear;
         let turn = front_m * front_m * front + rear_m * rear_m * rear;
-        Tyres {
+        LateralDynamics {
             grip: DMat2::from_cols_array_2d(&[
                 [-(front + rear) / mass, -moment / inertia],
                 [-moment / mass, -turn / inertia],
@@ -76,7 +76,7 @@ impl Vehicle {
     }
 }
 
-impl Tyres {
+impl LateralDynamics {
     /// The matrix of `|v| dz/dt = G z + v steer δ`, in m/s².
     pub(super) fn matrix(&self, speed_m_s: f64) -> DMat2 {
         let mut matrix = self.grip;

@@ -116,7 +116,7 @@ impl Axes {
             let turned = rotation * DQuat::from_xyzw(x, y, z, w);
             *quat = [turned.w, turned.x, turned.y, turned.z].map(|q| q as f32);
         }
-        let turn = sh::Turn::new(matrix, gaussians.sh_degree);
+        let turn = sh::ShRotation::new(matrix, gaussians.sh_degree);
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);
         }

@@ -22,7 +22,7 @@ use half::f16;
 use image::{DynamicImage, ImageFormat, ImageReader, RgbImage};
 
 use crate::limits;
-use wildcity_scene::sky::{CubeMap, FACES, Layer, Model, Network, SkyError};
+use wildcity_scene::sky::{CubeMap, FACES, Layer, Network, SkyError, SkyModel};
 
 use super::file::{self, FileError};
 use super::{IngestError, read_whole};
@@ -33,7 +33,7 @@ pub struct SkyFile {
     /// It as a twin keeps it: what [`decode`] reads.
     pub bytes: Vec<u8>,
     /// It, ready to be looked at.
-    pub model: Model,
+    pub model: SkyModel,
 }
 
 /// Reads a sky from a file, or the six images of a folder. `image` is whose appearance a network is seen
@@ -65,17 +65,17 @@ pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestErr
 ///
 /// # Errors
 /// As [`read`].
-pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<Model, IngestError> {
+pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<SkyModel, IngestError> {
     if bytes.get(8) == Some(&b'{') {
         let Weights { layers, appearances } = Weights::read(bytes)?;
-        return Ok(Model::network(Network::new(layers, appearances.of(image)?)?));
+        return Ok(SkyModel::network(Network::new(layers, appearances.of(image)?)?));
     }
     if let Some(image) = image {
         return Err(SkyError::Image { image, count: 0 }.into());
     }
     let strip = picture(bytes)?;
     let map = CubeMap::from_faces(strip.width() as usize, strip.as_raw())?;
-    Ok(Model::cube(map))
+    Ok(SkyModel::cube(map))
 }
 
 /// A network's tensors.

@@ -118,7 +118,7 @@ impl Cache {
             return Ok(Some(sky));
         }
         let Some(sky) = self.catalog.sky(version)? else { return Ok(None) };
-        let baked = sky.drawn(profile.sky_error);
+        let baked = sky.drawable(profile.sky_error);
         baked.map_err(|cause| ResidencyError::Sky { twin: twin.clone(), cause })?;
         let sky = Arc::new(sky);
         skies.push((key, Arc::downgrade(&sky)));

@@ -23,7 +23,7 @@ use crate::limits;
 use wildcity_scene::chunk::{Chunk, LANES, Lanes, columns};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
-use wildcity_scene::record::{Clamped, PART, Record};
+use wildcity_scene::record::{Clamped, PART_GAUSSIANS, RecordFormat};
 
 const MAGIC: [u8; 8] = *b"WILDCHNK";
 /// The layout that this build reads and writes.
@@ -73,12 +73,12 @@ pub(super) fn pack(
     chunk: &Chunk,
     [block, level]: [u8; 2],
     error_m: f32,
-    record: Record,
+    record: RecordFormat,
     clamped: &mut Clamped,
 ) -> io::Result<PackedSection> {
     let mut bytes = Vec::new();
-    for start in (0..chunk.len()).step_by(PART) {
-        let part = record.encode(chunk, start..chunk.len().min(start + PART), clamped);
+    for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
+        let part = record.encode(chunk, start..chunk.len().min(start + PART_GAUSSIANS), clamped);
         let part = zstd::bulk::compress(&part, ZSTD_LEVEL)?;
         bytes.extend((part.len() as u32).to_le_bytes());
         bytes.extend(part);
@@ -86,7 +86,7 @@ pub(super) fn pack(
     let mut bounds = Bounds::EMPTY;
     for index in 0..chunk.len() {
         let mean_m = [0, 1, 2].map(|axis| f64::from(chunk.value(index, axis)));
-        bounds.add(DVec3::from_array(mean_m), chunk.reach_m(index));
+        bounds.add(DVec3::from_array(mean_m), chunk.half_extent_m(index));
     }
     let section = Section {
         block,
@@ -109,7 +109,7 @@ pub(super) fn write(
     out: &mut dyn Write,
     (cell, origin_m): ([i32; 2], DVec3),
     sh_degree: u8,
-    record: Record,
+    record: RecordFormat,
     mut packed: Vec<PackedSection>,
 ) -> io::Result<(Vec<Section>, Bounds)> {
     packed.sort_by_key(|packed| (std::cmp::Reverse(packed.section.level), packed.section.block));
@@ -166,14 +166,14 @@ pub(super) fn unpack(
     chunk: &ChunkEntry,
     section: &Section,
     sh_degree: u8,
-    record: Record,
+    record: RecordFormat,
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
     let width = columns(sh_degree);
     let mut lanes = Vec::new();
     let mut rest = bytes;
-    for start in (0..count).step_by(PART) {
-        let here = (count - start).min(PART);
+    for start in (0..count).step_by(PART_GAUSSIANS) {
+        let here = (count - start).min(PART_GAUSSIANS);
         let (length, after) = rest.split_first_chunk().ok_or("it ends before its last part")?;
         let length = u32::from_le_bytes(*length) as usize;
         let part = after.get(..length).ok_or("it ends within a part")?;
@@ -193,7 +193,11 @@ pub(super) fn unpack(
 }
 
 /// The table of all chunks.
-pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io::Result<Vec<u8>> {
+pub(super) fn table(
+    chunks: &[ChunkEntry],
+    sh_degree: u8,
+    record: RecordFormat,
+) -> io::Result<Vec<u8>> {
     let mut table = Vec::new();
     for chunk in chunks {
         let sections = chunk.sections.iter().map(Row::of).collect();
@@ -211,7 +215,7 @@ pub(super) fn table(chunks: &[ChunkEntry], sh_degree: u8, record: Record) -> io:
 pub(super) fn fill(
     chunks: &mut [ChunkEntry],
     sh_degree: u8,
-    record: Record,
+    record: RecordFormat,
     mut table: &[u8],
 ) -> Result<(), String> {
     for chunk in chunks {
@@ -342,11 +346,12 @@ mod tests {
         };
         let lost = &mut Clamped::default();
         let packed = [(0, 0.0, 300), (1, 0.5, 100)].map(|(level, error_m, count)| {
-            pack(&chunk(count), [10, level], error_m, Record::Q32, lost).unwrap()
+            pack(&chunk(count), [10, level], error_m, RecordFormat::Q32, lost).unwrap()
         });
         let mut bytes = Vec::new();
         let place = (cell.cell, cell.origin_m);
-        let (sections, bounds) = write(&mut bytes, place, 0, Record::Q32, packed.into()).unwrap();
+        let (sections, bounds) =
+            write(&mut bytes, place, 0, RecordFormat::Q32, packed.into()).unwrap();
         let entry = ChunkEntry {
             cell: cell.cell,
             object: blake3::hash(&bytes).to_hex().to_string(),
@@ -361,7 +366,7 @@ mod tests {
 
     fn filled(entry: &ChunkEntry, table: &[u8]) -> Result<Vec<Section>, String> {
         let mut chunks = [ChunkEntry { sections: Vec::new(), ..entry.clone() }];
-        fill(&mut chunks, 0, Record::Q32, table).map(|()| chunks[0].sections.clone())
+        fill(&mut chunks, 0, RecordFormat::Q32, table).map(|()| chunks[0].sections.clone())
     }
 
     #[test]
@@ -376,7 +381,7 @@ mod tests {
         for section in [full, coarse] {
             let start = section.offset_bytes as usize;
             let own = &bytes[start..start + section.bytes as usize];
-            let chunk = unpack(own, &entry, section, 0, Record::Q32).unwrap();
+            let chunk = unpack(own, &entry, section, 0, RecordFormat::Q32).unwrap();
             assert_eq!((chunk.cell(), chunk.len()), (entry.cell, section.count as usize));
         }
     }
@@ -384,7 +389,7 @@ mod tests {
     #[test]
     fn a_table_comes_back_and_one_that_lies_is_refused() {
         let (_, entry) = object();
-        let table = table(std::slice::from_ref(&entry), 0, Record::Q32).unwrap();
+        let table = table(std::slice::from_ref(&entry), 0, RecordFormat::Q32).unwrap();
         assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
         // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
         assert_eq!(table.len(), 42 + 2 * 78);
@@ -396,7 +401,7 @@ mod tests {
         let refused = |change: &dyn Fn(&mut ChunkEntry)| {
             let mut other = entry.clone();
             change(&mut other);
-            let table = super::table(&[other], 0, Record::Q32).unwrap();
+            let table = super::table(&[other], 0, RecordFormat::Q32).unwrap();
             filled(&entry, &table).unwrap_err()
         };
         assert!(refused(&|e| e.cell[0] += 1).contains("something else of cell"));
@@ -445,7 +450,7 @@ mod tests {
         let own = &bytes[start..start + section.bytes as usize];
         let refused = |own: &[u8], count: u32| {
             let section = Section { count, ..section };
-            unpack(own, &entry, &section, 0, Record::Q32).unwrap_err()
+            unpack(own, &entry, &section, 0, RecordFormat::Q32).unwrap_err()
         };
         for cut in 0..own.len() {
             refused(&own[..cut], 300);
@@ -459,7 +464,7 @@ mod tests {
             let mut own = own.to_vec();
             own[at] ^= 0x40;
             // The hash is looked at before: here it only must not panic.
-            let _ = unpack(&own, &entry, &section, 0, Record::Q32);
+            let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32);
         }
     }
 }

@@ -7,7 +7,7 @@ use crate::limits;
 use wildcity_scene::manifest::{ChunkEntry, ObjectRef, Provenance};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::validate::{self, Field};
-use wildcity_scene::{Gaussians, Manifest, Record, RenderProfile, Rig, Trajectory};
+use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Rig, Trajectory};
 
 use super::catalog::check_name;
 use super::diff::Diff;
@@ -37,14 +37,14 @@ pub struct Commit {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StorageOptions {
     /// In how many bits.
-    pub record: Record,
+    pub record: RecordFormat,
     /// Whether levels of detail are made, too.
     pub levels: bool,
 }
 
 impl Default for StorageOptions {
     fn default() -> Self {
-        Self { record: Record::default(), levels: true }
+        Self { record: RecordFormat::default(), levels: true }
     }
 }
 

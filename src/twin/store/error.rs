@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::ingest::IngestError;
 use crate::limits;
-use wildcity_scene::Record;
+use wildcity_scene::RecordFormat;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
 use wildcity_scene::trajectory::TrajectoryError;
@@ -201,7 +201,7 @@ pub enum StoreError {
     )]
     Clamped {
         /// The record.
-        record: Record,
+        record: RecordFormat,
         /// The field with most of them.
         field: &'static str,
         /// How many values.

@@ -10,7 +10,7 @@ use wildcity_scene::chunk::{CellRun, Partition};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::ChunkEntry;
 use wildcity_scene::record::Clamped;
-use wildcity_scene::{Chunk, Gaussians, Record, lod};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, lod};
 
 use super::chunk_file::{self, PackedSection};
 use super::objects::Staging;
@@ -119,7 +119,8 @@ impl<'a> CellPacker<'a> {
         packed: Vec<PackedSection>,
     ) -> Result<ChunkEntry, StoreError> {
         let CellRun { cell, origin_m, ref run, .. } = *cell;
-        let (sh_degree, record): (u8, Record) = (self.gaussians.sh_degree, self.storage.record);
+        let (sh_degree, record): (u8, RecordFormat) =
+            (self.gaussians.sh_degree, self.storage.record);
         let (mut sections, mut bounds) = (Vec::new(), Bounds::EMPTY);
         let put = staging.put(|out| {
             (sections, bounds) =

@@ -42,7 +42,7 @@ impl NewSky {
             Self::Kept(_) => Ok(()),
             Self::Put(SkyBytes { bytes, image, sky_from_world }) => {
                 let sky = Sky::new(sky::decode(bytes, *image)?, *sky_from_world);
-                sky.drawn(profile.sky_error).map_err(crate::ingest::IngestError::Sky)?;
+                sky.drawable(profile.sky_error).map_err(crate::ingest::IngestError::Sky)?;
                 Ok(())
             }
         }

@@ -74,7 +74,7 @@ pub(super) fn fades(camera: &Camera) -> bool {
         let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
         let in_full = at_px.is_some_and(|at_px| {
             camera.unproject(at_px).is_some_and(|outside| {
-                let found = camera.project_beyond(outside).distance(at_px) < 1e-6;
+                let found = camera.project_extrapolated(outside).distance(at_px) < 1e-6;
                 // Between two of the 32 it is nearly the same.
                 found && outside.z >= in_full + 0.02
             })

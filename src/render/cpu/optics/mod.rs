@@ -80,11 +80,11 @@ impl Optics {
         let kind = match lens {
             // As it is behind a windshield or when it moves: slopes without a distortion.
             Lens::Pinhole => {
-                let limit = view.camera.straight_slope().powi(2) as f32 * INSIDE;
+                let limit = view.camera.extrapolation_slope().powi(2) as f32 * INSIDE;
                 Kind::Slopes { focal_px, k: [0.0; 6], p: [0.0; 2], s: [0.0; 4], limit }
             }
             Lens::OpenCv(lens) => {
-                let end = view.camera.straight_slope().min(lens.limit_slope());
+                let end = view.camera.extrapolation_slope().min(lens.limit_slope());
                 let limit = (end * end) as f32;
                 Kind::Slopes {
                     focal_px,
@@ -229,7 +229,7 @@ mod tests {
     use glam::{DMat3, DQuat, DVec2, DVec3};
     use wildcity_scene::Rig;
     use wildcity_scene::geometry::Pose;
-    use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, Rolls};
+    use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, ShutterDirection};
 
     /// The real cameras, one of them behind its windshield, and one of each other model: with how many of
     /// 4,000 directions up to the end of its field are surely within.
@@ -239,7 +239,8 @@ mod tests {
         let mut cameras: Vec<_> =
             real.map(|mounted| (mounted.name, mounted.camera, 3_800)).collect();
         let windshield = cameras.iter().find_map(|(_, camera, _)| camera.windshield);
-        let ideal = Camera::ideal(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
+        let ideal =
+            Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
         let (k, p) = ([-0.12, 0.03, -0.002, 0.01, 0.002, 0.0005], [0.0015, -0.001]);
         let opencv = Lens::opencv(OpenCv::new(k, p, [0.001, -0.0005, -0.0008, 0.0004]));
         let fisheye = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
@@ -261,7 +262,7 @@ mod tests {
             position_m: pose.rotation * DVec3::new(-0.05, 0.0, -0.9),
             rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
         };
-        let direction = Rolls::BottomToTop;
+        let direction = ShutterDirection::BottomToTop;
         [
             still,
             View {

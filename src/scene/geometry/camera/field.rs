@@ -6,12 +6,12 @@ use super::{Camera, Lens, WIDEST_RAD};
 
 /// The columns of each row that a lens sees, where it does not see all of its image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Field {
+pub struct FieldMask {
     /// First column and the one after the last, row by row; equal where nothing is seen.
     pub columns: Vec<[u32; 2]>,
 }
 
-impl Field {
+impl FieldMask {
     /// `None` where the whole image is seen, as almost always; telling that costs some microseconds.
     ///
     /// A field has no holes, and neither has a row of it: every model's is a disc, slightly bent.
@@ -39,13 +39,18 @@ impl Field {
     }
 
     /// The share of the image that is seen.
-    pub fn share(&self, camera: &Camera) -> f64 {
+    pub fn visible_share(&self, camera: &Camera) -> f64 {
         let seen: u64 = self.columns.iter().map(|[first, end]| u64::from(end - first)).sum();
         seen as f64 / camera.pixels() as f64
     }
 
     /// Zeroes what is not seen, of an image with so many values a pixel.
-    pub fn clear<T: Default + Clone>(&self, camera: &Camera, values: usize, image: &mut [T]) {
+    pub fn clear_outside<T: Default + Clone>(
+        &self,
+        camera: &Camera,
+        values: usize,
+        image: &mut [T],
+    ) {
         let rows = image.chunks_mut(values * camera.width_px as usize);
         for (row, [first, end]) in rows.zip(&self.columns) {
             let (first, end) = (values * *first as usize, values * *end as usize);
@@ -84,7 +89,7 @@ fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
 
 /// What of a lens decides whether something may be seen: a cone around its axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cone {
+pub struct FieldCone {
     /// All pixels' rays are within this angle of the axis, in radians.
     pub image_rad: f64,
     /// Beyond, the distance from the axis' pixel grows by at least so many pixels a radian.
@@ -93,7 +98,7 @@ pub struct Cone {
     pub most_px_per_rad: f64,
 }
 
-impl Cone {
+impl FieldCone {
     /// Steps of the angle off the axis, and of the azimuth, at which a lens is looked at.
     const STEPS: u32 = 64;
     const AZIMUTHS: u32 = 16;
@@ -108,7 +113,7 @@ impl Cone {
             let (sin, cos) = (f64::from(step) * step_rad).sin_cos();
             (0..Self::AZIMUTHS).map(move |k| {
                 let (y, x) = (f64::from(k) * turn_rad).sin_cos();
-                camera.project_beyond(DVec3::new(x * sin, y * sin, cos)) - axis_px
+                camera.project_extrapolated(DVec3::new(x * sin, y * sin, cos)) - axis_px
             })
         };
         let mut cone =

@@ -3,7 +3,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::rising::{Rising, TERMS};
+use super::monotone::{MonotonePolynomial, TERMS};
 use super::{CameraError, WIDEST_RAD};
 
 /// `r = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, in focal lengths (Kannala and Brandt 2006; OpenCV's
@@ -12,7 +12,7 @@ use super::{CameraError, WIDEST_RAD};
 pub struct Fisheye {
     k: [f64; 4],
     max_angle_rad: Option<f64>,
-    radius: Rising,
+    radius: MonotonePolynomial,
 }
 
 impl Fisheye {
@@ -24,7 +24,7 @@ impl Fisheye {
         for (k, to) in k.into_iter().zip([3, 5, 7, 9]) {
             coefficients[to] = k;
         }
-        let radius = Rising::new(coefficients, max_angle_rad.unwrap_or(WIDEST_RAD));
+        let radius = MonotonePolynomial::new(coefficients, max_angle_rad.unwrap_or(WIDEST_RAD));
         Self { k, max_angle_rad, radius }
     }
 
@@ -39,7 +39,7 @@ impl Fisheye {
     }
 
     /// The distance from the axis in focal lengths, by the angle off it in radians.
-    pub fn radius(&self) -> &Rising {
+    pub fn radius(&self) -> &MonotonePolynomial {
         &self.radius
     }
 

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::CameraError;
 use super::fisheye::{at_angle, radial};
-use super::rising::{Rising, TERMS};
+use super::monotone::{MonotonePolynomial, TERMS};
 
 /// `pixel = [[c, d], [e, 1]] r(θ) (x, y)/|(x, y)| + principal point`, for the angle
 /// `θ = atan2(|(x, y)|, z)` (NVIDIA's public description of its vehicle cameras).
@@ -14,17 +14,17 @@ use super::rising::{Rising, TERMS};
 /// Only the exact one, the reference, is kept here, and inverted by Newton's method.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FTheta {
-    reference: Reference,
+    reference: FThetaReference,
     polynomial: [f64; 6],
     linear_cde: [f64; 3],
     max_angle_rad: f64,
-    rising: Rising,
+    rising: MonotonePolynomial,
 }
 
 /// Which way the exact polynomial goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Reference {
+pub enum FThetaReference {
     /// From radians off the axis to pixels from the principal point.
     AngleToPixel,
     /// From pixels to radians.
@@ -38,7 +38,7 @@ impl FTheta {
     /// With coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and how far off the axis
     /// rays are seen.
     pub fn new(
-        reference: Reference,
+        reference: FThetaReference,
         polynomial: [f64; 6],
         linear_cde: [f64; 3],
         max_angle_rad: f64,
@@ -46,17 +46,17 @@ impl FTheta {
         let mut coefficients = [0.0; TERMS];
         coefficients[..6].copy_from_slice(&polynomial);
         let rising = match reference {
-            Reference::AngleToPixel => Rising::new(coefficients, max_angle_rad),
-            Reference::PixelToAngle => {
-                let whole = Rising::new(coefficients, Self::MOST_PX);
-                Rising::new(coefficients, whole.invert(max_angle_rad).min(whole.end()))
+            FThetaReference::AngleToPixel => MonotonePolynomial::new(coefficients, max_angle_rad),
+            FThetaReference::PixelToAngle => {
+                let whole = MonotonePolynomial::new(coefficients, Self::MOST_PX);
+                MonotonePolynomial::new(coefficients, whole.invert(max_angle_rad).min(whole.end()))
             }
         };
         Self { reference, polynomial, linear_cde, max_angle_rad, rising }
     }
 
     /// Which way the polynomial goes.
-    pub fn reference(&self) -> Reference {
+    pub fn reference(&self) -> FThetaReference {
         self.reference
     }
 
@@ -78,9 +78,11 @@ impl FTheta {
     /// How far off the axis it sees.
     pub fn limit_rad(&self) -> f64 {
         match self.reference {
-            Reference::AngleToPixel => self.rising.end(),
-            Reference::PixelToAngle if self.rising.end() > 0.0 => self.rising.at(self.rising.end()),
-            Reference::PixelToAngle => 0.0,
+            FThetaReference::AngleToPixel => self.rising.end(),
+            FThetaReference::PixelToAngle if self.rising.end() > 0.0 => {
+                self.rising.at(self.rising.end())
+            }
+            FThetaReference::PixelToAngle => 0.0,
         }
     }
 
@@ -93,21 +95,21 @@ impl FTheta {
     #[inline(always)]
     pub fn radius_px(&self, angle_rad: f64) -> f64 {
         match self.reference {
-            Reference::AngleToPixel => self.rising.at(angle_rad),
-            Reference::PixelToAngle => self.rising.invert(angle_rad),
+            FThetaReference::AngleToPixel => self.rising.at(angle_rad),
+            FThetaReference::PixelToAngle => self.rising.invert(angle_rad),
         }
     }
 
     /// The angle off the axis that lands so far from the principal point, the other way.
     pub fn angle_rad(&self, radius_px: f64) -> f64 {
         match self.reference {
-            Reference::AngleToPixel => self.rising.invert(radius_px),
-            Reference::PixelToAngle => self.rising.at(radius_px),
+            FThetaReference::AngleToPixel => self.rising.invert(radius_px),
+            FThetaReference::PixelToAngle => self.rising.at(radius_px),
         }
     }
 
     /// The reference polynomial, as far as it is used: radians to pixels, or the other way.
-    pub fn rising(&self) -> &Rising {
+    pub fn rising(&self) -> &MonotonePolynomial {
         &self.rising
     }
 
@@ -124,8 +126,8 @@ impl FTheta {
         let mut polynomial = self.polynomial;
         for (power, coefficient) in polynomial.iter_mut().enumerate() {
             *coefficient *= match self.reference {
-                Reference::AngleToPixel => scale.y,
-                Reference::PixelToAngle => scale.y.powi(-(power as i32)),
+                FThetaReference::AngleToPixel => scale.y,
+                FThetaReference::PixelToAngle => scale.y.powi(-(power as i32)),
             };
         }
         Self::new(self.reference, polynomial, [c * wider, d * wider, e], self.max_angle_rad)
@@ -164,8 +166,8 @@ impl FTheta {
     /// Pixels per radian at the axis.
     fn central_px(&self) -> f64 {
         match self.reference {
-            Reference::AngleToPixel => self.polynomial[1],
-            Reference::PixelToAngle => 1.0 / self.polynomial[1],
+            FThetaReference::AngleToPixel => self.polynomial[1],
+            FThetaReference::PixelToAngle => 1.0 / self.polynomial[1],
         }
     }
 }

@@ -11,8 +11,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bivariate, Camera, CameraError, FTheta, Fisheye, Lens, OpenCv, Pinhole, Reference, Windshield,
-    WindshieldReference,
+    Bivariate, Camera, CameraError, FTheta, FThetaReference, Fisheye, Lens, OpenCv, Pinhole,
+    Windshield, WindshieldReference,
 };
 
 /// A camera without its place: what JSON says of it.
@@ -56,7 +56,7 @@ pub enum LensFields {
     /// NVIDIA's f-theta.
     Ftheta {
         /// Which way the polynomial goes.
-        reference: Reference,
+        reference: FThetaReference,
         /// Coefficients of powers 0 to 5.
         polynomial: [f64; 6],
         /// `[c, d, e]` of `[[c, d], [e, 1]]`.

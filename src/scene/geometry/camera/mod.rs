@@ -8,21 +8,21 @@ pub mod field;
 pub mod fisheye;
 pub mod ftheta;
 pub mod json;
+pub mod monotone;
 pub mod opencv;
 pub mod pinhole;
-pub mod rising;
 pub mod shutter;
 pub mod windshield;
 
 use glam::{DVec2, DVec3};
 
-pub use field::{Cone, Field};
+pub use field::{FieldCone, FieldMask};
 pub use fisheye::Fisheye;
-pub use ftheta::{FTheta, Reference};
+pub use ftheta::{FTheta, FThetaReference};
+pub use monotone::MonotonePolynomial;
 pub use opencv::OpenCv;
 pub use pinhole::Pinhole;
-pub use rising::Rising;
-pub use shutter::{Rolls, Shutter};
+pub use shutter::{Shutter, ShutterDirection};
 pub use windshield::{Bivariate, Windshield, WindshieldReference};
 
 /// The widest field of any lens, in radians off the axis: 160°. Where all directions but one land on a
@@ -130,7 +130,7 @@ impl Camera {
     const LEAST_SHARE: f64 = 0.125;
 
     /// A pinhole camera of these pixels, as it is.
-    pub fn ideal(width_px: u32, height_px: u32, pinhole: Pinhole) -> Self {
+    pub fn from_pinhole(width_px: u32, height_px: u32, pinhole: Pinhole) -> Self {
         Self { width_px, height_px, pinhole, lens: Lens::Pinhole, windshield: None }
     }
 
@@ -140,7 +140,7 @@ impl Camera {
     /// Names the first field that cannot be used.
     pub fn checked(width_px: u64, height_px: u64, pinhole: Pinhole) -> Result<Self, CameraError> {
         let [width_px, height_px] = sides(width_px, height_px)?;
-        let camera = Self::ideal(width_px, height_px, pinhole);
+        let camera = Self::from_pinhole(width_px, height_px, pinhole);
         camera.check()?;
         Ok(camera)
     }
@@ -186,7 +186,7 @@ impl Camera {
     }
 
     /// Whether it is a pinhole and nothing else.
-    pub fn is_ideal(&self) -> bool {
+    pub fn is_pinhole(&self) -> bool {
         self.lens == Lens::Pinhole && self.windshield.is_none()
     }
 
@@ -208,8 +208,8 @@ impl Camera {
     /// Where a camera-space point lands if the model is continued beyond its field: at the same rate
     /// in the angle as at its end. For the shape of what reaches into the field from beyond.
     #[inline(always)]
-    pub fn project_beyond(&self, point_m: DVec3) -> DVec2 {
-        self.land(self.inside(point_m), self.straight_slope())
+    pub fn project_extrapolated(&self, point_m: DVec3) -> DVec2 {
+        self.land(self.inside(point_m), self.extrapolation_slope())
     }
 
     /// The slope from which pinholes and OpenCV's lenses are continued straight in the angle: 4, 76° off the
@@ -218,7 +218,7 @@ impl Camera {
     /// A slope grows with the square of its own per radian: at 8, what lies beside the camera, a road below
     /// it, is torn into splats of some hundred pixels that reach into the image. At 4 none did.
     #[inline(always)]
-    pub fn straight_slope(&self) -> f64 {
+    pub fn extrapolation_slope(&self) -> f64 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let center_px = DVec2::new(cx, cy);
         let most_px = center_px.abs().max((self.size_px() - center_px).abs());
@@ -332,7 +332,7 @@ impl Camera {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let (focal_px, center_px) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
         match &self.lens {
-            Lens::Pinhole => center_px + focal_px * Pinhole::slope_beyond(inside, straight),
+            Lens::Pinhole => center_px + focal_px * Pinhole::extrapolated_slope(inside, straight),
             Lens::OpenCv(lens) => center_px + focal_px * lens.plane(inside, straight),
             Lens::Fisheye(lens) => center_px + focal_px * lens.plane(inside),
             Lens::FTheta(lens) => center_px + lens.offset_px(inside),

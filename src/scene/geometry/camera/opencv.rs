@@ -4,7 +4,7 @@ use glam::{DMat2, DVec2, DVec3};
 
 use super::CameraError;
 use super::fisheye::azimuth;
-use super::rising::{last, reaches};
+use super::monotone::{last, reaches};
 
 /// `(x, y) -> (x, y) icD + tangential + prism` of the slopes `x/z, y/z`, with
 /// `icD = (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's `projectPoints`).

@@ -45,7 +45,7 @@ impl Pinhole {
     /// The slopes x/z and y/z of a direction; from `straight` on, they rise with the angle as they do there,
     /// and on behind the camera, so that the shape of what reaches there is finite.
     #[inline(always)]
-    pub(super) fn slope_beyond(direction: DVec3, straight: f64) -> DVec2 {
+    pub(super) fn extrapolated_slope(direction: DVec3, straight: f64) -> DVec2 {
         let off_axis = direction.truncate().length();
         let within = off_axis < straight * direction.z;
         if within {

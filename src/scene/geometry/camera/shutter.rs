@@ -10,7 +10,7 @@ use super::{Camera, CameraError};
 #[serde(deny_unknown_fields)]
 pub struct Shutter {
     /// Which row or column comes first.
-    pub direction: Rolls,
+    pub direction: ShutterDirection,
     /// From the exposure of the first row to that of the last, in microseconds. The image's time is
     /// that of the last.
     pub duration_us: i64,
@@ -19,7 +19,7 @@ pub struct Shutter {
 /// The way a shutter rolls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Rolls {
+pub enum ShutterDirection {
     /// The top row first.
     TopToBottom,
     /// The bottom row first.
@@ -46,7 +46,7 @@ impl Shutter {
     }
 }
 
-impl Rolls {
+impl ShutterDirection {
     /// When a place on the image is exposed: 0 with the first row's middle, 1 with the last's, and
     /// neither sooner nor later.
     #[inline(always)]

@@ -13,7 +13,7 @@ const GROUP: usize = 8;
 
 /// A network whose appearance is folded into its biases.
 #[derive(Clone, Debug)]
-pub struct Folded {
+pub struct InferenceNetwork {
     octaves: usize,
     identity: bool,
     skip: bool,
@@ -43,7 +43,7 @@ pub struct Scratch {
     logits: [Lanes; GROUP],
 }
 
-impl Folded {
+impl InferenceNetwork {
     /// The same network.
     pub fn new(network: &Network) -> Self {
         let [first, second, third] = network.layers();

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use crate::chunk::{LANES, Lanes, columns};
-use crate::record::{Clamped, PART};
-use crate::{Chunk, Record, Scene};
+use crate::record::{Clamped, PART_GAUSSIANS};
+use crate::{Chunk, RecordFormat, Scene};
 
 /// A scene as it comes out of a record.
 #[derive(Clone, Debug)]
-pub struct Recorded {
+pub struct RoundTrip {
     /// The scene.
     pub scene: Scene,
     /// Bytes of all parts, as coded.
@@ -18,14 +18,14 @@ pub struct Recorded {
 }
 
 /// Codes every chunk of a scene in parts, and decodes them again.
-pub fn recorded(scene: &Scene, record: Record) -> Recorded {
+pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
     let empty = Scene { chunks: Vec::new(), sky: scene.sky.clone() };
-    let mut all = Recorded { scene: empty, coded_bytes: 0, clamped: 0 };
+    let mut all = RoundTrip { scene: empty, coded_bytes: 0, clamped: 0 };
     for chunk in &scene.chunks {
         let mut lanes = vec![Lanes([0.0; LANES]); chunk.len().div_ceil(LANES) * width(chunk)];
         let mut clamped = Clamped::default();
-        for start in (0..chunk.len()).step_by(PART) {
-            let end = (start + PART).min(chunk.len());
+        for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
+            let end = (start + PART_GAUSSIANS).min(chunk.len());
             let part = record.encode(chunk, start..end, &mut clamped);
             all.coded_bytes += part.len() as u64;
             let own = start / LANES * width(chunk)..end.div_ceil(LANES) * width(chunk);

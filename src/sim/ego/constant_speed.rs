@@ -2,7 +2,7 @@
 
 use glam::{DMat2, DVec2};
 
-use super::vehicle::Tyres;
+use super::vehicle::LateralDynamics;
 
 /// What turns the wheel: the steering angle follows what it is told, `dδ/dt = (told - δ) / lag`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -10,7 +10,7 @@ pub(super) struct Steering {
     /// The angle of the front wheels, in radians, to the left.
     pub(super) angle_rad: f64,
     /// What it is told to be.
-    pub(super) told_rad: f64,
+    pub(super) target_rad: f64,
     /// Its lag, in seconds.
     pub(super) lag_s: f64,
 }
@@ -23,7 +23,7 @@ pub(super) struct Steering {
 /// as it is steered. `G + |v| / lag` is regular wherever no eigenvalue is that of the lag, -10 1/s: they
 /// are below -14 at up to 10 m/s backwards, and forwards below -23 or complex.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Held {
+pub(super) struct ConstantSpeed {
     speed_m_s: f64,
     lag_s: f64,
     matrix: DMat2,
@@ -35,17 +35,22 @@ pub(super) struct Held {
 impl Steering {
     /// The angle after a time in seconds.
     pub(super) fn after(&self, time_s: f64) -> f64 {
-        self.told_rad + (self.angle_rad - self.told_rad) * (-time_s / self.lag_s).exp()
+        self.target_rad + (self.angle_rad - self.target_rad) * (-time_s / self.lag_s).exp()
     }
 }
 
-impl Held {
-    pub(super) fn new(tyres: &Tyres, speed_m_s: f64, steering: Steering, sideways: DVec2) -> Self {
-        let Steering { angle_rad, told_rad, lag_s } = steering;
+impl ConstantSpeed {
+    pub(super) fn new(
+        tyres: &LateralDynamics,
+        speed_m_s: f64,
+        steering: Steering,
+        sideways: DVec2,
+    ) -> Self {
+        let Steering { angle_rad, target_rad, lag_s } = steering;
         let matrix = tyres.matrix(speed_m_s);
         let with_lag = matrix + DMat2::from_diagonal(DVec2::splat(speed_m_s.abs() / lag_s));
-        let settled = -(matrix.inverse() * tyres.steer) * (speed_m_s * told_rad);
-        let lagging = -(with_lag.inverse() * tyres.steer) * (speed_m_s * (angle_rad - told_rad));
+        let settled = -(matrix.inverse() * tyres.steer) * (speed_m_s * target_rad);
+        let lagging = -(with_lag.inverse() * tyres.steer) * (speed_m_s * (angle_rad - target_rad));
         let fading = sideways - settled - lagging;
         Self { speed_m_s, lag_s, matrix, settled, lagging, fading }
     }
@@ -123,9 +128,10 @@ mod tests {
     #[test]
     fn at_a_crawl_the_car_rolls_as_it_is_steered() {
         let (car, tyres) = (Vehicle::DEFAULT, Vehicle::DEFAULT.tyres());
-        let steering = Steering { angle_rad: 0.3, told_rad: 0.3, lag_s: 0.1 };
+        let steering = Steering { angle_rad: 0.3, target_rad: 0.3, lag_s: 0.1 };
         for speed in [0.0, 1e-300, 1e-9, -1e-9, 1e-3] {
-            let (z, turned) = Held::new(&tyres, speed, steering, DVec2::new(1.0, -2.0)).after(0.1);
+            let (z, turned) =
+                ConstantSpeed::new(&tyres, speed, steering, DVec2::new(1.0, -2.0)).after(0.1);
             let rolls = speed * 0.3 / car.wheelbase_m;
             assert!((z.y - rolls).abs() <= 1e-7 * rolls.abs(), "{speed}: {z}");
             assert!((z.x - rolls * car.rear_to_cg_m).abs() <= 1e-6 * rolls.abs(), "{speed}: {z}");

@@ -9,7 +9,7 @@ use crate::geometry::Bounds;
 /// A search looks at every box, and into few: of 84 km at 0.5 m, 2,600 boxes and some hundred of
 /// 168,000 keyframes.
 #[derive(Clone, Debug)]
-pub struct Boxes {
+pub struct BoxIndex {
     bounds: Vec<Bounds>,
     items: usize,
 }
@@ -17,7 +17,7 @@ pub struct Boxes {
 /// Near the root of 168,000, half of it: looking into a box costs more than looking at one.
 const BOX_ITEMS: usize = 64;
 
-impl Boxes {
+impl BoxIndex {
     /// Of items that lie in these bounds, in order.
     pub fn new(items: &[Bounds]) -> Self {
         let union = |chunk: &[Bounds]| chunk.iter().fold(Bounds::EMPTY, |all, one| all.union(one));
@@ -26,7 +26,7 @@ impl Boxes {
 
     /// The item of the least cost, the first of several, and its cost. A cost is in metres, and no less
     /// than the distance between the point and the item's bounds; the less it exceeds that, the faster.
-    pub fn cheapest(&self, point_m: DVec3, cost_m: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
+    pub fn min_cost(&self, point_m: DVec3, cost_m: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
         let distances_m = self.bounds.iter().map(|bounds| bounds.distance_m(point_m));
         let (nearest, _) =
             distances_m.enumerate().min_by(|(_, a_m), (_, b_m)| a_m.total_cmp(b_m))?;
@@ -72,7 +72,7 @@ mod tests {
     fn the_first_of_the_nearest_as_if_all_were_looked_at() {
         let drive = drive();
         let point = |at_m: &DVec3| Bounds { min_m: *at_m, max_m: *at_m };
-        let boxes = Boxes::new(&drive.iter().map(point).collect::<Vec<_>>());
+        let boxes = BoxIndex::new(&drive.iter().map(point).collect::<Vec<_>>());
         let looked_at = Cell::new(0);
         for i in 0..400 {
             let (x_m, y_m) = (f64::from(i % 20) * 7.0 - 20.0, f64::from(i / 20) * 5.0 - 20.0);
@@ -83,9 +83,9 @@ mod tests {
             };
             let slow = drive.iter().map(|at_m| at_m.distance(place_m)).enumerate();
             let slow = slow.min_by(|(_, a), (_, b)| a.total_cmp(b));
-            assert_eq!(boxes.cheapest(place_m, cost_m), slow, "{place_m}");
+            assert_eq!(boxes.min_cost(place_m, cost_m), slow, "{place_m}");
         }
         assert!(looked_at.get() < 400 * 640 / 2, "{} of {}", looked_at.get(), 400 * 640);
-        assert_eq!(Boxes::new(&[]).cheapest(DVec3::ZERO, |_| 0.0), None);
+        assert_eq!(BoxIndex::new(&[]).min_cost(DVec3::ZERO, |_| 0.0), None);
     }
 }

@@ -5,13 +5,13 @@ pub const TERMS: usize = 10;
 
 /// A polynomial that is 0 at 0, on the range from 0 on over which it rises.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rising {
+pub struct MonotonePolynomial {
     coefficients: [f64; TERMS],
     /// Where the range ends; 0 if it does not even begin.
     end: f64,
 }
 
-impl Rising {
+impl MonotonePolynomial {
     /// How much of its slope at 0 a polynomial must keep: a pixel at the end of the range sees fifty
     /// times the angle of one in the middle, and beyond, the image would fold back.
     const LEAST_SLOPE: f64 = 0.02;
@@ -127,7 +127,7 @@ mod tests {
         // θ - θ³/3 turns at 1, and has 2 % of its slope left at √0.98.
         let mut coefficients = [0.0; TERMS];
         (coefficients[1], coefficients[3]) = (1.0, -1.0 / 3.0);
-        let rising = Rising::new(coefficients, 3.0);
+        let rising = MonotonePolynomial::new(coefficients, 3.0);
         assert!((rising.end() - 0.98_f64.sqrt()).abs() < 1e-12, "{}", rising.end());
         for i in 0..=1000 {
             let x = rising.end() * f64::from(i) / 1000.0;
@@ -137,7 +137,7 @@ mod tests {
         assert!((rising.invert(rising.at(beyond)) - beyond).abs() < 1e-9);
         for unusable in [f64::NAN, -1.0, 0.0, f64::INFINITY] {
             coefficients[1] = unusable;
-            assert_eq!(Rising::new(coefficients, 3.0).end(), 0.0, "{unusable}");
+            assert_eq!(MonotonePolynomial::new(coefficients, 3.0).end(), 0.0, "{unusable}");
         }
     }
 }

@@ -5,7 +5,7 @@ use crate::Trajectory;
 
 /// A piece of a drive.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Cut {
+pub struct SubTrajectory {
     /// Where it begins and ends on the drive, in metres.
     pub stations_m: [f64; 2],
     /// When it begins, on the drive's clock, in microseconds; its own clock begins with it.
@@ -16,7 +16,7 @@ pub struct Cut {
 }
 
 /// Most pieces of a drive: one every metre of 100 km.
-pub const MAX_CUTS: usize = 100_000;
+pub const MAX_SUB_TRAJECTORIES: usize = 100_000;
 
 /// Pieces of `length_m`, one every `stride_m` from the start of a drive; what is left at its end is
 /// in none. With a stride as long as the pieces they do not overlap, and each begins where the one
@@ -24,18 +24,18 @@ pub const MAX_CUTS: usize = 100_000;
 ///
 /// # Errors
 /// [`RouteError::Value`] if a length is not positive and finite, or the stride makes more than
-/// [`MAX_CUTS`] pieces; for a piece [`RouteError::Trajectory`] if its name becomes too long.
-pub fn cuts<'a>(
+/// [`MAX_SUB_TRAJECTORIES`] pieces; for a piece [`RouteError::Trajectory`] if its name becomes too long.
+pub fn sub_trajectories<'a>(
     route: &'a Route<'_>,
     length_m: f64,
     stride_m: f64,
-) -> Result<impl Iterator<Item = Result<Cut, RouteError>> + use<'a>, RouteError> {
+) -> Result<impl Iterator<Item = Result<SubTrajectory, RouteError>> + use<'a>, RouteError> {
     positive("length_m", length_m)?;
     positive("stride_m", stride_m)?;
     // A micrometre: a drive of 100 m has two pieces of 50 m, whatever rounding did to its length.
     let left_m = route.length_m() + 1e-6 - length_m;
     let count = if left_m < 0.0 { 0.0 } else { 1.0 + (left_m / stride_m).floor() };
-    if count > MAX_CUTS as f64 {
+    if count > MAX_SUB_TRAJECTORIES as f64 {
         let must = "a stride makes at most 100000 pieces of a drive";
         return Err(RouteError::Value { field: "stride_m", value: stride_m, must });
     }
@@ -44,7 +44,11 @@ pub fn cuts<'a>(
     Ok((0..count as usize).map(at))
 }
 
-fn piece(route: &Route<'_>, number: usize, stations_m: [f64; 2]) -> Result<Cut, RouteError> {
+fn piece(
+    route: &Route<'_>,
+    number: usize,
+    stations_m: [f64; 2],
+) -> Result<SubTrajectory, RouteError> {
     let [from_m, to_m] = stations_m;
     let [first, last] = stations_m.map(|station_m| route.at(station_m));
     // Keyframes between the ends in space and, where the drive stood still or an end was rounded to
@@ -61,14 +65,14 @@ fn piece(route: &Route<'_>, number: usize, stations_m: [f64; 2]) -> Result<Cut, 
     for keyframe in &mut keyframes {
         keyframe.time_us = keyframe.time_us.saturating_sub(first.time_us);
     }
-    let name = format!("{}-{}-{number:04}", route.trajectory.name, label(to_m - from_m));
+    let name = format!("{}-{}-{number:04}", route.trajectory.name, length_label(to_m - from_m));
     let trajectory = Trajectory { name, keyframes };
     trajectory.check()?;
-    Ok(Cut { stations_m, from_us: first.time_us, trajectory })
+    Ok(SubTrajectory { stations_m, from_us: first.time_us, trajectory })
 }
 
 /// A length as names of pieces have it, to the millimetre or the metre: `50m`, `2.5km`.
-pub fn label(length_m: f64) -> String {
+pub fn length_label(length_m: f64) -> String {
     let millimetre_m = |value: f64| (1e3 * value).round() / 1e3;
     if length_m < 1_000.0 {
         format!("{}m", millimetre_m(length_m))

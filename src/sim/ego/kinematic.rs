@@ -3,25 +3,25 @@
 use glam::DVec2;
 
 use super::Action;
-use super::single_track::SingleTrack;
+use super::single_track::SingleTrackState;
 use super::speed::Drive;
 use super::vehicle::Vehicle;
 
 /// The car after a step in seconds of constant acceleration and curvature, which it has at once, its speed
 /// within bounds that 0 lies in (m/s). It rolls without slipping.
 pub(super) fn rolled(
-    from: &SingleTrack,
+    from: &SingleTrackState,
     car: &Vehicle,
     action: Action,
     step_s: f64,
     bounds_m_s: [f64; 2],
-) -> SingleTrack {
+) -> SingleTrackState {
     let Action { acceleration_m_s2, curvature_1_m } = action;
     // A drive that gives what it is told has no lag, whatever the number.
     let drive = Drive {
         speed_m_s: from.speed_m_s,
         acceleration_m_s2,
-        told_m_s2: acceleration_m_s2,
+        target_m_s2: acceleration_m_s2,
         lag_s: car.lag_s,
     };
     let (phases, _) = drive.phases(step_s, bounds_m_s);
@@ -33,7 +33,7 @@ pub(super) fn rolled(
     let speed_m_s = phases.last().map_or(from.speed_m_s, |phase| phase.end_m_s);
     let (way_m, turned_rad) = arc(length_m, curvature_1_m);
     let yaw_rate_rad_s = speed_m_s * curvature_1_m;
-    SingleTrack {
+    SingleTrackState {
         position_m: from.position_m + DVec2::from_angle(from.yaw_rad).rotate(way_m),
         yaw_rad: from.yaw_rad + turned_rad,
         speed_m_s,
