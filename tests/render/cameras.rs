@@ -325,7 +325,8 @@ fn t22_six_points_scatter_as_a_million() {
 
     let mut random = crate::scene_files::Random(77);
     let mut normal = || {
-        let (u, v) = (random.unit().max(1e-300), random.unit());
+        let u = random.unit().max(1e-300);
+        let v = random.unit();
         (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
     };
     let samples: Vec<DVec2> = (0..200_000)

@@ -45,18 +45,22 @@ fn each_model_is_its_formula() {
     let point = DVec3::new(0.7, -0.4, 2.0);
     for (name, camera) in lenses() {
         let Pinhole { fx, fy, cx, cy } = camera.pinhole;
-        let (x, y) = (point.x / point.z, point.y / point.z);
-        let (r2, theta) = (x * x + y * y, x.hypot(y).atan());
+        let x = point.x / point.z;
+        let y = point.y / point.z;
+        let r2 = x * x + y * y;
+        let theta = x.hypot(y).atan();
         let at_px = match camera.lens {
             _ if camera.windshield.is_some() => continue,
             Lens::OpenCv(lens) => {
-                let ([k1, k2, k3, k4, k5, k6], [p1, p2], [s1, s2, s3, s4]) =
-                    (lens.k(), lens.p(), lens.s());
+                let [k1, k2, k3, k4, k5, k6] = lens.k();
+                let [p1, p2] = lens.p();
+                let [s1, s2, s3, s4] = lens.s();
                 let icd = (1.0 + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
                     / (1.0 + k4 * r2 + k5 * r2.powi(2) + k6 * r2.powi(3));
                 let u = x * icd + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
                 let v = y * icd + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-                let (prism_u, prism_v) = (s1 * r2 + s2 * r2 * r2, s3 * r2 + s4 * r2 * r2);
+                let prism_u = s1 * r2 + s2 * r2 * r2;
+                let prism_v = s3 * r2 + s4 * r2 * r2;
                 DVec2::new(fx * (u + prism_u) + cx, fy * (v + prism_v) + cy)
             }
             Lens::Fisheye(lens) => {
@@ -74,7 +78,8 @@ fn each_model_is_its_formula() {
                 let radius_px = match lens.reference() {
                     FThetaReference::AngleToPixel => polynomial(theta),
                     FThetaReference::PixelToAngle => {
-                        let (mut low, mut high) = (0.0, 200.0);
+                        let mut low = 0.0;
+                        let mut high = 200.0;
                         for _ in 0..100 {
                             let middle = 0.5 * (low + high);
                             let ends =
@@ -85,7 +90,8 @@ fn each_model_is_its_formula() {
                     }
                 };
                 let [c, d, e] = lens.linear_cde();
-                let (u, v) = (radius_px * x / r2.sqrt(), radius_px * y / r2.sqrt());
+                let u = radius_px * x / r2.sqrt();
+                let v = radius_px * y / r2.sqrt();
                 DVec2::new(c * u + d * v + cx, e * u + v + cy)
             }
             Lens::Pinhole => DVec2::new(fx * x + cx, fy * y + cy),
@@ -100,12 +106,14 @@ fn a_windshield_turns_rays_as_its_polynomials_say_and_back() {
     let camera = lenses()[4].1;
     let windshield = camera.windshield.unwrap();
     let point = DVec3::new(0.7, -0.4, 2.0).normalize();
-    let (phi, theta) = (point.x.asin(), point.y.asin());
+    let phi = point.x.asin();
+    let theta = point.y.asin();
     let [h, v] = [windshield.horizontal(), windshield.vertical()].map(|polynomial| {
         let c = polynomial.coefficients();
         c[0] + c[1] * phi + c[2] * phi * phi + (c[3] + c[4] * phi) * theta + c[5] * theta * theta
     });
-    let (x, y) = (h.sin(), v.sin());
+    let x = h.sin();
+    let y = v.sin();
     let inside = DVec3::new(x, y, (1.0 - x * x - y * y).sqrt());
     let without = Camera { windshield: None, ..camera };
     let off_px = camera.project(point).unwrap().distance(without.project(inside).unwrap());
@@ -245,11 +253,9 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
     let mut accepted = 0;
     for set in 0..600 {
         let size = |of: usize, sizes: [f64; 4]| sizes[set / of % 4];
-        let (radial, tangential, prism) = (
-            size(1, [0.01, 0.1, 1.0, 10.0]),
-            size(4, [0.0, 1e-3, 0.02, 0.3]),
-            size(16, [0.0, 1e-3, 0.02, 0.3]),
-        );
+        let radial = size(1, [0.01, 0.1, 1.0, 10.0]);
+        let tangential = size(4, [0.0, 1e-3, 0.02, 0.3]);
+        let prism = size(16, [0.0, 1e-3, 0.02, 0.3]);
         let k = [0; 6].map(|_| within(radial));
         let rational = if set % 3 == 0 { 0.0 } else { 1.0 };
         let k = [k[0], k[1], k[2], rational * k[3], rational * k[4], rational * k[5]];
@@ -399,7 +405,8 @@ fn a_windshield_that_folds_where_it_fades_is_refused() {
 fn windshields_neither_fold_nor_lose_what_is_behind_them() {
     let mut random = Random(9);
     let mut within = |most: f64| most * (2.0 * random.unit() - 1.0);
-    let (mut accepted, mut fading) = (0, 0);
+    let mut accepted = 0;
+    let mut fading = 0;
     for set in 0..240 {
         let most = [1e-3, 0.01, 0.05, 0.1][set % 4];
         let limit_rad = [1.0, 1.3, 1.5, 1.7][set / 4 % 4];

@@ -97,7 +97,8 @@ fn an_edge_belongs_to_neither_side() {
     let scene = scene_of(&[board, behind].concat());
     let drawn = draw(&cpu(), &scene, forward_view([160, 100], 90.0));
     // The board's last discs fade out over some pixels, whose depth is between the two and has a slope.
-    let (mut on_one, mut slopes) = (0, 0);
+    let mut on_one = 0;
+    let mut slopes = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
         if (depth_m - 2.0).abs() < 0.01 || (depth_m - 4.0).abs() < 0.02 {
             on_one += 1;

@@ -106,8 +106,9 @@ fn every_instruction_set_of_this_machine() {
 /// A comparison that cannot fail proves nothing.
 #[test]
 fn a_slip_of_the_scene_is_caught() {
-    let (right, profile, view) =
-        (street(20_000, 1, 9), RenderProfile::default(), street_views()[0]);
+    let right = street(20_000, 1, 9);
+    let profile = RenderProfile::default();
+    let view = street_views()[0];
     let truth = render_one(&Reference, &Scene::from_gaussians(&right), &profile, view);
     let caught = |wrong: &Gaussians| {
         let image = render_one(&cpu(), &Scene::from_gaussians(wrong), &profile, view);

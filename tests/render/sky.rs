@@ -210,7 +210,8 @@ fn a_sky_behind_gaussians() {
             assert!(profile != EXACT || db > 75.0, "{db}");
             assert_eq!((&image.opacity, &image.depth_m), (&without.opacity, &without.depth_m));
             let sky = scene.sky.as_ref().unwrap();
-            let (mut shown, mut hidden) = (0, 0);
+            let mut shown = 0;
+            let mut hidden = 0;
             for (pixel, (with, alone)) in
                 image.rgba.chunks(4).zip(without.rgba.chunks(4)).enumerate()
             {

@@ -129,7 +129,8 @@ impl Backend for Faulty<'_> {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         let count = self.count.fetch_add(1, Relaxed);
-        let (mut scene, mut profile) = (frame.scene.clone(), *frame.profile);
+        let mut scene = frame.scene.clone();
+        let mut profile = *frame.profile;
         let mut views = frame.views.to_vec();
         match self.fault {
             Fault::Culled => scene = Scene::default(),
@@ -210,7 +211,8 @@ fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Sce
         let row = |i| (0..width).map(|c| chunk.value(i, c)).collect::<Vec<f32>>();
         let mut rows: Vec<_> = (0..chunk.len()).map(row).collect();
         edit(chunk.origin_m(), &mut rows);
-        let (cell, origin_m) = (chunk.cell(), chunk.origin_m());
+        let cell = chunk.cell();
+        let origin_m = chunk.origin_m();
         let mut again = Chunk::new(cell, origin_m, chunk.sh_degree(), rows.len());
         for row in &rows {
             again.push_activated(&ActivatedGaussian {
@@ -262,7 +264,7 @@ const PLANTED: &[(&str, Fault, &[&str])] = &[
     ("T5", Mirror, &["behind: opacity", "as f64"]),
     ("T5", Culled, &["inside: seen"]),
     ("T6", Reversed, &["the first of each pair is in front", "as f64"]),
-    ("T6", Restless, &["100 drawings"]),
+    ("T6", Restless, &["100 images"]),
     ("T7", Places, &["the nearer one is in front", "as f64"]),
     ("T8", Culled, &["it pops"]),
     ("T8", Pale, &["apart", "as f64"]),
@@ -278,7 +280,7 @@ const PLANTED: &[(&str, Fault, &[&str])] = &[
     ("T12", Flicker, &["neighbours off by", "as f64"]),
     ("T13", Blur, &["as f64"]),
     ("T13", Pale, &["centre's opacity from 0.9"]),
-    ("T14", Restless, &["20 drawings"]),
+    ("T14", Restless, &["20 images"]),
     ("T14", Pale, &["as f64"]),
     ("T15", Restless, &["the small frame after it", "and so has the large one"]),
     ("T15", Pale, &["as f64"]),
@@ -438,7 +440,8 @@ fn too_much_is_refused_and_the_next_frame_is_right() {
     let wall =
         || GaussianSpec { sigma_m: DVec3::splat(1e3), opacity: 0.01, ..GaussianSpec::default() };
     let walls: Vec<GaussianSpec> = (0..340).map(|_| wall()).collect();
-    let (backend, profile) = (cpu(), RenderProfile::default());
+    let backend = cpu();
+    let profile = RenderProfile::default();
     let view = forward_view([10_240, 10_240], 300.0);
     let small = forward_view([64, 48], 50.0);
     let walls = scene_of(&walls);

@@ -133,11 +133,11 @@ impl Lens {
     }
 
     fn set_rolling(&mut self, still: &ShutterMotion) {
-        let [a, b, c] = still.share.map(|value| value as f32);
+        let [a, b, c] = still.remaining.map(|value| value as f32);
         self.rolls = [a, b, c, 0.0];
-        self.moved_world_m = still.moved_world_m.as_vec3().to_array();
-        self.moved_m = still.moved_m.as_vec3().to_array();
-        self.turned = still.axis.extend(still.turned_rad).as_vec4().to_array();
+        self.moved_world_m = still.translation_world_m.as_vec3().to_array();
+        self.moved_m = still.translation_m.as_vec3().to_array();
+        self.turned = still.axis.extend(still.rotation_rad).as_vec4().to_array();
     }
 }
 
