@@ -41,7 +41,8 @@ fn a_thousand_laps_end_where_they_began() {
         let mut driven = episode(EgoModel::Kinematic, start, 10.0);
         let mut worst_m = 0.0f64;
         for step in 1..=STEPS {
-            driven = driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
+            driven =
+                driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
             let pose = driven.world_from_rig();
             assert!(skewness(&pose) < MAX_SKEWNESS, "step {step}: {pose:?}");
             if step % 100 == 0 {
@@ -70,7 +71,8 @@ fn a_dynamic_car_driven_twice_is_bit_identical() {
                 acceleration_m_s2: 6.0 * (phase / 70.0).sin(),
                 curvature_1_m: 0.05 * (phase / 31.0).sin(),
             };
-            driven = driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
+            driven =
+                driven.stepped(&Command::Action(action), &Ground::from_drives(&[]), false).unwrap();
             let pose = driven.world_from_rig();
             assert!(skewness(&pose) < MAX_SKEWNESS, "step {step}: {pose:?}");
             let speed_m_s = driven.ego().velocity_m_s().dot(pose.rotation * DVec3::X);
