@@ -176,7 +176,7 @@ mod tests {
                 "saturating_add(block_sums[block], prefix_before(thread))",
                 "max(block_sums[block], prefix_before(thread))",
             ),
-            ("bin", "i - prefix_before(holder)", "i"),
+            ("bin", "i - prefix_before(band_index)", "i"),
             ("expand", "next += countOneBits", "next = first + countOneBits"),
             ("rasterize", "sums.green += weight", "sums.green += 1.02 * weight"),
         ] {
