@@ -1,4 +1,5 @@
-//! City twins on disk and in memory: files of outside formats in, sections of a versioned store out.
+//! City twins on disk and in memory: files of outside formats in, sections of a versioned store
+//! out.
 
 pub mod ingest;
 pub mod limits;

@@ -1,4 +1,4 @@
-//! WebP images whose pixels are numbers.
+//! WebP images with numbers as pixels.
 
 use std::io::Cursor;
 
@@ -19,13 +19,13 @@ pub(super) struct Image {
 }
 
 impl Image {
-    /// Decodes a named image of at least so many pixels.
+    /// Decodes a named image of at least `count` pixels.
     pub(super) fn decode(
         (name, file): (String, Vec<u8>),
         count: usize,
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
-        // The decoder would not miss what pads the end.
+        // The decoder would accept a truncated file.
         let promised = match file.as_slice() {
             [b'R', b'I', b'F', b'F', a, b, c, d, ..] => {
                 8 + u64::from(u32::from_le_bytes([*a, *b, *c, *d]))
@@ -42,7 +42,7 @@ impl Image {
         if decoder.is_lossy() {
             return Err(body(
                 &name,
-                "is lossy, which no number survives; encode it lossless".into(),
+                "is lossy, which would change the numbers; encode it lossless".into(),
             ));
         }
         let (width_px, height_px) = decoder.dimensions();
@@ -52,7 +52,7 @@ impl Image {
             let reason = format!("{width_px}x{height_px} pixels for {count} Gaussians");
             return Err(body(&name, reason));
         }
-        // The decoder works on four bytes per pixel, whether there is alpha or not.
+        // The decoder uses four bytes per pixel, with or without alpha.
         budget.unpack(FORMAT, &name, 4 * pixels)?;
         let channels = if decoder.has_alpha() { 4 } else { 3 };
         let mut bytes = vec![0; channels * size_px[0] * size_px[1]];
@@ -60,7 +60,7 @@ impl Image {
         Ok(Self { bytes, channels, size_px })
     }
 
-    /// The first so many pixels.
+    /// The first `count` pixels.
     pub(super) fn pixels(&self, count: usize) -> impl Iterator<Item = [u8; 4]> {
         self.bytes.chunks_exact(self.channels).take(count).map(|pixel| {
             let alpha = pixel.get(3).copied().unwrap_or(255);
@@ -69,11 +69,11 @@ impl Image {
     }
 }
 
-/// The colours of higher degrees that labels choose from.
+/// The palette of higher SH degrees. Labels are indices of its entries.
 pub(super) struct Palette {
     image: Image,
     pub(super) sh_degree: u8,
-    /// Pixels of an entry: coefficients without the first.
+    /// Pixels of an entry: one per coefficient above degree 0.
     coefficients: usize,
     entries: usize,
 }
@@ -82,8 +82,8 @@ pub(super) struct Palette {
 const ENTRIES_PER_ROW: usize = 64;
 
 impl Palette {
-    /// Decodes an image of so many entries and such a degree, where that is known; the width says
-    /// the degree, too.
+    /// Decodes an image, and checks its number of entries and its degree where they are known. Its
+    /// width implies the degree, too.
     pub(super) fn decode(
         part: (String, Vec<u8>),
         entries: Option<u64>,
@@ -112,7 +112,8 @@ impl Palette {
 
     /// The bytes of an entry: coefficient-major, then red, green, blue.
     pub(super) fn entry(&self, label: u16) -> Option<impl Iterator<Item = u8>> {
-        let (label, stride) = (usize::from(label), self.image.channels);
+        let label = usize::from(label);
+        let stride = self.image.channels;
         if label >= self.entries {
             return None;
         }
