@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use serde_json::json;
 use wildcity_client::PushState;
@@ -13,11 +14,11 @@ use wildcity_session::{
     SessionOptions,
 };
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::Catalog;
+use wildcity_twin::store::{Catalog, Retention};
 
-use crate::http::{get, in_cell, push};
+use crate::http::{get, in_cell, post, push};
 use crate::metrics::scrape;
-use crate::support::{Agent, PATIENCE, Seen, TestServer, pose, refused};
+use crate::support::{Agent, PATIENCE, Seen, TestServer, commit_twin_of, pose, refused};
 
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;
@@ -258,4 +259,19 @@ async fn without_a_session_there_is_nothing_to_switch() {
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
     refused(&agent.ask(json!({ "type": "switch_version" })).await, "session_state");
+}
+
+/// A version that garbage collection removed is gone for HTTP as well, and no fault of the server.
+#[tokio::test]
+async fn a_rollback_to_a_collected_version_is_refused() {
+    let server = TestServer::start().await;
+    commit_twin_of(server.twins.path(), 1.0);
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let retention = Retention { versions: 1, grace: Duration::ZERO };
+    // The first run notes the garbage, the second one removes it.
+    for _ in 0..2 {
+        assert_eq!(catalog.collect("test", retention, false).unwrap().kept, [2]);
+    }
+    let body = json!({ "version": 1 });
+    post(&server, "/v1/twins/test/rollback", &body).await.refused(404, "unknown_version");
 }
