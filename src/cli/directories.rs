@@ -94,7 +94,9 @@ fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
     }
 }
 
-/// A directory of the XDG base directory specification: from the environment, or below HOME.
+/// A directory of the XDG base directory specification: from the environment, or below HOME. By
+/// hand, because a crate would be longer to call, and would look up a home in the user database
+/// where HOME is unset.
 fn user_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))
