@@ -1,4 +1,13 @@
-//! The command line: one file per subcommand.
+//! The command line: one file, or one folder, for each subcommand.
+//!
+//! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
+//! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
+//! failure, 2 for a command line that cannot be parsed.
+//!
+//! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
+//! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
+//! belongs to. Numbers from outside are printed with `{:?}`, which writes 1e300 as such and not as 301
+//! digits.
 
 use std::process::ExitCode;
 
@@ -9,6 +18,7 @@ mod demo;
 mod devices;
 mod directories;
 mod import;
+mod input_files;
 mod inspect;
 mod limits;
 mod lod;
@@ -30,13 +40,20 @@ mod twin;
 
 use clap::{Parser, Subcommand};
 
-/// A closed-loop driving simulator server for city twins.
+/// A closed-loop driving simulator server for city twins made of 3D Gaussians.
 #[derive(Debug, Parser)]
-#[command(version, about, arg_required_else_help = true)]
+#[command(version, about, arg_required_else_help = true, after_long_help = EXAMPLES)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity demo                                   (build a street, drive through it, look at images)
+  wildcity import street.ply --twin street --axes y-down-z-forward
+  wildcity serve                                  (then an agent can open the twin \"street\")
+  wildcity help import                            (options and examples of one command)";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -58,7 +75,8 @@ enum Command {
     Devices(devices::Devices),
 }
 
-/// Parses the command line, runs, and tells how it went: 0 done, 1 failed, 2 not understood.
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure. A
+/// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let result = match arguments.command {

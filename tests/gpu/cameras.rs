@@ -1,5 +1,5 @@
-//! Lenses and rolling shutters on the device: as the cpu backend draws them, and nothing of them for a
-//! pinhole.
+//! Lenses and rolling shutters on the device against the cpu backend. For static pinhole cameras, nothing
+//! for lenses is compiled.
 
 use glam::DVec3;
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -22,8 +22,9 @@ fn straight() -> View {
     view_along([150, 90], 110.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y)
 }
 
-/// Every lens at rest, and shutters that roll all four ways; one windshield is given the other way round.
-pub(crate) fn bent_views() -> Vec<View> {
+/// Every lens at rest, and rolling shutters in all four directions. One windshield is given by its inverse
+/// polynomials.
+pub(crate) fn lens_views() -> Vec<View> {
     let lenses = lenses();
     let camera = |name: &str| lenses.iter().find(|(known, _)| *known == name).unwrap().1;
     let behind = camera("fisheye behind a windshield");
@@ -46,7 +47,7 @@ pub(crate) fn bent_views() -> Vec<View> {
 fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     let gpu = gpu();
     let street = Scene::from_gaussians(&street(20_000, 1, 31));
-    let views: Vec<View> = bent_views().into_iter().chain([straight()]).collect();
+    let views: Vec<View> = lens_views().into_iter().chain([straight()]).collect();
     for setting in ["near=0.01", "antialiased=true", "near=3", "far=30", "blur=0.1"] {
         let mut profile = RenderProfile::default();
         profile.set(setting).unwrap();
@@ -60,7 +61,7 @@ fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     }
 }
 
-/// Thousands of surfels of one plane: seen by z, by distance, and by a camera that moves meanwhile.
+/// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving camera.
 #[test]
 fn the_demo_street_through_lenses_and_shutters() {
     let (street, views) = demo_street();
@@ -112,7 +113,7 @@ fn known_points_land_where_the_model_says() {
 }
 
 #[test]
-fn what_passes_close_is_drawn_as_by_the_cpu() {
+fn gaussians_that_pass_close_are_drawn_as_by_the_cpu() {
     let ball = |k: i32| GaussianSpec {
         mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
         sigma_m: DVec3::splat(0.05),
@@ -124,7 +125,7 @@ fn what_passes_close_is_drawn_as_by_the_cpu() {
     agree(&render_one(&*gpu(), &balls, &profile, passing()), &truth).unwrap();
 }
 
-/// The f-theta cameras of a real car, at full size and at that which a model reads.
+/// The f-theta cameras of a real car, at full size and at the input size of a driving model.
 #[test]
 fn a_real_cars_points_land_where_its_lenses_say() {
     let gpu = gpu();
@@ -139,28 +140,30 @@ fn a_real_cars_points_land_where_its_lenses_say() {
     }
 }
 
-/// What is not compiled cannot fail: the projection of lenses does not parse here.
+/// A shader that is not compiled cannot fail. Here the projection of lenses does not parse.
 #[test]
 fn without_a_lens_nothing_of_it_is_compiled() {
     let broken = || {
         let shaders = Shaders::default();
-        shaders.with_mutation("project_bent", "struct Exposed {", "struct Nothing {").unwrap()
+        shaders
+            .with_mutation("project_unscented", "struct ProjectedPoint {", "struct Nothing {")
+            .unwrap()
     };
     let (street, profile) = (Scene::from_gaussians(&street(300, 0, 1)), RenderProfile::default());
     render_one(&gpu_with(broken()), &street, &profile, straight());
-    // Nobody listens here: this one is to fail.
+    // Without the log watch of `gpu_with`, since this one must fail.
     let gpu = Gpu::with_shaders(&AdapterChoice::Best, 0, broken()).unwrap();
-    let failed = try_render(&gpu, &street, &profile, &bent_views()[..1]);
+    let failed = try_render(&gpu, &street, &profile, &lens_views()[..1]);
     assert!(matches!(failed, Err(RenderError::Device { .. })), "{failed:?}");
 }
 
 #[test]
-fn a_pinhole_beside_a_lens_is_drawn_to_the_byte() {
+fn a_pinhole_next_to_a_lens_is_drawn_to_the_same_bytes() {
     let (street, profile) = (Scene::from_gaussians(&street(5_000, 1, 2)), RenderProfile::default());
     let gpu = gpu();
     let alone = render(&gpu, &street, &profile, &[straight()]);
     let pipelines = gpu.usage().unwrap().totals.pipelines;
-    let [before, after] = [bent_views()[1], bent_views()[7]];
+    let [before, after] = [lens_views()[1], lens_views()[7]];
     let together = render(&gpu, &street, &profile, &[before, straight(), after]);
     assert!(together[1..2] == alone);
     assert_eq!(gpu.usage().unwrap().totals.pipelines, pipelines + 2, "cull and project");

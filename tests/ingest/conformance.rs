@@ -240,10 +240,10 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
         matches(few, many, steps).unwrap_or_else(|strange| panic!("{file}: {strange}"))
     };
     let (read, fitted, original) = if read.len() > original.len() {
-        (pick(&read, &find(&fitted, &read)), fitted, original)
+        (read.select(find(&fitted, &read)), fitted, original)
     } else {
         let found = find(&read, &fitted);
-        (read, pick(&fitted, &found), pick(&original, &found))
+        (read, fitted.select(found.iter().copied()), original.select(found.iter().copied()))
     };
     let off = |i: usize| off(&read, i, &fitted, i, steps);
     let most = (0..read.len()).map(off).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
@@ -255,19 +255,7 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
     }
 }
 
-/// Some Gaussians, in that order.
-fn pick(g: &Gaussians, indices: &[usize]) -> Gaussians {
-    Gaussians {
-        sh_degree: g.sh_degree,
-        means_m: indices.iter().map(|&i| g.means_m[i]).collect(),
-        quats_wxyz: indices.iter().map(|&i| g.quats_wxyz[i]).collect(),
-        ln_scales: indices.iter().map(|&i| g.ln_scales[i]).collect(),
-        logit_opacities: indices.iter().map(|&i| g.logit_opacities[i]).collect(),
-        sh: indices.iter().flat_map(|&i| g.sh_of(i)).copied().collect(),
-    }
-}
-
-/// The same with colours of a lower degree.
+/// The same Gaussians with colours of a lower degree.
 fn cut(g: &Gaussians, sh_degree: u8) -> Gaussians {
     let sh = (0..g.len()).flat_map(|i| &g.sh_of(i)[..3 * sh::coefficients(sh_degree)]).copied();
     Gaussians { sh_degree, sh: sh.collect(), ..g.clone() }

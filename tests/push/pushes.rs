@@ -19,11 +19,7 @@ async fn a_push_replaces_the_cells_that_it_touches() {
     let server = TestServer::start().await;
     let mut gaussians = in_cell([0, 0], 40, 1);
     let far = in_cell([3, -1], 10, 2);
-    gaussians.means_m.extend(&far.means_m);
-    gaussians.quats_wxyz.extend(&far.quats_wxyz);
-    gaussians.ln_scales.extend(&far.ln_scales);
-    gaussians.logit_opacities.extend(&far.logit_opacities);
-    gaussians.sh.extend(&far.sh);
+    gaussians.append(&far);
     let pushed = push(&server, &gaussians, |_| {}).await;
     assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(2)), "{pushed:?}");
     let report = pushed.report.unwrap();

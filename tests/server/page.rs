@@ -53,9 +53,9 @@ fn limits_are_those_of_the_configuration() {
             "| age of an abandoned upload | {} h |",
             seconds(wildcity_server::limits::UPLOAD_AGE) / 3600
         ),
-        format!("| pushes that wait or run | {} |", wildcity_server::limits::PUSHES),
-        format!("| files of a push | {} |", wildcity_server::limits::PUSH_FILES),
-        format!("| poses compared | {} |", wildcity_server::limits::GOLDEN_POSES),
+        format!("| pushes that wait or run | {} |", wildcity_push::limits::OPEN_PUSHES),
+        format!("| files of a push | {} |", wildcity_push::limits::PUSH_FILES),
+        format!("| poses compared | {} |", wildcity_push::limits::PREVIEW_POSES),
         format!(
             "frames up to {} GiB",
             wildcity_protocol::limits::OBSERVATION_BYTES as f64 / f64::from(1 << 30)

@@ -101,8 +101,8 @@ impl VersionClaims {
     }
 }
 
-/// The default limit: three quarters of the machine's memory.
-pub(super) fn default_bytes() -> u64 {
+/// The memory that twins may take by default, in bytes: three quarters of the machine's memory.
+pub fn default_memory_bytes() -> u64 {
     physical_bytes().map_or(limits::RESIDENT_BYTES, |physical| physical / 4 * 3)
 }
 

@@ -9,7 +9,7 @@ use crate::store::{Catalog, StoreError, TwinListing, Version};
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{Manifest, Sky};
 
-use super::budget::{Budget, default_bytes};
+use super::budget::{Budget, default_memory_bytes};
 use super::pager::Pager;
 use super::resident::Shared;
 use super::{ResidencyError, Resident, SectionSource, Stats};
@@ -54,7 +54,7 @@ impl Cache {
         source: Arc<dyn SectionSource>,
         limit_bytes: Option<u64>,
     ) -> Self {
-        let limit_bytes = limit_bytes.unwrap_or_else(default_bytes);
+        let limit_bytes = limit_bytes.unwrap_or_else(default_memory_bytes);
         let pager = Pager::new(source, limit_bytes);
         let budget = Mutex::new(Budget::new(limit_bytes));
         Self {

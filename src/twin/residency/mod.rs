@@ -70,6 +70,7 @@ mod stats;
 mod table;
 mod worst_case;
 
+pub use budget::default_memory_bytes;
 pub use cache::Cache;
 pub use demand::{SectionRef, Viewpoint};
 pub use error::ResidencyError;
