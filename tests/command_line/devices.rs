@@ -55,8 +55,9 @@ fn a_device_is_for_the_gpu_backend() {
 #[test]
 fn a_shader_that_does_not_compile_is_an_error() {
     let broken = wildcity_render::gpu::shaders::Shaders::default();
-    let broken =
-        broken.with_mutation("ranges", "let own = macros[i];", "let own = nothing[i];").unwrap();
+    let broken = broken
+        .with_mutation("ranges", "let own = touch_macro_tiles[i];", "let own = nothing[i];")
+        .unwrap();
     let error = Gpu::with_shaders(&AdapterChoice::Best, 1, broken).unwrap_err();
     assert!(error.to_string().contains("nothing"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! Memory over thousands of steps.
+//! Memory does not grow over thousands of steps.
 
 use std::fs;
 use std::ops::Range;
@@ -13,23 +13,24 @@ use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::view_along;
 use crate::streets::street;
 
-/// What one step may leave behind is 4 MiB / 10,000 = 419 B; a bind group or a buffer is more.
+/// A step may leak at most 4 MiB / 10,000 = 419 B; a bind group or a buffer is larger.
 const GROWTH_BYTES: u64 = 4 << 20;
 
 #[test]
 fn memory_is_flat_over_ten_thousand_steps() {
-    in_its_own_process("flat::ten_thousand_steps");
+    in_its_own_process("memory_growth::ten_thousand_steps");
 }
 
 #[test]
 fn memory_is_flat_over_changing_scenes_and_frames_that_fail() {
-    in_its_own_process("flat::three_at_once");
+    in_its_own_process("memory_growth::three_at_once");
 }
 
 fn in_its_own_process(test: &str) {
     let output = std::process::Command::new(std::env::current_exe().unwrap())
         .args(["--exact", test, "--ignored"])
-        // Else glibc gives threads arenas of their own, which fill up with what others free.
+        // Without this, glibc gives each thread its own arena, which grows with memory that other
+        // threads free.
         .env("MALLOC_ARENA_MAX", "1")
         .output()
         .unwrap();
@@ -38,7 +39,7 @@ fn in_its_own_process(test: &str) {
 }
 
 #[test]
-#[ignore = "a process of its own, started by memory_is_flat_over_ten_thousand_steps"]
+#[ignore = "runs in its own process, started by memory_is_flat_over_ten_thousand_steps"]
 fn ten_thousand_steps() {
     let gpu = gpu();
     let scene = Scene::from_gaussians(&street(300, 1, 61));
@@ -52,10 +53,10 @@ fn ten_thousand_steps() {
     assert_eq!(device_before, device_after);
 }
 
-/// A thread for each frame that is in hand at once, on small bindings: pages of four clusters. Scenes
-/// come and go, so that pages are freed and taken again, and some frames exceed the device.
+/// A thread for each frame in flight, with small bindings: pages of four clusters. Scenes change, so that
+/// pages are freed and allocated again, and some frames exceed the device.
 #[test]
-#[ignore = "a process of its own, started by memory_is_flat_over_changing_scenes_and_frames_that_fail"]
+#[ignore = "runs in its own process, started by memory_is_flat_over_changing_scenes_and_frames_that_fail"]
 fn three_at_once() {
     let gpu = gpu_with_limits(bindings(64 << 10));
     let layer = |i| GaussianSpec {
@@ -80,17 +81,17 @@ fn three_at_once() {
                 scope.spawn(|| (0..ROUND).for_each(step));
             }
         });
-        // Whatever scenes were drawn last, this one alone is resident now.
+        // Now only this scene is resident, whichever scenes were drawn last.
         draw(&gpu, &Scene::from_gaussians(&streets[0]), 0).unwrap();
         memory(&gpu)
     };
-    // Each buffer that is read back has seen the widest frame, whichever thread gets its turn when.
+    // Each read-back buffer has held the largest frame, whatever the order of the threads.
     draw_within(&gpu, &Scene::from_gaussians(&streets[1]), gpu.frames_in_flight());
     let rounds = [(); 6].map(|()| round());
     let [(before, _), .., (after, _)] = rounds;
     assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
-    // Who draws when decides which scenes share a page, and buffers keep the largest size that this ever
-    // took: a larger one may still come in a later round. A leak comes in every round.
+    // The order of the threads decides which scenes share a page, and buffers keep the largest size that
+    // this needed: a later round may need a larger one. A leak would grow in every round.
     let device = rounds.map(|(_, device_bytes)| device_bytes);
     assert!(
         device.windows(2).any(|two| two[0] == two[1]),
@@ -98,7 +99,7 @@ fn three_at_once() {
     );
 }
 
-/// Draws the widest frame, and another while it is in hand, until so many are.
+/// Draws the largest frame, and another one from its callback, until `frames` of them are in flight.
 fn draw_within(gpu: &Gpu, scene: &Scene, frames: usize) {
     if frames > 0 {
         let one_more = |view: usize, _: &Target<'_>| {
@@ -110,10 +111,10 @@ fn draw_within(gpu: &Gpu, scene: &Scene, frames: usize) {
     }
 }
 
-/// After so many steps everything repeats: scenes (2), sizes (3) and places.
+/// Number of steps after which scenes (2), sizes (3), and camera positions repeat.
 const ROUND: u32 = 198;
 
-/// Two small views of changing size from a place that changes.
+/// Draws two small views whose size and position depend on the step.
 fn draw(gpu: &Gpu, scene: &Scene, step: u32) -> Result<(), RenderError> {
     draw_and(gpu, scene, step, &|_, _| {})
 }
@@ -129,7 +130,8 @@ fn draw_and(
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
         view_along([24 + 8 * (step % 3), 16], 20.0, at, forward, DVec3::Y)
     };
-    let (views, profile) = ([view(0.0), view(2.0)], RenderProfile::default());
+    let views = [view(0.0), view(2.0)];
+    let profile = RenderProfile::default();
     let mut images = views.map(|view| vec![0; 3 * view.camera.pixels()]);
     let mut targets =
         images.each_mut().map(|image| Target { rgb8: Some(image), ..Target::default() });
@@ -137,14 +139,14 @@ fn draw_and(
     gpu.render(&frame, &mut targets, finished).map(drop)
 }
 
-/// Bytes of this process, and of the device.
+/// Bytes of memory of this process, and of the device.
 fn memory(gpu: &Gpu) -> (u64, u64) {
     let device = gpu.usage().unwrap().allocated_bytes.expect("the device counts its memory");
     assert!(device > 0);
     (status_bytes("VmRSS"), device)
 }
 
-/// A size of /proc/self/status.
+/// A size in /proc/self/status, in bytes.
 fn status_bytes(field: &str) -> u64 {
     let status = fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find(|line| line.starts_with(field)).unwrap();

@@ -1,4 +1,4 @@
-//! Frames that exceed a device are drawn in parts, and nobody can tell.
+//! Frames that exceed a device are drawn region by region, to the same bytes.
 
 use glam::DVec3;
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
@@ -9,7 +9,8 @@ use crate::images::{agree, cpu, render, render_one, view_along};
 use crate::scene_files::{Random, gaussians};
 use crate::streets::{street, turning_views};
 
-/// A street with mist over many tiles, so that splats and instances both run out.
+/// A street with large translucent Gaussians over many tiles, so that both splats and instances exceed the
+/// limits.
 fn misty(n: usize, step: usize, seed: u64) -> Scene {
     let mut street = street(n, 1, seed);
     for i in (0..street.len()).step_by(step) {
@@ -19,15 +20,16 @@ fn misty(n: usize, step: usize, seed: u64) -> Scene {
     Scene::from_gaussians(&street)
 }
 
-/// 32 B a splat and 4 B an instance: dust that runs out of splats, clouds that run out of instances.
+/// A splat takes 32 B and an instance 4 B: many small Gaussians exceed the limit of splats, and few large
+/// ones that of instances.
 #[test]
-fn the_image_does_not_depend_on_the_parts() {
+fn the_image_does_not_depend_on_the_regions() {
     let view = |yaw: f64| {
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
         view_along([90, 360], 150.0, DVec3::ZERO, forward, DVec3::Y)
     };
-    let (views, profile) =
-        ((0..6).map(f64::from).map(view).collect::<Vec<_>>(), RenderProfile::default());
+    let views: Vec<View> = (0..6).map(f64::from).map(view).collect();
+    let profile = RenderProfile::default();
     for (n, ln_scale) in [(60_000, -3.0), (3_000, 1.0)] {
         let mut cloud = gaussians(n, 1, 20.0, 31);
         cloud.ln_scales.fill([ln_scale; 3]);
@@ -36,33 +38,35 @@ fn the_image_does_not_depend_on_the_parts() {
         let whole = gpu();
         let expected = render(&whole, &scene, &profile, &views);
         assert_eq!(whole.usage().unwrap().regions, 1);
-        // Groups of views, and bands of views.
-        let parts = [256 << 10, 128 << 10, 64 << 10].map(|binding_bytes| {
+        // Groups of views, then bands of single views.
+        let regions = [256 << 10, 128 << 10, 64 << 10].map(|binding_bytes| {
             let limited = gpu_with_limits(bindings(binding_bytes));
             assert!(render(&limited, &scene, &profile, &views) == expected, "{binding_bytes} B");
             limited.usage().unwrap().regions
         });
-        let bands = parts[2] > 2 * views.len() as u64;
-        assert!(parts.is_sorted() && parts[0] >= 2 && bands, "{parts:?}");
+        let has_bands = regions[2] > 2 * views.len() as u64;
+        assert!(regions.is_sorted() && regions[0] >= 2 && has_bands, "{regions:?}");
     }
 }
 
 #[test]
-fn parts_are_known_from_the_frame_before() {
-    let (scene, profile, views) = (misty(12_000, 4, 32), RenderProfile::default(), turning_views());
+fn a_frame_starts_with_the_regions_of_the_previous_one() {
+    let scene = misty(12_000, 4, 32);
+    let profile = RenderProfile::default();
+    let views = turning_views();
     let other = misty(9_000, 100, 33);
     let limited = gpu_with_limits(bindings(256 << 10));
     let expected = render(&limited, &scene, &profile, &views);
     render(&limited, &other, &profile, &views);
     let known = limited.usage().unwrap();
-    assert!(known.retries > 0 && known.regions > 4, "nothing was cut: {known:?}");
+    assert!(known.retries > 0 && known.regions > 4, "nothing was split: {known:?}");
     for _ in 0..3 {
         assert!(render(&limited, &scene, &profile, &views) == expected);
         render(&limited, &other, &profile, &views);
     }
-    assert_eq!(limited.usage().unwrap().retries, known.retries, "a frame began with a failure");
+    assert_eq!(limited.usage().unwrap().retries, known.retries, "a frame had to be drawn again");
 
-    // What fits again is drawn at once.
+    // A frame that fits is drawn at once again.
     let small = Scene::from_gaussians(&street(2_000, 1, 34));
     let before = limited.usage().unwrap().regions;
     render(&limited, &small, &profile, &views);
@@ -79,7 +83,8 @@ fn a_row_of_tiles_that_exceeds_a_device_is_an_error() {
         wall.logit_opacities.push(-4.0);
         wall.sh.extend([0.5; 3]);
     }
-    let (scene, profile) = (Scene::from_gaussians(&wall), RenderProfile::default());
+    let scene = Scene::from_gaussians(&wall);
+    let profile = RenderProfile::default();
     let limited = gpu_with_limits(bindings(64 << 10));
     let one_row = view_along([64, 16], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let rows = view_along([64, 64], 50.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
@@ -92,17 +97,19 @@ fn a_row_of_tiles_that_exceeds_a_device_is_an_error() {
         assert_eq!(error, RenderError::TooMany { what, limit: 2_048 });
         assert!(image.iter().all(|&byte| byte == 77), "something was written");
     }
-    // And the next frame is drawn.
+    // The next frame is drawn.
     let street = Scene::from_gaussians(&street(1_000, 1, 35));
     let view = turning_views()[0];
     let image = render_one(&limited, &street, &profile, view);
     assert!(image == render_one(&gpu(), &street, &profile, view));
 }
 
-/// 4,194,304 splats of 32 B are what a binding of lavapipe holds; cards hold 16 times as many.
+/// A binding of lavapipe holds 4,194,304 splats of 32 B; one of a graphics card holds 16 times as many.
 #[test]
 fn more_splats_than_lavapipe_holds_at_once() {
-    let (width, height, focal_px) = (640, 400, 300.0);
+    let width = 640;
+    let height = 400;
+    let focal_px = 300.0;
     let mut random = Random(36);
     let mut dust = Gaussians::with_capacity(0, 4_500_000);
     for _ in 0..4_500_000 {
@@ -119,7 +126,7 @@ fn more_splats_than_lavapipe_holds_at_once() {
     exceeds_lavapipe(&Scene::from_gaussians(&dust), view);
 }
 
-/// 33,554,432 instances of 4 B are what a binding of lavapipe holds; cards hold four times as many.
+/// A binding of lavapipe holds 33,554,432 instances of 4 B; one of a graphics card holds four times as many.
 #[test]
 fn more_instances_than_lavapipe_holds_at_once() {
     let mut mist = street(60_000, 0, 37);
@@ -129,17 +136,18 @@ fn more_instances_than_lavapipe_holds_at_once() {
     exceeds_lavapipe(&Scene::from_gaussians(&mist), view);
 }
 
-/// Draws what exceeds bindings of 128 MiB, whatever the device could do.
+/// Draws a scene that exceeds bindings of 128 MiB, even if the device allows larger ones.
 fn exceeds_lavapipe(scene: &Scene, view: View) {
     let limited = gpu_with_limits(bindings(128 << 20));
     let image = render_one(&limited, scene, &RenderProfile::default(), view);
-    let parts = limited.usage().unwrap().regions;
-    assert!(parts >= 2, "it fitted");
+    let regions = limited.usage().unwrap().regions;
+    assert!(regions >= 2, "the frame fitted at once");
     let truth = render_one(&cpu(), scene, &RenderProfile::default(), view);
     agree(&image, &truth).unwrap();
 }
 
-/// Lavapipe leaves a loop after 65,535 iterations: what it would not blend must not be missing.
+/// Lavapipe leaves a loop after 65,535 iterations. A frame whose splats it would not all blend must be
+/// refused, not drawn without them.
 #[test]
 fn more_splats_in_a_tile_than_software_blends() {
     let mut fog = Gaussians::with_capacity(0, 70_000);
@@ -147,7 +155,7 @@ fn more_splats_in_a_tile_than_software_blends() {
         fog.means_m.push([0.0, 0.0, 5.0 + 1e-4 * f64::from(i)]);
         fog.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         fog.ln_scales.push([0.0; 3]);
-        // 2^-8 is above the cut of 1/255; four in a thousand of 70,000 are opaque by far.
+        // Alpha is 2^-8, above the cut of 1/255; 70,000 times four in a thousand is opaque by far.
         fog.logit_opacities.push(-5.53);
         fog.sh.extend([0.5; 3]);
     }
@@ -167,8 +175,8 @@ fn more_splats_in_a_tile_than_software_blends() {
     }
 }
 
-/// As many iterations, of the loops that list the tiles of huge splats: without bands, some of the
-/// 10,625 tiles of some of these would stay as they were in the frame before.
+/// The loops that list the tiles of huge splats have the same limit: if the image were not drawn in bands,
+/// some of its 10,625 tiles would keep the pixels of the previous frame.
 #[test]
 fn huge_splats_on_a_large_image() {
     let mut haze = Gaussians::with_capacity(0, 300);
@@ -179,7 +187,8 @@ fn huge_splats_on_a_large_image() {
         haze.logit_opacities.push(-4.5);
         haze.sh.extend([0.01 * i as f32, 0.5, 0.2]);
     }
-    let (scene, profile) = (Scene::from_gaussians(&haze), RenderProfile::default());
+    let scene = Scene::from_gaussians(&haze);
+    let profile = RenderProfile::default();
     let view = view_along([2_000, 1_360], 1_000.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let image = render_one(&gpu(), &scene, &profile, view);
     agree(&image, &render_one(&cpu(), &scene, &profile, view)).unwrap();
