@@ -1,8 +1,9 @@
-// Stage bin: for every splat, from the nearest, the macro tiles that its ellipse touches, and which of
-// their tiles.
+// Stage bin, first part: for every splat, in order of depth, lists the macro tiles that its ellipse
+// touches, with one bit for each touched tile of the macro tile. Such a (splat, macro tile) pair is
+// called a touch.
 //
-// `count` counts them; a prefix sum gives each splat its places; `emit` writes (macro tile, splat, bit
-// per tile) there. Twin of `src/render/cpu/bin.rs`, where the test is documented.
+// `count` counts the touches of each splat, a prefix sum gives each splat the index of its first touch,
+// and `emit` writes the touches. Twin of `src/render/cpu/bin.rs`, where the ellipse test is documented.
 
 #import constants
 #import layout
@@ -13,11 +14,11 @@
 @group(0) @binding(1) var<storage, read> job: Job;
 @group(0) @binding(2) var<storage, read> touches_job: Job;
 @group(0) @binding(3) var<storage, read> keys: array<u32>;
-@group(0) @binding(4) var<storage, read> places: array<u32>;
+@group(0) @binding(4) var<storage, read> splat_indices: array<u32>;
 @group(0) @binding(5) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(6) var<storage, read_write> offsets: array<u32>;
-@group(0) @binding(7) var<storage, read_write> touch_macros: array<u32>;
-@group(0) @binding(8) var<storage, read_write> touch_places: array<u32>;
+@group(0) @binding(7) var<storage, read_write> touch_macro_tiles: array<u32>;
+@group(0) @binding(8) var<storage, read_write> touch_splats: array<u32>;
 @group(0) @binding(9) var<storage, read_write> touch_masks: array<u32>;
 
 @compute @workgroup_size(WORKGROUP)
@@ -32,14 +33,15 @@ fn count(
     }
     let reach = reach_of(rank);
     let macro_rows = macro_rows_of(reach);
-    var macros = 0u;
+    var count = 0u;
     for (var row = macro_rows.x; row <= macro_rows.y; row++) {
-        macros += band_of(reach, row).count;
+        count += band_of(reach, row).count;
     }
-    offsets[rank] = macros;
+    offsets[rank] = count;
 }
 
-// Threads whose splat the whole workgroup emits, in any order: places do not depend on it.
+// Threads whose splat the whole workgroup emits. Their order is arbitrary; where touches are written does
+// not depend on it.
 var<workgroup> big: array<u32, WORKGROUP>;
 var<workgroup> big_count: atomic<u32>;
 var<workgroup> big_total: u32;
@@ -59,7 +61,7 @@ fn emit(
     let rank = first_rank + thread;
     if rank < job.length && touches_job.length > 0u {
         let span = touch_span(rank);
-        if span.count > BIG_SPLAT_MACROS {
+        if span.count > LARGE_SPLAT_MACRO_TILES {
             big[atomicAdd(&big_count, 1u)] = thread;
         } else {
             emit_alone(rank, span);
@@ -75,7 +77,8 @@ fn emit(
     }
 }
 
-// Where a rank's touches go. `offsets` has no element behind the last one.
+// Range of the touches of the splat with this rank (its position in depth order). `offsets` has no
+// element after the last rank.
 fn touch_span(rank: u32) -> Span {
     let first = offsets[rank];
     var end = touches_job.length;
@@ -85,31 +88,34 @@ fn touch_span(rank: u32) -> Span {
     return Span(first, end - first);
 }
 
+// Emits the touches of one splat by one thread.
 fn emit_alone(rank: u32, span: Span) {
     let reach = reach_of(rank);
     let macro_rows = macro_rows_of(reach);
-    let place = places[rank];
+    let splat = splat_indices[rank];
     var at = span.first;
     let end = span.first + span.count;
     for (var row = macro_rows.x; row <= macro_rows.y; row++) {
         let band = band_of(reach, row);
         for (var i = 0u; i < band.count && at < end; i++) {
-            write_touch(at, band, i, place);
+            write_touch(at, band, i, splat);
             at++;
         }
     }
-    // Should the two pipelines round a row differently, what is left over belongs to no macro tile.
+    // `count` and `emit` are two pipelines, and a compiler may round a row differently in each. Touches
+    // that `count` counted and this one does not find are assigned to no macro tile.
     for (; at < end; at++) {
-        write_nothing(at, place);
+        write_nothing(at, splat);
     }
 }
 
-// One row of macro tiles per thread finds its columns; then one touch per thread finds its row.
+// Emits the touches of one splat by the whole workgroup: first each thread computes the columns of one
+// row of macro tiles, then each thread writes touches and finds the row of each by binary search.
 fn emit_together(rank: u32, thread: u32) {
     let span = touch_span(rank);
     let reach = reach_of(rank);
     let macro_rows = macro_rows_of(reach);
-    let place = places[rank];
+    let splat = splat_indices[rank];
     let end = span.first + span.count;
     var at = span.first;
     for (var first_row = macro_rows.x; first_row <= macro_rows.y; first_row += i32(WORKGROUP)) {
@@ -123,21 +129,21 @@ fn emit_together(rank: u32, thread: u32) {
         workgroupBarrier();
         let count = prefix_sums[WORKGROUP - 1u];
         for (var i = thread; i < count && at + i < end; i += WORKGROUP) {
-            let holder = first_above(i);
-            write_touch(at + i, bands[holder], i - prefix_before(holder), place);
+            let band_index = first_above(i);
+            write_touch(at + i, bands[band_index], i - prefix_before(band_index), splat);
         }
         at += count;
         workgroupBarrier();
     }
     for (var i = at + thread; i < end; i += WORKGROUP) {
-        write_nothing(i, place);
+        write_nothing(i, splat);
     }
 }
 
-// Macro tile `i` of a band.
-fn write_touch(at: u32, band: Band, i: u32, place: u32) {
-    touch_macros[at] = band.first_macro + i;
-    touch_places[at] = place;
+// Writes the touch of macro tile `i` of a band.
+fn write_touch(at: u32, band: Band, i: u32, splat: u32) {
+    touch_macro_tiles[at] = band.first_macro_tile + i;
+    touch_splats[at] = splat;
     let left = band.left + i * MACRO_COLUMNS;
     var mask = 0u;
     for (var k = 0u; k < MACRO_ROWS; k++) {
@@ -146,20 +152,21 @@ fn write_touch(at: u32, band: Band, i: u32, place: u32) {
     touch_masks[at] = mask;
 }
 
-fn write_nothing(at: u32, place: u32) {
-    touch_macros[at] = frame.macros;
-    touch_places[at] = place;
+// Writes a touch of no tile; `ranges.wgsl` skips it.
+fn write_nothing(at: u32, splat: u32) {
+    touch_macro_tiles[at] = frame.macro_tiles;
+    touch_splats[at] = splat;
     touch_masks[at] = 0u;
 }
 
-// A bit for each column from `left` on that a row of a band has.
+// Bits of the eight columns from `left` on, set where a row of a band touches the column's tile.
 fn row_mask(columns: u32, left: u32) -> u32 {
     let first = max(columns & 0xFFFFu, left);
     let end = min(columns >> 16u, left + MACRO_COLUMNS);
     return select(0u, (1u << (end - left)) - (1u << (first - left)), first < end);
 }
 
-// The first thread whose inclusive prefix sum is above `i`.
+// First thread whose inclusive prefix sum is greater than `i`.
 fn first_above(i: u32) -> u32 {
     var low = 0u;
     var high = WORKGROUP - 1u;
@@ -174,14 +181,14 @@ fn first_above(i: u32) -> u32 {
     return low;
 }
 
-// What a splat touches of a row of macro tiles. An ellipse so flat that rows miss each other may have
-// macro tiles between them of which it touches nothing.
+// Tiles of one row of macro tiles that a splat touches. For an ellipse so flat that the columns of
+// neighbouring rows do not overlap, macro tiles between them may have no touched tile.
 struct Band {
-    // Columns of tiles, row by row: the first in the low half of a word, the end in the high half.
+    // Columns of tiles of each row: the first in the low 16 bits, the end (exclusive) in the high 16.
     rows: array<u32, MACRO_ROWS>,
-    // Column of tiles where the first macro tile begins.
+    // First column of tiles of the first macro tile.
     left: u32,
-    first_macro: u32,
+    first_macro_tile: u32,
     count: u32,
 }
 
@@ -203,14 +210,14 @@ fn band_of(reach: Reach, macro_row: i32) -> Band {
     if first < end {
         let first_column = first / MACRO_COLUMNS;
         band.left = first_column * MACRO_COLUMNS;
-        band.first_macro =
-            reach.view.first_macro + u32(macro_row) * reach.view.macro_columns + first_column;
+        band.first_macro_tile =
+            reach.view.first_macro_tile + u32(macro_row) * reach.view.macro_columns + first_column;
         band.count = (end - 1u) / MACRO_COLUMNS - first_column + 1u;
     }
     return band;
 }
 
-// First and last row of macro tiles.
+// First and last row of macro tiles that a splat's box covers; (0, -1) if it covers none.
 fn macro_rows_of(reach: Reach) -> vec2i {
     if reach.first_row > reach.last_row {
         return vec2i(0, -1);
@@ -218,27 +225,30 @@ fn macro_rows_of(reach: Reach) -> vec2i {
     return vec2i(reach.first_row, reach.last_row) / i32(MACRO_ROWS);
 }
 
-// A splat's box on its view's grid of tiles, and what its rows need.
+// A splat's box on its view's grid of tiles, and the terms that the ellipse test of each row needs.
 struct Reach {
     shape: SplatShape,
     view: FrameView,
     first_row: i32,
     last_row: i32,
-    // Pixels of the box.
+    // First and last column of pixels of the box.
     left: i32,
     right: i32,
-    // Whether the box is one tile wide or high: then no row is narrower.
+    // Whether the box is one tile wide or high. Then every row has the box's columns.
     thin: bool,
+    // log2(peak opacity / alpha_cut): the exponent that may be lost before alpha falls below the cut.
     power: f32,
     inverse_l0: f32,
+    // Shift of the row's middle per pixel of dy: -l1 / l0.
     skew: f32,
+    // dy at which the ellipse reaches farthest to the right; it reaches farthest to the left at -widest_dy.
     widest_dy: f32,
 }
 
 fn reach_of(rank: u32) -> Reach {
     var reach: Reach;
     reach.view = frame.view[keys[rank] >> DEPTH_BITS];
-    reach.shape = shapes[places[rank]];
+    reach.shape = shapes[splat_indices[rank]];
     let mean = reach.shape.mean_px;
     let extent = reach.shape.extent_px;
     let size_px = vec2i(reach.view.size_px);
@@ -253,7 +263,7 @@ fn reach_of(rank: u32) -> Reach {
     }
     reach.thin = reach.first_row == reach.last_row
         || columns.x / i32(TILE_PX) == columns.y / i32(TILE_PX);
-    // Of an image that is drawn in bands, the rows of this one.
+    // Of a frame that is drawn region by region, only the rows of this region.
     reach.first_row = max(reach.first_row, i32(reach.view.rows.x));
     reach.last_row = min(reach.last_row, i32(reach.view.rows.y) - 1);
     let l = reach.shape.factor;
@@ -264,7 +274,7 @@ fn reach_of(rank: u32) -> Reach {
     return reach;
 }
 
-// The tiles of one row that the ellipse touches: the first column, and the one after the last.
+// Columns of the tiles of one row that the ellipse touches: first, and end (exclusive).
 fn columns_of(reach: Reach, row: i32) -> vec2u {
     var columns = vec2i(reach.left, reach.right);
     if !reach.thin {
@@ -285,13 +295,15 @@ fn columns_of(reach: Reach, row: i32) -> vec2u {
     return vec2u(u32(columns.x) / TILE_PX, u32(columns.y) / TILE_PX + 1u);
 }
 
+// Half-width of the ellipse in pixels at a vertical distance from its centre.
 fn half_width(reach: Reach, dy: f32) -> f32 {
     let v = reach.shape.factor.z * dy;
     return sqrt(max(reach.power - v * v, 0.0)) * reach.inverse_l0;
 }
 
-// First and last pixel with its centre, at +0.5, between `center + low` and `center + high`, of
-// `size`. Clamped before the conversion, which WGSL leaves open beyond the range of i32.
+// First and last of `size` pixels whose centre, at +0.5, lies between `center + low` and
+// `center + high`. The values are clamped before the conversion, since WGSL does not define conversions
+// of values outside of i32's range.
 fn pixels(center: f32, low: f32, high: f32, size: i32) -> vec2i {
     let first = clamp(ceil(center + low - 0.5), 0.0, f32(size));
     let last = clamp(floor(center + high - 0.5), -1.0, f32(size - 1));

@@ -1,119 +1,125 @@
-// What is no pinhole at rest: lenses, windshields, rolling shutters, there and back. Twin of
-// `src/geometry/camera` and `src/render/view.rs`, where the models are documented. Loops are short: some
-// devices in software have 65,535 iterations for all of a shader's.
+// Lenses, windshields, and rolling shutters: projection and its inverse. Twin of
+// `src/scene/geometry/camera` and `src/render/view.rs`, where the models are documented.
+//
+// Iteration counts are small, since Mesa's software devices allow 65,535 iterations for all loops of a
+// shader together.
 
 #import angle
 
 @group(0) @binding(12) var<storage, read> lenses: array<Lens, MAX_VIEWS>;
 
-// `Lens.model`. A pinhole is 0.
+// Values of `Lens.model`; 0 is a pinhole.
 const OPENCV: u32 = 1;
 const FROM_ANGLE: u32 = 2;
 const FROM_DISTANCE: u32 = 3;
 
-// `Lens.windshield`: which way its polynomials go. There is none at 0.
-const INWARDS: u32 = 1;
-const OUTWARDS: u32 = 2;
+// Values of `Lens.windshield`: whether its polynomials map outside directions to inside ones (forward)
+// or the other way round (backward). 0 means that there is no windshield.
+const FORWARD: u32 = 1;
+const BACKWARD: u32 = 2;
 
-// Where a direction of any length lands, in pixels; beyond the field the model goes on straight.
-fn land(of_view: u32, outside: vec3f) -> vec2f {
-    let inside = turn(of_view, outside, INWARDS);
+// Where a direction (of any length) lands, in pixels. Beyond the lens' field the model is continued
+// linearly in the angle.
+fn project_extrapolated(view_index: u32, outside: vec3f) -> vec2f {
+    let inside = through_windshield(view_index, outside, FORWARD);
     let off_axis = length(inside.xy);
-    // Straight behind there is none.
+    // Finite also straight behind the camera, where the azimuth is undefined.
     let azimuth = inside.xy / max(off_axis, max(-1e-3 * inside.z, 1e-30));
-    let end = lenses[of_view].end;
+    let end = lenses[view_index].end;
     var plane: vec2f;
-    switch lenses[of_view].model {
+    switch lenses[view_index].model {
         case OPENCV: {
             if off_axis < end * inside.z {
-                plane = distort(of_view, inside.xy / inside.z);
+                plane = distort(view_index, inside.xy / inside.z);
             } else {
                 let edge = azimuth * end;
-                let beyond_rad = angle(off_axis, inside.z) - lenses[of_view].end_rad;
+                // d(tan a)/da = 1 + tan(a)^2 at the end of the field.
+                let beyond_rad = angle(off_axis, inside.z) - lenses[view_index].end_rad;
                 let beyond = (1.0 + end * end) * beyond_rad;
-                plane = distort(of_view, edge) + jacobian(of_view, edge) * azimuth * beyond;
+                plane = distort(view_index, edge) + jacobian(view_index, edge) * azimuth * beyond;
             }
         }
-        case FROM_ANGLE: { plane = azimuth * rise(of_view, angle(off_axis, inside.z)); }
-        case FROM_DISTANCE: { plane = azimuth * fall(of_view, angle(off_axis, inside.z)); }
+        case FROM_ANGLE: { plane = azimuth * polynomial_extrapolated(view_index, angle(off_axis, inside.z)); }
+        case FROM_DISTANCE: { plane = azimuth * polynomial_inverse(view_index, angle(off_axis, inside.z)); }
         default: {
             if off_axis < end * inside.z {
                 plane = inside.xy / inside.z;
             } else {
-                let beyond_rad = angle(off_axis, inside.z) - lenses[of_view].end_rad;
+                let beyond_rad = angle(off_axis, inside.z) - lenses[view_index].end_rad;
                 plane = azimuth * (end + (1.0 + end * end) * beyond_rad);
             }
         }
     }
-    return lenses[of_view].center_px + linear(of_view) * plane;
+    return lenses[view_index].center_px + linear(view_index) * plane;
 }
 
-// The unit direction that lands on a place of the image, in pixels; any one outside of the field.
-fn unproject(of_view: u32, at_px: vec2f) -> vec3f {
-    let plane = solve(linear(of_view), at_px - lenses[of_view].center_px);
+// The unit direction that lands on a point of the image, in pixels; arbitrary outside of the field.
+fn unproject(view_index: u32, at_px: vec2f) -> vec3f {
+    let plane = solve(linear(view_index), at_px - lenses[view_index].center_px);
     var inside: vec3f;
-    switch lenses[of_view].model {
-        case OPENCV: { inside = normalize(vec3f(undistort(of_view, plane), 1.0)); }
-        case FROM_ANGLE: { inside = off_axis_by(fall(of_view, length(plane)), plane); }
-        case FROM_DISTANCE: { inside = off_axis_by(rise(of_view, length(plane)), plane); }
+    switch lenses[view_index].model {
+        case OPENCV: { inside = normalize(vec3f(undistort(view_index, plane), 1.0)); }
+        case FROM_ANGLE: { inside = off_axis_by(polynomial_inverse(view_index, length(plane)), plane); }
+        case FROM_DISTANCE: { inside = off_axis_by(polynomial_extrapolated(view_index, length(plane)), plane); }
         default: { inside = normalize(vec3f(plane, 1.0)); }
     }
-    return turn(of_view, inside, OUTWARDS);
+    return through_windshield(view_index, inside, BACKWARD);
 }
 
-// The unit direction at an angle off the axis, in radians, along an azimuth.
+// The unit direction at an angle off the axis, in radians, along an azimuth (of any length).
 fn off_axis_by(angle_rad: f32, azimuth: vec2f) -> vec3f {
     let at = vec4f(angle_rad, 0.0, 0.0, 0.0);
     return vec3f(azimuth * (sine(at, 0.0).x / max(length(azimuth), 1e-30)), sine(at, 0.5).x);
 }
 
-// Pixels of a distorted slope, or of a distance along an azimuth.
-fn linear(of_view: u32) -> mat2x2f {
-    let columns = lenses[of_view].linear;
+// Matrix from the lens' plane (distorted slopes, or a radius along an azimuth) to pixels.
+fn linear(view_index: u32) -> mat2x2f {
+    let columns = lenses[view_index].linear;
     return mat2x2f(columns.xy, columns.zw);
 }
 
-// A rising polynomial without a constant, in shares of where it ends; beyond, it goes on straight.
-fn rise(of_view: u32, x: f32) -> f32 {
-    let end = lenses[of_view].end;
-    let beyond = max(x - end, 0.0) * lenses[of_view].end_slope;
-    return polynomial(of_view, min(x / end, 1.0)).x + beyond;
+// The lens' rising polynomial, which has no constant term, continued linearly beyond its end. Its
+// variable is a fraction of the end.
+fn polynomial_extrapolated(view_index: u32, x: f32) -> f32 {
+    let end = lenses[view_index].end;
+    let beyond = max(x - end, 0.0) * lenses[view_index].end_slope;
+    return polynomial(view_index, min(x / end, 1.0)).x + beyond;
 }
 
-// Where it reaches a value of at least 0: Newton's steps, and halves of what is left where one would
-// leave it.
-fn fall(of_view: u32, y: f32) -> f32 {
-    let end = lenses[of_view].end;
-    let top = lenses[of_view].end_value;
+// Inverse of `polynomial_extrapolated` for a value of at least 0: Newton's method, with a bisection step where
+// Newton's would leave the bracket.
+fn polynomial_inverse(view_index: u32, y: f32) -> f32 {
+    let end = lenses[view_index].end;
+    let top = lenses[view_index].end_value;
     if y >= top {
-        return end + (y - top) / lenses[of_view].end_slope;
+        return end + (y - top) / lenses[view_index].end_slope;
     }
     var low = 0.0;
     var high = 1.0;
-    var share = clamp(y / lenses[of_view].c[0].x, low, high);
+    var fraction = clamp(y / lenses[view_index].coefficients[0].x, low, high);
     for (var step = 0u; step < 40u; step++) {
-        let at = polynomial(of_view, share);
+        let at = polynomial(view_index, fraction);
         if at.x > y {
-            high = share;
+            high = fraction;
         } else {
-            low = share;
+            low = fraction;
         }
-        let newton = share - (at.x - y) / at.y;
+        let newton = fraction - (at.x - y) / at.y;
         let next = select(0.5 * (low + high), newton, newton > low && newton < high);
-        let done = abs(next - share) <= 6e-8;
-        share = next;
+        let done = abs(next - fraction) <= 6e-8;
+        fraction = next;
         if done {
             break;
         }
     }
-    return share * end;
+    return fraction * end;
 }
 
-// Value and slope of `c1 u + .. + c9 u^9`.
-fn polynomial(of_view: u32, u: f32) -> vec2f {
-    let a = lenses[of_view].c[0];
-    let b = lenses[of_view].c[1];
-    let c = lenses[of_view].c[2].x;
+// Value and derivative of `c1 u + .. + c9 u^9`.
+fn polynomial(view_index: u32, u: f32) -> vec2f {
+    let a = lenses[view_index].coefficients[0];
+    let b = lenses[view_index].coefficients[1];
+    let c = lenses[view_index].coefficients[2].x;
     let value = u * (a.x + u * (a.y + u * (a.z + u * (a.w
         + u * (b.x + u * (b.y + u * (b.z + u * (b.w + u * c))))))));
     let slope = a.x + u * (2.0 * a.y + u * (3.0 * a.z + u * (4.0 * a.w + u * (5.0 * b.x
@@ -121,10 +127,11 @@ fn polynomial(of_view: u32, u: f32) -> vec2f {
     return vec2f(value, slope);
 }
 
-// OpenCV's factor `icD` and its derivative by r².
-fn radial(of_view: u32, r2: f32) -> vec2f {
-    let k = lenses[of_view].c[0];
-    let l = lenses[of_view].c[1];
+// OpenCV's radial factor `(1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)`, called `icD` in its
+// source, and the derivative of the factor by r².
+fn radial(view_index: u32, r2: f32) -> vec2f {
+    let k = lenses[view_index].coefficients[0];
+    let l = lenses[view_index].coefficients[1];
     let above = 1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z));
     let below = 1.0 + r2 * (k.w + r2 * (l.x + r2 * l.y));
     let above_rise = k.x + r2 * (2.0 * k.y + r2 * 3.0 * k.z);
@@ -132,20 +139,21 @@ fn radial(of_view: u32, r2: f32) -> vec2f {
     return vec2f(above / below, (above_rise * below - above * below_rise) / (below * below));
 }
 
-fn distort(of_view: u32, slope: vec2f) -> vec2f {
-    let p = lenses[of_view].c[1].zw;
-    let s = lenses[of_view].c[2];
+// OpenCV's distortion of a slope (x/z, y/z): radial, tangential (p), and thin prism (s).
+fn distort(view_index: u32, slope: vec2f) -> vec2f {
+    let p = lenses[view_index].coefficients[1].zw;
+    let s = lenses[view_index].coefficients[2];
     let r2 = dot(slope, slope);
     let tangential = 2.0 * slope.x * slope.y * p + p.yx * (r2 + 2.0 * slope * slope);
-    return slope * radial(of_view, r2).x + tangential + (s.xz + s.yw * r2) * r2;
+    return slope * radial(view_index, r2).x + tangential + (s.xz + s.yw * r2) * r2;
 }
 
-// How `distort` changes with the slope.
-fn jacobian(of_view: u32, slope: vec2f) -> mat2x2f {
-    let p = lenses[of_view].c[1].zw;
-    let s = lenses[of_view].c[2];
+// Jacobian of `distort` by the slope.
+fn jacobian(view_index: u32, slope: vec2f) -> mat2x2f {
+    let p = lenses[view_index].coefficients[1].zw;
+    let s = lenses[view_index].coefficients[2];
     let r2 = dot(slope, slope);
-    let factor = radial(of_view, r2);
+    let factor = radial(view_index, r2);
     let prism = 2.0 * (s.xz + 2.0 * s.yw * r2);
     let across = 2.0 * slope.x * slope.y * factor.y + 2.0 * dot(p, slope);
     let along = factor.x + 2.0 * slope * slope * factor.y + 2.0 * p * slope.yx + 6.0 * p.yx * slope;
@@ -155,21 +163,21 @@ fn jacobian(of_view: u32, slope: vec2f) -> mat2x2f {
     );
 }
 
-// The slope that is distorted to this one: Newton's steps from where the radial part alone would be, halved
-// until they lead nearer.
-fn undistort(of_view: u32, plane: vec2f) -> vec2f {
-    let most = lenses[of_view].end;
-    let away = length(plane);
-    var slope = plane * (radial_slope(of_view, away) / max(away, 1e-30));
-    var off = distort(of_view, slope) - plane;
+// Inverse of `distort`: Newton's method, which starts at the inverse of the radial part alone; a step is
+// halved until it decreases the residual.
+fn undistort(view_index: u32, plane: vec2f) -> vec2f {
+    let most = lenses[view_index].end;
+    let radius = length(plane);
+    var slope = plane * (radial_slope(view_index, radius) / max(radius, 1e-30));
+    var off = distort(view_index, slope) - plane;
     for (var step = 0u; step < 32u; step++) {
-        var by = solve(jacobian(of_view, slope), off);
+        var by = solve(jacobian(view_index, slope), off);
         var next = slope;
         var next_off = off;
         for (var halved = 0u; halved < 12u; halved++) {
             next = slope - by;
             next *= min(1.01 * most / max(length(next), 1e-30), 1.0);
-            next_off = distort(of_view, next) - plane;
+            next_off = distort(view_index, next) - plane;
             if length(next_off) < length(off) {
                 break;
             }
@@ -188,15 +196,15 @@ fn undistort(of_view: u32, plane: vec2f) -> vec2f {
     return slope;
 }
 
-// Where `r icD(r)` reaches a distance, or the end if that is sooner: Newton's steps, and halves of what is
-// left where one would leave it.
-fn radial_slope(of_view: u32, away: f32) -> f32 {
+// The slope r at which `r icD(r)` reaches a radius, at most the end of the field: Newton's method, with a
+// bisection step where Newton's would leave the bracket.
+fn radial_slope(view_index: u32, radius: f32) -> f32 {
     var low = 0.0;
-    var high = lenses[of_view].end;
-    var slope = min(away, high);
+    var high = lenses[view_index].end;
+    var slope = min(radius, high);
     for (var step = 0u; step < 24u; step++) {
-        let factor = radial(of_view, slope * slope);
-        let off = slope * factor.x - away;
+        let factor = radial(view_index, slope * slope);
+        let off = slope * factor.x - radius;
         if off > 0.0 {
             high = slope;
         } else {
@@ -213,16 +221,17 @@ fn radial_slope(of_view: u32, away: f32) -> f32 {
     return slope;
 }
 
-// What `m` takes to `to`.
+// Solution x of `m x = to`.
 fn solve(m: mat2x2f, to: vec2f) -> vec2f {
     let adjugate = mat2x2f(vec2f(m[1].y, -m[0].y), vec2f(-m[1].x, m[0].x));
     return adjugate * to / determinant(m);
 }
 
-// What the windshield makes of a direction on its way in or out.
-fn turn(of_view: u32, direction: vec3f, way: u32) -> vec3f {
-    let has = lenses[of_view].windshield;
-    if has == 0u {
+// Direction after refraction by the windshield: into the car (`FORWARD`) or out of it (`BACKWARD`). The
+// polynomials give one of both; the other one is found by fixed-point iteration.
+fn through_windshield(view_index: u32, direction: vec3f, wanted: u32) -> vec3f {
+    let given = lenses[view_index].windshield;
+    if given == 0u {
         return direction;
     }
     let unit = normalize(direction);
@@ -232,36 +241,37 @@ fn turn(of_view: u32, direction: vec3f, way: u32) -> vec3f {
     let from_rad = vec2f(arc_sine(unit.x), arc_sine(unit.y));
     let cosines = sqrt(max((1.0 - unit.xy) * (1.0 + unit.xy), vec2f(0.0)));
     var sines = unit.xy;
-    var bent_rad = bend(of_view, from_rad, sines);
-    if way != has {
-        // What is bent to `from_rad`: nearly that itself.
+    var shift_rad = windshield_shift_rad(view_index, from_rad, sines);
+    if wanted != given {
+        // Solve for the angles that the polynomials map to `from_rad`. They differ little from it.
         var off_rad = vec2f(0.0);
         for (var step = 0u; step < 26u; step++) {
-            let next_rad = -bent_rad;
+            let next_rad = -shift_rad;
             let done = distance(next_rad, off_rad) <= 3e-8;
             off_rad = next_rad;
             if done {
                 break;
             }
-            sines = turned(unit.xy, cosines, off_rad);
-            bent_rad = bend(of_view, from_rad + off_rad, sines);
+            sines = sines_of_sums(unit.xy, cosines, off_rad);
+            shift_rad = windshield_shift_rad(view_index, from_rad + off_rad, sines);
         }
-        bent_rad = off_rad;
+        shift_rad = off_rad;
     }
-    sines = turned(unit.xy, cosines, bent_rad);
+    sines = sines_of_sums(unit.xy, cosines, shift_rad);
     return normalize(vec3f(sines, sqrt(max(1.0 - dot(sines, sines), 0.0))));
 }
 
-// Sines of two angles after each has grown.
-fn turned(sines: vec2f, cosines: vec2f, by_rad: vec2f) -> vec2f {
+// Sines of the sums of two angles, given by sine and cosine, and two increments in radians.
+fn sines_of_sums(sines: vec2f, cosines: vec2f, by_rad: vec2f) -> vec2f {
     let by = vec4f(by_rad, 0.0, 0.0);
     return sines * sine(by, 0.5).xy + cosines * sine(by, 0.0).xy;
 }
 
-// By how much two angles change, whose sines are these. It fades out from 81 degrees off the axis to 87.
-fn bend(of_view: u32, at_rad: vec2f, sines: vec2f) -> vec2f {
+// Change of a direction's two angles by the windshield, in radians. It fades out between 81 and 87 degrees
+// off the axis.
+fn windshield_shift_rad(view_index: u32, at_rad: vec2f, sines: vec2f) -> vec2f {
     let z = sqrt(max(1.0 - dot(sines, sines), 0.0));
-    let c = lenses[of_view].bend;
+    let c = lenses[view_index].windshield_shift;
     let x = at_rad.x;
     let row0 = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))));
     let row1 = c[6] + x * (c[7] + x * (c[8] + x * (c[9] + x * c[10])));
@@ -273,17 +283,18 @@ fn bend(of_view: u32, at_rad: vec2f, sines: vec2f) -> vec2f {
     return saturate((z - 0.05) / 0.1) * sum;
 }
 
-// The share of the exposure that is still to come when a place of the image, in pixels, is exposed.
-fn still_to_come(of_view: u32, at_px: vec2f) -> f32 {
-    let along = lenses[of_view].rolls;
-    return saturate(along.x * at_px.x + along.y * at_px.y + along.z);
+// Fraction of the exposure that remains when a point of the image, in pixels, is exposed.
+fn remaining_exposure(view_index: u32, at_px: vec2f) -> f32 {
+    let plane = lenses[view_index].remaining_exposure;
+    return saturate(plane.x * at_px.x + plane.y * at_px.y + plane.z);
 }
 
-// By how much a direction or a point changes from the camera's frame at the exposure's end to that while
-// such a share of it was still to come; with a negative share, the other way.
-fn turning(of_view: u32, v: vec3f, share: f32) -> vec3f {
-    let axis = lenses[of_view].turned.xyz;
-    let sines = sine(vec4f(1.0, 0.5, 0.0, 0.0) * (share * lenses[of_view].turned.w), 0.0);
+// Change of a direction or a point when it is transformed from the camera's frame at the end of the
+// exposure to the frame when `fraction` of the exposure remained, because of the camera's rotation
+// (Rodrigues' formula). With a negative fraction: the inverse.
+fn rotation_shift(view_index: u32, v: vec3f, fraction: f32) -> vec3f {
+    let axis = lenses[view_index].axis_angle.xyz;
+    let sines = sine(vec4f(1.0, 0.5, 0.0, 0.0) * (fraction * lenses[view_index].axis_angle.w), 0.0);
     let across = cross(axis, v);
     return sines.x * across + 2.0 * sines.y * sines.y * cross(axis, across);
 }

@@ -1,7 +1,9 @@
-// How much the next stages have to do, decided on the device: nothing is read back in mid-frame.
+// Computes on the device how many workgroups the next stages need (for indirect dispatches), so that
+// nothing is read back in the middle of a frame.
 //
-// A total that exceeds its buffers leaves nothing to do; the host sees it in the counters after the
-// frame, makes larger buffers, and draws the frame again.
+// If a total exceeds its buffers, the job is set to zero elements and the rest of the frame does
+// nothing. The host sees the total in the counters after the frame, allocates larger buffers, and draws
+// the frame again.
 
 #import constants
 #import layout
@@ -12,8 +14,8 @@
 @group(0) @binding(2) var<storage, read> block_sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> counters: Counters;
 
-// Slots of `jobs`.
-const ITEMS: u32 = 0;
+// Slots of `jobs`; `src/render/gpu/plan.rs` has the same numbers.
+const CLUSTER_VIEWS: u32 = 0;
 const SPLATS: u32 = 1;
 const SPLATS_SCAN: u32 = 2;
 const SPLATS_SORT: u32 = 3;
@@ -25,39 +27,41 @@ const TILES: u32 = 8;
 const INSTANCES: u32 = 9;
 const JOB_COUNT: u32 = 10;
 
-// After the visible splats of all items were counted.
+// Runs after the prefix sum over the visible splats of all cluster views.
 @compute @workgroup_size(1)
 fn splats() {
-    let total = block_sums[blocks(jobs[ITEMS].job.length, SCAN_BLOCK)];
+    let total = block_sums[div_ceil(jobs[CLUSTER_VIEWS].job.length, SCAN_BLOCK)];
     counters.splats = total;
     let length = select(0u, total, total <= frame.splat_capacity);
     jobs[SPLATS].job = job(length, WORKGROUP);
     jobs[SPLATS_SCAN].job = job(length, SCAN_BLOCK);
     jobs[SPLATS_SORT].job = job(length, SORT_BLOCK);
-    jobs[SPLATS_DIGITS].job = job(DIGITS * blocks(length, SORT_BLOCK), SCAN_BLOCK);
+    jobs[SPLATS_DIGITS].job = job(DIGITS * div_ceil(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// After the macro tiles of all splats were counted.
+// Runs after the prefix sum over the touches of all splats.
 @compute @workgroup_size(1)
 fn touches() {
-    let total = block_sums[blocks(jobs[SPLATS].job.length, SCAN_BLOCK)];
+    let total = block_sums[div_ceil(jobs[SPLATS].job.length, SCAN_BLOCK)];
     counters.touches = total;
     let length = select(0u, total, total <= frame.touch_capacity);
     jobs[TOUCHES].job = job(length, WORKGROUP);
     jobs[TOUCHES_SORT].job = job(length, SORT_BLOCK);
-    jobs[TOUCHES_DIGITS].job = job(DIGITS * blocks(length, SORT_BLOCK), SCAN_BLOCK);
+    jobs[TOUCHES_DIGITS].job = job(DIGITS * div_ceil(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// After the splats of all tiles were counted.
+// Runs after the prefix sum over the splats of all tiles.
 @compute @workgroup_size(1)
 fn instances() {
-    let total = block_sums[blocks(jobs[TILES].job.length, SCAN_BLOCK)];
+    let total = block_sums[div_ceil(jobs[TILES].job.length, SCAN_BLOCK)];
     counters.instances = total;
     jobs[INSTANCES].job = job(select(0u, total, total <= frame.instance_capacity), WORKGROUP);
 }
 
+// A job of `length` elements, `per_group` in a workgroup. Workgroups are folded into rows of at most
+// 65,535, of about equal length.
 fn job(length: u32, per_group: u32) -> Job {
-    let groups = blocks(length, per_group);
-    let rows = max(blocks(groups, MAX_GROUPS), 1u);
-    return Job(length, array(blocks(groups, rows), rows, 1u));
+    let groups = div_ceil(length, per_group);
+    let rows = max(div_ceil(groups, MAX_GROUPS), 1u);
+    return Job(length, array(div_ceil(groups, rows), rows, 1u));
 }

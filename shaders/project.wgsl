@@ -1,22 +1,23 @@
-// Stage project: 3D Gaussians become splats on the screens of all views, one workgroup per item: one
-// cluster of 256 Gaussians in one view. Items are in order of (view, global id).
+// Stage project: projects 3D Gaussians to splats on the images of all views, one workgroup per cluster
+// view (one cluster of 256 Gaussians in one view). Cluster views are in order of (view, global id).
 //
-// `cull` decides which are visible and counts them; a prefix sum over the items gives each its place;
-// `project` writes the visible ones there, so that splats keep the order of their items. Twin of
-// `src/render/cpu/project.rs`, where the equations are documented. `SIGHT` is `straight` for pinholes at
-// rest, and `bent` for all else.
+// `cull` decides which Gaussians are visible and counts them, a prefix sum over the cluster views gives
+// each the index of its first splat, and `project` writes the visible splats, so that splats keep the
+// order of their cluster views. Twin of `src/render/cpu/project.rs`, where the equations are documented.
+// `PROJECTION` stands for `pinhole` (static pinhole cameras) or `unscented` (lenses and rolling
+// shutters).
 
 #import constants
 #import layout
 #import math
-#import SIGHT
+#import PROJECTION
 
 override SH_DEGREE: u32;
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;
-@group(0) @binding(2) var<storage, read> page_items: array<u32>;
-@group(0) @binding(3) var<storage, read> items: array<Item>;
+@group(0) @binding(2) var<storage, read> page_cluster_views: array<u32>;
+@group(0) @binding(3) var<storage, read> cluster_views: array<ClusterView>;
 @group(0) @binding(4) var<storage, read> chunk_views: array<ChunkView>;
 @group(0) @binding(5) var<storage, read> gaussians: array<u32>;
 @group(0) @binding(6) var<storage, read_write> visible: array<u32>;
@@ -24,7 +25,7 @@ override SH_DEGREE: u32;
 @group(0) @binding(8) var<storage, read_write> shapes: array<SplatShape>;
 @group(0) @binding(9) var<storage, read_write> colors: array<SplatColor>;
 @group(0) @binding(10) var<storage, read_write> keys: array<u32>;
-@group(0) @binding(11) var<storage, read_write> places: array<u32>;
+@group(0) @binding(11) var<storage, read_write> splat_indices: array<u32>;
 
 const MASK_WORDS: u32 = CLUSTER / 32;
 
@@ -40,27 +41,27 @@ fn cull(
     if index >= span.count {
         return;
     }
-    let item_index = page_items[span.first + index];
-    let item = items[item_index];
+    let cluster_view_index = page_cluster_views[span.first + index];
+    let cluster_view = cluster_views[cluster_view_index];
     if thread < MASK_WORDS {
         atomicStore(&mask[thread], 0u);
     }
     workgroupBarrier();
-    // Behind the last Gaussian lie other clusters.
-    if thread < gaussians[item.line * STRIP + 2u]
-        && project_shape(geometry(item.line, thread), chunk_views[item.chunk_view], false).visible {
+    // The header's third word is the number of Gaussians; after the last one lie other clusters.
+    if thread < gaussians[cluster_view.line * SOA_BLOCK + 2u]
+        && project_shape(geometry(cluster_view.line, thread), chunk_views[cluster_view.chunk_view], false).visible {
         atomicOr(&mask[thread / 32u], 1u << (thread % 32u));
     }
     workgroupBarrier();
     if thread < MASK_WORDS {
-        visible[item_index * MASK_WORDS + thread] = atomicLoad(&mask[thread]);
+        visible[cluster_view_index * MASK_WORDS + thread] = atomicLoad(&mask[thread]);
     }
     if thread == 0u {
         var count = 0u;
         for (var word = 0u; word < MASK_WORDS; word++) {
             count += countOneBits(atomicLoad(&mask[word]));
         }
-        offsets[item_index] = count;
+        offsets[cluster_view_index] = count;
     }
 }
 
@@ -74,69 +75,71 @@ fn project(
     if index >= span.count {
         return;
     }
-    let item_index = page_items[span.first + index];
-    let item = items[item_index];
-    // What `cull` decided stands, even where this pipeline rounds otherwise.
-    let own_word = visible[item_index * MASK_WORDS + thread / 32u];
+    let cluster_view_index = page_cluster_views[span.first + index];
+    let cluster_view = cluster_views[cluster_view_index];
+    // The decision of `cull` stands, even where this pipeline rounds differently.
+    let own_word = visible[cluster_view_index * MASK_WORDS + thread / 32u];
     let own_bit = 1u << (thread % 32u);
     if (own_word & own_bit) == 0u {
         return;
     }
-    var place = offsets[item_index] + countOneBits(own_word & (own_bit - 1u));
+    var slot = offsets[cluster_view_index] + countOneBits(own_word & (own_bit - 1u));
     for (var word = 0u; word < thread / 32u; word++) {
-        place += countOneBits(visible[item_index * MASK_WORDS + word]);
+        slot += countOneBits(visible[cluster_view_index * MASK_WORDS + word]);
     }
-    if place >= frame.splat_capacity {
+    if slot >= frame.splat_capacity {
         return;
     }
-    let chunk_view = chunk_views[item.chunk_view];
-    let own = geometry(item.line, thread);
-    let projected = project_shape(own, chunk_view, true);
-    shapes[place] = projected.shape;
-    let rgb = color(item.line, thread, projected.toward_m);
-    colors[place] = SplatColor(rgb, projected.depth_m);
+    let chunk_view = chunk_views[cluster_view.chunk_view];
+    let gaussian = geometry(cluster_view.line, thread);
+    let projected = project_shape(gaussian, chunk_view, true);
+    shapes[slot] = projected.shape;
+    let rgb = color(cluster_view.line, thread, projected.from_camera_m);
+    colors[slot] = SplatColor(rgb, projected.depth_m);
     let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
-    keys[place] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
-    places[place] = place;
+    keys[slot] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
+    splat_indices[slot] = slot;
 }
 
+// A splat and what its key and its colour need.
 struct Projected {
     visible: bool,
     shape: SplatShape,
     depth_m: f32,
-    // The way from the camera to the centre, in world axes.
-    toward_m: vec3f,
+    // From the camera's centre to the Gaussian's, in world axes.
+    from_camera_m: vec3f,
 }
 
-// A Gaussian on the screen, before the blur.
+// A Gaussian on the image, before the blur, in a unit of which `units_per_px` are a pixel.
 struct Footprint {
     mean_px: vec2f,
-    // xx, xy, yy and their determinant, a sum of positives. `per_px` of its units are a pixel.
+    // xx, xy, yy, and their determinant, which is computed as a sum of squares: it cannot become
+    // negative.
     covariance: vec3f,
-    det_before: f32,
-    per_px: f32,
+    det_unblurred: f32,
+    units_per_px: f32,
 }
 
-// The shape of a footprint, and whether any of it is on what is drawn of the image.
-fn shape_of(foot: Footprint, of_log2_opacity: f32, view: u32) -> Projected {
-    let blur = frame.blur_px2 * foot.per_px * foot.per_px;
+// The shape of a footprint after the blur, and whether any of it lies on the rows that are drawn.
+fn shape_of(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected {
+    let blur = frame.blur_px2 * foot.units_per_px * foot.units_per_px;
     let xx = foot.covariance.x;
     let yy = foot.covariance.z;
-    let det = blur * (xx + yy + blur) + foot.det_before;
+    let det = blur * (xx + yy + blur) + foot.det_unblurred;
     let a = xx + blur;
     let c = yy + blur;
-    var log2_opacity = of_log2_opacity;
+    var log2_opacity = gaussian_log2_opacity;
     if frame.antialiased != 0u {
-        log2_opacity += 0.5 * log2(max(foot.det_before / det, 0.005 * 0.005));
+        log2_opacity += 0.5 * log2(max(foot.det_unblurred / det, 0.005 * 0.005));
     }
-    let unit = 0.8493218 * foot.per_px; // sqrt(log2(e) / 2)
+    let unit = 0.8493218 * foot.units_per_px; // sqrt(log2(e) / 2)
     let root_c = sqrt(c);
     let root_det = sqrt(det);
     let l2 = unit / root_c;
     let l0 = unit * root_c / root_det;
     let l1 = -(foot.covariance.y * l2) / root_det;
 
-    // The box where alpha reaches the cut, against the pixel centres of what is drawn of the image.
+    // The box in which alpha reaches alpha_cut, against the pixel centres of the rows that are drawn.
     let power = log2_opacity - frame.log2_alpha_cut;
     let reach = sqrt(max(power, 0.0)) / unit;
     let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
@@ -149,46 +152,48 @@ fn shape_of(foot: Footprint, of_log2_opacity: f32, view: u32) -> Projected {
     return Projected(power >= 0.0 && on_image, shape, 0.0, vec3f(0.0));
 }
 
-// A product and what its rounding loses (Dekker 1971). Not by `fma`, which may round twice: lavapipe's
-// does.
-fn product(a: f32, b: f32) -> vec2f {
+// A product and its rounding error (TwoProduct, Dekker 1971). `fma` would be shorter, but WGSL allows it
+// to round twice, and lavapipe's does.
+fn two_product(a: f32, b: f32) -> vec2f {
     let rounds_to = a * b;
-    let p = halves(a);
-    let q = halves(b);
+    let p = split(a);
+    let q = split(b);
     return vec2f(rounds_to, ((p.x * q.x - rounds_to) + p.x * q.y + p.y * q.x) + p.y * q.y);
 }
 
-// A sum and what its rounding loses (two-sum by Knuth).
-fn sum_of(a: f32, b: f32) -> vec2f {
-    let next = rounded(a + b);
-    let part = rounded(next - a);
+// A sum and its rounding error (TwoSum, Knuth).
+fn two_sum(a: f32, b: f32) -> vec2f {
+    let next = keep_rounding(a + b);
+    let part = keep_rounding(next - a);
     return vec2f(next, (a - (next - part)) + (b - part));
 }
 
-// Camera-space z at the exposure's end and what its rounding lost: their sum is rounded once. Splats are
-// blended in order of depth, and surfels of one facade must not be ordered by rounding errors.
+// Camera-space z at the end of the exposure as a pair (z, rounding error), in metres: a compensated dot
+// product. The sum of both is rounded only once. Splats are blended in order of depth, and surfels of
+// one facade, which have equal depths, must not be ordered by rounding errors.
 fn exact_z(mean: vec3f, view: ChunkView) -> vec2f {
     var sum = view.depth_high.w;
     var lost = view.depth_low.w;
     for (var axis = 0; axis < 3; axis++) {
-        let term = product(mean[axis], view.depth_high[axis]);
+        let term = two_product(mean[axis], view.depth_high[axis]);
         lost += term.y;
         lost += mean[axis] * view.depth_low[axis];
-        let next = sum_of(sum, term.x);
+        let next = two_sum(sum, term.x);
         lost += next.y;
         sum = next.x;
     }
     return vec2f(sum, lost);
 }
 
-// Keeps a compiler from calculating with what was to be rounded: WGSL has no `precise`, and Mesa takes
-// (a + b) - a for b. No camera sees as far.
-fn rounded(x: f32) -> f32 {
+// Forces the compiler to round the argument. WGSL has no `precise`, and Mesa simplifies (a + b) - a to
+// b; a `max` with a number that no depth reaches stops it.
+fn keep_rounding(x: f32) -> f32 {
     return max(x, -3e38);
 }
 
-// A number as the sum of two of 12 bits each, whose products are exact in the 24 bits of f32.
-fn halves(x: f32) -> vec2f {
+// Splits a number into a sum of two with 12 significant bits each; products of those are exact in the
+// 24 bits of f32.
+fn split(x: f32) -> vec2f {
     let high = bitcast<f32>(bitcast<u32>(x) & 0xFFFFF000u);
     return vec2f(high, x - high);
 }
@@ -197,7 +202,7 @@ fn max_component(v: vec3f) -> f32 {
     return max(v.x, max(v.y, v.z));
 }
 
-// World from own axes, of a unit quaternion.
+// Rotation matrix (world from the Gaussian's axes) of a unit quaternion.
 fn rotation_from_quat(wxyz: vec4f) -> mat3x3f {
     let w = wxyz.x;
     let x = 2.0 * wxyz.y * wxyz.yzw;
@@ -211,7 +216,7 @@ fn rotation_from_quat(wxyz: vec4f) -> mat3x3f {
     );
 }
 
-// A Gaussian without its colour.
+// A Gaussian without its colour, in its chunk's frame.
 struct Geometry {
     mean_m: vec3f,
     scale_m: vec3f,
@@ -219,19 +224,20 @@ struct Geometry {
     quat_wxyz: vec4f,
 }
 
-// Decodes what `src/render/gpu/mirror/encode.rs` encodes: strips of 32 Gaussians, word after word.
+// Decodes a Gaussian of a cluster; the format is documented in `src/render/gpu/mirror/encode.rs`.
 fn geometry(line: u32, thread: u32) -> Geometry {
     var at = first_word(line, thread);
-    var own: Geometry;
-    own.mean_m = vec3f(float(at), float(at + STRIP), float(at + 2u * STRIP));
-    at += 3u * STRIP;
-    own.scale_m = vec3f(float(at), float(at + STRIP), float(at + 2u * STRIP));
-    own.log2_opacity = float(at + 3u * STRIP);
-    own.quat_wxyz = quat_from_bits(gaussians[at + 4u * STRIP], gaussians[at + 5u * STRIP]);
-    return own;
+    var gaussian: Geometry;
+    gaussian.mean_m = vec3f(float(at), float(at + SOA_BLOCK), float(at + 2u * SOA_BLOCK));
+    at += 3u * SOA_BLOCK;
+    gaussian.scale_m = vec3f(float(at), float(at + SOA_BLOCK), float(at + 2u * SOA_BLOCK));
+    gaussian.log2_opacity = float(at + 3u * SOA_BLOCK);
+    gaussian.quat_wxyz = quat_from_bits(gaussians[at + 4u * SOA_BLOCK], gaussians[at + 5u * SOA_BLOCK]);
+    return gaussian;
 }
 
-// The three smaller components in 20 bits each, and which one is the largest, made positive.
+// Decodes a unit quaternion: the three smaller components in 20 bits each, and the index of the largest
+// one, which is positive.
 fn quat_from_bits(low: u32, high: u32) -> vec4f {
     let steps = vec3u(low & 0xFFFFFu, (low >> 20u) | ((high & 0xFFu) << 12u), (high >> 8u) & 0xFFFFFu);
     let small = (vec3f(steps) / 1048575.0 * 2.0 - 1.0) * 0.70710678;
@@ -244,24 +250,26 @@ fn quat_from_bits(low: u32, high: u32) -> vec4f {
     }
 }
 
+// SH coefficients per colour channel.
 fn coefficients() -> u32 {
     return (SH_DEGREE + 1u) * (SH_DEGREE + 1u);
 }
 
-// Where a Gaussian begins, of a cluster whose header is a line.
+// Index of the first word of a Gaussian. The cluster's header is its first line.
 fn first_word(line: u32, thread: u32) -> u32 {
     let words = GEOMETRY_WORDS + (3u * coefficients() + 1u) / 2u;
-    return (line + 1u + thread / STRIP * words) * STRIP + thread % STRIP;
+    return (line + 1u + thread / SOA_BLOCK * words) * SOA_BLOCK + thread % SOA_BLOCK;
 }
 
 fn float(at: u32) -> f32 {
     return bitcast<f32>(gaussians[at]);
 }
 
-// `max(0, SH(direction) + 0.5)` along `toward`, which need not be unit.
+// `max(0, SH(direction) + 0.5)` in the direction of `toward`, which need not be a unit vector. The basis
+// functions and their signs are those of Kerbl et al. 2023.
 fn color(line: u32, thread: u32, toward: vec3f) -> vec3f {
-    let scale = vec2f(float(line * STRIP), float(line * STRIP + 1u));
-    let at = first_word(line, thread) + GEOMETRY_WORDS * STRIP;
+    let scale = vec2f(float(line * SOA_BLOCK), float(line * SOA_BLOCK + 1u));
+    let at = first_word(line, thread) + GEOMETRY_WORDS * SOA_BLOCK;
     var rgb = 0.28209479177387814 * scale.x * coefficient(at, 0u) + 0.5;
     if SH_DEGREE > 0u {
         let d = toward * (1.0 / sqrt(max(dot(toward, toward), 1e-30)));
@@ -298,10 +306,10 @@ fn third_band(at: u32, d: vec3f) -> vec3f {
         - 0.5900435899266435 * d.x * (dd.x - 3.0 * dd.y) * coefficient(at, 15u);
 }
 
-// Red, green and blue of coefficient `k`, before the cluster's scale: two values to a word.
+// Red, green, and blue of coefficient `k` as fractions of the cluster's largest value, two to a word.
 fn coefficient(at: u32, k: u32) -> vec3f {
-    let word = at + (3u * k / 2u) * STRIP;
+    let word = at + (3u * k / 2u) * SOA_BLOCK;
     let first = unpack2x16snorm(gaussians[word]);
-    let second = unpack2x16snorm(gaussians[word + STRIP]);
+    let second = unpack2x16snorm(gaussians[word + SOA_BLOCK]);
     return select(vec3f(first.y, second), vec3f(first, second.x), k % 2u == 0u);
 }

@@ -1,5 +1,5 @@
-// Stage bin, after its sort: where each macro tile's touches start and end. Macro tiles without any
-// keep (0, 0).
+// Stage bin, after the sort of touches by macro tile: finds where each macro tile's touches start and
+// end. The host clears the ranges before, so a macro tile without touches keeps (0, 0).
 
 #import constants
 #import layout
@@ -7,7 +7,7 @@
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> job: Job;
-@group(0) @binding(2) var<storage, read> macros: array<u32>;
+@group(0) @binding(2) var<storage, read> touch_macro_tiles: array<u32>;
 @group(0) @binding(3) var<storage, read_write> ranges: array<vec2u>;
 
 @compute @workgroup_size(WORKGROUP)
@@ -20,15 +20,15 @@ fn main(
     if i >= job.length {
         return;
     }
-    // Places that `bin` left over bear the number after the last macro tile.
-    let own = macros[i];
-    if own >= frame.macros {
+    // Touches of no tile have the index after the last macro tile; see `write_nothing` in `bin.wgsl`.
+    let own = touch_macro_tiles[i];
+    if own >= frame.macro_tiles {
         return;
     }
-    if i == 0u || macros[i - 1u] != own {
+    if i == 0u || touch_macro_tiles[i - 1u] != own {
         ranges[own].x = i;
     }
-    if i + 1u == job.length || macros[i + 1u] != own {
+    if i + 1u == job.length || touch_macro_tiles[i + 1u] != own {
         ranges[own].y = i + 1u;
     }
 }

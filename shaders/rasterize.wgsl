@@ -1,32 +1,33 @@
-// Stage rasterize: each tile blends its splats from the nearest, one workgroup per tile, four pixels
-// of a row per thread: what is read of a splat serves four, and so does what depends on the row.
-// Batches of splats travel through workgroup memory.
+// Stage rasterize: one workgroup per tile blends the tile's splats front to back. Each thread has four
+// pixels of a row, so that loading a splat and computing the terms that depend on the row are shared by
+// four pixels. Splats are loaded batch by batch into workgroup memory.
 //
-// Twin of `src/render/cpu/rasterize.rs`.
+// `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`. Twin of
+// `src/render/cpu/rasterize.rs`.
 
 #import constants
 #import layout
 #import math
 #import resolve
-#import BEHIND
+#import BACKGROUND
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;
 @group(0) @binding(2) var<storage, read> ranges: array<vec2u>;
-@group(0) @binding(3) var<storage, read> instance_places: array<u32>;
+@group(0) @binding(3) var<storage, read> instance_splats: array<u32>;
 @group(0) @binding(4) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
 @group(0) @binding(6) var<storage, read_write> counters: Counters;
 
-// 64 threads of 4 pixels, and 40 B for each splat of a batch: 5 KiB, so that a multiprocessor holds
-// as many workgroups as it can.
+// 64 threads of 4 pixels. A batch takes 40 B per splat, 5 KiB of workgroup memory, so that this memory
+// does not limit how many workgroups a multiprocessor can hold.
 const THREADS: u32 = TILE_PX * TILE_PX / 4;
 
 var<workgroup> means: array<vec2f, RASTER_BATCH>;
-// The factor, and the base-2 logarithm of the peak opacity.
+// Cholesky factor (l0, l1, l2), and base-2 logarithm of the peak opacity.
 var<workgroup> factors: array<vec4f, RASTER_BATCH>;
-// Colour and depth.
-var<workgroup> paints: array<vec4f, RASTER_BATCH>;
+// Colour, and depth in metres.
+var<workgroup> color_depths: array<vec4f, RASTER_BATCH>;
 var<workgroup> done_count: atomic<u32>;
 var<workgroup> done_threads: u32;
 
@@ -52,10 +53,11 @@ fn main(
         atomicStore(&done_count, 0u);
     }
     workgroupBarrier();
-    // Images need not be multiples of 16 px.
     var sums = Sums(vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(1.0));
-    // Runs on after a pixel has stopped: it only falls, so that a pixel stays stopped.
+    // Transmittance that is also updated after a pixel has stopped. It never rises, so a stopped pixel
+    // stays stopped without a flag per pixel.
     var running = vec4f(1.0);
+    // Pixels outside of the image are done at once: sizes need not be multiples of 16 px.
     var done = any(corner + first_pixel >= view.size_px);
     if done {
         atomicAdd(&done_count, 1u);
@@ -73,14 +75,15 @@ fn main(
         batches++;
         let count = min(range.y - first, RASTER_BATCH);
         for (var k = thread; k < count; k += THREADS) {
-            let place = instance_places[first + k];
-            let shape = shapes[place];
-            let color = colors[place];
+            let splat = instance_splats[first + k];
+            let shape = shapes[splat];
+            let color = colors[splat];
             means[k] = shape.mean_px;
             factors[k] = vec4f(shape.factor, shape.log2_opacity);
-            paints[k] = vec4f(color.rgb, color.depth_m);
+            color_depths[k] = vec4f(color.rgb, color.depth_m);
         }
         workgroupBarrier();
+        // exponent = log2(alpha) = log2(opacity) - (l0 dx + l1 dy)^2 - (l2 dy)^2 at each of four pixels.
         let was_done = done;
         for (var k = 0u; k < count && !done; k++) {
             let factor = factors[k];
@@ -93,15 +96,15 @@ fn main(
                 let alpha =
                     select(vec4f(0.0), min(exp2(exponent), vec4f(frame.alpha_cap)), touched);
                 let after = running - alpha * running;
-                // The Gaussian that would bring the transmittance to the stop is left out.
+                // The Gaussian that would bring the transmittance to the stop or below is not blended.
                 let counts = after > vec4f(frame.stop);
                 let weight = select(vec4f(0.0), alpha * running, counts);
-                let paint = paints[k];
-                sums.red += weight * paint.r;
-                sums.green += weight * paint.g;
-                sums.blue += weight * paint.b;
+                let color_depth = color_depths[k];
+                sums.red += weight * color_depth.r;
+                sums.green += weight * color_depth.g;
+                sums.blue += weight * color_depth.b;
                 if DEPTH {
-                    sums.depth += weight * paint.w;
+                    sums.depth += weight * color_depth.w;
                 }
                 sums.transmittance = select(sums.transmittance, after, counts);
                 running = after;
@@ -116,10 +119,11 @@ fn main(
         atomicAdd(&counters.batches, batches);
         atomicMax(&counters.most_batches, batches);
     }
-    sums = complete(sums, view_index, at_px, thread);
+    sums = composite(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 
+// Index of the view that a tile belongs to.
 fn view_of(tile: u32) -> u32 {
     var view = 0u;
     while view + 1u < frame.views && frame.view[view + 1u].first_tile <= tile {

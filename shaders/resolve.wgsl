@@ -1,8 +1,9 @@
-// Stage resolve: a pixel's sums become the values that were asked for. It runs in the threads of
-// `rasterize`, so that the sums never travel through memory.
+// Stage resolve: computes the requested values from a pixel's sums. It runs in the threads of
+// `rasterize`, so that the sums stay in registers.
 //
-// Output is tile after tile, and within a tile one plane of 256 pixels after another, of those asked
-// for: packed RGBA8, red, green, blue, opacity, depth. Twin of `src/render/cpu/resolve.rs`.
+// The output is tile after tile, and within a tile one plane of 256 values after another, in this order
+// and only if requested: packed RGBA8, red, green, blue, opacity, depth. Twin of
+// `src/render/cpu/resolve.rs`.
 
 override RGB8: bool;
 override RGB: bool;
@@ -13,18 +14,19 @@ override DEPTH: bool;
 
 const PLANE: u32 = TILE_PX * TILE_PX;
 
-// What four pixels of a row have gathered.
+// Accumulated values of four pixels of a row.
 struct Sums {
     // Linear and premultiplied.
     red: vec4f,
     green: vec4f,
     blue: vec4f,
-    // Weighted by contribution, in metres; zero unless wanted.
+    // Sum of depth times weight, in metres; zero unless depth is requested.
     depth: vec4f,
-    // Share of the background that is seen.
+    // Fraction of the background that is visible.
     transmittance: vec4f,
 }
 
+// Writes four pixels of a tile; `first_pixel` is the index of the first one in the tile.
 fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
     let planes = u32(RGB8) + 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH);
     var at = tile * planes * PLANE + first_pixel;
@@ -54,12 +56,12 @@ fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
     }
 }
 
-// Planes and rows are multiples of four pixels.
+// Writes four values of a plane. Planes and rows are multiples of four values, so `at` is one too.
 fn write(at: u32, four: vec4u) {
     pixels[at / 4u] = four;
 }
 
-// Clamps to [0, 1], and rounds to the nearest of 0 to 255.
+// Clamps to [0, 1], scales to 255, and rounds to the nearest integer.
 fn to_8_bit(linear: vec4f) -> vec4u {
     return vec4u(saturate(linear) * 255.0 + 0.5);
 }

@@ -1,4 +1,5 @@
-// What the device can do: copy memory, and multiply and add. No stage; `wildcity bench gpu` runs it.
+// Measures the device's peak rates of copying memory and of multiply-adds. This is not a stage of the
+// renderer; only `wildcity bench gpu` runs it.
 
 #import constants
 #import layout
@@ -21,7 +22,7 @@ fn copy(
 
 @group(0) @binding(2) var<uniform> span: Span;
 
-// As many rounds as `span` counts, of 64 multiply-adds: four vectors of four, four times.
+// `span.count` rounds of 64 multiply-adds per thread: four vectors of four components, four times.
 @compute @workgroup_size(WORKGROUP)
 fn multiply_add(
     @builtin(workgroup_id) group: vec3u,

@@ -1,7 +1,8 @@
-// Exclusive prefix sum of `values` in place: reduce, then scan. No group waits for another.
+// Exclusive prefix sum of `values` in place, by reduce-then-scan: three dispatches, so that no workgroup
+// has to wait for another one.
 //
-// `reduce` sums each block of 2048, `sums` scans the blocks' sums and puts the total behind them,
-// `apply` scans within each block. Sums saturate, so a total that is too large is seen.
+// `reduce` sums each block of 2,048 values, `sums` scans the sums of the blocks and appends the total,
+// and `apply` scans within each block. Sums saturate, so an overflowing total is detected.
 
 #import constants
 #import layout
@@ -21,7 +22,7 @@ fn reduce(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let block = group_index(group, groups);
-    if block >= blocks(job.length, SCAN_BLOCK) {
+    if block >= div_ceil(job.length, SCAN_BLOCK) {
         return;
     }
     let first = block * SCAN_BLOCK + thread * PER_THREAD;
@@ -37,7 +38,7 @@ fn reduce(
 
 @compute @workgroup_size(WORKGROUP)
 fn sums(@builtin(local_invocation_index) thread: u32) {
-    let count = blocks(job.length, SCAN_BLOCK);
+    let count = div_ceil(job.length, SCAN_BLOCK);
     var before = 0u;
     for (var first = 0u; first < count; first += WORKGROUP) {
         let block = first + thread;
@@ -63,7 +64,7 @@ fn apply(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let block = group_index(group, groups);
-    if block >= blocks(job.length, SCAN_BLOCK) {
+    if block >= div_ceil(job.length, SCAN_BLOCK) {
         return;
     }
     let first = block * SCAN_BLOCK + thread * PER_THREAD;

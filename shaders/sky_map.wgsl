@@ -1,46 +1,47 @@
-// A sky that was baked: `CubeMap` in `src/scene/sky/cube.rs`.
+// Sky from a baked cube map with bilinear interpolation. Twin of `CubeMap` in `src/scene/sky/cube.rs`.
 
-// Red in the lower and green in the upper 16 bits, and blue.
+// 16-bit colours: red in the low and green in the high half of the first word, blue in the second.
 @group(0) @binding(9) var<storage, read> texels: array<vec2u>;
 
-// The colours behind four pixels, if they are wanted.
+// Red, green, and blue of the sky at four pixels; zero if not `wanted`.
 fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     if !wanted {
         return array<vec4f, 3>();
     }
-    let away = look(view, at_px);
-    let ax = abs(away.x);
-    let ay = abs(away.y);
-    let az = abs(away.z);
+    let rays = sky_rays(view, at_px);
+    let ax = abs(rays.x);
+    let ay = abs(rays.y);
+    let az = abs(rays.z);
+    // The face is that of the largest component: +x, -x, +y, -y, +z, -z.
     let is_x = (ax >= ay) & (ax >= az);
     let is_y = ay >= az;
     let zero = vec4f(0.0);
-    let east = away.x >= zero;
-    let north = away.y >= zero;
-    let up = away.z >= zero;
+    let east = rays.x >= zero;
+    let north = rays.y >= zero;
+    let up = rays.z >= zero;
     let face = select(
         select(select(vec4u(5u), vec4u(4u), up), select(vec4u(3u), vec4u(2u), north), is_y),
         select(vec4u(1u), vec4u(0u), east),
         is_x,
     );
     let right = select(
-        select(select(-away.x, away.x, up), away.x, is_y),
-        select(away.z, -away.z, east),
+        select(select(-rays.x, rays.x, up), rays.x, is_y),
+        select(rays.z, -rays.z, east),
         is_x,
     );
-    let down = select(select(-away.y, select(-away.z, away.z, north), is_y), -away.y, is_x);
+    let down = select(select(-rays.y, select(-rays.z, rays.z, north), is_y), -rays.y, is_x);
     let ahead = select(select(az, ay, is_y), ax, is_x);
-    let half = 0.5 * behind.scale;
-    let u = right / ahead * half + (half + behind.offset);
-    let v = down / ahead * half + (half + behind.offset);
-    let last = vec4f(f32(behind.edge - 2u));
+    let half = 0.5 * background.scale;
+    let u = right / ahead * half + (half + background.offset);
+    let v = down / ahead * half + (half + background.offset);
+    let last = vec4f(f32(background.edge - 2u));
     let column = clamp(floor(u), zero, last);
     let row = clamp(floor(v), zero, last);
-    let place = (face * behind.edge + vec4u(row)) * behind.edge + vec4u(column);
+    let index = (face * background.edge + vec4u(row)) * background.edge + vec4u(column);
     var rgb = array<vec4f, 3>(zero, zero, zero);
     for (var k = 0u; k < 4u; k++) {
-        let upper = mix(texel(place[k]), texel(place[k] + 1u), u[k] - column[k]);
-        let below = place[k] + behind.edge;
+        let upper = mix(texel(index[k]), texel(index[k] + 1u), u[k] - column[k]);
+        let below = index[k] + background.edge;
         let lower = mix(texel(below), texel(below + 1u), u[k] - column[k]);
         let colour = mix(upper, lower, v[k] - row[k]);
         rgb[0][k] = colour.r;
@@ -50,7 +51,7 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     return rgb;
 }
 
-fn texel(place: u32) -> vec3f {
-    let bits = texels[place];
+fn texel(index: u32) -> vec3f {
+    let bits = texels[index];
     return vec3f(f32(bits.x & 0xFFFFu), f32(bits.x >> 16u), f32(bits.y)) / 65535.0;
 }

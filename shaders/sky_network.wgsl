@@ -1,36 +1,43 @@
-// A sky that is evaluated: `Folded` in `src/scene/sky/folded.rs`. The threads of a tile evaluate it together,
-// four pixels after four, an output of a layer each: what one thread alone would need, 9 KiB for every
-// four pixels, is in no register.
+// Sky from a neural network (MLP), evaluated for each pixel. Twin of `InferenceNetwork` in
+// `src/scene/sky/inference.rs`.
+//
+// The threads of a tile evaluate the network together for four pixels at a time, and each thread
+// computes outputs of each layer. One thread alone would need 9 KiB for its four pixels, which does not
+// fit registers.
 
 #import angle
 
-// Layer by layer, output by output: the bias, and then its weights, four a vector.
+// Layer by layer and output by output: the bias (first component of a vector), then the weights, four
+// per vector.
 @group(0) @binding(9) var<storage, read> weights: array<vec4f>;
 
-// Four directions whose colours are asked for, if they are.
-var<workgroup> asked: array<vec4f, 3>;
-var<workgroup> is_asked: u32;
-// The second layer's outputs, the first one's, and behind them the encoded directions.
+// The four directions that are evaluated now, and whether their colours are wanted.
+var<workgroup> directions: array<vec4f, 3>;
+var<workgroup> is_wanted: u32;
+// Outputs of the second layer, then of the first layer, then the encoded directions: 2 x 256 + 64 values
+// of four pixels at most.
 var<workgroup> values: array<vec4f, 576>;
 
-// The colours behind four pixels, if they are wanted. All threads of a tile call it.
+// Red, green, and blue of the sky at four pixels; zero if not `wanted`. All threads of a tile must call
+// it.
 fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
-    let width = behind.width;
-    let encoded = (behind.encoded + 3u) / 4u * 4u;
-    let joined = width + select(0u, encoded, behind.skip != 0u);
+    let width = background.width;
+    let encoded = (background.encoded + 3u) / 4u * 4u;
+    let joined = width + select(0u, encoded, background.skip != 0u);
     let second = width * (1u + encoded / 4u);
     let third = second + width * (1u + joined / 4u);
     var rgb: array<vec4f, 3>;
+    // Thread after thread, the pixels of each.
     for (var turn = 0u; turn < THREADS; turn++) {
         if thread == turn {
-            is_asked = u32(wanted);
+            is_wanted = u32(wanted);
             if wanted {
-                let away = look(view, at_px);
-                let scale = inverseSqrt(away.x * away.x + away.y * away.y + away.z * away.z);
-                asked = array<vec4f, 3>(away.x * scale, away.y * scale, away.z * scale);
+                let rays = sky_rays(view, at_px);
+                let scale = inverseSqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z);
+                directions = array<vec4f, 3>(rays.x * scale, rays.y * scale, rays.z * scale);
             }
         }
-        if workgroupUniformLoad(&is_asked) == 0u {
+        if workgroupUniformLoad(&is_wanted) == 0u {
             continue;
         }
         if thread < encoded {
@@ -54,37 +61,37 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     return rgb;
 }
 
-// One value of the encoded directions; 0 behind the last.
-fn encode(place: u32) -> vec4f {
-    let first = select(0u, 3u, behind.identity != 0u);
-    if place < first {
-        return asked[place];
+// One value of the frequency encoding of the directions; 0 after the last.
+fn encode(index: u32) -> vec4f {
+    let first = select(0u, 3u, background.identity != 0u);
+    if index < first {
+        return directions[index];
     }
-    if place >= behind.encoded {
+    if index >= background.encoded {
         return vec4f(0.0);
     }
-    let wave = (place - first) / 3u;
-    let scale = f32(1u << (wave % behind.octaves));
-    return sine(asked[(place - first) % 3u] * scale, select(0.0, 0.5, wave >= behind.octaves));
+    let wave = (index - first) / 3u;
+    let scale = f32(1u << (wave % background.octaves));
+    return sine(directions[(index - first) % 3u] * scale, select(0.0, 0.5, wave >= background.octaves));
 }
 
-// One hidden layer, whose weights begin `at`: reads `inputs` values after `source`, writes as many as
-// there are `outputs` after `dest`.
+// One hidden layer with ReLU, whose weights start `at`: reads `inputs` values from `source` on, and
+// writes `outputs` values from `dest` on.
 fn dense(at: u32, source: u32, inputs: u32, thread: u32, outputs: u32, dest: u32) {
     for (var own = thread; own < outputs; own += THREADS) {
         values[dest + own] = max(output(at, source, inputs, own), vec4f(0.0));
     }
 }
 
-// One output of a layer, before anything cuts it off.
+// One output of a layer, before the activation.
 fn output(at: u32, source: u32, inputs: u32, own: u32) -> vec4f {
     let row = at + own * (1u + inputs / 4u);
     var sum = vec4f(weights[row].x);
     for (var input = 0u; input < inputs; input += 4u) {
         let weight = weights[row + 1u + input / 4u];
-        let place = source + input;
-        sum += weight.x * values[place] + weight.y * values[place + 1u];
-        sum += weight.z * values[place + 2u] + weight.w * values[place + 3u];
+        let index = source + input;
+        sum += weight.x * values[index] + weight.y * values[index + 1u];
+        sum += weight.z * values[index + 2u] + weight.w * values[index + 3u];
     }
     return sum;
 }

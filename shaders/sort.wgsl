@@ -1,8 +1,9 @@
-// Stage sort: one pass of a stable radix sort over 8 bits of the keys, from the least significant.
+// Stage sort: one pass of a stable LSD radix sort, 8 bits of the keys per pass.
 //
-// `histogram` counts each block's digits, digit-major; their prefix sum says where each block's keys
-// of each digit go; `scatter` puts them there, `scatter_masked` with two values each. Twin:
-// `src/render/cpu/sort.rs`, which sorts by the same keys at once.
+// `histogram` counts the digits of each block (digit-major), a prefix sum over the counts gives the
+// first index of each block's keys of each digit, and `scatter` moves keys and values there.
+// `scatter_masked` does the same with two values per key. Twin: `src/render/cpu/sort.rs`, which sorts by
+// the same keys in one call.
 
 #import constants
 #import layout
@@ -31,7 +32,7 @@ fn histogram(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let block = group_index(group, groups);
-    let block_count = blocks(job.length, SORT_BLOCK);
+    let block_count = div_ceil(job.length, SORT_BLOCK);
     if block >= block_count {
         return;
     }
@@ -47,9 +48,9 @@ fn histogram(
     offsets[thread * block_count + block] = atomicLoad(&counts[thread]);
 }
 
-// For each digit, a bit per thread that has it: bit `t % 32` of word `t / 32`, word-major.
-var<workgroup> holders: array<atomic<u32>, DIGITS * MASK_WORDS>;
-// For each digit, where its next key goes.
+// For each digit, one bit per thread whose key has it: bit `t % 32` of word `t / 32`. Word-major.
+var<workgroup> digit_threads: array<atomic<u32>, DIGITS * MASK_WORDS>;
+// For each digit, the index where its next key goes.
 var<workgroup> next: array<u32, DIGITS>;
 
 @compute @workgroup_size(WORKGROUP)
@@ -64,7 +65,7 @@ fn scatter(
     }
 }
 
-// The same for keys with two values.
+// As `scatter`, for keys with two values: an index and a mask.
 @compute @workgroup_size(WORKGROUP)
 fn scatter_masked(
     @builtin(workgroup_id) group: vec3u,
@@ -81,7 +82,7 @@ fn scatter_masked(
     }
 }
 
-// A key and its value per thread; where they went.
+// Moves one key and its value per thread. Returns the index where they went.
 fn scatter_round(at: u32, end: u32, thread: u32) -> u32 {
     let i = at + thread;
     let held = i < end;
@@ -97,40 +98,42 @@ fn scatter_round(at: u32, end: u32, thread: u32) -> u32 {
     return to;
 }
 
-// First key and end of a block; none for a group too many.
+// First key and end of a block; an empty range for a surplus workgroup of the folded dispatch.
 fn start_block(block: u32, thread: u32) -> vec2u {
-    let block_count = blocks(job.length, SORT_BLOCK);
+    let block_count = div_ceil(job.length, SORT_BLOCK);
     if block >= block_count {
         return vec2u(0u);
     }
     next[thread] = offsets[thread * block_count + block];
     for (var word = 0u; word < MASK_WORDS; word++) {
-        atomicStore(&holders[word * DIGITS + thread], 0u);
+        atomicStore(&digit_threads[word * DIGITS + thread], 0u);
     }
     return vec2u(block * SORT_BLOCK, min((block + 1u) * SORT_BLOCK, job.length));
 }
 
-// Where a thread's key goes, if it holds one, round after round. A key's rank among the equal digits of
-// its round is the number of holders before its thread: stable for subgroups of any size, whatever the
-// order in which the bits were set. The last holder moves the digit's place on, and each clears the
-// word that it set a bit of.
+// Index where a thread's key goes, if `held`; called once per round of 256 keys.
+//
+// A key's rank among the equal digits of its round is the number of lower threads with the same digit.
+// It is computed from one bit per thread, so the sort is stable for any subgroup size and for any order
+// in which the bits were set. The last thread of a digit advances the digit's next index, and each
+// thread clears the word in which it set a bit.
 fn place_of(key: u32, held: bool, thread: u32) -> u32 {
     let own_word = thread / 32u;
     let own_bit = 1u << (thread % 32u);
     let own_digit = digit(key);
     workgroupBarrier();
     if held {
-        atomicOr(&holders[own_word * DIGITS + own_digit], own_bit);
+        atomicOr(&digit_threads[own_word * DIGITS + own_digit], own_bit);
     }
     workgroupBarrier();
     var place = 0u;
     var is_last = false;
     if held {
-        let beside = atomicLoad(&holders[own_word * DIGITS + own_digit]);
+        let beside = atomicLoad(&digit_threads[own_word * DIGITS + own_digit]);
         place = next[own_digit] + countOneBits(beside & (own_bit - 1u));
         var after = beside & ~(own_bit | (own_bit - 1u));
         for (var word = 0u; word < MASK_WORDS; word++) {
-            let others = atomicLoad(&holders[word * DIGITS + own_digit]);
+            let others = atomicLoad(&digit_threads[word * DIGITS + own_digit]);
             place += select(0u, countOneBits(others), word < own_word);
             after |= select(0u, others, word > own_word);
         }
@@ -138,7 +141,7 @@ fn place_of(key: u32, held: bool, thread: u32) -> u32 {
     }
     workgroupBarrier();
     if held {
-        atomicStore(&holders[own_word * DIGITS + own_digit], 0u);
+        atomicStore(&digit_threads[own_word * DIGITS + own_digit], 0u);
         if is_last {
             next[own_digit] = place + 1u;
         }
@@ -146,6 +149,7 @@ fn place_of(key: u32, held: bool, thread: u32) -> u32 {
     return place;
 }
 
+// The digit of a key that this pass sorts by.
 fn digit(key: u32) -> u32 {
     return (key >> SHIFT) & (DIGITS - 1u);
 }

@@ -1,117 +1,119 @@
-//! What a camera is beyond a pinhole.
+//! Properties of a camera beyond the pinhole: lens, windshield, shutter and colour correction.
 
 use serde::{Deserialize, Serialize};
 
-/// How a lens maps rays to pixels, where it is no pinhole.
+/// A lens model other than the pinhole: how it maps rays to pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "model", rename_all = "lowercase")]
 pub enum Lens {
-    /// OpenCV's radial, tangential and thin prism distortion.
+    /// OpenCV's radial, tangential and thin-prism distortion.
     Opencv {
-        /// k1 to k6.
+        /// Radial coefficients k1 to k6.
         k: [f64; 6],
-        /// p1 and p2.
+        /// Tangential coefficients p1 and p2.
         #[serde(default)]
         p: [f64; 2],
-        /// s1 to s4.
+        /// Thin-prism coefficients s1 to s4.
         #[serde(default)]
         s: [f64; 4],
     },
-    /// OpenCV's fisheye.
+    /// OpenCV's fisheye model.
     Fisheye {
-        /// k1 to k4.
+        /// Coefficients k1 to k4.
         k: [f64; 4],
-        /// How far off the axis it sees, in radians; as far as its polynomial rises if absent.
+        /// Largest angle from the optical axis that the lens sees, in radians. If absent, the angle up to
+        /// which its polynomial increases.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max_angle: Option<f64>,
     },
-    /// NVIDIA's f-theta, which has its focal lengths from its polynomial.
+    /// NVIDIA's f-theta model. Its polynomial determines the focal lengths.
     Ftheta {
-        /// Which way the polynomial goes.
+        /// What the polynomial maps to what.
         reference: FthetaReference,
-        /// Coefficients of powers 0 to 5, in radians and pixels.
+        /// Coefficients of the powers 0 to 5, in radians and pixels.
         polynomial: [f64; 6],
-        /// `[c, d, e]` of `[[c, d], [e, 1]]`, from round to real pixels.
+        /// `[c, d, e]` of the matrix `[[c, d], [e, 1]]`, which maps rotationally symmetric pixel offsets to
+        /// those of the real sensor.
         linear_cde: [f64; 3],
-        /// How far off the axis it sees, in radians.
+        /// Largest angle from the optical axis that the lens sees, in radians.
         max_angle: f64,
     },
 }
 
-/// Which way an f-theta polynomial goes.
+/// What an f-theta polynomial maps to what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "Reference"))]
 pub enum FthetaReference {
-    /// From radians off the axis to pixels from the principal point.
+    /// The angle from the optical axis, in radians, to the distance from the principal point, in pixels.
     AngleToPixel,
-    /// From pixels to radians.
+    /// The distance from the principal point, in pixels, to the angle, in radians.
     PixelToAngle,
 }
 
-/// What a camera makes of colours: `matrix * rgb + offset`, linear red, green, blue from 0 to 1. The matrix,
-/// or a gain per channel; answers have the matrix.
+/// Colour correction of a camera: `matrix * rgb + offset`, on linear red, green and blue from 0 to 1.
+/// Requests give the matrix, or a gain per channel instead; answers have the matrix.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Exposure {
-    /// Row by row.
+    /// The matrix, row by row.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub matrix: Option<[[f64; 3]; 3]>,
-    /// Of red, green and blue, in its place.
+    /// Gain of red, green and blue, instead of the matrix.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gain: Option<[f64; 3]>,
-    /// Added to each channel.
+    /// Added to each channel after the matrix or gain.
     #[serde(default)]
     pub offset: [f64; 3],
 }
 
-/// A windshield before the lens.
+/// A windshield in front of the lens, which refracts rays.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Windshield {
-    /// Which way the polynomials go.
+    /// Which rays the polynomials map to which.
     pub reference: WindshieldReference,
-    /// Coefficients of the angle to the right.
+    /// Coefficients of the polynomial for the angle to the right.
     pub horizontal: Vec<f64>,
-    /// Coefficients of the angle downwards.
+    /// Coefficients of the polynomial for the angle downwards.
     pub vertical: Vec<f64>,
 }
 
-/// Which way a windshield's polynomials go.
+/// Which rays a windshield's polynomials map to which.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum WindshieldReference {
-    /// From the world's rays to the lens'.
+    /// Rays outside the windshield to rays at the lens.
     Forward,
-    /// From the lens' rays to the world's.
+    /// Rays at the lens to rays outside the windshield.
     Backward,
 }
 
-/// A shutter that exposes rows, or columns, one after the other.
+/// A rolling shutter: it exposes the image's rows, or columns, one after the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Shutter {
-    /// Which row or column comes first.
+    /// The order in which rows or columns are exposed.
     pub direction: ShutterDirection,
-    /// From the first row's exposure to the last's, in microseconds.
+    /// Time from the exposure of the first row (or column) to that of the last, in microseconds.
     pub duration_us: i64,
 }
 
-/// The way a shutter rolls.
+/// The order in which a rolling shutter exposes rows or columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "Rolls"))]
 pub enum ShutterDirection {
-    /// The top row first.
+    /// Rows, the top one first.
     TopToBottom,
-    /// The bottom row first.
+    /// Rows, the bottom one first.
     BottomToTop,
-    /// The left column first.
+    /// Columns, the left one first.
     LeftToRight,
-    /// The right column first.
+    /// Columns, the right one first.
     RightToLeft,
 }

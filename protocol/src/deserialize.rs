@@ -1,4 +1,4 @@
-//! Reading requests so that a mistake can be named: fields that are one of two things, and fields
+//! Parsing of requests with errors that name the mistake: fields that accept one of two forms, and fields
 //! that do not exist.
 
 use std::fmt;
@@ -7,18 +7,18 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use super::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
+use crate::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
 
-/// The first field of a request that was sent and not understood, as `rig.cameras[2].widht`.
+/// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
 ///
-/// Answers may gain fields, so the types that requests share with them let unknown ones pass; what
-/// was understood, written as JSON again, tells which those were.
+/// Answers may gain fields, so the types that requests share with answers ignore unknown ones. `understood`
+/// is the parsed request written as JSON again: a field that is missing there was ignored.
 pub fn unknown_field(sent: &Value, understood: &Value) -> Option<String> {
     match (sent, understood) {
         (Value::Object(sent), Value::Object(understood)) => {
             sent.iter().find_map(|(name, value)| match understood.get(name) {
                 Some(same) => unknown_field(value, same).map(|path| join(name, &path)),
-                // Left out is what a missing option is when it is written.
+                // An option that is `null` is left out when it is written again.
                 None if value.is_null() => None,
                 None => Some(name.clone()),
             })
@@ -37,8 +37,8 @@ fn join(outer: &str, inner: &str) -> String {
     format!("{outer}{dot}{inner}")
 }
 
-/// By its fields rather than by trying one variant after the other, which would forget what was
-/// wrong with each.
+/// Decided by the fields that are present. Serde's own `untagged` tries one variant after the other, and
+/// cannot say what was wrong with each.
 impl<'de> Deserialize<'de> for Start {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
@@ -59,7 +59,7 @@ impl<'de> Deserialize<'de> for Start {
     }
 }
 
-/// A text is the name of a preset, an object is a rig.
+/// A string is the name of a preset, an object is a rig.
 impl<'de> Deserialize<'de> for RigChoice {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         struct Either;
@@ -67,7 +67,7 @@ impl<'de> Deserialize<'de> for RigChoice {
             type Value = RigChoice;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("the name of a preset, or a rig written out")
+                f.write_str("the name of a preset, or a rig")
             }
 
             fn visit_str<E: Error>(self, name: &str) -> Result<RigChoice, E> {
@@ -82,7 +82,7 @@ impl<'de> Deserialize<'de> for RigChoice {
     }
 }
 
-/// A text is the name of a model, an object has all of it.
+/// A string is the name of a model, an object has all fields.
 impl<'de> Deserialize<'de> for DynamicsChoice {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         struct Either;

@@ -2,32 +2,33 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What went wrong. The list is closed: a new code is a new protocol version.
+/// Error code. The list is closed: a new code requires a new protocol version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Code {
     /// The text frame is not JSON, or is nested too deeply.
     MalformedJson,
-    /// The JSON is not a request: unknown type, missing, unknown or mistyped field.
+    /// The JSON is not a request: its type is unknown, or a field is missing, unknown or of the wrong type.
     InvalidRequest,
-    /// A binary frame from the client; only the server sends those.
+    /// The client sent a binary frame; only the server sends those.
     UnexpectedBinary,
     /// The message is larger than `limits.message_bytes`.
     MessageTooLarge,
-    /// `seq` is not the next number, nor the last one repeated.
+    /// `seq` is neither the next number nor the last one.
     SeqOutOfOrder,
-    /// The request needs a `hello` first, or comes a second time.
+    /// The request came before `hello`, or is a second `hello`.
     WrongOrder,
-    /// No common protocol version.
+    /// Client and server have no protocol version in common.
     UnsupportedProtocol,
-    /// A session is open already on this connection, or none is.
+    /// The request does not fit the state of the session: a session is already open, none is open, the
+    /// episode has ended, or the session's dynamics do not accept this step.
     SessionState,
     /// There is no twin of this name.
     UnknownTwin,
     /// The twin has no such version.
     UnknownVersion,
-    /// The twin could not be loaded.
+    /// The twin could not be loaded or written.
     TwinDamaged,
     /// There is no rig preset of this name.
     UnknownRig,
@@ -35,48 +36,48 @@ pub enum Code {
     UnknownCamera,
     /// The twin has no trajectory of this name.
     UnknownTrajectory,
-    /// There is no session of this name to resume.
+    /// There is no session of this name that can be resumed.
     UnknownSession,
-    /// A session of this name exists already.
+    /// A session of this name already exists.
     SessionExists,
-    /// A name is not 1 to 64 of `[a-z0-9._-]`.
+    /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.
     InvalidName,
     /// A component of a pose is NaN or infinite.
     PoseNotFinite,
-    /// A pose is not a rotation, or too far away.
+    /// The quaternion of a pose is not a rotation, or the position is too far away.
     PoseInvalid,
     /// A camera's size or intrinsics cannot be used.
     CameraInvalid,
     /// A number or count is outside its limits.
     OutOfRange,
-    /// The answer would be larger than the limits allow.
+    /// The answer would exceed the limits.
     AnswerTooLarge,
-    /// Too many sessions or connections.
+    /// The server is at a limit: too many sessions or connections, or too little memory.
     Busy,
-    /// The answer did not come within the deadline; nothing changed.
+    /// The answer was not ready before the deadline. Nothing changed.
     DeadlineExceeded,
-    /// The client was silent, or did not read, for too long.
+    /// The client sent nothing, or did not read its answer, for too long.
     TimedOut,
     /// The server is shutting down.
     ShuttingDown,
-    /// A token is needed, and none was given that the server knows.
+    /// The request has no token, or one that the server does not know.
     Unauthorized,
-    /// The token does not go that far.
+    /// The token's role or twins do not permit this request.
     Forbidden,
     /// There is no upload of this id.
     UnknownUpload,
-    /// An upload goes on elsewhere than at the given offset.
+    /// The upload does not continue at the given offset.
     UploadOffset,
-    /// An upload is not what its digest or size promises.
+    /// The uploaded bytes do not match the announced digest or size.
     UploadDigest,
-    /// No room for the upload.
+    /// There is no space for the upload, or for what a push writes.
     StorageFull,
     /// There is no push of this id.
     UnknownPush,
-    /// The cells were changed by somebody else since the base version.
+    /// Another push changed the same cells since the base version.
     Conflict,
-    /// The pushed Gaussians cannot be used.
+    /// The pushed Gaussians are invalid.
     PushRefused,
-    /// A fault of the server.
+    /// An internal error of the server.
     Internal,
 }

@@ -1,83 +1,83 @@
 //! Bodies of HTTP requests and answers: uploads, pushes, versions, sessions.
 //!
-//! As on the WebSocket, answers may gain fields and unknown fields of requests are mistakes.
+//! As on the WebSocket, unknown fields of requests are refused, and answers may gain fields.
 
 use serde::{Deserialize, Serialize};
 
-use super::error::Code;
-use super::message::Pose;
+use crate::error::Code;
+use crate::message::Pose;
 
 /// `POST /v1/uploads`: announces a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewUpload {
-    /// What the file is called, for reports.
+    /// Name of the file, for reports.
     pub name: String,
-    /// Its size, in bytes.
+    /// Size of the file, in bytes.
     pub size: u64,
-    /// Its digest in hex, as `blake3:...` or `sha-256:...`.
+    /// Digest of the file, as `blake3:` or `sha-256:` followed by 64 hex digits.
     pub digest: String,
 }
 
-/// An upload: what `POST`, `GET` and `PATCH` of uploads answer.
+/// State of an upload: the answer to `POST`, `GET` and `PATCH` of uploads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Upload {
-    /// Its id, made of the digest: the same content, the same upload.
+    /// Id of the upload. It is made from the digest, so the same content is the same upload.
     pub id: String,
-    /// As announced.
+    /// Name, as announced.
     pub name: String,
-    /// As announced, in bytes.
+    /// Size, as announced, in bytes.
     pub size: u64,
-    /// Bytes that have arrived: where to go on.
+    /// Number of bytes received: the offset at which the upload continues.
     pub offset: u64,
-    /// Whether all have, and are what the digest promises.
+    /// Whether all bytes were received and match the digest.
     pub complete: bool,
 }
 
-/// `POST /v1/twins/{twin}/pushes`: makes a new version of uploaded files.
+/// `POST /v1/twins/{twin}/pushes`: makes a new version of a twin from uploaded files.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewPush {
-    /// Name for the push, so that it can be sent again; made of its content if absent.
+    /// Id of the push, so that it can be sent again safely. If absent, it is made from the content.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
-    /// The scenes, which become one.
+    /// The scene files, which are merged into one scene.
     pub files: Vec<PushFile>,
-    /// The version that it is made from; the latest if absent.
+    /// The version that the push is based on. If absent, the latest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub base: Option<u64>,
-    /// The 64 m cells that it replaces; those that its Gaussians touch, if absent.
+    /// The 64 m cells to replace. If absent, those that contain Gaussians of the push.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cells: Option<CellSelection>,
-    /// In how many bits Gaussians are stored: `f32`, `h52`, `q32` or `q24`; the base's if absent,
-    /// and `q32` in a new twin.
+    /// Storage format of a Gaussian: `f32`, `h52`, `q32` or `q24`. If absent, that of the base version;
+    /// `q32` in a new twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub record: Option<String>,
-    /// Whether levels of detail are made.
+    /// Whether to build levels of detail.
     #[serde(default = "yes")]
     pub levels: bool,
-    /// How it must be rendered where that is not as the base, as `near=0.2`.
+    /// Changes of the render profile from the base version's, for example `near=0.2`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub profile: Vec<String>,
-    /// For people: what this version is.
+    /// A description of the version, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
-    /// Where to compare before and after.
+    /// Where to compare the images before and after the push.
     #[serde(default, rename = "golden")]
     pub preview: PreviewRequest,
 }
 
-/// One scene of a push.
+/// One scene file of a push.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PushFile {
-    /// Id of its upload.
+    /// Id of the upload.
     pub upload: String,
-    /// Which way its axes point: a preset, or nine numbers; as in `wildcity import --axes`.
+    /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`.
     #[serde(default = "identity")]
     pub axes: String,
     /// Metres per unit of the file.
@@ -85,175 +85,178 @@ pub struct PushFile {
     pub scale: f64,
 }
 
-/// Which cells a push replaces.
+/// The cells that a push replaces.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(untagged)]
 #[cfg_attr(feature = "schema", schemars(rename = "Cells"))]
 pub enum CellSelection {
-    /// `"all"`: the whole twin.
+    /// `"all"`: every cell of the twin.
     All(AllCells),
-    /// These, as (x, y); cell (i, j) is centred on (64 i, 64 j) m. Gaussians elsewhere are left out.
+    /// A list of cells (x, y). Cell (i, j) is centred on (64 i, 64 j) m. Gaussians in other cells are left
+    /// out.
     Listed(Vec<[i32; 2]>),
 }
 
-/// The word `all`.
+/// The string `all`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "All"))]
 pub enum AllCells {
-    /// The whole twin.
+    /// Every cell of the twin.
     All,
 }
 
-/// Where a push is compared with what was there.
+/// Where a push is compared with its base version: images of both are rendered from some poses, and their
+/// PSNR is reported.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 #[cfg_attr(feature = "schema", schemars(rename = "Golden"))]
 pub struct PreviewRequest {
-    /// `world_from_rig` each; if absent, a few along the twin's first trajectory.
+    /// Poses of the rig, `world_from_rig`. If absent, a few along the twin's first trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poses: Option<Vec<Pose>>,
-    /// Refuses the push if a pose differs by more than this, in dB.
+    /// Refuse the push if the PSNR at any pose is below this, in dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub min_psnr_db: Option<f64>,
 }
 
-/// A push: what `POST` and `GET` of pushes answer.
+/// State of a push: the answer to `POST` and `GET` of pushes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Push {
-    /// Its id.
+    /// Id of the push.
     pub id: String,
-    /// The twin.
+    /// Name of the twin.
     pub twin: String,
-    /// How far it is.
+    /// The stage that the push has reached.
     pub state: PushState,
-    /// How far it is within that state.
+    /// Progress within that stage.
     pub progress: Progress,
-    /// The version that it made.
+    /// Number of the new version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u64>,
-    /// BLAKE3 of that version's manifest, in hex.
+    /// BLAKE3 of the version's manifest, in hex.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version_hash: Option<String>,
-    /// What was found in the files, once that is known.
+    /// What the server found in the files, once it has read them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub report: Option<PushReport>,
-    /// Why it was refused, or failed.
+    /// Why the push was refused or failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<PushError>,
 }
 
-/// How far a push is.
+/// Stage of a push.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum PushState {
-    /// It waits for pushes before it.
+    /// It waits for earlier pushes.
     Queued,
     /// Its files are read.
     Ingesting,
-    /// They are compared with what is there.
+    /// They are checked, and compared with the base version.
     Validating,
-    /// The new version is written; nobody sees it yet.
+    /// The new version is written. No session sees it yet.
     Committing,
-    /// It is there, and is loaded for those who will ask for it.
+    /// The version exists, and is loaded into memory for the sessions that will open it.
     Prefetching,
     /// It is the latest version.
     Ready,
-    /// Its content cannot be accepted; nothing changed.
+    /// Its content was refused. Nothing changed.
     Refused,
-    /// The server could not do it; nothing changed, and it can be sent again.
+    /// The server failed. Nothing changed, unless the error's message says otherwise, and the push can be
+    /// sent again.
     Failed,
 }
 
-/// A part of a whole.
+/// Progress within a stage; what is counted depends on the stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Progress {
-    /// How much is done.
+    /// Number of items done.
     pub done: u64,
-    /// Of how much.
+    /// Number of items in total.
     pub total: u64,
 }
 
-/// Why a push was refused, or failed.
+/// Why a push was refused or failed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct PushError {
-    /// What went wrong.
+    /// Error code.
     pub code: Code,
-    /// For people: what, and how to fix it.
+    /// What went wrong and how to fix it, for people.
     pub message: String,
-    /// The cells at fault, as (x, y), where cells are.
+    /// The cells (x, y) at fault, if the error concerns cells.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub cells: Vec<[i32; 2]>,
 }
 
-/// What was found in the files of a push.
+/// What the server found in the files of a push.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct PushReport {
-    /// The files, in order.
+    /// The files, in the order of the request.
     pub files: Vec<FileReport>,
-    /// Gaussians of all files.
+    /// Number of Gaussians in all files.
     pub gaussians: u64,
-    /// Gaussians outside the cells that were asked for: left out.
+    /// Number of Gaussians left out because they are outside the requested cells.
     pub left_out: u64,
-    /// Spherical-harmonic degree.
+    /// Degree of the spherical harmonics.
     pub sh_degree: u8,
-    /// Smallest and largest, of all Gaussians; absent if there is none.
+    /// Smallest and largest values over all Gaussians. Absent if there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ranges: Option<Ranges>,
-    /// The cells that are replaced.
+    /// The replaced cells.
     pub cells: Vec<CellReport>,
-    /// How single poses look before and after.
+    /// Comparison of the images before and after the push, pose by pose.
     #[serde(rename = "golden")]
     pub previews: Vec<PsnrPreview>,
 }
 
-/// One file of a push.
+/// What the server found in one file of a push.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FileReport {
-    /// Its name.
+    /// Name of the file.
     pub name: String,
-    /// Its Gaussians.
+    /// Number of Gaussians.
     pub gaussians: u64,
-    /// How many of them cannot be used.
+    /// Number of invalid Gaussians.
     pub bad: u64,
-    /// The first of those.
+    /// The first of the invalid Gaussians.
     pub first_bad: Vec<BadGaussian>,
 }
 
-/// A Gaussian that cannot be used.
+/// An invalid Gaussian.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct BadGaussian {
-    /// Which one of its file, from 0.
+    /// Index in the file, from 0.
     pub index: u64,
-    /// The field, as the file calls it.
+    /// Name of the invalid field in the file.
     pub field: String,
-    /// Its value.
+    /// Value of the field.
     pub value: String,
-    /// What must hold instead.
+    /// The condition that the value must meet.
     pub must: String,
 }
 
-/// Smallest and largest values.
+/// Smallest and largest values of the Gaussians' fields.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ranges {
-    /// Centres, smallest and largest (x, y, z), in metres.
+    /// Smallest and largest (x, y, z) of the centres, in metres.
     pub mean_m: [[f64; 3]; 2],
-    /// Standard deviations along own axes, in metres.
+    /// Standard deviations along the Gaussians' own axes, in metres.
     pub scale_m: [f64; 2],
     /// Opacities.
     pub opacity: [f64; 2],
-    /// Lengths of quaternions before they are normalised.
+    /// Lengths of the quaternions before normalisation.
     pub quat_length: [f64; 2],
 }
 
@@ -263,20 +266,20 @@ pub struct Ranges {
 pub struct CellReport {
     /// The cell (x, y).
     pub cell: [i32; 2],
-    /// Gaussians in the base.
+    /// Number of Gaussians in the base version.
     pub before: u64,
-    /// Gaussians in the push.
+    /// Number of Gaussians in the push.
     pub after: u64,
 }
 
-/// One pose, before and after.
+/// Comparison of the images before and after the push at one pose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[cfg_attr(feature = "schema", schemars(rename = "GoldenReport"))]
 pub struct PsnrPreview {
     /// `world_from_rig`.
     pub pose: Pose,
-    /// How alike all images of the pose are, in dB; absent where they are equal.
+    /// PSNR over all images of the pose, in dB. Absent if the images are equal.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr_db: Option<f64>,
 }
@@ -285,28 +288,30 @@ pub struct PsnrPreview {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct VersionInfo {
-    /// Its number.
+    /// Number of the version.
     pub version: u64,
-    /// BLAKE3 of its manifest, in hex.
+    /// BLAKE3 of the version's manifest, in hex.
     pub version_hash: String,
-    /// When it was committed, in microseconds since 1970.
+    /// Time of the commit, in microseconds since 1970-01-01 UTC.
     pub created_us: i64,
-    /// How it came about: `import`, `push` or `rollback`.
+    /// What made the version: `import`, `push` or `rollback`.
     pub kind: String,
-    /// Whether who opens the latest version may get it; not while a push still makes it ready.
+    /// Whether sessions that open the latest version can get this one. False while a push is still
+    /// preparing it.
     #[serde(default = "yes")]
     pub ready: bool,
-    /// The version that it was made from: what a push changed, or what a rollback restored.
+    /// The version that this one was made from: the base of a push, or the version that a rollback
+    /// restored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parent: Option<u64>,
 }
 
-/// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again, as a new one.
+/// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again, as a new version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Rollback {
-    /// The old version.
+    /// Number of the old version.
     pub version: u64,
 }
 
@@ -314,35 +319,35 @@ pub struct Rollback {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct SessionInfo {
-    /// Its name.
+    /// Name of the file.
     pub session: String,
-    /// The twin.
+    /// Name of the twin.
     pub twin: String,
-    /// The version that it sees.
+    /// The version that the session shows.
     pub version: u64,
     /// Steps done in the episode.
     pub step: u64,
     /// `world_from_rig`.
     pub pose: Pose,
-    /// Whether a client is connected to it; else it waits to be resumed.
+    /// Whether a client is connected. If not, the session waits to be resumed.
     pub connected: bool,
 }
 
-/// The body of every refusal.
+/// Body of the answer to a refused request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Refusal {
-    /// What went wrong.
+    /// Error code.
     pub code: Code,
-    /// For people: what, and how to fix it.
+    /// What went wrong and how to fix it, for people.
     pub message: String,
-    /// The field at fault, as `files[0].axes`.
+    /// The field at fault, for example `files[0].axes`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
-    /// The cells at fault, as (x, y), where cells are.
+    /// The cells (x, y) at fault, if the error concerns cells.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub cells: Vec<[i32; 2]>,
-    /// Where an upload goes on, in bytes, where that is the matter.
+    /// The offset at which the upload continues, in bytes, if the request had another one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub offset: Option<u64>,
 }

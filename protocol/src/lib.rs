@@ -1,8 +1,26 @@
-//! `wildcity.v1`: the wire, and only the wire.
+//! The messages of the protocol `wildcity.v1`. This package has the types that are sent, and nothing else.
 //!
-//! Text frames are JSON, [`message::Request`] one way and [`message::Answer`] the other, matched by
-//! `seq`. Binary frames are [`observation`]s. The prose is `protocol/README.md`; the JSON schemas
-//! beside it are generated from these types. What HTTP carries beside sessions is in [`http`].
+//! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server, matched by
+//! `seq`. Binary frames are [observations](observation). [`http`] has the bodies of HTTP requests and answers
+//! for uploads, pushes and versions. `protocol/README.md` describes the protocol; the JSON schemas beside it
+//! are generated from these types.
+//!
+//! ```
+//! use wildcity_protocol::message::{Pose, Request};
+//!
+//! let pose = Pose { xyz: [13.0, -3.25, 0.0], q: [1.0, 0.0, 0.0, 0.0] };
+//! let step = Request::Step {
+//!     seq: 3,
+//!     pose: Some(pose),
+//!     trajectory: None,
+//!     action: None,
+//!     terminate: false,
+//! };
+//! let json = serde_json::to_string(&step)?;
+//! assert!(json.starts_with(r#"{"type":"step","seq":3,"pose":{"xyz":[13.0,"#));
+//! assert_eq!(serde_json::from_str::<Request>(&json)?, step);
+//! # Ok::<(), serde_json::Error>(())
+//! ```
 
 pub mod camera;
 mod deserialize;
@@ -14,5 +32,5 @@ pub mod observation;
 
 pub use deserialize::unknown_field;
 
-/// The WebSocket subprotocol, and the only protocol version there is so far.
+/// Name of the WebSocket subprotocol. It is also the only protocol version so far.
 pub const PROTOCOL: &str = "wildcity.v1";

@@ -1,22 +1,26 @@
 //! The observation: one binary frame in safetensors layout.
 //!
-//! 8 bytes little-endian header length, a JSON header (space-padded), raw tensor bytes. The
-//! header's `__metadata__` is `{"observation": "<JSON of ObservationMetadata>"}`: safetensors allows only
-//! strings there.
+//! The frame starts with the length of its header, 8 bytes little-endian. Then come the header, JSON padded
+//! with spaces, and the bytes of the tensors. The header's `__metadata__` is
+//! `{"observation": "<JSON of ObservationMetadata>"}`, because safetensors allows only strings there.
 //!
-//! Tensors, in this order: `ego.history_xyz` f32 `[16, 3]`, `ego.history_rot` f32 `[16, 3, 3]`,
-//! then per image `camera/<name>/depth` f32 and `camera/<name>/opacity` f32 and `camera/<name>/normals` f32 where asked for, then
-//! per image `camera/<name>/rgb` u8. The header's length is a multiple of 8 and floats come first,
-//! so that they lie on multiples of 4 and can be read in place. With several poses (`observe`)
-//! image names start with `pose/<k>/`. Last come earlier frames, where asked for:
-//! `camera/<name>/history/<back>/rgb` u8.
+//! The order of the tensors:
+//!
+//! 1. `ego.history_xyz`, f32 `[16, 3]`, and `ego.history_rot`, f32 `[16, 3, 3]`.
+//! 2. For each image, as requested, `camera/<name>/depth`, `camera/<name>/opacity` and
+//!    `camera/<name>/normals`, all f32.
+//! 3. For each image `camera/<name>/rgb`, u8.
+//! 4. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
+//!
+//! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the header is a
+//! multiple of 8 and floats come first, so floats are aligned to 4 bytes and can be read in place.
 
 use serde::{Deserialize, Serialize};
 
-use super::camera::{Lens, Windshield};
-use super::message::{Encoding, Pose};
+use crate::camera::{Lens, Windshield};
+use crate::message::{Encoding, Pose};
 
-/// What an observation says beside its tensors.
+/// Everything that an observation holds beside its tensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[cfg_attr(feature = "schema", schemars(rename = "Observation"))]
@@ -33,7 +37,7 @@ pub struct ObservationMetadata {
     pub seed: u64,
     /// Whether the episode has ended.
     pub terminated: bool,
-    /// The twin.
+    /// Name of the twin.
     pub twin: String,
     /// Its version.
     pub version: u64,
@@ -45,38 +49,40 @@ pub struct ObservationMetadata {
     pub backend: String,
     /// BLAKE3 of the images' hashes (32 bytes each, in order), in hex.
     pub frame_hash: String,
-    /// The ego at this time.
+    /// State of the ego at this time.
     pub ego: Ego,
-    /// The images, in order; none between two decisions.
+    /// The images, in order. Empty between two decisions.
     pub images: Vec<Image>,
-    /// Earlier frames of the same cameras, camera by camera, the newest first; absent if there are
-    /// none.
+    /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Image>,
-    /// What it cost.
+    /// Wall time that the observation took.
     pub timings: Timings,
-    /// What of it had to be loaded.
+    /// Memory of the server, and how long the observation waited for loading.
     pub residency: Residency,
 }
 
-/// The ego vehicle at one time.
+/// State of the ego vehicle at one time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ego {
     /// `world_from_rig`.
     pub pose: Pose,
-    /// Velocity in world axes, in m/s: now, or of a teleport over the last step, and zero at step 0.
+    /// Velocity in world axes, in m/s. With teleport dynamics: the displacement of the last step divided by
+    /// its time, zero at step 0.
     pub velocity: [f64; 3],
-    /// Change of velocity over the last step per second, in world axes, in m/s²; zero as long as no
-    /// velocity before is known.
+    /// Change of the velocity over the last step, per second, in world axes, in m/s². Zero as long as no
+    /// earlier velocity is known.
     pub acceleration: [f64; 3],
-    /// Yaw rate about the rig's z axis, to the left, in rad/s: now, or of a teleport over the last step.
+    /// Yaw rate about the rig's z axis, positive to the left, in rad/s. With teleport dynamics: the mean
+    /// over the last step.
     pub yaw_rate: f64,
-    /// Angle of the front wheels, to the left, in radians; absent of a teleport, which has none.
+    /// Angle of the front wheels, positive to the left, in radians. Absent with teleport dynamics, which
+    /// have no wheels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steering: Option<f64>,
-    /// How many poses of the history, counted from its end, were driven; the earlier ones repeat
-    /// the start.
+    /// Number of poses of the history, counted from its end, that were driven. The earlier ones repeat the
+    /// start.
     pub history_count: u64,
 }
 
@@ -86,16 +92,17 @@ pub struct Ego {
 pub struct Image {
     /// Name of the camera.
     pub camera: String,
-    /// Its index in `opened.cameras`.
+    /// Index of the camera in `opened.cameras`.
     pub index: u64,
-    /// Which of the request's poses: 0 but for `observe`.
+    /// Index of the request's pose. Always 0 except after `observe`.
     pub pose: u64,
-    /// How many frames of this camera ago; absent, for 0, in `images`.
+    /// Number of this camera's frames since this one. 0, and therefore absent, in `images`.
     #[serde(default, skip_serializing_if = "is_now")]
     pub back: u64,
-    /// Name of the colour tensor; `depth`, `opacity` and `normals` replace `rgb` at its end.
+    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity` or `normals` in
+    /// place of its final `rgb`.
     pub tensor: String,
-    /// How the colour image travels.
+    /// Encoding of the colour image.
     pub encoding: Encoding,
     /// Width, in pixels.
     pub width: u64,
@@ -109,42 +116,43 @@ pub struct Image {
     pub cx: f64,
     /// Principal point, y, in pixels.
     pub cy: f64,
-    /// The lens, where it is no pinhole, as it maps rays to the image as sent.
+    /// The lens model, for the image as sent. Absent for a pinhole.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lens: Option<Lens>,
-    /// The windshield before it, if there is one.
+    /// The windshield in front of the lens, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub windshield: Option<Windshield>,
-    /// The share of the image that the lens sees, where that is not all of it: elsewhere colour, depth
-    /// and opacity are 0.
+    /// Fraction of the image that the lens sees, if that is not all of it. In the rest, colour, depth and
+    /// opacity are 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seen: Option<f64>,
     /// `rig_from_camera`.
     pub camera_to_rig: Pose,
-    /// Exposure of the first row, in simulated microseconds; equal to the end with a global shutter.
+    /// Time at which the first row is exposed, in simulated microseconds. Equal to `shutter_end_us` with a
+    /// global shutter.
     pub shutter_start_us: i64,
-    /// Exposure of the last row, in simulated microseconds: the image's time.
+    /// Time at which the last row is exposed, in simulated microseconds. This is the image's time.
     pub shutter_end_us: i64,
     /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
     pub hash: String,
-    /// How far it may be believed, if asked for.
+    /// Confidence in the image, if the session asked for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<Trust>,
 }
 
-/// How far an image may be believed, and why.
+/// Confidence in an image: how close it is to what was recorded, and the measurements behind that number.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Trust {
-    /// 1 where and as it was recorded, 0 where nothing is known.
+    /// 1 at a recorded pose, 0 where nothing is known.
     pub value: f64,
-    /// From the rig to the nearest recorded keyframe, in metres.
+    /// Distance from the rig to the nearest recorded keyframe, in metres.
     pub distance_m: f64,
-    /// Between the rig's axes there and here, in radians.
+    /// Angle between the rig's orientation there and here, in radians.
     pub angle_rad: f64,
-    /// Share of pixels of less than half opacity, of those that look down at the ground.
+    /// Among the pixels that look down at the ground, the fraction with an opacity below one half.
     pub low_coverage: f64,
-    /// Share of rays that meet no block of the twin, of those that look down.
+    /// Among the rays that look down at the ground, the fraction that meets no block of the twin.
     pub outside: f64,
 }
 
@@ -152,31 +160,31 @@ fn is_now(back: &u64) -> bool {
     *back == 0
 }
 
-/// What an observation cost, in milliseconds of wall time.
+/// Wall time that an observation took, in milliseconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Timings {
-    /// Waiting for other sessions' frames.
+    /// Time spent waiting for other sessions' frames.
     pub queue_ms: f64,
-    /// Rendering, with the encoding that ran beside it.
+    /// Time of rendering, including the encoding that ran in parallel.
     pub render_ms: f64,
-    /// CPU time of encoding and hashing, most of it beside rendering.
+    /// CPU time of encoding and hashing, most of it in parallel with rendering.
     pub encode_ms: f64,
     /// Wall time of each render stage.
     pub stages_ms: Vec<Stage>,
 }
 
-/// Memory of the server behind an observation. What is in memory never changes what is drawn.
+/// Memory of the server. What is in memory never changes the images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Residency {
-    /// Bytes of Gaussians in memory, of all twins.
+    /// Bytes of Gaussians in memory, over all twins.
     pub held_bytes: u64,
-    /// Bytes that there may be.
+    /// Largest number of bytes of Gaussians that may be in memory.
     pub limit_bytes: u64,
-    /// Sections of the twin that were not in memory when the request came.
+    /// Number of sections of the twin that were not in memory when the request came.
     pub waited_for: u64,
-    /// How long the request waited until they were, in microseconds of wall time.
+    /// How long the request waited for them, in microseconds of wall time.
     pub waited_us: u64,
 }
 
@@ -186,6 +194,6 @@ pub struct Residency {
 pub struct Stage {
     /// Name of the stage.
     pub name: String,
-    /// Its time, in milliseconds.
+    /// Wall time of the stage, in milliseconds.
     pub ms: f64,
 }

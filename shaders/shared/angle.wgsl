@@ -1,9 +1,11 @@
-// Angles, as exact as f32 has them: WGSL's own functions may be 2^-11 off.
+// Trigonometry accurate to f32 rounding. WGSL allows its own functions an absolute error of 2^-11.
 
 const HALF_TURN: f32 = 3.14159265359;
 
-// The angle of (x, y) from the x axis in radians, for y of at least 0; 0 at the origin. A fit of degree
-// 9, 5e-9 off up to 22.5 degrees, where the rest is folded to.
+// Angle of (x, y) from the x axis, in radians, for y >= 0; 0 at the origin.
+//
+// The argument is folded to at most 22.5 degrees. There an odd polynomial of degree 9 is fitted to the
+// arc tangent; its error is 5e-9.
 fn angle(y: f32, x: f32) -> f32 {
     let along = abs(x);
     let small = min(y, along);
@@ -17,12 +19,17 @@ fn angle(y: f32, x: f32) -> f32 {
     return select(folded, HALF_TURN - folded, x < 0.0);
 }
 
+// Arc sine of a number in [-1, 1], in radians.
 fn arc_sine(x: f32) -> f32 {
     return sign(x) * angle(abs(x), sqrt(max((1.0 - x) * (1.0 + x), 0.0)));
 }
 
-// Sines (`quarter` 0) or cosines (0.5), as in `src/scene/sky/folded.rs`. Products with the first two
-// parts of pi are exact, so that it does not matter whether sums are fused with them.
+// Sines (`quarter` = 0) or cosines (`quarter` = 0.5) of four angles in radians, as in
+// `src/scene/sky/inference.rs`.
+//
+// Range reduction to [-pi/2, pi/2] by Cody and Waite: pi is subtracted in three parts. The products
+// with the first two parts are exact, so a compiler may fuse the multiplication and the subtraction
+// without changing the result.
 fn sine(x: vec4f, quarter: f32) -> vec4f {
     let whole = floor(x * 0.31830988618 + (0.5 - quarter));
     let turns = whole + quarter;

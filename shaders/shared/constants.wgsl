@@ -1,5 +1,5 @@
-// Documented in `src/render/constants.rs`, `src/scene` and `src/render/gpu/layout.rs`; held equal by
-// `tests/gpu/twins.rs`.
+// Constants shared with Rust. They are documented in `src/render/constants.rs`, `src/scene`, and
+// `src/render/gpu/layout.rs`; `tests/gpu/twins.rs` checks that both sides are equal.
 
 const TILE_PX: u32 = 16;
 const EXTENT_SLACK_PX: f32 = 2e-3;
@@ -9,7 +9,7 @@ const MAX_VIEWS: u32 = 16;
 const SKY_CUT: f32 = 0.003921568627;
 
 const CLUSTER: u32 = 256;
-const STRIP: u32 = 32;
+const SOA_BLOCK: u32 = 32;
 const GEOMETRY_WORDS: u32 = 9;
 
 const WORKGROUP: u32 = 256;
@@ -19,6 +19,6 @@ const DIGITS: u32 = 256;
 const MAX_GROUPS: u32 = 65535;
 const MACRO_COLUMNS: u32 = 8;
 const MACRO_ROWS: u32 = 4;
-const BIG_SPLAT_MACROS: u32 = 16;
+const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 const EXPAND_BATCH: u32 = 1024;
 const RASTER_BATCH: u32 = 128;

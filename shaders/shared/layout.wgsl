@@ -1,11 +1,12 @@
-// Documented in `src/render/gpu/layout.rs`; held equal by `tests/gpu/twins.rs`.
+// Buffer layouts shared with Rust. They are documented in `src/render/gpu/layout.rs`;
+// `tests/gpu/twins.rs` checks that names, offsets, and sizes are equal.
 
 struct FrameView {
     size_px: vec2u,
     columns: u32,
     first_tile: u32,
     macro_columns: u32,
-    first_macro: u32,
+    first_macro_tile: u32,
     rows: vec2u,
 }
 
@@ -15,7 +16,7 @@ struct Frame {
     instance_capacity: u32,
     views: u32,
     tiles: u32,
-    macros: u32,
+    macro_tiles: u32,
     near_m: f32,
     far_m: f32,
     blur_px2: f32,
@@ -29,7 +30,7 @@ struct Frame {
     view: array<FrameView, MAX_VIEWS>,
 }
 
-struct Behind {
+struct Background {
     scale: f32,
     offset: f32,
     edge: u32,
@@ -41,11 +42,11 @@ struct Behind {
     sky_from_pixel: array<array<vec4f, 3>, MAX_VIEWS>,
 }
 
-struct Seen {
+struct CameraAppearance {
     exposure: array<vec4f, 3>,
     overlay_px: vec2u,
     first_overlay: u32,
-    exposed: u32,
+    has_exposure: u32,
 }
 
 struct ChunkView {
@@ -71,19 +72,19 @@ struct Lens {
     end_rad: f32,
     widest_rad: f32,
     by_distance: u32,
-    bent: u32,
+    non_pinhole: u32,
     pad0: u32,
-    c: array<vec4f, 3>,
-    bend: array<vec2f, 22>,
-    rolls: vec4f,
+    coefficients: array<vec4f, 3>,
+    windshield_shift: array<vec2f, 22>,
+    remaining_exposure: vec4f,
     moved_m: vec3f,
     pad1: u32,
     moved_world_m: vec3f,
     pad2: u32,
-    turned: vec4f,
+    axis_angle: vec4f,
 }
 
-struct Item {
+struct ClusterView {
     line: u32,
     chunk_view: u32,
 }

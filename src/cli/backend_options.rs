@@ -1,4 +1,4 @@
-//! Options that choose the backend and the hardware it runs on.
+//! Options that choose the backend and the hardware that it runs on.
 
 use std::io::{self, Write};
 
@@ -12,23 +12,23 @@ use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
 use wildcity_render::stage::Stage;
 
-/// Who renders, for the commands that look at the renderer itself.
+/// `--backend` and `--cpu-through`, for commands that examine the renderer.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct RendererOptions {
     #[command(flatten)]
     backend: BackendOptions,
 
-    /// Run the stages up to and including this one on the cpu backend, and the rest on --device (one in
-    /// software too). An image that is wrong with --cpu-through project and right with
-    /// --cpu-through sort was spoilt by the GPU's sort; `wildcity bisect` tries them all.
+    /// Run the stages up to and including this one on the cpu backend, and the rest on --device, even if
+    /// that is software. If an image is wrong with --cpu-through project and right with --cpu-through sort,
+    /// the fault is in the GPU's sort. `wildcity bisect` tries all stages.
     #[arg(long, value_name = "STAGE", value_enum)]
     cpu_through: Option<StageName>,
 }
 
-/// Which backend, on what.
+/// `--backend`, and the hardware that it runs on.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct BackendOptions {
-    /// Who renders.
+    /// Backend that renders.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendName,
 
@@ -36,21 +36,21 @@ pub(super) struct BackendOptions {
     hardware: HardwareOptions,
 }
 
-/// What the backends run on.
+/// The hardware that the backends run on.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct HardwareOptions {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
-    #[arg(long, default_value_t = 0, value_parser = threads)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
 
-    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name; the fastest
-    /// kind if not given.
+    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name [default: the
+    /// fastest kind]
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Memory of the GPU that Gaussians may take, in GiB; those not drawn for longest make room for
-    /// others. What is drawn on the way to the pixels comes on top [default: as much as it has]
-    #[arg(long, value_name = "N", value_parser = gib)]
+    /// GPU memory for Gaussians, in GiB. If they need more, those that were not drawn for longest are
+    /// evicted. Buffers of the render stages come in addition [default: all that the GPU has]
+    #[arg(long, value_name = "GIB", value_parser = gib)]
     gpu_memory_gib: Option<f64>,
 
     /// Instruction set of the cpu backend.
@@ -61,26 +61,26 @@ pub(super) struct HardwareOptions {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// gpu if `--device` names one, or if there is one in hardware that draws a trial card as the cpu
-    /// backend does; else cpu. It is said on standard error.
+    /// gpu if `--device` names a device, or if a hardware device renders a test image as the cpu backend
+    /// does; otherwise cpu. The choice is printed on standard error.
     #[default]
     Auto,
-    /// wgpu on Vulkan, `--device`.
+    /// wgpu on Vulkan, on `--device`.
     Gpu,
     /// f32, SIMD, all cores.
     Cpu,
-    /// f64 by definition: slow.
+    /// f64, the definition that the other backends are compared with: slow.
     Reference,
 }
 
 /// [`Stage`] on the command line.
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 enum StageName {
-    /// Gaussians become splats.
+    /// Gaussians are projected to splats.
     Project,
-    /// Splats are put in order of depth.
+    /// Splats are sorted by depth.
     Sort,
-    /// Every tile gets its list of splats: only rasterize is left to the GPU.
+    /// Each tile gets its list of splats. Only rasterize is left to the GPU.
     Bin,
 }
 
@@ -97,7 +97,7 @@ impl From<StageName> for Stage {
 /// The instruction sets of [`Simd`].
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum SimdName {
-    /// The best of the machine.
+    /// The best one of the machine.
     #[default]
     Best,
     /// Sixteen lanes.
@@ -120,30 +120,30 @@ impl From<SimdName> for Simd {
 }
 
 impl BackendOptions {
-    /// Makes the backend, and says on standard error which one it is if nobody named it.
+    /// Creates the backend. If it is chosen automatically, prints the choice on standard error.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let HardwareOptions { threads, device, simd, .. } = &self.hardware;
         match (self.backend, device) {
             (BackendName::Auto, None) => {
-                let limits = self.hardware.limits();
+                let limits = self.hardware.memory_limits();
                 let Selection { backend, reason } =
                     automatic::select(*threads, (*simd).into(), limits)?;
                 writeln!(io::stderr(), "backend {reason}")?;
                 Ok(backend)
             }
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
-            (_, Some(device)) => {
-                anyhow::bail!("--device {device:?} is one of the gpu backend: add --backend gpu")
-            }
+            (_, Some(device)) => anyhow::bail!(
+                "--device {device:?} belongs to the gpu backend: add --backend gpu, or leave --device away"
+            ),
             (BackendName::Cpu, None) => Ok(Box::new(self.hardware.cpu()?)),
             (BackendName::Reference, None) => Ok(Box::new(Reference)),
         }
     }
 
-    /// The same, but what was recorded is drawn by what drew it, unless another one is named.
+    /// Creates the backend that rendered a recording, unless `--backend` names another one.
     pub(super) fn backend_of(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
-        let named = BackendName::from_str(recorded, false);
-        match (self.backend, named) {
+        let recorded = BackendName::from_str(recorded, false);
+        match (self.backend, recorded) {
             (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),
             _ => self.backend(),
         }
@@ -151,18 +151,18 @@ impl BackendOptions {
 }
 
 impl HardwareOptions {
-    /// The cpu backend.
+    /// Creates the cpu backend.
     pub(super) fn cpu(&self) -> anyhow::Result<Cpu> {
         Ok(Cpu::new(self.threads, self.simd.into())?)
     }
 
-    /// The gpu backend.
+    /// Creates the gpu backend.
     pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
-        Ok(Gpu::with_limits(&choice, self.threads, self.limits())?)
+        Ok(Gpu::with_limits(&choice, self.threads, self.memory_limits())?)
     }
 
-    fn limits(&self) -> MemoryLimits {
+    fn memory_limits(&self) -> MemoryLimits {
         MemoryLimits {
             mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
             ..MemoryLimits::default()
@@ -171,7 +171,7 @@ impl HardwareOptions {
 }
 
 impl RendererOptions {
-    /// Makes the backend.
+    /// Creates the backend.
     pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
@@ -180,7 +180,7 @@ impl RendererOptions {
                 Ok(Box::new(HybridBackend::new(hardware.cpu()?, hardware.gpu()?, stage.into())))
             }
             (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
-                "--cpu-through leaves the stages after it to the GPU: leave --backend away, or give \
+                "--cpu-through leaves the later stages to the GPU: leave --backend away, or give \
                  --backend gpu"
             ),
         }
@@ -194,15 +194,15 @@ fn threads(text: &str) -> Result<usize, String> {
     }
 }
 
-/// A number of GiB on the command line.
+/// Parses a number of GiB.
 pub(super) fn gib(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
-        _ => Err("expected a number above 0, to 65536".to_owned()),
+        _ => Err("expected GiB above 0 and up to 65536, for example 2 or 0.5".to_owned()),
     }
 }
 
-/// Bytes of so many GiB.
+/// GiB in bytes.
 pub(super) fn bytes_of_gib(gib: f64) -> u64 {
     (gib * f64::from(1 << 30)) as u64
 }

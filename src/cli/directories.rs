@@ -1,4 +1,4 @@
-//! Where twins lie unless told otherwise.
+//! Directories of twins, episodes and uploads, and names of twins, on the command line.
 
 use std::env;
 use std::path::PathBuf;
@@ -6,52 +6,52 @@ use std::path::PathBuf;
 use crate::cli::limits;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
-/// `--twins`, for every command that has it.
+/// `--twins` and the disk cache, for every command that reads twins.
 #[derive(Debug, clap::Args)]
 pub(super) struct Twins {
-    /// Directory of the twins, or s3://BUCKET/FOLDER, gs://.. or az://.., with credentials from the
-    /// environment (AWS_*, GOOGLE_*, AZURE_*) [default: $XDG_DATA_HOME/wildcity/twins, or
-    /// ~/.local/share/wildcity/twins]
-    #[arg(long, value_name = "PLACE")]
+    /// Directory of the twins, or an object store: s3://BUCKET/FOLDER, gs://BUCKET/FOLDER or
+    /// az://CONTAINER/FOLDER, with credentials from the environment (AWS_*, GOOGLE_*, AZURE_*)
+    /// [default: $XDG_DATA_HOME/wildcity/twins, or ~/.local/share/wildcity/twins]
+    #[arg(long, value_name = "DIR_OR_URL")]
     twins: Option<PathBuf>,
 
-    /// Directory that keeps parts of twins from elsewhere [default: $XDG_CACHE_HOME/wildcity, or
+    /// Directory that caches parts of twins from an object store [default: $XDG_CACHE_HOME/wildcity, or
     /// ~/.cache/wildcity]
     #[arg(long, value_name = "DIR")]
     cache_dir: Option<PathBuf>,
 
-    /// How much it keeps, in GiB; 0 for nothing.
-    #[arg(long, value_name = "N", default_value_t = limits::CACHE_GIB)]
+    /// Size of that cache, in GiB; 0 for no cache.
+    #[arg(long, value_name = "GIB", default_value_t = limits::CACHE_GIB)]
     cache_gib: u32,
 }
 
 impl Twins {
-    /// The twins there.
+    /// Opens the catalog of the twins.
     pub(super) fn catalog(&self) -> anyhow::Result<Catalog> {
         Ok(Catalog::open_cached(&self.dir()?, self.cache().as_ref())?)
     }
 
-    /// Where parts of remote twins are kept: nowhere without a home.
+    /// The cache for twins from an object store. None with size 0, and without a home directory.
     pub(super) fn cache(&self) -> Option<DiskCacheSettings> {
         let limit_bytes = u64::from(self.cache_gib) << 30;
-        let own = || Some(user_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
-        let dir = self.cache_dir.clone().or_else(own)?;
+        let default_dir = || Some(xdg_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
+        let dir = self.cache_dir.clone().or_else(default_dir)?;
         (limit_bytes > 0).then_some(DiskCacheSettings { dir, limit_bytes })
     }
 
-    /// The place given, or the user's own directory.
+    /// The directory or URL of `--twins`, or the user's own directory.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
         if let Some(dir) = &self.twins {
             return Ok(dir.clone());
         }
-        match user_dir("XDG_DATA_HOME", ".local/share") {
+        match xdg_dir("XDG_DATA_HOME", ".local/share") {
             Some(data) => Ok(data.join("wildcity/twins")),
             None => anyhow::bail!("neither HOME nor XDG_DATA_HOME is set: give --twins DIR"),
         }
     }
 }
 
-/// `--episodes`, for every command that records.
+/// `--episodes`, for every command that records episodes.
 #[derive(Debug, clap::Args)]
 pub(super) struct Episodes {
     /// Directory where episodes are recorded [default: $XDG_STATE_HOME/wildcity/episodes, or
@@ -61,50 +61,51 @@ pub(super) struct Episodes {
 }
 
 impl Episodes {
-    /// The directory given, or the user's own.
+    /// The directory of `--episodes`, or the user's own.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
         state_dir(self.episodes.as_ref(), "episodes")
     }
 }
 
-/// `--uploads`, for every command that takes them.
+/// `--uploads`, for every command that accepts uploads.
 #[derive(Debug, clap::Args)]
 pub(super) struct Uploads {
-    /// Directory where uploads are kept until they are pushed, one server's at a time [default:
-    /// $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
+    /// Directory where uploads are kept until they are pushed; only one server at a time may use it
+    /// [default: $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
     #[arg(long, value_name = "DIR")]
     uploads: Option<PathBuf>,
 }
 
 impl Uploads {
-    /// The directory given, or the user's own.
+    /// The directory of `--uploads`, or the user's own.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
         state_dir(self.uploads.as_ref(), "uploads")
     }
 }
 
-/// The directory given with an option, or the one of the same name among the user's own.
+/// The directory that an option gives, or the user's own directory of the same name.
 fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
     if let Some(dir) = given {
         return Ok(dir.clone());
     }
-    match user_dir("XDG_STATE_HOME", ".local/state") {
+    match xdg_dir("XDG_STATE_HOME", ".local/state") {
         Some(state) => Ok(state.join("wildcity").join(name)),
         None => anyhow::bail!("neither HOME nor XDG_STATE_HOME is set: give --{name} DIR"),
     }
 }
 
-/// A directory of the XDG base directory specification: from the environment, or below HOME.
-fn user_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
+/// A directory of the XDG base directory specification: from its variable, or below HOME. By hand, since
+/// it is shorter than the use of a crate.
+fn xdg_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))
 }
 
-/// A twin and perhaps one of its versions, as `street` or `street@3`.
+/// A twin and perhaps one of its versions: `street`, or `street@3`.
 #[derive(Clone, Debug)]
 pub(super) struct TwinVersion {
     pub(super) name: String,
-    /// None for the latest.
+    /// None for the latest version.
     pub(super) number: Option<u64>,
 }
 
@@ -115,7 +116,9 @@ impl std::str::FromStr for TwinVersion {
         let Some((name, number)) = text.split_once('@') else {
             return Ok(Self { name: text.to_owned(), number: None });
         };
-        let number = number.parse().map_err(|e| format!("version {number:?}: {e}"))?;
+        let number = number.parse().map_err(|error| {
+            format!("version {number:?}: {error}; expected NAME@NUMBER, for example street@3")
+        })?;
         Ok(Self { name: name.to_owned(), number: Some(number) })
     }
 }

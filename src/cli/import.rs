@@ -1,46 +1,44 @@
 //! `wildcity import`.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
-use serde::de::DeserializeOwned;
 
-use crate::cli::limits;
-use wildcity_scene::manifest::Provenance;
+use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{RecordFormat, RenderProfile, Rig, Trajectory};
-use wildcity_twin::ingest::{self, Axes};
+use wildcity_scene::{RecordFormat, RenderProfile};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
+use super::input_files::{read_rig, read_trajectories};
 use super::profile_options::ProfileOptions;
 use super::progress;
 use super::sky_source::SkySource;
 
-/// Make a twin of a trained scene, or a new version of one.
+/// Make a twin from a trained scene, or a new version of an existing twin.
 ///
-/// SRC is told by how it starts, never by its name; below is what is read. Every Gaussian is checked
-/// first; an import that fails leaves nothing behind.
+/// The format of SRC is detected from its content, not from its extension; the formats are listed below.
+/// Every Gaussian is checked before anything is written. An import that fails leaves nothing behind.
 ///
-/// Memory: twice what the scene takes uncompressed (56 bytes per Gaussian without SH, 236 with
-/// degree 3), and what an archive, a glTF buffer or a payload of NuRec holds.
+/// Memory: twice the uncompressed scene (56 bytes per Gaussian without SH, 236 with SH degree 3), and in
+/// addition the contents of an archive, a glTF buffer, or a NuRec payload.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The scene file; of a scene in a folder, its meta.json, lod-meta.json or .gltf.
+    /// The scene file. For a scene in a folder: its meta.json, lod-meta.json or .gltf.
     #[arg(value_name = "SRC")]
     source: PathBuf,
 
-    /// Name of the twin, of a-z 0-9 . _ -; an existing one gets a new version.
+    /// Name of the twin, made of a-z 0-9 . _ -; an existing twin gets a new version.
     #[arg(long, value_name = "NAME")]
     twin: String,
 
     #[command(flatten)]
     twins: Twins,
 
-    /// Which way the file's axes point; no format says. A preset, or the 9 numbers of the matrix
-    /// that takes the file's axes to the twin's (x east, y north, z up), row by row.
+    /// Directions of the file's axes, which no format records: a preset, or the 9 numbers of
+    /// the matrix from the file's axes to the twin's (x east, y north, z up), row by row.
     ///
     /// identity: z is up already.
     /// y-down-z-forward: OpenCV, COLMAP; most captures.
@@ -53,11 +51,11 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// JSON file of the vehicle's cameras (see below), kept as the twin's default rig.
+    /// JSON file of the vehicle's cameras (see below). They become the twin's default rig.
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
 
-    /// JSON file of a recorded drive (see below), in the twin's axes and metres; may be given again.
+    /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given again.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
@@ -67,80 +65,81 @@ pub(super) struct Import {
     #[command(flatten)]
     profile: ProfileOptions,
 
-    /// In how many bits Gaussians are stored: f32 (exact), h52, q32, q24; the number is bytes at SH
-    /// degree 1, before compression.
-    #[arg(long, default_value_t)]
+    /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last three the
+    /// number is the bytes per Gaussian at SH degree 1, before compression.
+    #[arg(long, value_name = "FORMAT", default_value_t)]
     record: RecordFormat,
 
-    /// Makes no levels of detail: everything is drawn in full, however far away.
+    /// Make no levels of detail: everything is rendered at full detail, at any distance.
     #[arg(long)]
     no_lod: bool,
 }
 
 const EXAMPLES: &str = "\
-Formats, and the axes that they usually have; files of one extension differ, so look at a render:
+Formats, and their usual axes. Files of one format differ, so render the twin to check its axes:
   PLY                 INRIA's columns in any order, SH degree 0 to 3        y-down-z-forward
   compressed PLY      PlayCanvas, SuperSplat                                y-down-z-forward
   safetensors         gsplat's names: means, quats, scales, opacities, ..   y-down-z-forward
   checkpoint (.pt)    python -m wildcity.convert CKPT.pt OUT.safetensors    y-down-z-forward
   .splat              antimatter15                                          y-down-z-forward
   .ksplat             mkkellogg, levels 0 to 2                              y-down-z-forward
-  SPZ 2, 3, 4         Niantic; right, up, back by its description, but      y-up-z-back
-                      some tools keep those of the PLY
+  SPZ 2, 3, 4         Niantic; by its specification right, up, back, but    y-up-z-back
+                      some tools keep the axes of the PLY
   SOG 1 and 2         PlayCanvas; meta.json, or one .sog or .zip            y-down-z-forward
   streamed SOG        lod-meta.json, or one .zip; the finest level is read  y-down-z-forward
-  glTF, GLB           KHR_gaussian_splatting, where its nodes put it; the   '-1 0 0 0 0 1 0 1 0'
-                      standard has x left, y up, z to the front
-  glTF, GLB of        triangles, covered with 200,000 flat Gaussians in     the same
-  ordinary meshes     their base colour
-  NuRec (.usdz)       NVIDIA; what stands still. Axes are the payload's:    y-down-z-forward
-                      what the USD layers around it turn is not looked at
+  glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
+                      nodes; the standard has x left, y up, z to the front
+  glTF, GLB of        triangles are covered with 200,000 flat Gaussians     the same
+  ordinary meshes     in their base colour
+  NuRec (.usdz)       NVIDIA; static content only. Axes are the payload's,  y-down-z-forward
+                      without the transforms of the USD layers around it
 
 Examples:
   wildcity import skull.ply --twin skull --axes y-down-z-forward --set near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
-Rig file: sizes and intrinsics in pixels, camera_to_rig in metres. Cameras have x right, y down, z
-forward; the rig has x forward, y left, z up. q is (w, x, y, z); this one looks straight ahead.
+Rig file: sizes and intrinsics are in pixels, camera_to_rig is in metres. Cameras have x right, y down, z
+forward; the rig has x forward, y left, z up. q is (w, x, y, z). This camera looks straight ahead:
   {\"name\": \"car\", \"cameras\": [
     {\"name\": \"front\", \"width\": 1440, \"height\": 928,
      \"fx\": 1800, \"fy\": 1800, \"cx\": 720, \"cy\": 464,
      \"camera_to_rig\": {\"xyz\": [1.9, 0, 1.65], \"q\": [0.5, -0.5, 0.5, -0.5]}}]}
 
-Trajectory file: where the rig was, in the twin's axes and metres, at rising times.
+Trajectory file: poses of the rig in the twin's axes and metres, at rising times:
   {\"name\": \"log\", \"keyframes\": [
     {\"time_us\": 0, \"world_from_rig\": {\"xyz\": [0, 0, 0], \"q\": [1, 0, 0, 0]}},
     {\"time_us\": 100000, \"world_from_rig\": {\"xyz\": [0.8, 0, 0], \"q\": [1, 0, 0, 0]}}]}";
 
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        // Everything that is quick to check, before the long part.
+        // 1. Options and small files, which are quick to check.
         if !is_name(&self.twin) {
             return Err(StoreError::Name { name: self.twin }.into());
         }
-        let axes = self.axes.parse::<Axes>()?.scaled(self.scale)?;
+        let axes = SourceAxes::parse(&self.axes, self.scale)?;
         let profile = self.profile.load()?.apply(RenderProfile::default())?;
         let sky = self.sky.read(&self.axes)?;
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
 
+        // 2. The scene.
         let cannot = || format!("cannot import {}", self.source.display());
         let bar = progress::bytes("reading");
-        let read = ingest::read_hashed(&self.source, &mut progress::show(&bar));
-        let (mut gaussians, source) = read.with_context(cannot)?;
-        axes.apply(&mut gaussians);
+        let read = read_scene(&self.source, &axes, &mut progress::show(&bar));
+        let SourceScene { gaussians, hash } = read.with_context(cannot)?;
         bar.finish_and_clear();
         if gaussians.is_empty() {
             let source = self.source.display();
-            writeln!(std::io::stderr(), "warning: {source} holds no Gaussians: nothing to see")?;
+            writeln!(
+                std::io::stderr(),
+                "warning: {source} holds no Gaussians: the twin will be empty"
+            )?;
         }
 
-        let mut options = vec![format!("axes={}", self.axes), format!("scale={}", self.scale)];
-        if self.no_lod {
-            options.push("lod=off".to_owned());
-        }
+        // 3. The twin.
+        let levels = !self.no_lod;
         let bar = progress::count("writing");
         let new = NewVersion {
             name: &self.twin,
@@ -149,11 +148,11 @@ impl Import {
             rig,
             trajectories,
             sky: sky.map(NewSky::Put),
-            provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
-            storage: StorageOptions { record: self.record, levels: !self.no_lod },
+            provenance: provenance(&[hash], axes.options().to_vec(), levels),
+            storage: StorageOptions { record: self.record, levels },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
-        // The file was sound, so what cannot be used now was made by the options.
+        // The file passed its checks, so a Gaussian that is refused now was changed by the options.
         let version = version.map_err(|error| match error {
             StoreError::Gaussians(error) => anyhow::Error::new(error)
                 .context(format!("after --axes {:?} --scale {}", self.axes, self.scale)),
@@ -179,41 +178,4 @@ impl Import {
         )?;
         Ok(())
     }
-}
-
-/// Reads a vehicle's cameras from their JSON, and checks them.
-pub(super) fn read_rig(path: &Path) -> anyhow::Result<Rig> {
-    let rig: Rig = read_json(path)?;
-    rig.check().with_context(|| format!("{}", path.display()))?;
-    Ok(rig)
-}
-
-fn read_trajectories(paths: &[PathBuf]) -> anyhow::Result<Vec<Trajectory>> {
-    let mut read: Vec<Trajectory> = Vec::with_capacity(paths.len());
-    for path in paths {
-        let trajectory = read_trajectory(path)?;
-        if read.iter().any(|before| before.name == trajectory.name) {
-            return Err(StoreError::DuplicateTrajectory { name: trajectory.name })
-                .with_context(|| format!("{}", path.display()));
-        }
-        read.push(trajectory);
-    }
-    Ok(read)
-}
-
-/// Reads a recorded drive from its JSON, and checks it.
-pub(super) fn read_trajectory(path: &Path) -> anyhow::Result<Trajectory> {
-    let trajectory: Trajectory = read_json(path)?;
-    trajectory.check().with_context(|| format!("{}", path.display()))?;
-    Ok(trajectory)
-}
-
-fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES);
-    let text = text.with_context(|| format!("{}", path.display()))?;
-    // serde would take a list for the object's values in order, and count them.
-    if text.trim_ascii_start().first() == Some(&b'[') {
-        anyhow::bail!("{} is a JSON list; one object is read: see --help", path.display());
-    }
-    serde_json::from_slice(&text).with_context(|| format!("cannot read {}", path.display()))
 }

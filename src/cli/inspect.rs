@@ -9,11 +9,11 @@ use wildcity_twin::store::Version;
 use super::directories::{TwinVersion, Twins};
 use super::time::utc;
 
-/// Show what a twin consists of: counts, bounds, hashes, and its chunks.
+/// Show the contents of a twin: counts, bounds in metres, hashes, and its chunks.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Inspect {
-    /// The twin, or NAME@NUMBER for an older version.
+    /// The twin: NAME, or NAME@NUMBER for an older version.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
@@ -61,11 +61,13 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
     writeln!(out, "created     {}", utc(*created_us))?;
     writeln!(out, "gaussians   {}, SH degree {}", manifest.gaussians(), manifest.sh_degree)?;
     writeln!(out, "objects     {} chunks, {stored_bytes} bytes", manifest.chunks.len())?;
-    let (record, bits) = (manifest.record, manifest.record.bits(manifest.sh_degree));
-    writeln!(out, "record      {record}, {bits} bits each before compression")?;
-    let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
-    let (count, most) = levels.fold((0, 0), |(count, most), s| (count + 1, most.max(s.level)));
-    writeln!(out, "sections    {count}, levels of detail 0 to {most} (see `wildcity lod`)")?;
+    let record = manifest.record;
+    let bits = record.bits(manifest.sh_degree);
+    writeln!(out, "record      {record}, {bits} bits per Gaussian before compression")?;
+    let sections = || manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
+    let count = sections().count();
+    let max_level = sections().map(|section| section.level).max().unwrap_or(0);
+    writeln!(out, "sections    {count}, levels of detail 0 to {max_level} (see `wildcity lod`)")?;
     if !manifest.chunks.is_empty() {
         writeln!(out, "bounds      {}", metres(&manifest.bounds()))?;
     }
@@ -100,7 +102,8 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
         writeln!(out, "rig         {}: {}", rig.name, names.join(", "))?;
     }
     for trajectory in &manifest.trajectories {
-        let (keyframes, length_m) = (trajectory.keyframes.len(), trajectory.length_m());
+        let keyframes = trajectory.keyframes.len();
+        let length_m = trajectory.length_m();
         writeln!(out, "trajectory  {}: {keyframes} keyframes, {length_m:.1} m", trajectory.name)?;
     }
     let provenance = &manifest.provenance;
@@ -116,15 +119,17 @@ fn table(out: &mut impl Write, manifest: &Manifest) -> io::Result<()> {
     )?;
     for chunk in &manifest.chunks {
         let cell = format!("{},{}", chunk.cell[0], chunk.cell[1]);
-        let (count, bytes, bounds) = (chunk.count, chunk.bytes, metres(&chunk.bounds));
-        writeln!(out, "{cell:>12} {count:>10} {bytes:>12}  {}  {bounds}", &chunk.object[..16])?;
+        let object = &chunk.object[..16];
+        let bounds = metres(&chunk.bounds);
+        writeln!(out, "{cell:>12} {:>10} {:>12}  {object}  {bounds}", chunk.count, chunk.bytes)?;
     }
     Ok(())
 }
 
-/// A box as `x -1.50..2.25  y ...  m`.
+/// A box as text: `x -1.50..2.25  y ...  m`.
 fn metres(bounds: &Bounds) -> String {
-    let (low, high) = (bounds.min_m, bounds.max_m);
+    let low = bounds.min_m;
+    let high = bounds.max_m;
     let axis = |name, low, high| format!("{name} {low:.2}..{high:.2}");
     let axes = [axis("x", low.x, high.x), axis("y", low.y, high.y), axis("z", low.z, high.z)];
     format!("{} m", axes.join("  "))

@@ -1,21 +1,21 @@
-//! Limits and defaults of this package, with the arithmetic behind each.
+//! Limits and defaults of the command line, with the arithmetic behind each.
 
-/// The server that clients talk to unless told otherwise.
+/// URL of the server, unless the user gives another one.
 pub(super) const SERVER_URL: &str = "http://127.0.0.1:8080";
 
-/// What is kept on disk of twins from elsewhere, in GiB, unless told otherwise: half of a log's 32 GB.
+/// Default size of the disk cache for twins from an object store, in GiB: half of the 32 GB of a driving log.
 pub(super) const CACHE_GIB: u32 = 16;
 
-/// Versions that garbage collection keeps, unless told otherwise: a day of hourly pushes, twice.
+/// Versions that garbage collection keeps by default: two days of hourly pushes.
 pub(super) const GC_KEEP: u32 = 50;
 
-/// How long garbage stays, unless told otherwise: longer than any commit is in preparation.
+/// How long garbage stays by default: longer than the preparation of any commit.
 pub(super) const GC_GRACE: &str = "24h";
 
-/// Largest rig or trajectory file: what fits a manifest.
+/// Largest rig or trajectory file: what fits into a manifest.
 pub(super) const SETTINGS_FILE_BYTES: u64 = wildcity_twin::limits::MANIFEST_BYTES;
 
-/// Largest profile file: nine fields of at most 40 B.
+/// Largest profile file. A profile has twelve fields of about 40 B; the rest is room for white space.
 pub(super) const PROFILE_FILE_BYTES: u64 = 64 << 10;
 
 /// Most stations of a report: with four offsets and six cameras, 1,536 windows of the reference.
@@ -24,5 +24,5 @@ pub(super) const REPORT_STATIONS: i64 = 64;
 /// Largest window of a report, in pixels: with the most stations, 100 million pixels of 40 B.
 pub(super) const REPORT_WINDOW_PX: i64 = 256;
 
-/// Most Gaussians of a street of `wildcity bench gpu`: 200 B each while it is made.
+/// Most Gaussians of a street of `wildcity bench gpu`: each takes 200 B while the street is made.
 pub(super) const BENCH_GAUSSIANS: i64 = 100_000_000;

@@ -1,4 +1,13 @@
-//! The command line: one file per subcommand.
+//! The command line: one file, or one folder, for each subcommand.
+//!
+//! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
+//! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
+//! failure, 2 for a command line that cannot be parsed.
+//!
+//! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
+//! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
+//! belongs to. Numbers from outside are printed with `{:?}`, which writes 1e300 as such and not as 301
+//! digits.
 
 use std::process::ExitCode;
 
@@ -9,6 +18,7 @@ mod demo;
 mod devices;
 mod directories;
 mod import;
+mod input_files;
 mod inspect;
 mod limits;
 mod lod;
@@ -30,13 +40,20 @@ mod twin;
 
 use clap::{Parser, Subcommand};
 
-/// A closed-loop driving simulator server for city twins.
+/// A closed-loop driving simulator server for city twins made of 3D Gaussians.
 #[derive(Debug, Parser)]
-#[command(version, about, arg_required_else_help = true)]
+#[command(version, about, arg_required_else_help = true, after_long_help = EXAMPLES)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity demo                                   (build a street, drive through it, look at images)
+  wildcity import street.ply --twin street --axes y-down-z-forward
+  wildcity serve                                  (then an agent can open the twin \"street\")
+  wildcity help import                            (options and examples of one command)";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -58,7 +75,8 @@ enum Command {
     Devices(devices::Devices),
 }
 
-/// Parses the command line, runs, and tells how it went: 0 done, 1 failed, 2 not understood.
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure. A
+/// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let result = match arguments.command {
@@ -85,5 +103,66 @@ pub fn main() -> ExitCode {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// The commands without subcommands, each with the words that select it.
+    fn leaves_of(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
+        let path = format!("{path}{} ", command.get_name());
+        let mut leaves: Vec<_> =
+            command.get_subcommands().flat_map(|sub| leaves_of(sub, &path)).collect();
+        if leaves.is_empty() {
+            leaves.push((path.trim_end().to_owned(), command.clone()));
+        }
+        leaves
+    }
+
+    fn all_leaves() -> Vec<(String, clap::Command)> {
+        leaves_of(&Arguments::command(), "")
+    }
+
+    #[test]
+    fn every_command_and_option_is_explained_and_has_an_example() {
+        let leaves = all_leaves();
+        assert!(leaves.len() > 25, "{} commands", leaves.len());
+        for (path, command) in leaves {
+            let after = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
+            assert!(command.get_about().is_some(), "{path} has no description");
+            assert!(after.contains(&path) && after.contains("Example"), "{path} has no example");
+            for argument in command.get_arguments() {
+                assert!(argument.get_help().is_some(), "{path}: {} has no help", argument.get_id());
+            }
+        }
+    }
+
+    #[test]
+    fn profile_is_a_file_and_set_is_a_field_on_every_command() {
+        let mut counts = [0; 2];
+        for (path, command) in all_leaves() {
+            for argument in command.get_arguments() {
+                let names = argument.get_value_names().unwrap_or_default();
+                let names: Vec<&str> = names.iter().map(|name| name.as_str()).collect();
+                let expected = match argument.get_long() {
+                    Some("profile") => (0, ["FILE"]),
+                    Some("set") => (1, ["FIELD=VALUE"]),
+                    _ => continue,
+                };
+                counts[expected.0] += 1;
+                assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
+            }
+        }
+        // serve, import, render, bench step, bisect; and push instead of serve.
+        assert_eq!(counts, [5, 5]);
+    }
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        Arguments::command().debug_assert();
     }
 }

@@ -1,23 +1,23 @@
-//! Progress bars on standard error, where it is a terminal.
+//! Progress bars on standard error. indicatif hides them if standard error is not a terminal.
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// A bar that counts bytes. indicatif hides it where standard error is no terminal.
+/// A bar that counts bytes.
 pub(super) fn bytes(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {bytes}/{total_bytes} {eta}")
 }
 
-/// A bar that counts anything else.
+/// A bar that counts other things.
 pub(super) fn count(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {human_pos}/{human_len} {eta}")
 }
 
-/// A bar whose label says what is counted now.
+/// A bar with a label that names the item in progress.
 pub(super) fn state() -> ProgressBar {
     bar("waiting", "{msg:12} {wide_bar} {percent} %")
 }
 
-/// Sets how much is done of how much.
+/// A callback that sets the bar to `done` of `total`.
 pub(super) fn show(bar: &ProgressBar) -> impl FnMut(u64, u64) {
     |done, total| {
         bar.set_length(total);

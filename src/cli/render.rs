@@ -11,11 +11,11 @@ use super::backend_options::RendererOptions;
 use super::scene_source::{SceneSource, Shot};
 use super::{output, progress};
 
-/// Render cameras of a file to images.
+/// Render a scene file or a twin to images, one for each camera of a list.
 ///
-/// Writes DIR/<name>.<format> for each camera of the list. PNG and JPEG hold the colour clamped to
-/// [0, 1] and rounded to 8 bit; npy holds float32 [height, width, 4]: linear premultiplied red,
-/// green, blue on black, and opacity.
+/// Writes DIR/<name>.<format> for each camera. PNG and JPEG hold colour clamped to [0, 1] and rounded to 8
+/// bits. npy holds float32 [height, width, 4]: linear premultiplied red, green and blue on black, and
+/// opacity.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Render {
@@ -25,21 +25,21 @@ pub(super) struct Render {
     #[command(flatten)]
     renderer: RendererOptions,
 
-    /// Directory for the images; made if it is missing.
+    /// Directory for the images; created if it is missing.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 
-    /// What to write.
+    /// File format of the images.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
 }
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity render skull.ply --cameras front.json --out pictures
-  wildcity render street --cameras views.json --out truth --backend reference --format npy
+  wildcity render skull.ply --cameras front.json --out images
+  wildcity render street --cameras views.json --out reference --backend reference --format npy
   wildcity render street --cameras views.json --out half --cpu-through sort
-  wildcity render scene.ply --cameras views.json --out p --set near=0.2 --set alpha_cap=0.999";
+  wildcity render scene.ply --cameras views.json --out images --set near=0.2 --set alpha_cap=0.999";
 
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum Format {
@@ -53,7 +53,7 @@ impl Render {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
         let backend = self.renderer.backend()?;
-        output::make_dir(&self.out)?;
+        output::create_dir(&self.out)?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
         let mut out = io::stdout().lock();
@@ -66,6 +66,7 @@ impl Render {
                 views: std::slice::from_ref(&shot.view),
             };
             let path = self.out.join(format!("{}.{}", shot.name, self.format.extension()));
+            // Only the buffer of the format is filled.
             let mut rgba = Vec::new();
             let mut rgb8 = Vec::new();
             let target = match self.format {
@@ -79,7 +80,7 @@ impl Render {
                 }
             };
             backend.render(&frame, &mut [target], &|_, _| {})?;
-            let file = self.format.file(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
+            let file = self.format.encode(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
             let file = file.with_context(|| format!("cannot write {}", path.display()))?;
             output::write(&path, &file)?;
             bar.inc(1);
@@ -99,9 +100,10 @@ impl Format {
         }
     }
 
-    /// The whole file: written at once, so that no error is lost in a buffer.
-    fn file(self, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> Result<Vec<u8>, String> {
-        let (width, height) = (shot.view.camera.width_px, shot.view.camera.height_px);
+    /// The bytes of the file. They are written at once, so that no error is lost in a buffer.
+    fn encode(self, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> Result<Vec<u8>, String> {
+        let width = shot.view.camera.width_px;
+        let height = shot.view.camera.height_px;
         match self {
             Self::Png => wildcity_session::png(rgb8, width, height),
             Self::Jpeg => {
@@ -112,7 +114,8 @@ impl Format {
     }
 }
 
-/// Version 1.0 of NumPy's format: magic, header length, a Python dict padded to 64 bytes, data.
+/// A file of NumPy's format, version 1.0 (numpy.lib.format): magic, header length, a Python dict padded to
+/// 64 bytes, data.
 fn npy(shape: [u32; 3], values: &[f32]) -> Vec<u8> {
     let [h, w, c] = shape;
     let dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({h}, {w}, {c}), }}");

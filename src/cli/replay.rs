@@ -12,23 +12,23 @@ use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::{output, progress};
 
-/// Show a recorded episode, render it again, and compare every frame.
+/// Show a recorded episode, or render it again and compare every image with the recording.
 ///
-/// Without --out or --verify, prints what was recorded. With either, renders it again and names the
-/// first step and camera whose pixels are not the recorded ones.
+/// Without --out and --verify, prints a summary of the recording. With either, renders it again and names
+/// the first step and camera where pixels differ from the recorded ones.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Replay {
-    /// The episode's file, <session>-<n>.jsonl.
+    /// The episode's file: <session>-<n>.jsonl.
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again and fail with exit code 1 if one differs (without --out, at once) or
-    /// the recording is incomplete.
+    /// Render every frame again; the exit code is 1 if an image differs, or if the recording is incomplete.
+    /// Without --out, stops at the first difference.
     #[arg(long)]
     verify: bool,
 
-    /// Write every image as DIR/<frame>_<request>_<camera>.png; made if it is missing.
+    /// Write every image as DIR/<frame>_<request>_<camera>.png; the directory is created if it is missing.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 
@@ -43,7 +43,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity replay ~/.local/state/wildcity/episodes/agent-1.jsonl
   wildcity replay agent-1.jsonl --verify
-  wildcity replay agent-1.jsonl --out pictures --backend reference";
+  wildcity replay agent-1.jsonl --out images --backend reference";
 
 impl Replay {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -54,7 +54,7 @@ impl Replay {
             return Ok(());
         }
         if let Some(dir) = &self.out {
-            output::make_dir(dir)?;
+            output::create_dir(dir)?;
         }
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
@@ -62,7 +62,7 @@ impl Replay {
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
-        // Pictures that were asked for are all drawn; a yes or no needs none after a no.
+        // With --out all images are rendered. Without it, the first difference decides the result.
         let extent =
             if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
         let mut open = |version| cache.open(&header.twin, Some(version));
@@ -80,8 +80,8 @@ impl Replay {
         }
         match &report.diverged {
             None => {}
-            Some(diverged) if self.verify => anyhow::bail!("strays at {diverged}"),
-            Some(diverged) => writeln!(out, "strays      {diverged}")?,
+            Some(diverged) if self.verify => anyhow::bail!("diverges at {diverged}"),
+            Some(diverged) => writeln!(out, "diverges    {diverged}")?,
         }
         match &report.difference {
             None => {
@@ -92,10 +92,10 @@ impl Replay {
                 writeln!(out, "differs     {difference}")?;
             }
         }
-        // Nothing, or the beginning of something, is no proof of the whole.
+        // An empty or unfinished recording does not prove that the whole episode repeats.
         let missing = match (recording.frames.is_empty(), &recording.end) {
             (true, _) => "has no frames",
-            (false, None) => "has no end: the episode still runs, or was cut off",
+            (false, None) => "has no end: the episode still runs, or was interrupted",
             (false, Some(_)) => return Ok(()),
         };
         anyhow::ensure!(!self.verify, "the recording is incomplete: it {missing}");
@@ -125,7 +125,9 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
             end.time_us as f64 * 1e-6,
             end.distance_m,
         ),
-        None => writeln!(out, "end         not recorded: the episode still runs, or was cut off"),
+        None => {
+            writeln!(out, "end         not recorded: the episode still runs, or was interrupted")
+        }
     }
 }
 
@@ -137,7 +139,8 @@ fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {
         FrameRequest::Observe => format!("observe{pose}"),
     };
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));
-    let (width, height) = (camera.camera.width_px, camera.camera.height_px);
+    let width = camera.camera.width_px;
+    let height = camera.camera.height_px;
     let file = wildcity_session::png(rgb8, width, height).map_err(anyhow::Error::msg);
     output::write(&path, &file.with_context(|| format!("cannot write {}", path.display()))?)
 }

@@ -10,83 +10,87 @@ use crate::cli::limits;
 use wildcity_render::gpu::Gpu;
 use wildcity_render::{Backend, RenderError};
 use wildcity_report::confidence::confidence_by_offset;
-use wildcity_report::measure::normalize_machine_speed;
 use wildcity_report::measure::{Benchmark, ReferenceImages};
+use wildcity_report::measurement::{Measurement, normalize_machine_speed};
 use wildcity_report::recommend::{Goal, Recommendation, recommend};
-use wildcity_report::sample_points::{Sampling, sample_points};
+use wildcity_report::sample_points::{SamplePoint, Sampling, sample_points};
 use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
 use wildcity_report::{Report, ReportError, Subject, feature_costs, page};
-use wildcity_scene::{Rays, Rig};
+use wildcity_scene::{Manifest, Rays, Rig};
 use wildcity_stress::CASES;
 use wildcity_stress::table::{self, Candidate, Column};
-use wildcity_twin::residency::Cache;
+use wildcity_twin::residency::{Cache, Resident};
 
 use super::backend_options::HardwareOptions;
 use super::directories::{TwinVersion, Twins};
 use super::rig::rig_of;
-use super::stress::{Name, candidate};
+use super::stress::{BackendName, candidate};
 use super::{demo, output, progress};
 
-/// Measure what each setting of the renderer costs and what it loses, on a twin and on this machine.
+/// Measure what each setting of the renderer costs and what it loses, on one twin and this machine.
 ///
-/// Backends, levels of detail, records, antialiasing, alpha cut, stop, the sky, lenses, image scale and
-/// encoding, each against the f64 reference, at places on the recorded drive and 1, 3 and 5 m beside it
-/// (around a twin that has none). Windows of each image are compared, at full focal length; whole steps
-/// are timed. What the twin cannot feel is left out, and named. Also how far images may be believed beside
-/// the drive, the stress table, and what a scene with and without each feature runs. Writes report.html,
-/// which needs nothing else, report.json and report.csv.
+/// Compares backends, levels of detail, record formats, antialiasing, the smallest alpha, the stop
+/// transmittance, the sky map, lenses, image scale and encoding with the f64 reference. Sample points lie
+/// on the recorded drive and 1, 3 and 5 m beside it, or around a twin without a drive. Windows of each
+/// image are compared at full focal length, and whole steps are timed. Settings that cannot affect this
+/// twin are skipped, and named. The report also has the trust in images beside the drive, the stress
+/// table, and what each feature of a scene costs.
 ///
-/// With --at-least-db or --at-most-ms it recommends a setting, verified at places that were not used to
-/// choose it, and writes it as profile.json for `wildcity serve --profile`; where it cannot, the report
-/// says why, and a profile.json of an earlier one is removed. Its decibels and milliseconds are of what is
-/// rendered, before images are encoded: a profile does not choose the encoding. What encodings lose and
-/// take is measured, and told beside it.
+/// Writes report.html, which loads nothing else, report.json and report.csv.
 ///
-/// The reference draws the whole twin in full detail, however far it goes: it must fit into memory.
+/// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points, verified at
+/// the others, and written as profile.json for `wildcity serve --profile`. If no setting can be
+/// recommended, the report says why, and the profile.json of an earlier report is removed. The decibels and
+/// milliseconds of a recommendation are of images before they are encoded, since a profile does not choose
+/// the encoding; the report says what encodings lose and take in addition.
+///
+/// The reference renders the whole twin at full detail and without a draw distance: it must fit into memory.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Command {
-    /// The twin, or NAME@NUMBER for an older version; `demo` is the demo street in record f32, built on
-    /// first use, so that all records can be compared.
+    /// The twin: NAME, or NAME@NUMBER for an older version. `demo` is the demo street in record format f32,
+    /// which is built on first use, so that all record formats can be compared.
     #[arg(value_name = "TWIN", default_value = demo::TWIN)]
     twin: TwinVersion,
 
     #[command(flatten)]
     twins: Twins,
 
-    /// Directory for the report; made if it is missing.
+    /// Directory for the report; created if it is missing.
     #[arg(long, value_name = "DIR", default_value = "wildcity-report")]
     out: PathBuf,
 
-    /// Recommend the fastest setting with at least this PSNR in every camera's window at every place, in
-    /// dB, before images are encoded.
+    /// Recommend the fastest setting with at least this PSNR in every camera's window at every sample
+    /// point, in dB, before images are encoded.
     #[arg(long, value_name = "DB", value_parser = at_least_db, allow_negative_numbers = true)]
     at_least_db: Option<Goal>,
 
-    /// Recommend the most exact setting of which all but one of twenty steps take at most this time, in
+    /// Recommend the most exact setting with at most this 95th percentile of the step time, in
     /// milliseconds, before images are encoded.
     #[arg(long, value_name = "MS", value_parser = at_most_ms, allow_negative_numbers = true)]
     #[arg(conflicts_with = "at_least_db")]
     at_most_ms: Option<Goal>,
 
-    /// Stations along the drive, each on it and 1, 3 and 5 m beside; around a twin without a drive, four
-    /// times as many places. The reference takes about a second for each place and camera.
+    /// Stations along the drive, each with a sample point on it and 1, 3 and 5 m beside it; a twin without a
+    /// drive has four times as many sample points around it. The reference takes about a second for each
+    /// sample point and camera.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=limits::REPORT_STATIONS))]
     stations: u32,
 
-    /// Side of the window that is compared of each image, in pixels.
+    /// Width and height of the compared window of each image, in pixels.
     #[arg(long, value_name = "PX", default_value_t = 96, value_parser = clap::value_parser!(u32).range(16..=limits::REPORT_WINDOW_PX))]
     window: u32,
 
-    /// Steps to time at each place, after one that is not counted.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    /// Steps to time at each sample point, after one that is not counted.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
 
-    /// Cameras to look with instead of the twin's own: a preset (see `wildcity rig show`) or a file.
+    /// Cameras to use instead of the twin's own: a preset (see `wildcity rig show`), or a JSON file as
+    /// `wildcity import --rig` reads it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
-    /// Backends beside the reference, the one that draws all settings first.
+    /// Backends to compare with the reference. The first one renders all settings.
     #[arg(long = "backend", value_name = "NAME", value_delimiter = ',', value_enum, default_values_t = [Measurable::Cpu, Measurable::Gpu])]
     backends: Vec<Measurable>,
 
@@ -106,14 +110,14 @@ Examples:
   wildcity report street --backend gpu --at-most-ms 20 && \\
     wildcity serve --backend gpu --profile wildcity-report/profile.json";
 
-/// Backends that can be measured: the reference is what they are compared with.
+/// Backends that can be measured. The reference is missing: they are compared with it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Measurable {
     Cpu,
     Gpu,
 }
 
-impl From<Measurable> for Name {
+impl From<Measurable> for BackendName {
     fn from(measurable: Measurable) -> Self {
         match measurable {
             Measurable::Cpu => Self::Cpu,
@@ -125,37 +129,60 @@ impl From<Measurable> for Name {
 fn at_least_db(text: &str) -> Result<Goal, String> {
     match text.parse() {
         Ok(db) if (0.0..=1000.0).contains(&db) => Ok(Goal::AtLeastDb(db)),
-        _ => Err("expected 0 to 1000 dB, as 40".to_owned()),
+        _ => Err("expected 0 to 1000 dB, for example 40".to_owned()),
     }
 }
 
 fn at_most_ms(text: &str) -> Result<Goal, String> {
     match text.parse() {
         Ok(ms) if ms > 0.0 && f64::is_finite(ms) => Ok(Goal::AtMostMs(ms)),
-        _ => Err("expected milliseconds, more than 0, as 20".to_owned()),
+        _ => Err("expected milliseconds above 0, for example 20".to_owned()),
     }
+}
+
+/// Measurements of all settings, and the settings that were skipped.
+struct Compared {
+    measurements: Vec<Measurement>,
+    skipped: Vec<Skipped>,
+    /// Time of a step of the reference, in milliseconds.
+    reference_ms: f64,
+    /// The same with a ray for every pixel; none if every camera is a pinhole at rest.
+    exact_rays_ms: Option<f64>,
+}
+
+/// The backends that are there, and the others with the reason.
+struct Backends {
+    present: Vec<Box<dyn Backend>>,
+    absent: Vec<Skipped>,
 }
 
 impl Command {
     pub(super) fn run(mut self) -> anyhow::Result<()> {
-        let again = |(index, name)| self.backends[..index].contains(name);
-        let twice = self.backends.iter().enumerate().any(again);
-        ensure!(!twice, "--backend names one twice: name each once");
+        let is_repeated = |(index, name)| self.backends[..index].contains(name);
+        let has_repeated = self.backends.iter().enumerate().any(is_repeated);
+        ensure!(!has_repeated, "--backend: the same backend is given twice; name each once");
         if self.twin.name == demo::TWIN {
-            self.twin.name = demo::exact(&self.twins.dir()?)?.manifest.twin;
+            self.twin.name = demo::exact_twin(&self.twins.dir()?)?.manifest.twin;
         }
         let report = self.measure()?;
-        output::make_dir(&self.out)?;
+        self.write(&report)?;
+        // The files have the measurements and the reason, but the command failed to do what was asked.
+        report.unmet_reason.map_or(Ok(()), |reason| bail!(reason))
+    }
+
+    /// Writes the report's files, and a summary on standard output.
+    fn write(&self, report: &Report) -> anyhow::Result<()> {
+        output::create_dir(&self.out)?;
         let mut files = vec![
-            ("report.html", page::html(&report)?),
-            ("report.json", format!("{:#}\n", serde_json::to_value(&report)?)),
+            ("report.html", page::render(report)?),
+            ("report.json", format!("{:#}\n", serde_json::to_value(report)?)),
             ("report.csv", report.csv()),
         ];
-        // It would be another report's beside this one.
+        // A profile of an earlier report would not belong to this one.
         let profile = self.out.join("profile.json");
-        remove(&profile)?;
-        if let Some(best) = &report.recommendation {
-            let changes = serde_json::to_value(best.changes()?)?;
+        remove_if_present(&profile)?;
+        if let Some(recommendation) = &report.recommendation {
+            let changes = serde_json::to_value(recommendation.changes()?)?;
             files.push(("profile.json", format!("{changes:#}\n")));
         }
         let mut out = io::stdout().lock();
@@ -164,96 +191,52 @@ impl Command {
             output::write(&path, text.as_bytes())?;
             writeln!(out, "{}", path.display())?;
         }
-        for Skipped { what, why } in &report.skipped {
-            writeln!(out, "not compared: {what} ({why})")?;
+        for Skipped { what, reason } in &report.skipped {
+            writeln!(out, "not compared: {what} ({reason})")?;
         }
-        if let Some(best) = &report.recommendation {
-            let Recommendation { wanted, setting, backend, chosen_by, margin, verified, .. } = best;
-            writeln!(
-                out,
-                "{wanted}: {setting} on {backend}, {chosen_by:.1} at worst where it was chosen, with a \
-                 margin of {margin:.1}, and {verified:.1} at worst at other places, {}",
-                best.of_what()
-            )?;
-            writeln!(out, "{}", best.serve(&profile.display().to_string()))?;
+        if let Some(recommendation) = &report.recommendation {
+            print_recommendation(&mut out, recommendation, &profile)?;
         }
-        // What was measured is on disk, and says so, too.
-        report.unmet_reason.map_or(Ok(()), |why| bail!(why))
+        Ok(())
     }
 
     fn measure(&self) -> anyhow::Result<Report> {
-        let candidates = self.backends.iter().map(|name| candidate((*name).into(), &self.hardware));
-        let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
-        let (mut backends, mut absent): (Vec<Box<dyn Backend>>, _) = (Vec::new(), Vec::new());
-        for candidate in candidates {
-            match candidate {
-                Ok(backend) => backends.push(backend),
-                Err((name, why)) => absent.push(Skipped::new(format!("backend {name}"), why)),
-            }
-        }
-        ensure!(!backends.is_empty(), "none of the --backend is there");
+        // 1. The backends, the twin, its cameras, and the sample points.
+        let Backends { present: backends, absent } = self.open_backends()?;
         let resident = Cache::new(self.twins.catalog()?).open(&self.twin.name, self.twin.number)?;
         let manifest = &resident.version.manifest;
-        let named = self.rig.as_deref().map(rig_of).transpose()?;
-        let own = || manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
-        let rig = named.or_else(own).context("no rig")?;
+        let rig = self.rig(manifest)?;
         let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
-        let places = sample_points(manifest, &rig.cameras, sampling);
+        let points = sample_points(manifest, &rig.cameras, sampling);
+        let names: Vec<String> = backends.iter().map(|backend| backend.name().to_owned()).collect();
 
-        let bench = Benchmark {
+        // 2. Errors and times of all settings.
+        let benchmark = Benchmark {
             resident: &resident,
             backends: &backends,
-            places: &places,
+            sample_points: &points,
             repeat: self.repeat,
-            device: &|| self.device(),
+            open_device: &|| self.open_device(),
         };
-        let truth = |rays: Rays, label| -> anyhow::Result<ReferenceImages> {
-            let bar = progress::count(label);
-            bar.set_length(places.len() as u64);
-            let truth = bench.truth(rays, &mut |done| bar.set_position(done as u64));
-            let truth = truth.context(
-                "the reference draws the whole twin, in full detail and however far it goes",
-            )?;
-            bar.finish_and_clear();
-            Ok(truth)
-        };
-        let twin = TwinFeatures::of(manifest, resident.sky().map(AsRef::as_ref), &places[0].views);
-        let splats = truth(Rays::Splats, "reference")?;
-        let rays = twin.bent.then(|| truth(Rays::Exact, "reference, every ray")).transpose()?;
+        let mut compared = compare(&benchmark, &resident, &points, &names)?;
+        compared.skipped.extend(absent);
+        let Compared { measurements, skipped, reference_ms, exact_rays_ms } = compared;
 
-        let names: Vec<&str> = backends.iter().map(|backend| backend.name()).collect();
-        let SettingList { settings, mut skipped } = settings_to_compare(&twin, &names);
-        skipped.extend(absent);
-        let bar = progress::state();
-        bar.set_length(settings.len() as u64);
-        let mut measured = Vec::new();
-        for setting in &settings {
-            bar.set_message(setting.name.clone());
-            let truth = match (setting.against, &rays) {
-                (Rays::Exact, Some(rays)) => rays,
-                // A ladder has nothing against rays unless a camera is bent.
-                (Rays::Splats | Rays::Exact, _) => &splats,
-            };
-            match bench.measure(setting, truth) {
-                Ok(one) => measured.push(one),
-                // A map that would be too large.
-                Err(ReportError::Render(why @ RenderError::Sky(_))) => {
-                    skipped.push(Skipped::new(setting.name.clone(), why.to_string()));
-                }
-                Err(error) => return Err(error.into()),
-            }
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        normalize_machine_speed(&mut measured);
-
-        let wanted = self.at_least_db.or(self.at_most_ms);
-        let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
-        let recommended = wanted.map(|wanted| recommend(wanted, &measured, &names)).transpose();
-        let (recommendation, unmet) = match recommended {
+        // 3. The setting for the goal.
+        let goal = self.at_least_db.or(self.at_most_ms);
+        let recommended = goal.map(|goal| recommend(goal, &measurements, &names)).transpose();
+        let (recommendation, unmet_reason) = match recommended {
             Ok(recommendation) => (recommendation, None),
-            Err(unmet) => (None, Some(unmet.to_string())),
+            Err(error) => (None, Some(error.to_string())),
         };
+
+        // 4. Trust, extreme scenes, and features.
+        let confidence = confidence_by_offset(&resident, &*backends[0], &points)?;
+        let stress = self.stress()?;
+        let feature_costs =
+            feature_costs::count_features(&self.hardware.cpu()?, &|| self.open_device())?;
+
+        let column = |b: &Box<dyn Backend>| Column { backend: b.name(), detail: b.detail() };
         Ok(Report {
             subject: Subject {
                 twin: manifest.twin.clone(),
@@ -263,41 +246,69 @@ impl Command {
                 sh_degree: manifest.sh_degree,
                 record: manifest.record.name(),
                 profile: manifest.profile,
-                cameras: places[0].views.len(),
+                cameras: points[0].views.len(),
                 repeat: self.repeat,
             },
-            backends: backends
-                .iter()
-                .map(|b| Column { backend: b.name(), detail: b.detail() })
-                .collect(),
+            backends: backends.iter().map(column).collect(),
             sampling,
-            sample_points: places.iter().map(|place| place.name.clone()).collect(),
-            reference_ms: splats.step_ms,
-            settings: measured,
+            sample_points: points.iter().map(|point| point.name.clone()).collect(),
+            reference_ms,
+            settings: measurements,
             skipped,
-            exact_rays_ms: rays.map(|rays| rays.step_ms),
-            confidence: confidence_by_offset(&resident, &*backends[0], &places)?,
-            goal: wanted,
+            exact_rays_ms,
+            confidence,
+            goal,
             recommendation,
-            unmet_reason: unmet,
-            stress: self.stress()?,
-            feature_costs: feature_costs::count_features(&self.hardware.cpu()?, &|| self.device())?,
+            unmet_reason,
+            stress,
+            feature_costs,
         })
     }
 
-    /// A device that drew nothing yet, if one is wanted and there.
-    fn device(&self) -> Option<Gpu> {
-        if self.backends.contains(&Measurable::Gpu) { self.hardware.gpu().ok() } else { None }
+    /// Opens the backends of `--backend`; at least one must be there.
+    fn open_backends(&self) -> anyhow::Result<Backends> {
+        let mut present = Vec::new();
+        let mut absent = Vec::new();
+        for name in &self.backends {
+            match candidate((*name).into(), &self.hardware)? {
+                Ok(backend) => present.push(backend),
+                Err((name, why)) => absent.push(Skipped::new(format!("backend {name}"), why)),
+            }
+        }
+        let reasons: Vec<&str> = absent.iter().map(|skipped| skipped.reason.as_str()).collect();
+        ensure!(
+            !present.is_empty(),
+            "--backend: this machine has none of them ({}); add --backend cpu",
+            reasons.join("; ")
+        );
+        Ok(Backends { present, absent })
     }
 
-    /// The stress table on every backend of the report, and on the definition.
+    /// The rig of `--rig`, the twin's own, or the default preset.
+    fn rig(&self, manifest: &Manifest) -> anyhow::Result<Rig> {
+        let named = self.rig.as_deref().map(rig_of).transpose()?;
+        let own = || manifest.rig.clone();
+        let default = || Rig::preset(wildcity_session::limits::RIG);
+        named.or_else(own).or_else(default).context("the default rig preset is missing")
+    }
+
+    /// A device that has rendered nothing yet, if `--backend` names gpu and there is one.
+    fn open_device(&self) -> Option<Gpu> {
+        let is_wanted = self.backends.contains(&Measurable::Gpu);
+        if is_wanted { self.hardware.gpu().ok() } else { None }
+    }
+
+    /// The stress table, on the reference and on every backend of the report.
     fn stress(&self) -> anyhow::Result<table::Table> {
-        let backends = self.backends.iter().map(|name| Name::from(*name));
-        let names = [Name::Reference].into_iter().chain(backends);
-        let names = names.filter(|_| !self.no_stress);
-        let candidates = names.map(|name| candidate(name, &self.hardware));
-        let candidates = candidates.collect::<anyhow::Result<Vec<_>>>()?;
-        let cases: Vec<_> = if self.no_stress { Vec::new() } else { CASES.iter().collect() };
+        let mut names = Vec::new();
+        let mut cases = Vec::new();
+        if !self.no_stress {
+            names.push(BackendName::Reference);
+            names.extend(self.backends.iter().map(|name| BackendName::from(*name)));
+            cases.extend(CASES.iter());
+        }
+        let candidates = names.into_iter().map(|name| candidate(name, &self.hardware));
+        let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
         let bar = progress::state();
         bar.set_length((cases.len() * candidates.len()) as u64);
         let table = table::run(&cases, &candidates, false, &mut |done, case| {
@@ -309,8 +320,84 @@ impl Command {
     }
 }
 
-/// Removes a file, if it is there.
-fn remove(path: &Path) -> anyhow::Result<()> {
+/// Measures every setting that can affect the twin.
+fn compare(
+    benchmark: &Benchmark<'_>,
+    resident: &Resident,
+    points: &[SamplePoint],
+    backends: &[String],
+) -> anyhow::Result<Compared> {
+    let manifest = &resident.version.manifest;
+    let sky = resident.sky().map(AsRef::as_ref);
+    let twin = TwinFeatures::new(manifest, sky, &points[0].views);
+    let splats = render_reference(benchmark, Rays::Splats, "reference")?;
+    let has_non_pinhole = twin.has_non_pinhole;
+    let rays = has_non_pinhole
+        .then(|| render_reference(benchmark, Rays::Exact, "reference, every ray"))
+        .transpose()?;
+
+    let names: Vec<&str> = backends.iter().map(String::as_str).collect();
+    let SettingList { settings, mut skipped } = settings_to_compare(&twin, &names);
+    let bar = progress::state();
+    bar.set_length(settings.len() as u64);
+    let mut measurements = Vec::new();
+    for setting in &settings {
+        bar.set_message(setting.name.clone());
+        let reference = match (setting.reference_rays, &rays) {
+            (Rays::Exact, Some(rays)) => rays,
+            // Without a non-pinhole camera no setting is compared with exact rays.
+            (Rays::Splats | Rays::Exact, _) => &splats,
+        };
+        match benchmark.measure(setting, reference) {
+            Ok(measurement) => measurements.push(measurement),
+            // The map of so exact a sky would be too large.
+            Err(ReportError::Render(error @ RenderError::Sky(_))) => {
+                skipped.push(Skipped::new(setting.name.clone(), error.to_string()));
+            }
+            Err(error) => return Err(error.into()),
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    normalize_machine_speed(&mut measurements);
+    let reference_ms = splats.step_ms;
+    let exact_rays_ms = rays.map(|rays| rays.step_ms);
+    Ok(Compared { measurements, skipped, reference_ms, exact_rays_ms })
+}
+
+fn render_reference(
+    benchmark: &Benchmark<'_>,
+    rays: Rays,
+    label: &'static str,
+) -> anyhow::Result<ReferenceImages> {
+    let bar = progress::count(label);
+    bar.set_length(benchmark.sample_points.len() as u64);
+    let images = benchmark.render_reference(rays, &mut |done| bar.set_position(done as u64));
+    let images = images.context(
+        "the reference cannot render the whole twin at full detail and without a draw distance",
+    )?;
+    bar.finish_and_clear();
+    Ok(images)
+}
+
+fn print_recommendation(
+    out: &mut impl Write,
+    recommendation: &Recommendation,
+    profile: &Path,
+) -> io::Result<()> {
+    let Recommendation {
+        goal, setting, backend, selection_worst, margin, verification_worst, ..
+    } = recommendation;
+    writeln!(
+        out,
+        "{goal}: {setting} on {backend}, {selection_worst:.1} at the worst sample point for selection, \
+         with a margin of {margin:.1}, and {verification_worst:.1} at the worst one for verification, {}",
+        recommendation.explanation()
+    )?;
+    writeln!(out, "{}", recommendation.serve_command(&profile.display().to_string()))
+}
+
+fn remove_if_present(path: &Path) -> anyhow::Result<()> {
     match fs::remove_file(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         removed => removed.with_context(|| format!("cannot remove {}", path.display())),

@@ -1,4 +1,9 @@
 //! `wildcity stress`.
+//!
+//! The stress table is part of the program and not of its tests, so that a faulty driver is found on the
+//! machine that has it. The reference is not compared with itself: its images must be finite, and hold the
+//! numbers that a case states. Each check has a planted fault that it must find, in the cpu backend and in
+//! the reference (`tests/stress/mutations.rs`).
 
 use std::io::{self, Write};
 
@@ -11,29 +16,30 @@ use wildcity_stress::{CASES, Case, Verdict};
 use super::backend_options::HardwareOptions;
 use super::progress;
 
-/// Draw stiff and extreme scenes on every backend, and hold each against its bound.
+/// Render extreme scenes on every backend, and compare each with its bound.
 ///
 /// Needles of 10,000 px, depths from a centimetre to ten kilometres, 4,500 km from the origin, NaN, 70
 /// million keys: each has broken a published renderer. Prints one table, and fails if a bound is missed.
-/// What cannot be run is named, with the reason; so is what a device refuses, with how much fits.
+/// The table names cases that cannot run here, with the reason, and cases that a device refuses, with how
+/// much fits.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Stress {
-    /// Cases, as T1,T26 [default: all]
+    /// Cases to run, for example T1,T26 [default: all]
     #[arg(long = "case", value_name = "T..", value_delimiter = ',', value_parser = case)]
     cases: Vec<&'static Case>,
 
-    /// Backends.
+    /// Backends to run them on.
     #[arg(
         long = "backend",
         value_name = "NAME",
         value_delimiter = ',',
         value_enum,
-        default_values_t = Name::ALL
+        default_values_t = BackendName::ALL
     )]
-    backends: Vec<Name>,
+    backends: Vec<BackendName>,
 
-    /// Run the cases that take gigabytes and minutes, too.
+    /// Also run the cases that take gigabytes and minutes.
     #[arg(long)]
     heavy: bool,
 
@@ -51,16 +57,16 @@ Examples:
   wildcity stress --case T1,T26 --backend cpu
   wildcity stress --backend gpu --device 0 --heavy --json > stress.json";
 
-/// The backends by their own names.
+/// The backends that a case can run on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Name {
+pub(super) enum BackendName {
     Reference,
     Cpu,
     Gpu,
 }
 
-impl Name {
-    /// All of them, the definition first.
+impl BackendName {
+    /// All of them; the reference is the first.
     pub(super) const ALL: [Self; 3] = [Self::Reference, Self::Cpu, Self::Gpu];
 }
 
@@ -88,12 +94,15 @@ impl Stress {
     }
 }
 
-/// A backend, or why this machine has none of the kind.
-pub(super) fn candidate(name: Name, hardware: &HardwareOptions) -> anyhow::Result<Candidate> {
+/// A backend, or the reason why this machine does not have it.
+pub(super) fn candidate(
+    name: BackendName,
+    hardware: &HardwareOptions,
+) -> anyhow::Result<Candidate> {
     Ok(match name {
-        Name::Reference => Ok(Box::new(Reference)),
-        Name::Cpu => Ok(Box::new(hardware.cpu()?)),
-        Name::Gpu => match hardware.gpu() {
+        BackendName::Reference => Ok(Box::new(Reference)),
+        BackendName::Cpu => Ok(Box::new(hardware.cpu()?)),
+        BackendName::Gpu => match hardware.gpu() {
             Ok(gpu) => Ok(Box::new(gpu)),
             Err(error) => Err(("gpu", error.to_string())),
         },

@@ -1,21 +1,30 @@
-//! Times as people write them.
+//! Times as text.
 
-/// A time as `2026-11-21T08:52:20Z`, from microseconds since 1970.
+/// A time such as `2026-11-21T08:52:20Z`, from microseconds since 1970.
 ///
-/// Counts in years that begin in March, so that a leap day ends one: 400 of them have 146,097 days,
-/// and the months from March on have 153 days per five.
+/// Computed as Hinnant does ("chrono-Compatible Low-Level Date Algorithms"): years begin in March, so that
+/// the leap day is the last day of a year. Then 400 years (an era) have 146,097 days, and any five months
+/// from March on have 153 days.
 pub(super) fn utc(time_us: i64) -> String {
     let seconds = time_us.div_euclid(1_000_000);
-    let (days, second) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
-    // 719,468 days from 0000-03-01 to 1970-01-01.
-    let (era, day) = ((days + 719_468).div_euclid(146_097), (days + 719_468).rem_euclid(146_097));
-    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
-    let day = day - (365 * year + year / 4 - year / 100);
-    let march_month = (5 * day + 2) / 153;
-    let day = day - (153 * march_month + 2) / 5 + 1;
-    let month = (march_month + 2) % 12 + 1;
-    let year = 400 * era + year + i64::from(month <= 2);
-    let (hour, minute, second) = (second / 3_600, second / 60 % 60, second % 60);
+    let days_since_1970 = seconds.div_euclid(86_400);
+    let second = seconds.rem_euclid(86_400);
+    // 0000-03-01 is 719,468 days before 1970-01-01.
+    let days = days_since_1970 + 719_468;
+    let era = days.div_euclid(146_097);
+    let day_of_era = days.rem_euclid(146_097);
+    // Leap days: one in 1,460 days, none in 36,524, one in 146,096.
+    let year_of_era =
+        (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    // 0 is March.
+    let month_from_march = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
+    let month = (month_from_march + 2) % 12 + 1;
+    let year = 400 * era + year_of_era + i64::from(month <= 2);
+    let hour = second / 3_600;
+    let minute = second / 60 % 60;
+    let second = second % 60;
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 

@@ -1,7 +1,7 @@
-//! The backend that nobody named: a GPU that has proved itself, or else the cpu.
+//! Automatic choice of a backend (`--backend auto`): a GPU that passes a self-test, or else the cpu.
 //!
-//! A driver may be wrong in ways that no error tells. So a device draws a card first, twice, and is
-//! taken only if both drawings have the same bytes and are what the cpu backend draws.
+//! A driver may be wrong without reporting an error. So a device first draws a small test scene twice. It is
+//! used only if both images have the same bytes and agree with those of the cpu backend.
 
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -12,16 +12,16 @@ use super::cpu::{Cpu, CpuError, Simd};
 use super::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
 use super::{Backend, Frame, RenderError, Target, View};
 
-/// A backend, and why it and no other.
+/// The chosen backend, and the reason for the choice.
 pub struct Selection {
-    /// What renders.
+    /// The backend.
     pub backend: Box<dyn Backend>,
-    /// One line for whoever started the program.
+    /// One line for the person who started the program.
     pub reason: String,
 }
 
-/// Takes the fastest device in hardware that draws the card right, or else the cpu backend.
-/// Devices in software are right and slow, and never taken. `limits` are for a device.
+/// Chooses the fastest hardware device if it passes the self-test, or else the cpu backend. Software devices
+/// are correct but slow, and are never chosen. `limits` apply to a device.
 ///
 /// # Errors
 /// As [`Cpu::new`].
@@ -33,7 +33,7 @@ pub fn select(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Select
                 let reason = format!("gpu: {}, {db:.1} dB against the cpu backend", gpu.detail());
                 return Ok(Selection { backend: Box::new(gpu), reason });
             }
-            Err(doubt) => format!("cpu: {} is not trusted, {doubt}", gpu.detail()),
+            Err(error) => format!("cpu: {} failed its self-test, {error}", gpu.detail()),
         },
         Err(GpuError::NoAdapter) => "cpu: there is no GPU".to_owned(),
         Err(error) => format!("cpu: {error}"),
@@ -41,76 +41,77 @@ pub fn select(threads: usize, simd: Simd, limits: MemoryLimits) -> Result<Select
     Ok(Selection { backend: Box::new(cpu), reason })
 }
 
-/// Why a backend is not taken.
+/// Why a backend did not pass the self-test.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SelfTestError {
-    /// It cannot draw at all.
+    /// It cannot draw the test scene.
     #[error(transparent)]
     Render(#[from] RenderError),
-    /// It draws something else.
+    /// Its images differ from those of the cpu backend.
     #[error(
-        "its drawing of the trial card is {db:.1} dB from the cpu backend's, not {MIN_PSNR_DB} dB"
+        "its image of the test scene has {db:.1} dB against the cpu backend's, below {MIN_PSNR_DB} dB"
     )]
-    Wrong {
+    Inaccurate {
         /// PSNR of linear colour and opacity, in dB.
         db: f64,
     },
-    /// It does not draw the same thing twice.
-    #[error("it drew the trial card twice, and not the same")]
-    Unstable,
+    /// Two images of the same scene differ.
+    #[error("two images of the test scene differ")]
+    Nondeterministic,
 }
 
-/// Has a backend draw the card, and tells its PSNR against `truth` in dB.
+/// Draws the test scene with a backend, and returns its PSNR against `truth` in dB.
 ///
 /// # Errors
-/// It fails, differs from itself, or differs from the truth.
+/// The backend fails, its images differ from each other, or they differ from the truth.
 pub fn self_test(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, SelfTestError> {
-    let (scene, views) = (card(), card_views());
-    let drawn = draw(backend, &scene, &views)?;
-    let again = draw(backend, &scene, &views)?;
-    // By bits: NaN differs from itself.
+    let scene = test_scene();
+    let views = test_views();
+    let first = draw(backend, &scene, &views)?;
+    let second = draw(backend, &scene, &views)?;
+    // Compare bits, since a NaN differs from itself.
     let bits = |image: &[f32]| image.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
-    if bits(&drawn) != bits(&again) {
-        return Err(SelfTestError::Unstable);
+    if bits(&first) != bits(&second) {
+        return Err(SelfTestError::Nondeterministic);
     }
     let truth = draw(truth, &scene, &views)?;
-    let db = psnr_db(drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b)));
-    // False for NaN too.
-    if db >= MIN_PSNR_DB { Ok(db) } else { Err(SelfTestError::Wrong { db }) }
+    let db = psnr_db(first.iter().zip(&truth).map(|(a, b)| f64::from(a - b)));
+    // False for a NaN too.
+    if db >= MIN_PSNR_DB { Ok(db) } else { Err(SelfTestError::Inaccurate { db }) }
 }
 
-/// Gaussians of the card. With two views some 46,000 splats: twelve blocks of the sort, and their 3,072
-/// counters are two blocks of the scan.
-const CARD_GAUSSIANS: usize = 30_000;
+/// Gaussians of the test scene. Its two views have about 46,000 splats, which are twelve blocks of the sort.
+/// Their 3,072 counters are two blocks of the scan. So every kernel runs with more than one workgroup.
+const TEST_GAUSSIANS: usize = 30_000;
 
-/// A street of Gaussians of all sizes, from 1 to 60 m ahead, with colour that depends on the
-/// direction, and some mist over more macro tiles than one thread lists.
-fn card() -> Scene {
-    let mut card = Gaussians::with_capacity(1, CARD_GAUSSIANS);
-    for i in 0..CARD_GAUSSIANS {
-        // Fractions that fill [0, 1)ⁿ evenly: multiples of powers of the root of x⁹ = x + 1
-        // (Roberts 2018). No generator of random numbers, so that the card never changes.
+/// Gaussians of all sizes, 1 to 60 m ahead, with colours of SH degree 1. Every 256th is large and faint
+/// (fog), and covers more macro tiles than one thread lists.
+fn test_scene() -> Scene {
+    let mut gaussians = Gaussians::with_capacity(1, TEST_GAUSSIANS);
+    for i in 0..TEST_GAUSSIANS {
+        // A low-discrepancy sequence: multiples of powers of the root of x⁹ = x + 1, modulo 1 (Roberts 2018).
+        // It needs no random number generator, so that the scene never changes.
         let fraction = |power: i32| (0.5 + (i + 1) as f64 * 1.085_f64.powi(-power)).fract();
         let z_m = 60.0_f64.powf(fraction(1));
         let across = |power| 2.0 * fraction(power) - 1.0;
-        card.means_m.push([0.9 * z_m * across(2), 0.5 * z_m * across(3), z_m]);
-        card.quats_wxyz.push([1.0, across(4) as f32, across(5) as f32, across(6) as f32]);
-        let is_mist = i % 256 == 0;
+        gaussians.means_m.push([0.9 * z_m * across(2), 0.5 * z_m * across(3), z_m]);
+        gaussians.quats_wxyz.push([1.0, across(4) as f32, across(5) as f32, across(6) as f32]);
+        let is_fog = i % 256 == 0;
         let ln_scale = |power| {
-            let sigma_m = z_m * if is_mist { 0.3 } else { 0.002 * 20.0_f64.powf(fraction(power)) };
+            let sigma_m = z_m * if is_fog { 0.3 } else { 0.002 * 20.0_f64.powf(fraction(power)) };
             sigma_m.ln() as f32
         };
-        card.ln_scales.push([ln_scale(7), ln_scale(8), ln_scale(4)]);
-        card.logit_opacities.push(if is_mist { -3.0 } else { 5.0 * across(5) as f32 });
+        gaussians.ln_scales.push([ln_scale(7), ln_scale(8), ln_scale(4)]);
+        gaussians.logit_opacities.push(if is_fog { -3.0 } else { 5.0 * across(5) as f32 });
         let degree_0 = [2, 6, 7].map(|power| (across(power) * 0.5 / sh::C0) as f32);
-        card.sh.extend(degree_0);
-        card.sh.extend((0..9).map(|k| 0.3 * across(1 + k % 8) as f32));
+        gaussians.sh.extend(degree_0);
+        gaussians.sh.extend((0..9).map(|k| 0.3 * across(1 + k % 8) as f32));
     }
-    Scene::from_gaussians(&card)
+    Scene::from_gaussians(&gaussians)
 }
 
-/// Two sizes, neither a multiple of a tile; the larger has 30 macro tiles.
-fn card_views() -> [View; 2] {
+/// Two image sizes, neither a multiple of the tile's; the larger has 30 macro tiles.
+fn test_views() -> [View; 2] {
     [[717, 301], [90, 75]].map(|[width_px, height_px]: [u32; 2]| {
         let [cx, cy] = [width_px, height_px].map(|size| 0.5 * f64::from(size));
         let pinhole = Pinhole { fx: 1.2 * cx, fy: 1.2 * cx, cx, cy };
@@ -139,22 +140,22 @@ mod tests {
     use crate::reference::Reference;
     use crate::{FrameStats, OnViewDone};
 
-    fn broken(stage: &str, part: &str, slip: &str) -> Gpu {
-        let shaders = Shaders::default().with_mutation(stage, part, slip).unwrap();
+    fn broken(stage: &str, part: &str, mutation: &str) -> Gpu {
+        let shaders = Shaders::default().with_mutation(stage, part, mutation).unwrap();
         Gpu::with_shaders(&AdapterChoice::Best, 1, shaders)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers")
     }
 
     #[test]
-    fn the_card_shows_something_everywhere() {
-        let image = draw(&Reference, &card(), &card_views()).unwrap();
+    fn the_test_scene_covers_every_pixel() {
+        let image = draw(&Reference, &test_scene(), &test_views()).unwrap();
         let mean = image.iter().sum::<f32>() / image.len() as f32;
         assert!((0.2..0.9).contains(&mean), "{mean}");
         assert!(image.chunks_exact(4).all(|rgba| rgba[3] > 0.0));
     }
 
     #[test]
-    fn a_right_device_is_trusted() {
+    fn a_correct_device_passes() {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
         let gpu = Gpu::new(&AdapterChoice::Best, 1)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
@@ -162,11 +163,11 @@ mod tests {
         assert!(self_test(&cpu, &Reference).unwrap() >= 80.0);
     }
 
-    /// What a wrong driver would do to one kernel each.
+    /// Each mutation is a fault of one kernel, as of a wrong driver.
     #[test]
-    fn a_wrong_device_is_not() {
+    fn a_wrong_device_fails() {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
-        for (stage, part, slip) in [
+        for (stage, part, mutation) in [
             ("project", "let l1 = -(foot.covariance.y * l2)", "let l1 = (foot.covariance.y * l2)"),
             ("scan", "sum = saturating_add(sum, before);", "sum = max(sum, before);"),
             ("sort", "is_last = after == 0u", "is_last = beside == own_bit"),
@@ -175,28 +176,31 @@ mod tests {
                 "saturating_add(block_sums[block], prefix_before(thread))",
                 "max(block_sums[block], prefix_before(thread))",
             ),
-            ("bin", "i - prefix_before(holder)", "i"),
+            ("bin", "i - prefix_before(band_index)", "i"),
             ("expand", "next += countOneBits", "next = first + countOneBits"),
             ("rasterize", "sums.green += weight", "sums.green += 1.02 * weight"),
         ] {
-            let doubt = self_test(&broken(stage, part, slip), &cpu);
-            // Counts that are wrong may be too many.
+            let result = self_test(&broken(stage, part, mutation), &cpu);
+            // A wrong count may be too large for a frame.
             let noticed = matches!(
-                doubt,
-                Err(SelfTestError::Wrong { .. }
-                    | SelfTestError::Unstable
+                result,
+                Err(SelfTestError::Inaccurate { .. }
+                    | SelfTestError::Nondeterministic
                     | SelfTestError::Render(RenderError::TooMany { .. }))
             );
-            assert!(noticed, "{stage}: {doubt:?}");
+            assert!(noticed, "{stage}: {result:?}");
         }
     }
 
-    /// Something that draws another thing each time, and something that draws NaN.
-    struct Restless(AtomicU32, f32);
+    /// A backend that fills the n-th image with n times a value.
+    struct Nondeterministic {
+        value: f32,
+        images: AtomicU32,
+    }
 
-    impl Backend for Restless {
+    impl Backend for Nondeterministic {
         fn name(&self) -> &'static str {
-            "restless"
+            "nondeterministic"
         }
 
         fn render(
@@ -205,19 +209,20 @@ mod tests {
             targets: &mut [Target<'_>],
             _: OnViewDone<'_>,
         ) -> Result<FrameStats, RenderError> {
-            let count = self.0.fetch_add(1, Relaxed);
+            let count = self.images.fetch_add(1, Relaxed);
             for target in targets {
-                target.rgba.as_mut().unwrap().fill(self.1 * count as f32);
+                target.rgba.as_mut().unwrap().fill(self.value * count as f32);
             }
             Ok(FrameStats::default())
         }
     }
 
     #[test]
-    fn nor_is_a_restless_one_or_one_that_draws_nothing_finite() {
+    fn a_nondeterministic_device_fails_and_one_that_draws_nan() {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
-        assert_eq!(self_test(&Restless(0.into(), 1e-3), &cpu), Err(SelfTestError::Unstable));
-        let nan = self_test(&Restless(0.into(), f32::NAN), &cpu);
-        assert!(matches!(nan, Err(SelfTestError::Wrong { db }) if db.is_nan()), "{nan:?}");
+        let with = |value| Nondeterministic { value, images: 0.into() };
+        assert_eq!(self_test(&with(1e-3), &cpu), Err(SelfTestError::Nondeterministic));
+        let nan = self_test(&with(f32::NAN), &cpu);
+        assert!(matches!(nan, Err(SelfTestError::Inaccurate { db }) if db.is_nan()), "{nan:?}");
     }
 }

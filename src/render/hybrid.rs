@@ -1,4 +1,8 @@
-//! The cpu backend up to a stage, and the gpu backend from there: to find which stage is wrong.
+//! The cpu backend up to a stage and the gpu backend from there, to find the gpu stage that is wrong.
+//!
+//! The stages exchange [`StageOutputs`](crate::stage::StageOutputs). [`bisect`] draws a frame with every
+//! stage in turn as the last one on the cpu: the first gpu stage with which the image is still wrong is the
+//! faulty one.
 
 use super::compare::psnr::{MIN_PSNR_DB, psnr_db, psnr_db_u8};
 use super::cpu::Cpu;
@@ -6,18 +10,18 @@ use super::gpu::Gpu;
 use super::stage::Stage;
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 
-/// One frame by two backends.
+/// A backend that runs the first stages of every frame on the cpu and the rest on the gpu.
 #[derive(Debug)]
 pub struct HybridBackend {
     cpu: Cpu,
     gpu: Gpu,
-    through: Stage,
+    last_on_cpu: Stage,
 }
 
 impl HybridBackend {
-    /// The cpu backend runs the stages up to and including `through`.
-    pub fn new(cpu: Cpu, gpu: Gpu, through: Stage) -> Self {
-        Self { cpu, gpu, through }
+    /// The cpu backend runs the stages up to and including `last_on_cpu`.
+    pub fn new(cpu: Cpu, gpu: Gpu, last_on_cpu: Stage) -> Self {
+        Self { cpu, gpu, last_on_cpu }
     }
 }
 
@@ -27,8 +31,9 @@ impl Backend for HybridBackend {
     }
 
     fn detail(&self) -> String {
-        let (cpu, gpu) = (self.cpu.detail(), self.gpu.detail());
-        format!("{cpu} through {}, then {gpu}", self.through.name())
+        let cpu = self.cpu.detail();
+        let gpu = self.gpu.detail();
+        format!("{cpu} through {}, then {gpu}", self.last_on_cpu.name())
     }
 
     fn threads(&self) -> usize {
@@ -39,33 +44,34 @@ impl Backend for HybridBackend {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: OnViewDone<'_>,
+        on_view_done: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        render_through(&self.cpu, &self.gpu, self.through, frame, targets, finished)
+        render_split(&self.cpu, &self.gpu, self.last_on_cpu, frame, targets, on_view_done)
     }
 }
 
-fn render_through(
+fn render_split(
     cpu: &Cpu,
     gpu: &Gpu,
-    through: Stage,
+    last_on_cpu: Stage,
     frame: &Frame<'_>,
     targets: &mut [Target<'_>],
-    finished: OnViewDone<'_>,
+    on_view_done: OnViewDone<'_>,
 ) -> Result<FrameStats, RenderError> {
     frame.check(targets)?;
-    let (between, before) = cpu.run_through(frame, through)?;
-    let mut stats = gpu.resume(&between, frame, targets, finished)?;
-    stats.stages_ms.splice(0..0, before.stages_ms);
+    let (outputs, cpu_stats) = cpu.run_through(frame, last_on_cpu)?;
+    let mut stats = gpu.resume(&outputs, frame, targets, on_view_done)?;
+    stats.stages_ms.splice(0..0, cpu_stats.stages_ms);
     Ok(stats)
 }
 
-/// How close the gpu backend comes to the cpu backend, by the stages that the latter runs for it.
+/// How close the images of the gpu backend are to those of the cpu backend, by the number of stages that run
+/// on the cpu.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
-    /// The last stage on the cpu, if any, and the PSNR of all views in dB: that of colour and opacity
-    /// or that of the 8-bit colour, whichever is less. Infinite where no value differs, NaN where the
-    /// gpu asked for more than a frame may hold.
+    /// The last stage on the cpu, if any, and the PSNR of all views in dB: the lesser of that of linear
+    /// colour and opacity and that of the 8-bit colour. Infinite if no value differs, NaN if the gpu failed
+    /// with [`RenderError::TooMany`].
     pub psnr_db: Vec<(Option<Stage>, f64)>,
 }
 
@@ -74,32 +80,34 @@ pub struct Bisection {
 /// # Errors
 /// As [`Backend::render`].
 pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, RenderError> {
-    let draw = |by: &dyn Fn(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
+    let draw = |render: &dyn Fn(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
         let mut images = Images::of(frame.views);
-        by(&mut images.targets())?;
+        render(&mut images.targets())?;
         Ok(images)
     };
     let truth = draw(&|targets| cpu.render(frame, targets, &|_, _| {}))?;
     let mut psnr_db = Vec::new();
-    for through in std::iter::once(None).chain(Stage::ALL.map(Some)) {
-        let images = draw(&|targets| match through {
+    for last_on_cpu in std::iter::once(None).chain(Stage::ALL.map(Some)) {
+        let images = draw(&|targets| match last_on_cpu {
             None => gpu.render(frame, targets, &|_, _| {}),
-            Some(stage) => render_through(cpu, gpu, stage, frame, targets, &|_, _| {}),
+            Some(stage) => render_split(cpu, gpu, stage, frame, targets, &|_, _| {}),
         });
         let db = match images {
             Ok(images) => images.psnr_db(&truth),
-            // A stage that counts wrong asks for more than there is; after bin nothing counts.
-            Err(RenderError::TooMany { .. }) if through != Some(Stage::Bin) => f64::NAN,
+            // A faulty stage may count too many pairs. After bin no stage counts.
+            Err(RenderError::TooMany { .. }) if last_on_cpu != Some(Stage::Bin) => f64::NAN,
             Err(error) => return Err(error),
         };
-        psnr_db.push((through, db));
+        psnr_db.push((last_on_cpu, db));
     }
     Ok(Bisection { psnr_db })
 }
 
 impl Bisection {
-    /// The gpu's stage that is wrong, by name: the first one that the gpu runs where the image is
-    /// still wrong for the last time. `None` if every image is right.
+    /// The name of the gpu stage that is wrong; `None` if every image is right.
+    ///
+    /// Of the images that are wrong it takes the one with the most stages on the cpu: the first stage that
+    /// the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
         let right = self.psnr_db.iter().rev().take_while(is_right).count();
@@ -108,7 +116,7 @@ impl Bisection {
     }
 }
 
-/// All views' colours.
+/// Linear and 8-bit colours of all views.
 struct Images {
     rgba: Vec<Vec<f32>>,
     rgb8: Vec<Vec<u8>>,
@@ -134,8 +142,8 @@ impl Images {
         let rgba = self.rgba.iter().flatten().zip(truth.rgba.iter().flatten());
         let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
         let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
-        let written = psnr_db_u8(rgb8);
-        // A NaN is not right, whatever the other is.
-        if linear < written || linear.is_nan() { linear } else { written }
+        let rounded = psnr_db_u8(rgb8);
+        // A NaN counts as wrong, whatever the other is.
+        if linear < rounded || linear.is_nan() { linear } else { rounded }
     }
 }

@@ -1,4 +1,7 @@
-//! From f64 scene and views to the camera-relative f32 that the fast backends compute with.
+//! Inputs of the fast backends: the scene and views in f64 become camera-relative f32.
+//!
+//! A position is subtracted from the camera's in f64, once per chunk and frame, and only the difference is
+//! rounded to f32: a twin 4,500 km from its origin loses nothing.
 
 use glam::{DVec3, Vec3};
 
@@ -6,11 +9,11 @@ use super::View;
 use super::constants::{DEPTH_BITS, SLOPE_SLACK};
 use wildcity_scene::{Chunk, RenderProfile};
 
-/// A splat: a Gaussian on the screen of one view (48 bytes).
+/// A splat: a Gaussian on the image of one view (48 bytes).
 ///
 /// Its alpha at pixel offset `(dx, dy)` from the mean is `2^(log2_opacity - u² - v²)` with
 /// `u = l0 dx + l1 dy`, `v = l2 dy`: the Cholesky factor of half the inverse covariance times
-/// log2(e). Sums of squares cannot turn negative, however thin the needle.
+/// log2(e). A sum of squares cannot become negative, however thin the needle.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Splat {
     /// Centre, in pixels from the image's top-left corner.
@@ -23,13 +26,13 @@ pub struct Splat {
     pub rgb: [f32; 3],
     /// Camera-space z of the centre, in metres.
     pub depth_m: f32,
-    /// Half-size of the box that alpha_cut reaches, in pixels, [`EXTENT_SLACK_PX`] included.
+    /// Half-size of the box outside of which alpha is below alpha_cut, in pixels, with [`EXTENT_SLACK_PX`].
     ///
     /// [`EXTENT_SLACK_PX`]: super::constants::EXTENT_SLACK_PX
     pub extent_px: [f32; 2],
 }
 
-/// The numbers of the profile in the form that the kernels compare with.
+/// The thresholds of a render profile, in the form that the kernels compare with.
 #[derive(Clone, Copy, Debug)]
 pub struct Cutoffs {
     /// Nearest z, in metres.
@@ -38,13 +41,13 @@ pub struct Cutoffs {
     pub far_m: f32,
     /// Added to the diagonal of the screen covariance, in px².
     pub blur_px2: f32,
-    /// Whether opacity is scaled for the blur.
+    /// Whether opacity is scaled down by what the blur adds to a splat's area.
     pub antialiased: bool,
     /// Largest alpha.
     pub alpha_cap: f32,
     /// Base-2 logarithm of the smallest alpha.
     pub log2_alpha_cut: f32,
-    /// Transmittance that ends a pixel.
+    /// Transmittance at which a pixel stops.
     pub stop: f32,
 }
 
@@ -62,7 +65,10 @@ impl Cutoffs {
         }
     }
 
-    /// What splats are sorted by: `view (4 bits) | depth (28 bits)`, from the nearest.
+    /// The sort key of a splat: `view (4 bits) | depth (28 bits)`, from the nearest.
+    ///
+    /// The bits of positive f32 rise with their values, so their difference from the bits of near is an exact
+    /// order; 28 bits reach 2^32 times near.
     #[inline(always)]
     pub fn sort_key(&self, view: usize, depth_m: f32) -> u32 {
         let depth = depth_m.to_bits() - self.near_m.to_bits();
@@ -75,15 +81,15 @@ impl Cutoffs {
     }
 }
 
-/// A pinhole view relative to one chunk.
+/// A static pinhole view relative to one chunk.
 #[derive(Clone, Copy, Debug)]
 pub struct ChunkView {
     /// Rows of the rotation camera_from_world.
     pub rotation: [[f32; 3]; 3],
     /// The chunk's origin in camera space, in metres.
     pub translation_m: [f32; 3],
-    /// The camera's forward axis in the world, and the chunk's origin along it in metres. f64: the
-    /// order of surfels in one plane must not be that of rounding errors.
+    /// The camera's forward axis in the world, and the camera-space z of the chunk's origin in metres. In
+    /// f64, so that surfels of one plane are not ordered by rounding errors.
     pub forward: [f64; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
@@ -100,18 +106,19 @@ pub struct ChunkView {
 }
 
 impl ChunkView {
-    /// Subtracts in f64, so that a twin 4,500 km from its origin loses nothing.
+    /// The view relative to a chunk.
     pub fn new(view: &View, chunk: &Chunk) -> Self {
         let camera_from_world = view.world_from_camera.inverse();
         let rotation = camera_from_world.rotation_matrix().transpose();
         let camera_m = view.world_from_camera.position_m - chunk.origin_m();
         let p = &view.camera.pinhole;
-        let axis = |size: u32, f: f64, c: f64| {
+        // Slopes of the image's edges, and the slack beyond them.
+        let slopes = |size: u32, f: f64, c: f64| {
             let slack = SLOPE_SLACK * 0.5 * f64::from(size) / f;
             [(-c / f - slack) as f32, ((f64::from(size) - c) / f + slack) as f32]
         };
-        let x = axis(view.camera.width_px, p.fx, p.cx);
-        let y = axis(view.camera.height_px, p.fy, p.cy);
+        let x = slopes(view.camera.width_px, p.fx, p.cx);
+        let y = slopes(view.camera.height_px, p.fy, p.cy);
         let forward = rotation.z_axis;
         let origin_m = camera_from_world.rotation * -camera_m;
         Self {
@@ -128,19 +135,21 @@ impl ChunkView {
     }
 }
 
-/// Half-spaces in which every Gaussian misses the image, for whole clusters at once.
+/// Half-spaces in which every Gaussian misses the image, to cull whole clusters of 256 at once.
 ///
-/// A splat misses the left edge when `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s`
-/// is its largest standard deviation, `t` its clamped slope and `k` the extent in standard
-/// deviations: `√cov_xx` is at most `(fx/z) √(1 + t²) s + √blur`. Times `z/fx` that is linear in
-/// the centre: `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. Likewise the other edges; near and
-/// far have no width, since centres decide.
+/// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat can be
+/// wider than the ellipsoid's outline, and culling must not change a pixel. A splat misses the left edge when
+/// `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s` is its largest standard deviation, `t` its
+/// clamped slope and `k` the extent in standard deviations: `√cov_xx` is at most
+/// `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx` the condition is linear in the centre:
+/// `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are alike. Near and far have no width,
+/// since only centres are compared with them.
 #[derive(Clone, Copy, Debug)]
 pub struct Frustum {
     planes: [Plane; 6],
 }
 
-/// `normal · mean + offset + spread * sigma < 0` culls.
+/// A Gaussian is culled if `normal · mean + offset + spread * sigma < 0`.
 #[derive(Clone, Copy, Debug)]
 struct Plane {
     normal: Vec3,
@@ -152,15 +161,18 @@ impl Frustum {
     /// The frustum of a view relative to one chunk's origin.
     pub fn new(view: &View, chunk: &Chunk, profile: &RenderProfile) -> Self {
         let p = &view.camera.pinhole;
-        let (width, height) = (f64::from(view.camera.width_px), f64::from(view.camera.height_px));
+        let width = f64::from(view.camera.width_px);
+        let height = f64::from(view.camera.height_px);
         let sigmas = f64::from(Cutoffs::new(profile).max_sigmas()) + 1e-3;
         let margin_px = sigmas * profile.blur.sqrt() + 1.0;
-        let slope = |size: f64, f: f64, c: f64| {
+        // The largest clamped slope.
+        let max_slope = |size: f64, f: f64, c: f64| {
             let slack = SLOPE_SLACK * 0.5 * size / f;
             (c / f + slack).abs().max(((size - c) / f + slack).abs())
         };
-        let spread_x = sigmas * (1.0 + slope(width, p.fx, p.cx).powi(2)).sqrt();
-        let spread_y = sigmas * (1.0 + slope(height, p.fy, p.cy).powi(2)).sqrt();
+        let spread_x = sigmas * (1.0 + max_slope(width, p.fx, p.cx).powi(2)).sqrt();
+        let spread_y = sigmas * (1.0 + max_slope(height, p.fy, p.cy).powi(2)).sqrt();
+        // Left, right, top, bottom, near, far: normal and offset in camera space, and k √(1 + t²).
         let camera_planes = [
             (DVec3::new(1.0, 0.0, (p.cx + margin_px) / p.fx), 0.0, spread_x),
             (DVec3::new(-1.0, 0.0, (width - p.cx + margin_px) / p.fx), 0.0, spread_x),
@@ -171,6 +183,7 @@ impl Frustum {
         ];
         let camera_from_world = view.world_from_camera.inverse();
         let origin = camera_from_world.transform_point(chunk.origin_m());
+        // From camera space to the chunk's.
         let plane = |(normal, offset_m, spread): (DVec3, f64, f64)| Plane {
             normal: (view.world_from_camera.rotation * normal).as_vec3(),
             offset_m: (normal.dot(origin) + offset_m) as f32,
@@ -179,11 +192,12 @@ impl Frustum {
         Self { planes: camera_planes.map(plane) }
     }
 
-    /// Whether anything of a box of centres, relative to the chunk's origin, can touch the image.
-    ///
-    /// 1e-5 of the terms' size is granted to f32.
+    /// Whether a Gaussian with its centre in a box, relative to the chunk's origin, and standard deviations
+    /// up to `sigma_m` can touch the image; `true` when in doubt. The test allows for rounding errors of 1e-5
+    /// of the terms' size.
     pub fn may_see(&self, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
-        let (center, half) = (0.5 * (min_m + max_m), 0.5 * (max_m - min_m));
+        let center = 0.5 * (min_m + max_m);
+        let half = 0.5 * (max_m - min_m);
         self.planes.iter().all(|plane| {
             let nearest = plane.normal.dot(center) + plane.normal.abs().dot(half);
             let distance = nearest + plane.offset_m + plane.spread * sigma_m;

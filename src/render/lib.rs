@@ -1,7 +1,17 @@
-//! The renderer: six images of one step, by one of several backends that compute the same thing.
+//! The renderer: images of all cameras of one step, by one of several backends that compute the same images.
 //!
-//! The stages project, sort, bin, rasterize, resolve bear one name in every backend. An image is a
-//! function of (scene, profile, views): no clock, no cache, no thread count.
+//! | backend | arithmetic | purpose |
+//! |---|---|---|
+//! | [`reference`](mod@reference) | f64, every pixel against every Gaussian, camera differentiated numerically | the definition that the others are compared with |
+//! | [`cpu`] | f32, SIMD, all cores | the default without a GPU |
+//! | [`gpu`] | f32, WGSL compute shaders, one per stage | the fastest |
+//!
+//! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu backend.
+//! Two combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first stages on the cpu
+//! and the rest on the gpu. [`compare`] measures how far images differ.
+//!
+//! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number
+//! of threads.
 
 pub mod automatic;
 pub mod compare;
@@ -29,42 +39,43 @@ use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
 pub use view::{RollingShutter, View};
 
-/// One chain of stages: all views of one step.
+/// What is rendered together: all views of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct Frame<'a> {
-    /// What is drawn.
+    /// The scene.
     pub scene: &'a Scene,
-    /// How it must be drawn.
+    /// The accuracy and the thresholds.
     pub profile: &'a RenderProfile,
-    /// From where: 1 to [`MAX_VIEWS`].
+    /// The cameras: 1 to [`MAX_VIEWS`].
     pub views: &'a [View],
 }
 
-/// Most views of one frame: those of the largest rig.
+/// Most views of one frame: the cameras of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
-/// Where the pixels of one view go, row by row from the top; what is `None` is not computed. What the
-/// view's lens does not see is 0 in all of them.
+/// Buffers for the images of one view, row by row from the top; an image that is `None` is not computed.
+/// Pixels outside of the lens' field are 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear red, green, blue, those of Gaussians premultiplied, on the sky or the
+    /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the
     /// background; and the opacity of the Gaussians alone.
     pub rgba: Option<&'a mut [f32]>,
-    /// `[height, width, 3]`: the same, clamped to [0, 1] and rounded to 8 bit.
+    /// `[height, width, 3]`: the same colours, clamped to [0, 1] and rounded to 8 bits.
     pub rgb8: Option<&'a mut [u8]>,
-    /// `[height, width]`: expected depth ([`Camera::depth_m`]) in metres, 0 where opacity is 0.
+    /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that may see 90°
+    /// and more) in metres, 0 where opacity is 0.
     pub depth_m: Option<&'a mut [f32]>,
-    /// `[height, width]`: accumulated opacity, the validity of the depth.
+    /// `[height, width]`: accumulated opacity, which tells how valid the depth is.
     pub opacity: Option<&'a mut [f32]>,
-    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which must be there, too: in the
-    /// camera's axes, on the side that is seen; 0 where there is no depth.
+    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
+    /// in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
-    /// What the camera makes of the colours, of `rgba` and `rgb8` alike.
+    /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
 
 impl Target<'_> {
-    /// What every backend does with a view's pixels in the end.
+    /// The last step of every backend: masks what the lens does not see, and computes normals.
     fn finish(&mut self, view: &View) {
         self.mask(&view.camera);
         if let (Some(depth_m), Some(normals)) = (&self.depth_m, &mut self.normals) {
@@ -72,7 +83,7 @@ impl Target<'_> {
         }
     }
 
-    /// Zeroes what a camera's lens does not see: nothing, where it is a pinhole.
+    /// Zeroes the pixels outside of the lens' field. A pinhole has none.
     fn mask(&mut self, camera: &Camera) {
         let Some(field) = FieldMask::of(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
@@ -87,62 +98,62 @@ impl Target<'_> {
     }
 }
 
-/// Called once per view, as soon as its pixels are final, from a worker thread: the place to
-/// encode one image while others are still drawn.
+/// Called once per view from a worker thread, with the view's index, as soon as its pixels are final: one
+/// image can be encoded while others are still drawn.
 pub type OnViewDone<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
 
-/// What a frame cost.
+/// Time and work of a frame.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 pub struct FrameStats {
-    /// Wall time per stage, in milliseconds, in the order of the chain.
+    /// Wall time of each stage, in milliseconds, in the order of the stages.
     pub stages_ms: Vec<(&'static str, f64)>,
-    /// (Gaussian, view) pairs that survived culling.
+    /// Number of (Gaussian, view) pairs after culling: splats.
     pub visible_pairs: u64,
-    /// (Gaussian, tile) pairs after binning.
+    /// Number of (Gaussian, tile) pairs after binning.
     pub instances: u64,
-    /// Gaussian-pixel evaluations of the rasterizer, idle lanes included.
+    /// Number of Gaussian-pixel evaluations of the rasterizer, with those of idle lanes.
     pub evaluations: u64,
 }
 
-/// Why a frame was not rendered. Nothing was written then.
+/// Why a frame was not rendered. No target was written then.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RenderError {
-    /// No view, or more than the sort key can tell apart.
+    /// No view, or more than the sort key has bits for.
     #[error("a frame has 1 to {MAX_VIEWS} views, not {count}")]
     Views {
-        /// How many were given.
+        /// The given number.
         count: usize,
     },
-    /// The backend draws splats alone.
+    /// The profile asks for exact rays, and the backend draws only splats.
     #[error(
         "the {backend} backend draws splats, and the profile asks for rays=exact: use the reference \
          backend, or rays=splats"
     )]
     ExactRays {
-        /// Its name.
+        /// The backend's name.
         backend: &'static str,
     },
-    /// A target's buffer is not of its view's size.
+    /// A target's buffer does not have its view's size.
     #[error(
         "view {view}: buffer {buffer} holds {given} values; the camera's size asks for {wanted}"
     )]
     TargetSize {
         /// Which view.
         view: usize,
-        /// Which buffer of [`Target`].
+        /// The field of [`Target`].
         buffer: &'static str,
         /// Its length.
         given: usize,
-        /// The length that the camera asks for.
+        /// The length that the camera's size requires.
         wanted: usize,
     },
-    /// Normals without the depth that they are computed of.
-    #[error("view {view}: normals are computed of depth: give depth_m a buffer, too")]
+    /// Normals are requested without depth.
+    #[error("view {view}: normals are computed from depth: give depth_m a buffer, too")]
     Normals {
         /// Which view.
         view: usize,
     },
-    /// An overlay is not of its view's size.
+    /// An overlay does not have its view's size.
     #[error("view {view}: the overlay is {given:?} pixels, and the image {wanted:?}")]
     Overlay {
         /// Which view.
@@ -152,7 +163,7 @@ pub enum RenderError {
         /// Width and height of the image.
         wanted: [u32; 2],
     },
-    /// Not one target for each view.
+    /// The number of targets is not that of views.
     #[error("{targets} targets for {views} views; each view needs its own")]
     Targets {
         /// How many targets were given.
@@ -160,73 +171,74 @@ pub enum RenderError {
         /// How many views.
         views: usize,
     },
-    /// More than a frame may hold.
+    /// The frame exceeds a limit of the backend.
     #[error("the frame needs more than {limit} {what}: ask for smaller images or fewer views")]
     TooMany {
-        /// What there is too much of.
+        /// The kind of item that is limited.
         what: &'static str,
-        /// How many fit.
+        /// The largest number that fits.
         limit: u64,
     },
-    /// The scene alone is more than the device may hold.
+    /// The scene alone exceeds the memory that the device may use.
     #[error(
         "the scene takes at least {needed_bytes} bytes of the GPU's memory and {limit_bytes} are \
          allowed: allow more with --gpu-memory-gib, or draw less with the profile's tau_px and reach_m"
     )]
     DeviceMemory {
-        /// What its Gaussians take, without the ends of pages that no cluster fits into.
+        /// What its Gaussians take, without the unused ends of pages.
         needed_bytes: u64,
-        /// What they may take.
+        /// What they may take at most.
         limit_bytes: u64,
     },
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
-    /// The device failed. It is opened anew for the next frame.
+    /// The device failed. The next frame opens it anew.
     #[error("{device} failed: {reason}")]
     Device {
-        /// Its name.
+        /// The device's name.
         device: String,
-        /// The driver's words.
+        /// The driver's error message.
         reason: String,
     },
 }
 
-/// Something that renders frames.
+/// A renderer of frames.
 pub trait Backend: Send + Sync {
-    /// The name, as `--backend` and observations spell it.
+    /// The name, as in `--backend` and in observations.
     fn name(&self) -> &'static str;
 
-    /// What else the last bit of a pixel depends on, as `Avx512`; nothing for most.
+    /// What the last bit of a pixel depends on beside the backend: the instruction set or the device. May be
+    /// empty.
     fn detail(&self) -> String {
         String::new()
     }
 
-    /// Threads that it renders with. Pixels do not depend on it.
+    /// Number of threads that it renders with. Pixels do not depend on it.
     fn threads(&self) -> usize {
         1
     }
 
-    /// Frames that it has in hand at once: as many callers of [`Backend::render`] get on faster
-    /// than one, and more do not. A backend that uses the whole machine for a frame says 1.
+    /// Number of frames that it processes at once: so many concurrent callers of [`Backend::render`] are
+    /// faster than one, and more are not. It is 1 for a backend that uses the whole machine for one frame.
     fn frames_in_flight(&self) -> usize {
         1
     }
 
-    /// Renders all views into their targets, `targets[i]` for `views[i]`.
+    /// Renders all views into their targets, `targets[i]` for `views[i]`, and calls `on_view_done` for each.
     ///
     /// # Errors
-    /// See [`RenderError`]; the same frame fails or succeeds the same way every time.
+    /// See [`RenderError`]. Except for a failing device, the same frame gives the same result every time.
     fn render(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: OnViewDone<'_>,
+        on_view_done: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError>;
 }
 
 impl Frame<'_> {
-    /// What is behind the Gaussians, and what takes directions in the world to its axes: the sky, or the
+    /// The background, and the matrix `sky_from_world` that takes directions to its axes: the sky, or the
     /// profile's background as a sky of one colour; `None` if that is black.
     ///
     /// # Errors
@@ -242,8 +254,10 @@ impl Frame<'_> {
         }
     }
 
+    /// Checks the number of views, and that each target fits its view.
+    ///
     /// # Errors
-    /// Names the first view whose target does not fit.
+    /// Names the first view with a target that does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
         self.check_views()?;
         let count = self.views.len();
@@ -277,8 +291,10 @@ impl Frame<'_> {
         Ok(())
     }
 
+    /// Checks that the profile asks for splats.
+    ///
     /// # Errors
-    /// The profile asks for rays that no splats are drawn for.
+    /// [`RenderError::ExactRays`].
     pub fn check_splats(&self, backend: &'static str) -> Result<(), RenderError> {
         match self.profile.rays {
             Rays::Splats => Ok(()),
@@ -286,8 +302,10 @@ impl Frame<'_> {
         }
     }
 
+    /// Checks the number of views.
+    ///
     /// # Errors
-    /// No view, or too many.
+    /// [`RenderError::Views`].
     pub fn check_views(&self) -> Result<(), RenderError> {
         let count = self.views.len();
         match (1..=MAX_VIEWS).contains(&count) {

@@ -10,7 +10,7 @@ pub const GPU_FRAMES: usize = 3;
 
 /// Frames that did not fit a GPU at once, and are known in which parts they do: a few kB, for more
 /// rigs than drive at once.
-pub const REMEMBERED_CUTS: usize = 64;
+pub const PARTITION_CACHE_ENTRIES: usize = 64;
 
 /// Smallest limit of a binding that the gpu backend is made to live with: one cluster of SH degree 3
 /// takes 34 kB of one.

@@ -1,9 +1,14 @@
-//! What lies between the stages, in the one form that every tiled backend can give and take: so that
-//! one can go on where another stopped, and that the same buffers can be given to both.
+//! The outputs of the stages project, sort and bin, in one plain form that every tiled backend can give and
+//! take.
+//!
+//! The cpu backend gives them after any stage, and the gpu backend continues from them
+//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`). Tests
+//! compare single stages on the same buffers: each of 32 mutations of the shaders must fail the stages that
+//! share the mutated shader, and no other. (The idea is Vello's "CPU up to a stage".)
 
 use super::layout::Splat;
 
-/// A stage that leaves something to the next one. The last one, rasterize, leaves pixels.
+/// A stage with an output for the next one. The last stage, rasterize, produces pixels instead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
     /// Gaussians become splats.
@@ -15,10 +20,10 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// All of them, in order.
+    /// All stages, in order.
     pub const ALL: [Self; 3] = [Self::Project, Self::Sort, Self::Bin];
 
-    /// The name of the field.
+    /// The stage's name, as in [`FrameStats::stages_ms`](crate::FrameStats::stages_ms).
     pub fn name(self) -> &'static str {
         match self {
             Self::Project => "project",
@@ -28,30 +33,31 @@ impl Stage {
     }
 }
 
-/// What the stages up to one of them leave of a frame: that of sort needs that of project, and so on.
+/// The outputs of a frame's stages up to one of them. The output of sort requires that of project, and that
+/// of bin requires both.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StageOutputs {
-    /// From project: all views' splats, in order of (view, global id).
+    /// Of project: all views' splats, in order of (view, global id).
     pub splats: Vec<Splat>,
-    /// What each splat is sorted by: [`Cutoffs::sort_key`](super::layout::Cutoffs::sort_key).
+    /// The sort key of each splat: [`Cutoffs::sort_key`](super::layout::Cutoffs::sort_key).
     pub keys: Vec<u32>,
-    /// From sort: indices of splats, by their keys, those with equal keys in order.
+    /// Of sort: indices of splats in order of their keys, equal keys in order of indices.
     pub order: Option<Vec<u32>>,
-    /// From bin.
+    /// Of bin.
     pub tiles: Option<TileLists>,
 }
 
 /// The lists of splats of all tiles.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TileLists {
-    /// First and end of each tile's list in `instances`: all views, one after the other, row by row.
+    /// First and end of each tile's list in `instances`: view after view, each row by row.
     pub ranges: Vec<[u32; 2]>,
-    /// Indices of splats, in each list in the order that sort left.
+    /// Indices of splats, in each list in the order of sort.
     pub instances: Vec<u32>,
 }
 
 impl StageOutputs {
-    /// The last stage that is done.
+    /// The last stage with an output here.
     pub fn last_stage(&self) -> Stage {
         match (&self.order, &self.tiles) {
             (_, Some(_)) => Stage::Bin,

@@ -1,4 +1,4 @@
-//! Views: a camera somewhere in the world, at rest or on its way.
+//! Views: a camera with a pose in the world, at rest or in motion while its rows are exposed.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -6,76 +6,77 @@ use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 
-/// A camera somewhere in the world.
+/// A camera with a pose in the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     /// Size, intrinsics and lens.
     pub camera: Camera,
-    /// Where the camera stands: at the end of the exposure.
+    /// The camera's pose at the end of the exposure.
     pub world_from_camera: Pose,
-    /// How it came there while its rows were exposed; `None` if all were at once, or it stood still.
+    /// The camera's motion while its rows are exposed; `None` if all are exposed at once, or the camera is at
+    /// rest.
     pub rolling_shutter: Option<RollingShutter>,
 }
 
-/// The way of a camera during one exposure, straight and even.
+/// The motion of a camera during one exposure: [`Pose::interpolate`] at constant speed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingShutter {
-    /// Which row or column is exposed first.
+    /// In which order rows or columns are exposed.
     pub direction: ShutterDirection,
-    /// Where the camera stood then.
+    /// The camera's pose when the first row or column is exposed.
     pub world_from_camera_first: Pose,
 }
 
-/// A rolling shutter as seen from the exposure's end, where little is lost in f32: what is still to come while
-/// a place of the image is exposed. The way is [`Pose::interpolate`]'s.
+/// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses little:
+/// what remains of the exposure, and of the camera's motion, while a place of the image is exposed. The
+/// motion is that of [`Pose::interpolate`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShutterMotion {
-    /// Of the exposure, at (x, y) of the image in pixels: the share `a x + b y + c`, from 0 to 1.
-    pub(super) share: [f64; 3],
-    /// Of the camera's way, for the whole exposure, in metres in the world and in the camera's frame at the
-    /// end.
-    pub(super) moved_world_m: DVec3,
-    pub(super) moved_m: DVec3,
-    /// Of its turn: about this unit axis of its own, by so many radians.
+    /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure remains,
+    /// clamped to 0 to 1.
+    pub(super) remaining: [f64; 3],
+    /// The camera's translation during the whole exposure, in metres, in world axes.
+    pub(super) translation_world_m: DVec3,
+    /// The same in the camera's frame at the end of the exposure.
+    pub(super) translation_m: DVec3,
+    /// Unit axis of the camera's rotation during the exposure, in its own frame.
     pub(super) axis: DVec3,
-    pub(super) turned_rad: f64,
+    /// The angle of that rotation, in radians.
+    pub(super) rotation_rad: f64,
 }
 
-/// Where a point of the world lands.
+/// A point of the world on the image of a camera that may move.
 #[derive(Clone, Copy, Debug)]
 pub struct ProjectedPoint {
-    /// Where on the image or beside it, in pixels.
+    /// Its place on the image or beside it, in pixels.
     pub at_px: DVec2,
-    /// When it is exposed: 0 with the first row, 1 with the last.
+    /// When it is exposed, as a fraction of the exposure: 0 with the first row, 1 with the last.
     pub fraction: f64,
-    /// Where the camera stands then.
+    /// The camera's pose then.
     pub world_from_camera: Pose,
     /// The point in the camera's frame then, in metres.
     pub point_m: DVec3,
 }
 
 impl View {
-    /// Rounds of the search for the row that sees a point. Each leaves of the error what the image moves per
-    /// row: a tenth for what passes close by. What passes so close that this is above a half is searched by
-    /// halves. Only what keeps up with the rows, and may be on many, is found on one of them or beside the
-    /// image.
-    const ROUNDS: u32 = 32;
+    /// Most rounds of the search for the row that sees a point.
+    const MAX_ROUNDS: u32 = 32;
 
-    /// The search ends when it moves by less than this share of the exposure: 1e-7 of 1 m.
-    const STILL: f64 = 1e-7;
+    /// The search ends when the moment changes by at most this fraction of the exposure: 1e-7 of 1 m.
+    const CONVERGED: f64 = 1e-7;
 
     /// A camera at rest.
     pub fn new(camera: Camera, world_from_camera: Pose) -> Self {
         Self { camera, world_from_camera, rolling_shutter: None }
     }
 
-    /// The cameras of a rig that stands still.
+    /// The cameras of a rig at rest.
     pub fn of_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
         Self::of_moving_rig(cameras, world_from_rig, &|_| world_from_rig)
     }
 
-    /// The cameras of a rig that stands somewhere now, and stood at `world_from_rig_before(age_us)` so
-    /// many microseconds ago: where it did matters to cameras with a rolling shutter.
+    /// The cameras of a rig with the pose `world_from_rig` now, and the pose `world_from_rig_before(age_us)`
+    /// that many microseconds ago, which cameras with a rolling shutter need.
     pub fn of_moving_rig(
         cameras: &[RigCamera],
         world_from_rig: Pose,
@@ -86,7 +87,7 @@ impl View {
             let rolling_shutter = camera.shutter.and_then(|shutter| {
                 let before = world_from_rig_before(shutter.duration_us);
                 let world_from_camera_first = before * camera.rig_from_camera;
-                let moves = !still(&world_from_camera_first, &world_from_camera);
+                let moves = !same_pose(&world_from_camera_first, &world_from_camera);
                 moves.then_some(RollingShutter {
                     direction: shutter.direction,
                     world_from_camera_first,
@@ -97,12 +98,12 @@ impl View {
         cameras.iter().map(view).collect()
     }
 
-    /// Whether it is a pinhole at rest, which a matrix projects.
+    /// Whether it is a pinhole at rest, without a windshield: the camera that one matrix projects.
     pub fn is_static_pinhole(&self) -> bool {
         self.camera.is_pinhole() && self.rolling_shutter.is_none()
     }
 
-    /// Where the camera stands when a place of its image, in pixels, is exposed.
+    /// The camera's pose when a place of its image, in pixels, is exposed.
     pub fn world_from_camera_at(&self, at_px: DVec2) -> Pose {
         match &self.rolling_shutter {
             None => self.world_from_camera,
@@ -112,15 +113,15 @@ impl View {
         }
     }
 
-    /// The unit direction in the world that a place of the image, in pixels, sees; `None` outside of
-    /// the lens' field. The ray starts where [`View::world_from_camera_at`] says.
+    /// The unit direction, in the world, in which a place of the image, in pixels, looks; `None` outside of the
+    /// lens' field. The ray's origin is the position of [`View::world_from_camera_at`].
     pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
         let direction = self.camera.unproject(at_px)?;
         Some(self.world_from_camera_at(at_px).rotation * direction)
     }
 
-    /// Of a pinhole at rest: rows that take `(x, y, 1)` of the image to a direction in a sky's axes, of any
-    /// length. As only its direction matters, f32 is right to 1e-7 rad.
+    /// For a static pinhole: rows that take `(x, y, 1)` of the image to a direction in a sky's axes, of any
+    /// length. f32 is accurate to 1e-7 rad, since only the direction matters.
     pub(super) fn sky_from_pixel(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
         let p = &self.camera.pinhole;
         let camera_from_pixel = DMat3::from_cols(
@@ -133,93 +134,106 @@ impl View {
         rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
     }
 
-    /// Rows that take directions in the camera's frame at the exposure's end to a sky's axes.
+    /// Rows that take directions in the camera's frame at the end of the exposure to a sky's axes.
     pub(super) fn sky_from_camera(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
         let rows = (sky_from_world * self.world_from_camera.rotation_matrix()).transpose();
         rows.to_cols_array_2d().map(|row| row.map(|value| value as f32))
     }
 
-    /// Where a point of the world lands, in pixels; `None` outside of the lens' field.
+    /// The image of a point of the world, in pixels; `None` outside of the lens' field.
     pub fn project_world(&self, point_m: DVec3) -> Option<DVec2> {
         self.camera.project(self.project_extrapolated(point_m, 1.0).point_m)
     }
 
-    /// Where a point of the world lands if the lens is continued beyond its field. With a rolling
-    /// shutter the row decides where the camera stands, and that decides the row: found by going back
-    /// and forth, from a first guess of when.
+    /// The image of a point of the world, with the lens extrapolated beyond its field.
+    ///
+    /// With a rolling shutter, the row decides when a point is exposed, that decides the camera's pose, and
+    /// the pose decides the row. A fixed-point iteration finds the moment, beginning with `first_guess`. Each
+    /// round multiplies the error by what the image moves per row: a tenth for an object that passes close
+    /// by. Where an object passes so close that a round leaves more than half of the error, the interval
+    /// between a moment that is too early and one that is too late is halved instead. An object that moves
+    /// over the image as fast as the rows are read may have several solutions; it is found on one of them, or
+    /// beside the image.
     #[inline(always)]
-    pub fn project_extrapolated(&self, world_m: DVec3, guess: f64) -> ProjectedPoint {
-        let landing = |fraction: f64, world_from_camera: Pose| {
+    pub fn project_extrapolated(&self, world_m: DVec3, first_guess: f64) -> ProjectedPoint {
+        let project_at = |fraction: f64, world_from_camera: Pose| {
             let from_camera_m = world_m - world_from_camera.position_m;
             let point_m = world_from_camera.rotation.inverse() * from_camera_m;
             let at_px = self.camera.project_extrapolated(point_m);
             ProjectedPoint { at_px, fraction, world_from_camera, point_m }
         };
         let Some(rolling_shutter) = &self.rolling_shutter else {
-            return landing(1.0, self.world_from_camera);
+            return project_at(1.0, self.world_from_camera);
         };
-        let mut landed = landing(guess, self.world_from_camera_at_fraction(guess));
-        let (mut sooner, mut later, mut off_before) = (0.0, 1.0, f64::INFINITY);
-        for _ in 0..Self::ROUNDS {
-            let exposed = rolling_shutter.direction.fraction(landed.at_px, &self.camera);
-            let off = exposed - landed.fraction;
-            if off.abs() <= Self::STILL {
+        let mut projected =
+            project_at(first_guess, self.world_from_camera_at_fraction(first_guess));
+        let mut earliest = 0.0;
+        let mut latest = 1.0;
+        let mut error_before = f64::INFINITY;
+        for _ in 0..Self::MAX_ROUNDS {
+            let exposed = rolling_shutter.direction.fraction(projected.at_px, &self.camera);
+            let error = exposed - projected.fraction;
+            if error.abs() <= Self::CONVERGED {
                 break;
             }
-            if off > 0.0 {
-                sooner = landed.fraction;
+            if error > 0.0 {
+                earliest = projected.fraction;
             } else {
-                later = landed.fraction;
+                latest = projected.fraction;
             }
-            let closes = off.abs() <= 0.5 * off_before && (sooner..=later).contains(&exposed);
-            let next = if closes { exposed } else { 0.5 * (sooner + later) };
-            off_before = off.abs();
-            landed = landing(next, self.world_from_camera_at_fraction(next));
+            let converges =
+                error.abs() <= 0.5 * error_before && (earliest..=latest).contains(&exposed);
+            let next = if converges { exposed } else { 0.5 * (earliest + latest) };
+            error_before = error.abs();
+            projected = project_at(next, self.world_from_camera_at_fraction(next));
         }
-        landed
+        projected
     }
 
-    /// Of a rolling shutter, seen from the exposure's end.
+    /// The rolling shutter relative to the end of the exposure; `None` if the camera does not move.
     pub(super) fn shutter_motion(&self) -> Option<ShutterMotion> {
         let RollingShutter { direction, world_from_camera_first: first } =
             self.rolling_shutter.as_ref()?;
         let last = &self.world_from_camera;
         let Camera { width_px, height_px, .. } = self.camera;
-        // 0 for the last row's middle, 1 for the first's; a single row is the last one.
+        // Slope and offset of the remaining fraction along an axis: 1 at the middle of the first row or
+        // column, 0 at the middle of the last; a single row is the last one.
         let along = |size_px: u32| {
             let last_px = f64::from(size_px) - 1.0;
             if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
         };
-        let (columns, rows) = (along(width_px), along(height_px));
-        let from_end =
+        let columns = along(width_px);
+        let rows = along(height_px);
+        // The same for the opposite direction.
+        let reversed =
             |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
-        let share = match direction {
+        let remaining = match direction {
             ShutterDirection::TopToBottom => [0.0, rows[0], rows[1]],
             ShutterDirection::BottomToTop => {
-                let [slope, start] = from_end(rows, height_px);
+                let [slope, start] = reversed(rows, height_px);
                 [0.0, slope, start]
             }
             ShutterDirection::LeftToRight => [columns[0], 0.0, columns[1]],
             ShutterDirection::RightToLeft => {
-                let [slope, start] = from_end(columns, width_px);
+                let [slope, start] = reversed(columns, width_px);
                 [slope, 0.0, start]
             }
         };
-        let moved_world_m = last.position_m - first.position_m;
-        let turn = first.rotation.inverse() * last.rotation;
-        // The short way round.
-        let turn = if turn.w < 0.0 { -turn } else { turn };
-        let sine = turn.xyz().length();
+        let translation_world_m = last.position_m - first.position_m;
+        let rotation = first.rotation.inverse() * last.rotation;
+        // Of the two quaternions of a rotation, the one with the smaller angle.
+        let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+        let sine = rotation.xyz().length();
         Some(ShutterMotion {
-            share,
-            moved_world_m,
-            moved_m: last.rotation.inverse() * moved_world_m,
-            axis: if sine > 0.0 { turn.xyz() / sine } else { DVec3::Z },
-            turned_rad: 2.0 * sine.atan2(turn.w),
+            remaining,
+            translation_world_m,
+            translation_m: last.rotation.inverse() * translation_world_m,
+            axis: if sine > 0.0 { rotation.xyz() / sine } else { DVec3::Z },
+            rotation_rad: 2.0 * sine.atan2(rotation.w),
         })
     }
 
-    /// Where the camera stands at a fraction of the exposure.
+    /// The camera's pose at a fraction of the exposure.
     #[inline(always)]
     fn world_from_camera_at_fraction(&self, fraction: f64) -> Pose {
         match &self.rolling_shutter {
@@ -231,8 +245,8 @@ impl View {
     }
 }
 
-/// Whether two poses are the same but for rounding: a nanometre, and 1e-12 rad.
-fn still(a: &Pose, b: &Pose) -> bool {
-    let turned = (a.rotation - b.rotation).length().min((a.rotation + b.rotation).length());
-    a.position_m.distance(b.position_m) <= 1e-9 && turned <= 1e-12
+/// Whether two poses differ by rounding at most: a nanometre, and 1e-12 rad.
+fn same_pose(a: &Pose, b: &Pose) -> bool {
+    let rotation = (a.rotation - b.rotation).length().min((a.rotation + b.rotation).length());
+    a.position_m.distance(b.position_m) <= 1e-9 && rotation <= 1e-12
 }

@@ -1,145 +1,161 @@
-//! How far images may be believed on the recorded drive and beside it, with what they show there.
+//! How far images can be trusted on the recorded drive and beside it, with an image from each distance.
 
 use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::ReportError;
-use super::sample_points::{OFFSETS_M, SamplePoint};
-use super::settings::scaled;
+use super::error::ReportError;
+use super::sample_points::{OFFSETS_M, SamplePoint, scaled};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::CameraError;
 use wildcity_session::{TrainingCoverage, Trust};
 use wildcity_twin::residency::Resident;
 
-/// Trust at one distance from the recorded drive: of all cameras at all stations.
+/// Trust in the images at one distance from the recorded drive: statistics over all cameras at all stations.
 #[derive(Clone, Debug, Serialize)]
 pub struct Confidence {
-    /// Distance from the drive, in metres.
+    /// Lateral distance from the drive, in metres.
     pub offset_m: f64,
     /// Mean trust of an image, from 0 to 1.
     pub mean: f64,
-    /// Trust of the image that is believed least.
-    pub least: f64,
-    /// Trust of the image that is believed most.
-    pub most: f64,
-    /// Mean distance to the nearest keyframe, in metres.
+    /// Trust of the image with the lowest trust.
+    #[serde(rename = "least")]
+    pub min: f64,
+    /// Trust of the image with the highest trust.
+    #[serde(rename = "most")]
+    pub max: f64,
+    /// Mean distance from the rig to the nearest recorded keyframe, in metres.
     pub distance_m: f64,
-    /// Mean angle to it, in radians.
+    /// Mean angle between the rig and that keyframe, in radians.
     pub angle_rad: f64,
-    /// Mean share of holes.
+    /// Mean share of pixels without content, from 0 to 1.
     pub low_coverage: f64,
-    /// Mean share of rays that leave what was trained.
+    /// Mean share of rays that leave the trained blocks, from 0 to 1.
     pub outside: f64,
-    /// What the rig's first camera sees in the middle of the drive.
+    /// Image of the rig's first camera at the middle station.
     #[serde(skip)]
-    pub picture: ViewImage,
+    pub image: ViewImage,
 }
 
-/// An image of a place.
+/// An image at a sample point.
 #[derive(Clone, Debug, Default)]
 pub struct ViewImage {
-    /// The place.
-    pub place: String,
+    /// Name of the sample point.
+    pub sample_point: String,
     /// A JPEG file.
-    pub file: Vec<u8>,
+    pub jpeg: Vec<u8>,
 }
 
-/// Widest image that is looked at, in pixels: trust needs shares of pixels, and a page small pictures.
+/// Widest image that is rendered, in pixels. Trust counts shares of pixels, which a small image has too, and
+/// the page shows small images.
 const WIDTH_PX: f64 = 360.0;
-/// Quality of the pictures.
-const QUALITY: u8 = 85;
+/// JPEG quality of the images on the page.
+const JPEG_QUALITY: u8 = 85;
 
-/// Trust by [`OFFSETS_M`]; nothing of a twin without a recorded drive.
+/// Trust at each distance of [`OFFSETS_M`]. Empty if the twin has no recorded drive.
 ///
 /// # Errors
-/// The twin cannot be read, a frame cannot be drawn, or a picture not be encoded.
+/// The twin cannot be read, a frame cannot be rendered, or an image cannot be encoded.
 pub fn confidence_by_offset(
     resident: &Arc<Resident>,
     backend: &dyn Backend,
-    places: &[SamplePoint],
+    sample_points: &[SamplePoint],
 ) -> Result<Vec<Confidence>, ReportError> {
-    let Some(trained) = TrainingCoverage::new(&resident.version.manifest) else {
+    let Some(coverage) = TrainingCoverage::new(&resident.version.manifest) else {
         return Ok(Vec::new());
     };
     let mut all = Vec::new();
     for offset_m in OFFSETS_M {
-        let here: Vec<&SamplePoint> =
-            places.iter().filter(|place| place.offset_m == offset_m).collect();
-        let (mut trusts, mut picture) = (Vec::new(), ViewImage::default());
-        for (station, place) in here.iter().enumerate() {
-            let seen = Seen::of(resident, backend, place, &trained)?;
-            if station == here.len() / 2 {
-                picture = seen.picture(place)?;
+        let at_offset = sample_points.iter().filter(|point| point.offset_m == offset_m);
+        let at_offset: Vec<&SamplePoint> = at_offset.collect();
+        let mut trusts = Vec::new();
+        let mut image = ViewImage::default();
+        for (station, point) in at_offset.iter().enumerate() {
+            let observed = Observed::new(resident, backend, point, &coverage)?;
+            if station == at_offset.len() / 2 {
+                image = observed.image(point)?;
             }
-            trusts.extend(seen.trusts);
+            trusts.extend(observed.trusts);
         }
-        all.push(summed(offset_m, &trusts, picture));
+        all.push(summarize(offset_m, &trusts, image));
     }
     Ok(all)
 }
 
-/// What the cameras see at one place.
-struct Seen {
+/// What the cameras observe at one sample point.
+struct Observed {
+    /// Trust of each camera's image.
     trusts: Vec<Trust>,
-    first: View,
-    rgb8: Vec<u8>,
+    /// The first camera.
+    first_view: View,
+    /// Its image.
+    first_rgb8: Vec<u8>,
 }
 
-impl Seen {
-    fn of(
+impl Observed {
+    fn new(
         resident: &Arc<Resident>,
         backend: &dyn Backend,
-        place: &SamplePoint,
-        trained: &TrainingCoverage,
+        point: &SamplePoint,
+        coverage: &TrainingCoverage,
     ) -> Result<Self, ReportError> {
-        let world_from_rig = place.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
-        let widest_px = place.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
-        let share = (WIDTH_PX / f64::from(widest_px)).min(1.0);
-        let views = place.views.iter().map(|view| scaled(*view, share));
+        let world_from_rig = point.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
+
+        // All cameras, scaled by the same factor.
+        let widest_px = point.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
+        let scale = (WIDTH_PX / f64::from(widest_px)).min(1.0);
+        let views = point.views.iter().map(|view| scaled(*view, scale));
         let views = views.collect::<Result<Vec<View>, CameraError>>()?;
+
+        // Colour and opacity of each.
         let profile = &resident.version.manifest.profile;
         let scene = resident.scene(&wildcity_session::viewpoints(&views), profile)?;
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut rgb8: Vec<Vec<u8>> = pixels().map(|count| vec![0; 3 * count]).collect();
         let mut opacity: Vec<Vec<f32>> = pixels().map(|count| vec![0.0; count]).collect();
-        let target = |(rgb8, opacity)| Target {
-            rgb8: Some(rgb8),
-            opacity: Some(opacity),
-            ..Target::default()
-        };
-        let buffers = rgb8.iter_mut().map(Vec::as_mut_slice);
-        let buffers = buffers.zip(opacity.iter_mut().map(Vec::as_mut_slice));
-        let mut targets: Vec<Target<'_>> = buffers.map(target).collect();
+        let buffers = rgb8.iter_mut().zip(&mut opacity);
+        let mut targets: Vec<Target<'_>> = buffers
+            .map(|(rgb8, opacity)| Target {
+                rgb8: Some(rgb8),
+                opacity: Some(opacity),
+                ..Target::default()
+            })
+            .collect();
         let frame = Frame { scene: &scene, profile, views: &views };
         backend.render(&frame, &mut targets, &|_, _| {})?;
-        let trust =
-            |(view, opacity): (&View, &Vec<f32>)| trained.trust(&world_from_rig, view, opacity);
-        let trusts = views.iter().zip(&opacity).map(trust).collect();
-        Ok(Self { trusts, first: views[0], rgb8: rgb8.swap_remove(0) })
+
+        let images = views.iter().zip(&opacity);
+        let trusts = images.map(|(view, opacity)| coverage.trust(&world_from_rig, view, opacity));
+        let trusts = trusts.collect();
+        Ok(Self { trusts, first_view: views[0], first_rgb8: rgb8.swap_remove(0) })
     }
 
-    fn picture(&self, place: &SamplePoint) -> Result<ViewImage, ReportError> {
-        let (width_px, height_px) = (self.first.camera.width_px, self.first.camera.height_px);
-        let file = wildcity_session::jpeg(&self.rgb8, width_px, height_px, QUALITY);
-        let file = file.map_err(|reason| ReportError::Encode { reason })?;
-        Ok(ViewImage { place: place.name.clone(), file })
+    fn image(&self, point: &SamplePoint) -> Result<ViewImage, ReportError> {
+        let camera = &self.first_view.camera;
+        let jpeg = wildcity_session::jpeg(
+            &self.first_rgb8,
+            camera.width_px,
+            camera.height_px,
+            JPEG_QUALITY,
+        );
+        let jpeg = jpeg.map_err(|reason| ReportError::Encode { reason })?;
+        Ok(ViewImage { sample_point: point.name.clone(), jpeg })
     }
 }
 
-fn summed(offset_m: f64, trusts: &[Trust], picture: ViewImage) -> Confidence {
+fn summarize(offset_m: f64, trusts: &[Trust], image: ViewImage) -> Confidence {
     let count = trusts.len().max(1) as f64;
     let mean = |of: &dyn Fn(&Trust) -> f64| trusts.iter().map(of).sum::<f64>() / count;
     let values = || trusts.iter().map(|trust| trust.value);
     Confidence {
         offset_m,
         mean: mean(&|trust| trust.value),
-        least: values().fold(1.0, f64::min),
-        most: values().fold(0.0, f64::max),
+        min: values().fold(1.0, f64::min),
+        max: values().fold(0.0, f64::max),
         distance_m: mean(&|trust| trust.distance_m),
         angle_rad: mean(&|trust| trust.angle_rad),
         low_coverage: mean(&|trust| trust.low_coverage),
         outside: mean(&|trust| trust.outside),
-        picture,
+        image,
     }
 }

@@ -1,14 +1,15 @@
-//! Only what is needed: what one step of a street holds, moves and runs, with each feature and without.
+//! What one step of a street holds, moves and runs, with each feature of a scene and without: a scene pays
+//! only for what it has.
 //!
-//! ResourceCounts, not times: they are the same on every machine, and a base scene that pays for a feature of
-//! others is seen at once.
+//! These are counts (pipelines, buffers, dispatches, bytes), not times: they are the same on every machine,
+//! and show at once if the base scene pays for a feature that it does not have.
 
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
-use super::ReportError;
+use super::error::ReportError;
 use super::measure::sky_bytes;
 use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;
@@ -21,166 +22,194 @@ use wildcity_scene::geometry::camera::{
 use wildcity_scene::sky::{CubeMap, Layer, Network, SkyModel};
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
 
-/// One street with one feature.
+/// Counts of the street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FeatureCounts {
-    /// The feature, as `SH degree 1`.
-    pub with: &'static str,
-    /// What was counted.
+    /// The feature, for example `SH degree 1`.
+    #[serde(rename = "with")]
+    pub feature: &'static str,
+    /// What one step takes.
     pub counts: ResourceCounts,
 }
 
-/// What one step takes. Those of a device are absent where there is none.
+/// What one step takes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ResourceCounts {
     /// Gaussians in the frame.
     pub gaussians: u64,
-    /// Bytes of one in the host's memory.
-    pub host_bytes: f64,
-    /// Bytes besides them there: maps of skies, images of hoods.
-    pub beside_bytes: u64,
-    /// Bytes of a pixel there.
-    pub host_pixel_bytes: u64,
+    /// Bytes per Gaussian in host memory.
+    #[serde(rename = "host_bytes")]
+    pub host_bytes_per_gaussian: f64,
+    /// Other host memory in bytes: sky maps, images of hoods.
+    #[serde(rename = "beside_bytes")]
+    pub other_host_bytes: u64,
+    /// Bytes per pixel in host memory.
+    #[serde(rename = "host_pixel_bytes")]
+    pub host_bytes_per_pixel: u64,
     /// Evaluations of a Gaussian at a pixel by the cpu backend.
     pub evaluations: u64,
-    /// What a device does.
+    /// What a device does. None without a device.
     pub device: Option<DeviceCounts>,
 }
 
-/// What one step takes on a device that draws nothing else.
+/// What one step takes on a device that renders nothing else.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct DeviceCounts {
-    /// Bytes of a Gaussian in its memory.
-    pub gaussian_bytes: f64,
-    /// Kernels that were compiled.
+    /// Bytes per Gaussian in device memory.
+    #[serde(rename = "gaussian_bytes")]
+    pub bytes_per_gaussian: f64,
+    /// Pipelines that were compiled.
     pub pipelines: u64,
-    /// Buffers that were made.
+    /// Buffers that were created.
     pub buffers: u64,
-    /// Kernels that a step starts.
+    /// Dispatches of a step.
     pub dispatches: u64,
-    /// Bytes that the stages move, at least.
+    /// Bytes that the stages move at least.
     pub moved_bytes: u64,
-    /// Bytes of a pixel that go back to the host.
-    pub pixel_bytes: u64,
+    /// Bytes per pixel that are read back to the host.
+    #[serde(rename = "pixel_bytes")]
+    pub read_back_bytes_per_pixel: u64,
 }
 
-/// Names of the columns, in order of [`ResourceCounts::texts`].
+/// Headings of [`ResourceCounts::cells`].
 pub const COLUMNS: [&str; 11] = [
     "Gaussians",
-    "B each, host",
-    "kB besides, host",
-    "B of a pixel, host",
-    "evaluations, cpu",
-    "B each, device",
-    "pipelines",
-    "buffers",
-    "dispatches",
-    "MB moved",
-    "B of a pixel back",
+    "host memory, B per Gaussian",
+    "other host memory, kB",
+    "host memory, B per pixel",
+    "evaluations on the cpu backend",
+    "device memory, B per Gaussian",
+    "pipelines compiled",
+    "buffers created",
+    "dispatches per step",
+    "device memory traffic, MB per step",
+    "read back, B per pixel",
 ];
 
-/// What this build has not, so that no twin can pay for it.
-pub const ABSENT: &str =
-    "Nothing repairs images: there is no code, library, buffer or pipeline of it.";
+/// What this build does not have at all.
+pub const NOT_IN_THIS_BUILD: &str =
+    "This build does not repair images: it has no code, library, buffer, or pipeline for it.";
 
-/// A feature, and what it changes.
-type Feature = (&'static str, fn(&mut Step));
+/// A feature: its name, and how it changes the base step.
+struct Feature {
+    name: &'static str,
+    add: fn(&mut Step),
+}
+
+const fn feature(name: &'static str, add: fn(&mut Step)) -> Feature {
+    Feature { name, add }
+}
 
 const FEATURES: [Feature; 18] = [
-    ("nothing else", |_| {}),
-    ("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
-    ("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
-    ("levels of detail, 1 m", |step| step.scene = coarser(&step.scene, 1.0)),
-    ("antialiasing", |step| step.profile.antialiased = true),
-    ("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
-    ("sky of images", |step| step.behind(SkyModel::cube(CubeMap::uniform(DVec3::splat(0.5))))),
-    ("sky, baked", |step| step.behind(network())),
-    ("sky, exact", |step| {
-        step.behind(network());
+    feature("nothing else", |_| {}),
+    feature("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
+    feature("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
+    feature("levels of detail, 1 m", |step| step.scene = with_levels(&step.scene, 1.0)),
+    feature("antialiasing", |step| step.profile.antialiased = true),
+    feature("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
+    feature("sky of images", |step| {
+        step.set_sky(SkyModel::cube(CubeMap::uniform(DVec3::splat(0.5))));
+    }),
+    feature("sky, baked", |step| step.set_sky(sky_network())),
+    feature("sky, exact", |step| {
+        step.set_sky(sky_network());
         step.profile.sky_error = 0.0;
     }),
-    ("fisheye", |step| {
+    feature("fisheye", |step| {
         step.view.camera.lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, 0.0, 0.0], None));
     }),
-    ("windshield", |step| step.view.camera.windshield = Some(windshield())),
-    ("rolling shutter", |step| {
+    feature("windshield", |step| step.view.camera.windshield = Some(windshield())),
+    feature("rolling shutter", |step| {
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
         let direction = ShutterDirection::TopToBottom;
         step.view.rolling_shutter =
             Some(RollingShutter { direction, world_from_camera_first: first });
     }),
-    ("exposure", |step| {
+    feature("exposure", |step| {
         let matrix = [[1.1, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]];
         step.appearance.exposure = Some(Exposure { matrix, offset: [0.0; 3] });
     }),
-    ("hood", |step| {
+    feature("hood", |step| {
         let rgba8 = [20, 20, 25, 255].repeat(step.view.camera.pixels());
-        // Whole rows: it is one.
+        // An overlay consists of whole rows, and this one is all rows of the image: it is valid.
         step.appearance.overlay = Overlay::new(step.view.camera.width_px, rgba8).ok().map(Arc::new);
     }),
-    ("depth", |step| step.depth = true),
-    ("depth and opacity", |step| (step.depth, step.opacity) = (true, true)),
-    // Normals are computed of the depth, on the host.
-    ("normals", |step| (step.depth, step.normals) = (true, true)),
-    // Trust is computed of the opacity, on the host.
-    ("trust", |step| step.opacity = true),
+    feature("depth", |step| step.depth = true),
+    feature("depth and opacity", |step| {
+        step.depth = true;
+        step.opacity = true;
+    }),
+    // The host computes normals from the depth.
+    feature("normals", |step| {
+        step.depth = true;
+        step.normals = true;
+    }),
+    // The host computes the trust from the opacity.
+    feature("trust", |step| step.opacity = true),
 ];
 
-/// Draws the street with each feature. `device` opens a device that drew nothing yet, or says that there
-/// is none.
+/// Renders the street with each feature on the cpu backend and on a device, and counts. `open_device` opens
+/// a device that has rendered nothing yet; it gives none if there is no device.
 ///
 /// # Errors
-/// A frame cannot be drawn.
+/// A frame cannot be rendered.
 pub fn count_features(
     cpu: &Cpu,
-    device: &dyn Fn() -> Option<Gpu>,
+    open_device: &dyn Fn() -> Option<Gpu>,
 ) -> Result<Vec<FeatureCounts>, ReportError> {
-    let counted = |(with, change): Feature| {
+    let count = |feature: Feature| {
         let mut step = Step::base();
-        change(&mut step);
-        Ok(FeatureCounts { with, counts: step.counts(cpu, device())? })
+        (feature.add)(&mut step);
+        let counts = step.counts(cpu, open_device())?;
+        Ok(FeatureCounts { feature: feature.name, counts })
     };
-    FEATURES.into_iter().map(counted).collect()
+    FEATURES.into_iter().map(count).collect()
 }
 
-/// A street with colours of a degree, as flat where the base is.
+/// A street of SH degree `degree`. Its colours are those of degree 0 with coefficients of 0 above.
 fn street(degree: u8) -> Gaussians {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
-    let flat = street.sh.chunks_exact(12).flat_map(|colour| colour[..3].to_vec()).collect();
-    (street.sh, street.sh_degree) = (flat, 0);
+    // The generated street has SH degree 1: 12 coefficients, of which the first 3 are degree 0.
+    street.sh = street.sh.chunks_exact(12).flat_map(|sh| sh[..3].to_vec()).collect();
+    street.sh_degree = 0;
     street.raise_sh_degree(degree);
     street
 }
 
-/// The coarsest level of each chunk with at most this error, in metres.
-fn coarser(scene: &Scene, error_m: f32) -> Scene {
-    let level = |chunk: &Arc<Chunk>| {
+/// Each chunk at its coarsest level that has at most this error, in metres.
+fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
+    let coarsest = |chunk: &Arc<Chunk>| {
         let levels = lod::levels(chunk).into_iter();
-        let fine = levels.take_while(|level| level.error_m <= error_m);
-        fine.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))
+        let allowed = levels.take_while(|level| level.error_m <= max_error_m);
+        allowed.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))
     };
-    Scene { chunks: scene.chunks.iter().map(level).collect(), ..scene.clone() }
+    Scene { chunks: scene.chunks.iter().map(coarsest).collect(), ..scene.clone() }
 }
 
-/// A sky of three octaves and 16 neurons, gentle enough to be baked coarsely.
-fn network() -> SkyModel {
+/// A sky network with three octaves and 16 neurons. It is smooth enough to be baked into a small map.
+fn sky_network() -> SkyModel {
     let layer = |outputs: usize, inputs: usize| {
         let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
         Layer { outputs, inputs, weight: numbers(outputs * inputs), bias: numbers(outputs) }
     };
+    // Three octaves of sine and cosine of three coordinates, and the coordinates: 21 inputs.
     let layers = [layer(16, 21), layer(16, 16), layer(3, 16)];
-    SkyModel::network(Network::new(layers, Vec::new()).expect("layers that fit each other"))
+    SkyModel::network(Network::new(layers, Vec::new()).expect("the sizes of the layers match"))
 }
 
-/// One that turns rays by some milliradians.
+/// A windshield that turns rays by some milliradians.
 fn windshield() -> Windshield {
-    let plane = |field, plane: [f64; 3]| Bivariate::new(field, &plane).expect("three are order 1");
+    let plane = |field, coefficients: [f64; 3]| {
+        Bivariate::new(field, &coefficients)
+            .expect("three coefficients are a polynomial of order 1")
+    };
     let horizontal = plane("horizontal", [-0.004, 1.002, 0.0]);
     let vertical = plane("vertical", [0.005, 0.0, 1.01]);
     Windshield::new(WindshieldReference::Forward, horizontal, vertical)
 }
 
+/// A scene, one camera, and the outputs that are asked for.
 struct Step {
     scene: Scene,
     profile: RenderProfile,
@@ -192,12 +221,13 @@ struct Step {
 }
 
 impl Step {
+    /// The street without features, seen by one pinhole camera.
     fn base() -> Self {
-        let eye_m = DVec3::new(-20.0, 0.3, 1.6);
+        let camera_m = DVec3::new(-20.0, 0.3, 1.6);
         Self {
             scene: Scene::from_gaussians(&street(0)),
             profile: RenderProfile::default(),
-            view: view_along([320, 180], 240.0, eye_m, DVec3::X, DVec3::NEG_Z),
+            view: view_along([320, 180], 240.0, camera_m, DVec3::X, DVec3::NEG_Z),
             appearance: Appearance::default(),
             depth: false,
             opacity: false,
@@ -205,49 +235,51 @@ impl Step {
         }
     }
 
-    fn behind(&mut self, model: SkyModel) {
+    fn set_sky(&mut self, model: SkyModel) {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
 
     fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<ResourceCounts, ReportError> {
-        let FrameStats { evaluations, .. } = self.draw(cpu)?;
-        let device = device.map(|gpu| self.of_device(&gpu)).transpose()?.flatten();
+        let FrameStats { evaluations, .. } = self.render(cpu)?;
+        let device = device.map(|gpu| self.device_counts(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
         Ok(ResourceCounts {
             gaussians,
-            host_bytes: self.scene.bytes() as f64 / gaussians as f64,
-            beside_bytes: sky_bytes + hood_bytes as u64,
-            host_pixel_bytes: 3 + 4 * floats,
+            host_bytes_per_gaussian: self.scene.bytes() as f64 / gaussians as f64,
+            other_host_bytes: sky_bytes + hood_bytes as u64,
+            // 8-bit colour, and f32 for the other outputs.
+            host_bytes_per_pixel: 3 + 4 * floats,
             evaluations,
             device,
         })
     }
 
-    /// `None` if it was lost meanwhile.
-    fn of_device(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
-        // The first frame makes room, perhaps in several tries.
-        self.draw(gpu)?;
+    /// None if the device was lost in the meantime.
+    fn device_counts(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
+        // The first frame grows the buffers, perhaps in several attempts; the second one is counted.
+        self.render(gpu)?;
         let dispatches = |usage: &GpuUsage| usage.totals.dispatches;
         let before = gpu.usage().as_ref().map_or(0, dispatches);
-        self.draw(gpu)?;
+        self.render(gpu)?;
         Ok(gpu.usage().map(|usage| DeviceCounts {
-            gaussian_bytes: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
+            bytes_per_gaussian: usage.mirror_bytes as f64 / self.scene.gaussians() as f64,
             pipelines: usage.totals.pipelines,
             buffers: usage.totals.buffers,
             dispatches: dispatches(&usage) - before,
             moved_bytes: usage.last_frame.stage_bytes().iter().map(|(_, bytes)| bytes).sum(),
-            pixel_bytes: 4 * usage.last_frame.planes,
+            read_back_bytes_per_pixel: 4 * usage.last_frame.planes,
         }))
     }
 
-    fn draw(&self, backend: &dyn Backend) -> Result<FrameStats, RenderError> {
+    fn render(&self, backend: &dyn Backend) -> Result<FrameStats, RenderError> {
         let pixels = self.view.camera.pixels();
-        let mut rgb8 = vec![0; 3 * pixels];
         let plane = |wanted: bool, values: usize| wanted.then(|| vec![0.0; values * pixels]);
-        let (mut depth_m, mut opacity) = (plane(self.depth, 1), plane(self.opacity, 1));
+        let mut rgb8 = vec![0; 3 * pixels];
+        let mut depth_m = plane(self.depth, 1);
+        let mut opacity = plane(self.opacity, 1);
         let mut normals = plane(self.normals, 3);
         let target = Target {
             rgb8: Some(&mut rgb8),
@@ -264,23 +296,23 @@ impl Step {
 }
 
 impl ResourceCounts {
-    /// In words, by [`COLUMNS`].
-    pub fn texts(&self) -> [String; 11] {
-        let device = |text: &dyn Fn(&DeviceCounts) -> String| {
+    /// The counts as text, in the order of [`COLUMNS`].
+    pub fn cells(&self) -> [String; 11] {
+        let on_device = |text: &dyn Fn(&DeviceCounts) -> String| {
             self.device.as_ref().map_or_else(|| "none".to_owned(), text)
         };
         [
             self.gaussians.to_string(),
-            format!("{:.1}", self.host_bytes),
-            format!("{:.1}", self.beside_bytes as f64 / 1e3),
-            self.host_pixel_bytes.to_string(),
+            format!("{:.1}", self.host_bytes_per_gaussian),
+            format!("{:.1}", self.other_host_bytes as f64 / 1e3),
+            self.host_bytes_per_pixel.to_string(),
             self.evaluations.to_string(),
-            device(&|d| format!("{:.1}", d.gaussian_bytes)),
-            device(&|d| d.pipelines.to_string()),
-            device(&|d| d.buffers.to_string()),
-            device(&|d| d.dispatches.to_string()),
-            device(&|d| format!("{:.2}", d.moved_bytes as f64 / 1e6)),
-            device(&|d| d.pixel_bytes.to_string()),
+            on_device(&|d| format!("{:.1}", d.bytes_per_gaussian)),
+            on_device(&|d| d.pipelines.to_string()),
+            on_device(&|d| d.buffers.to_string()),
+            on_device(&|d| d.dispatches.to_string()),
+            on_device(&|d| format!("{:.2}", d.moved_bytes as f64 / 1e6)),
+            on_device(&|d| d.read_back_bytes_per_pixel.to_string()),
         ]
     }
 }

@@ -1,253 +1,323 @@
-//! What is worth taking: the settings that no other one beats, and one for a wanted error or time.
+//! The Pareto front of error and time, and the setting for a wanted error or time.
+//!
+//! **A setting is selected at every other station and verified at the rest.** Its worst selection point must
+//! be better than the goal by a margin: the standard deviation of the worse half of the points, at least 1 dB
+//! or a tenth of the time. Of eight values of a normal distribution the worst lies 1.4 deviations from the
+//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. A margin of 1 dB
+//! alone selected a setting with 36 dB at two points of a capture that had 34.4 dB at two others.
+//!
+//! A setting that misses the goal at the verification points is not recommended, and no profile is written:
+//! a setting that is good by chance is worse than none. Records and image sizes are measured but not
+//! recommended, since a server cannot change them.
 
 use serde::Serialize;
 
-use super::ReportError;
-use super::measure::{Measurement, SampleResult, least};
-use super::settings::{Family, Sent};
+use super::error::ReportError;
+use super::measurement::{Measurement, SampleResult};
+use super::setting::{Family, ImageEncoding};
+use super::statistics::min;
 use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileOverrides, RenderProfile};
 
-/// What is wanted of a setting.
+/// What the user wants of a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Goal {
-    /// In every camera's window at every place at least this PSNR, in dB, in as little time as possible.
+    /// At least this PSNR in every camera's window at every sample point, in dB, in the least time.
     AtLeastDb(f64),
-    /// All but one of twenty steps within this time, in milliseconds, with as little error as possible.
+    /// At most this 95th percentile of the step time, in milliseconds, with the least error.
     AtMostMs(f64),
 }
 
-/// A setting that was chosen by some places, and what the others say of it. All but
-/// [`Recommendation::encoded`] is of what is rendered, before images are encoded: a profile does not choose
-/// the encoding.
+/// A recommended setting: selected at some sample points, and verified at the others.
+///
+/// All values except [`Recommendation::encodings`] are of images as they are rendered, before they are
+/// encoded: a profile does not choose the encoding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
-    /// What was wanted.
-    pub wanted: Goal,
-    /// The setting's name.
+    /// What the user wants.
+    #[serde(rename = "wanted")]
+    pub goal: Goal,
+    /// Name of the setting.
     pub setting: String,
-    /// Its changes of the profile.
+    /// Its changes of the profile, as `field=value`.
     pub profile: Vec<String>,
-    /// The backend's name.
+    /// Name of the backend.
     pub backend: String,
-    /// The worst that was measured where it was chosen: dB or milliseconds, whichever was wanted.
-    pub chosen_by: f64,
-    /// How much better than wanted that had to be, in the same unit: what places differ by.
+    /// The worst value at the selection points, in the goal's unit.
+    #[serde(rename = "chosen_by")]
+    pub selection_worst: f64,
+    /// How much better than the goal that value had to be, in the same unit: the spread of the points.
     pub margin: f64,
-    /// The worst at places that were not used to choose it.
-    pub verified: f64,
-    /// Where in the way of an image to an agent all of that was measured: [`RENDERED`].
-    pub measured: &'static str,
-    /// What encodings lose and take on top.
-    pub encoded: Vec<EncodingCost>,
+    /// The worst value at the verification points, in the same unit.
+    #[serde(rename = "verified")]
+    pub verification_worst: f64,
+    /// The state of the images in which all of this was measured: [`RENDERED`].
+    #[serde(rename = "measured")]
+    pub measured_state: &'static str,
+    /// What encodings lose and take in addition.
+    #[serde(rename = "encoded")]
+    pub encodings: Vec<EncodingCost>,
 }
 
-/// What the twin as served loses and takes when its images are encoded.
+/// What the twin as it is served loses and takes when its images are encoded.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EncodingCost {
-    /// The rung, as `jpeg 90`.
-    pub sent: String,
-    /// Whether sessions get their images so unless they ask for another encoding.
-    pub by_default: bool,
-    /// Least PSNR of a window at any place, in dB, of what arrives.
-    #[serde(serialize_with = "serialize_number")]
-    pub least_db: f64,
-    /// Milliseconds that the median step takes longer than without, each timed in turn with one without;
-    /// chance can make it less than 0.
-    pub more_ms: f64,
+    /// Name of the setting, for example `jpeg 90`.
+    #[serde(rename = "sent")]
+    pub encoding: String,
+    /// Whether sessions use it unless they ask for another encoding.
+    #[serde(rename = "by_default")]
+    pub is_default: bool,
+    /// Least PSNR of a window at any sample point after decoding, in dB.
+    #[serde(rename = "least_db", serialize_with = "serialize_number")]
+    pub min_db: f64,
+    /// How much longer the median step takes than without encoding, in milliseconds. The two are timed in
+    /// turn; it can be below 0 by chance.
+    #[serde(rename = "more_ms")]
+    pub extra_ms: f64,
 }
 
-/// What decibels and milliseconds of a recommendation are of.
+/// The state of the images that the values of a recommendation belong to.
 pub const RENDERED: &str = "what is rendered, before images are encoded";
 
-/// Least margin: 1 dB, ...
-const MARGIN_DB: f64 = 1.0;
-/// ... or a tenth of the time.
-const MARGIN_MS: f64 = 0.1;
-/// Where nothing differs PSNR has no end, and means need one: steps of f32 below 1 leave 20 log10(2^24).
-const MOST_DB: f64 = 144.5;
+/// Least margin of an error, in dB.
+const MIN_MARGIN_DB: f64 = 1.0;
+/// Least margin of a time, as a share of it.
+const MIN_MARGIN_MS_SHARE: f64 = 0.1;
+/// Exact images have an infinite PSNR, and a mean needs a number: the steps of an f32 below 1 leave
+/// 20 log10(2^24) = 144.5 dB.
+const MAX_DB: f64 = 144.5;
 
-/// Which of them no other one beats, in time and in error at once. What is compared with rays is another
-/// question, and neither beats nor is beaten.
+/// Which settings are on the Pareto front: no other setting is better in time or error without being worse
+/// in the other. Settings of [`Family::Rays`] have another reference; they are neither on the front nor
+/// compared with it.
 pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
-    let is_asked = |m: &&Measurement| m.setting.family != Family::Rays;
-    let point = |m: &Measurement| (m.cost.step_ms, m.errors.psnr_db);
-    let beaten = |(ms, db): (f64, f64)| {
-        let better = |(other_ms, other_db)| {
-            (other_ms < ms && other_db >= db) || (other_ms <= ms && other_db > db)
+    let is_comparable = |m: &&Measurement| m.setting.family != Family::Rays;
+    let is_dominated = |m: &Measurement| {
+        let own_ms = m.cost.step_ms;
+        let own_db = m.errors.psnr_db;
+        let dominates = |other: &Measurement| {
+            let ms = other.cost.step_ms;
+            let db = other.errors.psnr_db;
+            (ms < own_ms && db >= own_db) || (ms <= own_ms && db > own_db)
         };
-        all.iter().filter(is_asked).any(|other| better(point(other)))
+        all.iter().filter(is_comparable).any(dominates)
     };
-    all.iter().map(|m| is_asked(&m) && !m.errors.psnr_db.is_nan() && !beaten(point(m))).collect()
+    let is_on_front =
+        |m: &Measurement| is_comparable(&m) && !m.errors.psnr_db.is_nan() && !is_dominated(m);
+    all.iter().map(is_on_front).collect()
 }
 
-/// The setting for what is wanted, of those that a server can be told to use and that change something.
-/// Of equals it is the first of the ladder, which begins with the twin as served.
-///
-/// The worst of the places that choose must be better than wanted by the deviation of their worse half: the
-/// worst of eight values of a normal distribution lies 1.4 deviations from its mean on average, so
-/// what is wanted then lies 2.4 away, where one of 120 others falls. It is verified all the same.
+/// A setting that may be recommended, with its assessment.
+#[derive(Clone, Copy)]
+struct Candidate<'a> {
+    measurement: &'a Measurement,
+    assessment: Assessment,
+}
+
+/// The best setting for the goal, of those that a server can use and that change something. Of equally good
+/// ones it is the first of the list, which begins with the twin as it is served.
 ///
 /// # Errors
-/// None is good enough where settings are chosen; or the best one is not where it is verified.
+/// No setting reaches the goal at the selection points, or the best one misses it at the verification points.
 pub fn recommend(
-    wanted: Goal,
+    goal: Goal,
     all: &[Measurement],
     backends: &[String],
 ) -> Result<Recommendation, ReportError> {
+    // 1. The settings that may be recommended.
     let served = all.iter().find(|m| m.setting.family == Family::AsServed);
-    let changes = |m: &&Measurement| !served.is_some_and(|served| m.changes_nothing(served));
-    let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(changes);
-    let judged = servable.map(|m| (m, wanted.judge(m)));
-    let judged: Vec<(&Measurement, Assessment)> = judged.collect();
-    let meets = judged.iter().filter(|(_, judged)| wanted.holds(judged.assured));
-    let best = match wanted {
-        Goal::AtLeastDb(_) => {
-            meets.min_by(|(a, _), (b, _)| a.cost.step_ms.total_cmp(&b.cost.step_ms))
-        }
-        Goal::AtMostMs(_) => {
-            let db = |m: &Measurement| Goal::AtLeastDb(0.0).judge(m).worst;
-            let numbers = meets.filter(|(m, _)| !db(m).is_nan());
-            numbers.reduce(|best, next| if db(next.0) > db(best.0) { next } else { best })
-        }
-    };
-    let Some((best, Assessment { worst, margin, verified, .. })) = best.copied() else {
-        let assured = judged.iter().map(|(_, judged)| judged.assured);
-        let reached = match wanted {
-            Goal::AtLeastDb(_) => assured.fold(f64::NEG_INFINITY, f64::max),
-            Goal::AtMostMs(_) => assured.fold(f64::INFINITY, f64::min),
+    let has_effect = |m: &&Measurement| !served.is_some_and(|served| m.is_equivalent_to(served));
+    let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(has_effect);
+    let candidates: Vec<Candidate<'_>> = servable
+        .map(|measurement| Candidate { measurement, assessment: goal.assess(measurement) })
+        .collect();
+
+    // 2. The best of those that reach the goal with their margin.
+    let Some(best) = best_candidate(goal, &candidates) else {
+        let guaranteed = candidates.iter().map(|candidate| candidate.assessment.guaranteed);
+        let reached = match goal {
+            Goal::AtLeastDb(_) => guaranteed.fold(f64::NEG_INFINITY, f64::max),
+            Goal::AtMostMs(_) => guaranteed.fold(f64::INFINITY, f64::min),
         };
-        return Err(ReportError::GoalNotReached { wanted: wanted.to_string(), reached });
+        return Err(ReportError::GoalNotReached { goal: goal.to_string(), reached });
     };
-    if !wanted.holds(verified) {
-        let (setting, wanted) = (best.setting.name.clone(), wanted.to_string());
-        return Err(ReportError::NotVerified { setting, wanted, verified });
+
+    // 3. Verification at the other points.
+    let setting = &best.measurement.setting;
+    let Assessment { selection_worst, margin, verification_worst, .. } = best.assessment;
+    if !goal.is_met_by(verification_worst) {
+        return Err(ReportError::NotVerified {
+            setting: setting.name.clone(),
+            goal: goal.to_string(),
+            verified: verification_worst,
+        });
     }
-    let is_sent = |m: &&Measurement| m.setting.family == Family::Sent;
+
+    let is_encoding = |m: &&Measurement| m.setting.family == Family::Encoding;
     Ok(Recommendation {
-        wanted,
-        setting: best.setting.name.clone(),
-        profile: best.setting.profile.clone(),
-        backend: backends[best.setting.backend].clone(),
-        chosen_by: worst,
+        goal,
+        setting: setting.name.clone(),
+        profile: setting.profile.clone(),
+        backend: backends[setting.backend].clone(),
+        selection_worst,
         margin,
-        verified,
-        measured: RENDERED,
-        encoded: all.iter().filter(is_sent).map(EncodingCost::of).collect(),
+        verification_worst,
+        measured_state: RENDERED,
+        encodings: all.iter().filter(is_encoding).map(EncodingCost::new).collect(),
     })
 }
 
+/// The fastest candidate that reaches a wanted error, or the most exact one that reaches a wanted time.
+fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candidate<'a>> {
+    let reaching = candidates.iter().copied();
+    let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
+    match goal {
+        Goal::AtLeastDb(_) => reaching
+            .min_by(|a, b| a.measurement.cost.step_ms.total_cmp(&b.measurement.cost.step_ms)),
+        Goal::AtMostMs(_) => {
+            let worst_db =
+                |c: &Candidate<'_>| Goal::AtLeastDb(0.0).assess(c.measurement).selection_worst;
+            let mut best = reaching.find(|c| !worst_db(c).is_nan())?;
+            for candidate in reaching {
+                if worst_db(&candidate) > worst_db(&best) {
+                    best = candidate;
+                }
+            }
+            Some(best)
+        }
+    }
+}
+
 impl EncodingCost {
-    fn of(m: &Measurement) -> Self {
+    fn new(measurement: &Measurement) -> Self {
+        let default = ImageEncoding::Jpeg(wildcity_session::limits::JPEG_QUALITY);
         Self {
-            sent: m.setting.name.clone(),
-            by_default: m.setting.sent == Some(Sent::Jpeg(wildcity_session::limits::JPEG_QUALITY)),
-            least_db: m.least_db(),
-            more_ms: m.cost.step_ms - m.served_ms,
+            encoding: measurement.setting.name.clone(),
+            is_default: measurement.setting.encoding == Some(default),
+            min_db: measurement.min_db(),
+            extra_ms: measurement.cost.step_ms - measurement.baseline_ms,
         }
     }
 }
 
 impl Recommendation {
-    /// The fields of the profile that it changes, as a profile file has them.
+    /// The fields of the profile that the setting changes, as a profile file has them.
     ///
     /// # Errors
     /// Names the change that cannot be made.
     pub fn changes(&self) -> Result<ProfileOverrides, ProfileError> {
-        let mut profile = RenderProfile::default();
-        self.profile.iter().try_for_each(|change| profile.set(change))?;
         let bad =
             |field: &str, reason: String| ProfileError::Change { field: field.to_owned(), reason };
-        let all =
+        // A profile with the changes, as JSON; then only the fields that were changed.
+        let mut profile = RenderProfile::default();
+        self.profile.iter().try_for_each(|change| profile.set(change))?;
+        let all_fields =
             serde_json::to_value(profile).map_err(|error| bad("profile", error.to_string()))?;
-        let field = |change: &String| {
+        let changed_field = |change: &String| {
             let key = change.split_once('=').map_or(change.as_str(), |(key, _)| key);
-            let value = all.get(key).ok_or_else(|| bad(key, "it is not written".to_owned()))?;
+            let value = all_fields.get(key);
+            let value = value.ok_or_else(|| bad(key, "it is missing in the JSON".to_owned()))?;
             Ok((key.to_owned(), value.clone()))
         };
-        self.profile.iter().map(field).collect::<Result<_, _>>().map(ProfileOverrides::new)
+        self.profile.iter().map(changed_field).collect::<Result<_, _>>().map(ProfileOverrides::new)
     }
 
-    /// What starts a server that draws so, with the profile in a file.
-    pub fn serve(&self, profile: &str) -> String {
+    /// The command that starts a server with this setting, where `profile` is the path of the profile file.
+    pub fn serve_command(&self, profile: &str) -> String {
         format!("wildcity serve --backend {} --profile {profile}", self.backend)
     }
 
-    /// What its decibels and milliseconds are of, and what encodings add to them.
-    pub fn of_what(&self) -> String {
-        let one = |encoded: &EncodingCost| {
-            let EncodingCost { sent, by_default, least_db, more_ms } = encoded;
-            let default = if *by_default { " (the default)" } else { "" };
-            format!("{sent}{default} {least_db:.1} dB at worst and {more_ms:+.1} ms a step")
+    /// Says what the values belong to, and what encodings add to them.
+    pub fn explanation(&self) -> String {
+        let of_encoding = |cost: &EncodingCost| {
+            let EncodingCost { encoding, is_default, min_db, extra_ms } = cost;
+            let default = if *is_default { " (the default)" } else { "" };
+            format!("{encoding}{default} {min_db:.1} dB at worst and {extra_ms:+.1} ms a step")
         };
-        let all: Vec<String> = self.encoded.iter().map(one).collect();
-        let encoded = match all.is_empty() {
+        let all: Vec<String> = self.encodings.iter().map(of_encoding).collect();
+        let encodings = match all.is_empty() {
             true => String::new(),
             false => format!("; encoded, the twin as served has: {}", all.join(", ")),
         };
-        format!("of {}{encoded}", self.measured)
+        format!("of {}{encodings}", self.measured_state)
     }
 }
 
-/// What the places say of a setting, in dB or milliseconds.
+/// What the sample points say of a setting, in dB or milliseconds, whichever the goal is in.
 #[derive(Clone, Copy)]
 struct Assessment {
-    /// The worst of those that choose.
-    worst: f64,
-    /// What they differ by.
+    /// The worst value at the selection points.
+    selection_worst: f64,
+    /// The spread of the selection points.
     margin: f64,
-    /// What can be counted on elsewhere.
-    assured: f64,
-    /// The worst of the others.
-    verified: f64,
+    /// The worst value, less the margin: what other points can be expected to have.
+    guaranteed: f64,
+    /// The worst value at the verification points.
+    verification_worst: f64,
 }
 
 impl Goal {
-    fn holds(self, value: f64) -> bool {
+    /// Whether a value in the goal's unit reaches it. NaN does not.
+    fn is_met_by(self, value: f64) -> bool {
         match self {
             Self::AtLeastDb(db) => value >= db,
             Self::AtMostMs(ms) => value <= ms,
         }
     }
 
-    fn judge(self, m: &Measurement) -> Assessment {
-        let value = |place: &SampleResult| match self {
-            // NaN stays NaN, and holds nothing.
-            Self::AtLeastDb(_) => Some(place.least_db.clamp(f64::NEG_INFINITY, MOST_DB)),
-            Self::AtMostMs(_) => place.p95_ms,
+    fn assess(self, measurement: &Measurement) -> Assessment {
+        let value = |result: &SampleResult| match self {
+            // NaN stays NaN, which reaches no goal.
+            Self::AtLeastDb(_) => Some(result.min_db.clamp(f64::NEG_INFINITY, MAX_DB)),
+            Self::AtMostMs(_) => result.p95_ms,
         };
-        let of = |chooses: bool| {
-            let places = m.by_place.iter().filter(move |place| place.chooses == chooses);
-            places.filter_map(value).collect::<Vec<f64>>()
+        let values_at = |for_selection: bool| {
+            let results = measurement.by_sample_point.iter();
+            let results = results.filter(move |result| result.for_selection == for_selection);
+            results.filter_map(value).collect::<Vec<f64>>()
         };
-        let (choosing, verifying) = (of(true), of(false));
-        // NaN of no place, too.
-        let least = |values: &[f64]| least(values.iter().copied());
+        let selection = values_at(true);
+        let verification = values_at(false);
+        // Both give NaN for no values, too.
+        let least = |values: &[f64]| min(values.iter().copied());
         let most = |values: &[f64]| values.iter().copied().fold(f64::NAN, f64::max);
         match self {
             Self::AtLeastDb(_) => {
-                let (worst, margin) = (least(&choosing), spread(&choosing, f64::lt).max(MARGIN_DB));
-                Assessment { worst, margin, assured: worst - margin, verified: least(&verifying) }
+                let selection_worst = least(&selection);
+                let margin = worse_half_deviation(&selection, f64::lt).max(MIN_MARGIN_DB);
+                Assessment {
+                    selection_worst,
+                    margin,
+                    guaranteed: selection_worst - margin,
+                    verification_worst: least(&verification),
+                }
             }
             Self::AtMostMs(_) => {
-                let worst = most(&choosing);
-                let margin = spread(&choosing, f64::gt).max(MARGIN_MS * worst);
-                Assessment { worst, margin, assured: worst + margin, verified: most(&verifying) }
+                let selection_worst = most(&selection);
+                let min_margin_ms = MIN_MARGIN_MS_SHARE * selection_worst;
+                let margin = worse_half_deviation(&selection, f64::gt).max(min_margin_ms);
+                Assessment {
+                    selection_worst,
+                    margin,
+                    guaranteed: selection_worst + margin,
+                    verification_worst: most(&verification),
+                }
             }
         }
     }
 }
 
-/// Standard deviation of the worse half: from the median, so that places which are much better than others
-/// do not count against a setting. 0 where none is worse.
-fn spread(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
+/// Standard deviation of the values that are worse than the median, from the median. Values that are much
+/// better than the others do not count against a setting. 0 if no value is worse.
+fn worse_half_deviation(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().saturating_sub(1);
-    let middle = |at: usize| sorted.get(at).copied().unwrap_or(f64::NAN);
-    let median = 0.5 * (middle(last / 2) + middle(last.div_ceil(2)));
+    let at = |index: usize| sorted.get(index).copied().unwrap_or(f64::NAN);
+    let median = 0.5 * (at(last / 2) + at(last.div_ceil(2)));
     let worse: Vec<f64> = sorted.into_iter().filter(|value| is_worse(value, &median)).collect();
     let squares: f64 = worse.iter().map(|value| (value - median).powi(2)).sum();
     (squares / worse.len().max(1) as f64).sqrt()

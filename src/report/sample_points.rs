@@ -1,45 +1,47 @@
-//! From where a twin is looked at: along its recorded drive and beside it, or around it.
+//! The poses at which settings are compared: along the recorded drive and beside it, or around a capture.
 
 use glam::{DQuat, DVec3};
 
-use super::settings::scaled;
 use wildcity_render::View;
 use wildcity_render::compare::images::{crop_view, view_along};
 use wildcity_scene::geometry::{Bounds, CameraError, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Trajectory};
 
-/// Somewhere that all settings are measured.
+/// A pose at which all settings are measured.
 #[derive(Clone, Debug)]
 pub struct SamplePoint {
-    /// As `60 m, 3 m left`.
+    /// For example `60 m, 3 m left`.
     pub name: String,
-    /// Metres beside the recorded drive, whichever side; 0 on it, and where there is none.
+    /// Lateral distance from the recorded drive in metres, to either side. 0 on the drive, and for a twin
+    /// without one.
     pub offset_m: f64,
-    /// Whether a setting may be chosen by what is seen here. The others verify the choice.
-    pub chooses: bool,
-    /// Where the rig stands; none where there is no drive.
+    /// Whether settings are selected by the results here. The other points verify the selection.
+    pub for_selection: bool,
+    /// Pose of the rig. None for a twin without a drive.
     pub world_from_rig: Option<Pose>,
-    /// The cameras in full: what is timed.
+    /// The cameras with their whole images. They are what is timed.
     pub views: Vec<View>,
-    /// A part of each camera's image at full focal length: what is compared.
+    /// A window of each camera's image at full focal length. The windows are what is compared.
     pub windows: Vec<View>,
 }
 
-/// How many places, and how much is compared at each.
+/// How many sample points there are, and how much is compared at each.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Sampling {
-    /// Stations along the drive; around a capture without one, four times as many places.
+    /// Stations along the drive. Each has a sample point per distance of [`OFFSETS_M`]; a twin without a
+    /// drive gets as many points around it.
     pub stations: u32,
-    /// Width and height of the part of an image that is compared, in pixels.
+    /// Width and height of the compared windows, in pixels.
     pub window_px: [u32; 2],
 }
 
-/// How far beside the recorded drive, in metres: on it, in the lane's other half, the next lane, and the
-/// one after it.
+/// Lateral distances from the recorded drive, in metres: on it, in the other half of the lane, in the next
+/// lane, and in the lane after that.
 pub const OFFSETS_M: [f64; 4] = [0.0, 1.0, 3.0, 5.0];
 
-/// Places along the twin's first recorded drive with these cameras, or around it if there is none.
+/// Sample points along the twin's first recorded drive with these cameras, or around the twin if it has no
+/// drive.
 pub fn sample_points(
     manifest: &Manifest,
     cameras: &[RigCamera],
@@ -51,105 +53,145 @@ pub fn sample_points(
     }
 }
 
-/// Every other station chooses; offsets are to the left and to the right in turn. The rig moves as fast as
-/// it did on the whole drive, which rolling shutters see.
+/// Sample points at evenly spaced stations. Every other station is for selection. Two stations have their
+/// offsets to the left, the next two to the right, and so on.
+///
+/// The rig moves with the mean speed of the whole drive, for cameras with rolling shutters.
 fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<SamplePoint> {
-    let mut places = Vec::new();
     let length_m = drive.length_m();
-    let (first, last) = (drive.keyframes.first(), drive.keyframes.last());
-    let took_us = first.zip(last).map_or(0, |(first, last)| last.time_us - first.time_us);
-    let m_per_us = if took_us > 0 { length_m / took_us as f64 } else { 0.0 };
+    let speed_m_per_us = mean_speed_m_per_us(drive);
+    let mut points = Vec::new();
     for station in 0..sampling.stations {
         let share = (f64::from(station) + 0.5) / f64::from(sampling.stations);
         let station_m = share * length_m;
-        let (sign, side) =
-            if (station / 2).is_multiple_of(2) { (1.0, "left") } else { (-1.0, "right") };
+        let is_left = (station / 2).is_multiple_of(2);
+        // In the rig's axes y points to the left.
+        let sign = if is_left { 1.0 } else { -1.0 };
+        let side = if is_left { "left" } else { "right" };
         for offset_m in OFFSETS_M {
-            // In the rig's axes y is left.
-            let beside = Pose {
+            let rig_from_offset_rig = Pose {
                 position_m: DVec3::new(0.0, sign * offset_m, 0.0),
                 rotation: DQuat::IDENTITY,
             };
-            let world_from_rig_before =
-                |age_us: i64| drive.at_station(station_m - m_per_us * age_us as f64) * beside;
+            let world_from_rig_before = |age_us: i64| {
+                drive.at_station(station_m - speed_m_per_us * age_us as f64) * rig_from_offset_rig
+            };
             let world_from_rig = world_from_rig_before(0);
-            let views = View::of_moving_rig(cameras, world_from_rig, &world_from_rig_before);
             let name = match offset_m {
                 0.0 => format!("{station_m:.0} m"),
                 _ => format!("{station_m:.0} m, {offset_m} m {side}"),
             };
-            let place = SamplePoint {
+            let point = SamplePoint {
                 name,
                 offset_m,
-                chooses: station.is_multiple_of(2),
+                for_selection: station.is_multiple_of(2),
                 world_from_rig: Some(world_from_rig),
-                views,
+                views: View::of_moving_rig(cameras, world_from_rig, &world_from_rig_before),
                 windows: Vec::new(),
             };
-            places.push(place.with_windows(places.len(), sampling.window_px, 1.0));
+            points.push(point.with_windows(points.len(), sampling.window_px, 1.0));
         }
     }
-    places
+    points
 }
 
-/// Places around a capture for each station: as many as there are offsets beside a drive.
-const AROUND: u32 = OFFSETS_M.len() as u32;
+/// Length of a drive over its duration; 0 if it takes no time.
+fn mean_speed_m_per_us(drive: &Trajectory) -> f64 {
+    let ends = drive.keyframes.first().zip(drive.keyframes.last());
+    let duration_us = ends.map_or(0, |(first, last)| last.time_us - first.time_us);
+    if duration_us > 0 { drive.length_m() / duration_us as f64 } else { 0.0 }
+}
 
-/// Share of the sides of such images that windows lie in: around the middle, where the thing is.
-const MIDDLE: f64 = 0.5;
+/// Sample points around a capture for each station: as many as there are offsets beside a drive.
+const POINTS_PER_STATION: u32 = OFFSETS_M.len() as u32;
 
-/// Cameras of 640 x 480 px on a circle around the middle, 20° above it, that see all of it: a capture of
-/// one thing. z is up.
+/// Share of the sides of these images in which windows lie: around the middle, where the object is.
+const WINDOW_SHARE: f64 = 0.5;
+
+/// Images around a capture, in pixels.
+const AROUND_SIZE_PX: [u32; 2] = [640, 480];
+/// Focal length of these images, in pixels.
+const AROUND_FOCAL_PX: f64 = 600.0;
+/// How far above the object these cameras stand, seen from its middle.
+const AROUND_ELEVATION_DEG: f64 = 20.0;
+
+/// Cameras on a circle around the middle of a captured object. Each sees all of it. z is up.
 fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
     let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
-    // A lens of 600 px sees ±0.53 across and ±0.4 down of what is 1 m away: the box' longest side fits at
-    // 1.2 times its length from its middle.
-    let away_m = 1.2 * bounds.size_m().max_element();
-    let place_at = |station: u32| {
-        let share = f64::from(station) / f64::from(AROUND * sampling.stations);
-        let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
-        let toward = DVec3::new(cos, sin, 20.0_f64.to_radians().tan()).normalize();
-        let view = view_along([640, 480], 600.0, middle_m + away_m * toward, -toward, DVec3::NEG_Z);
-        let place = SamplePoint {
-            name: format!("{:.1}° around", 360.0 * share),
+    // 640 x 480 px at a focal length of 600 px show ±0.53 m across and ±0.4 m down at a distance of 1 m.
+    // So the longest side of the box fits at 1.2 times its length from the middle.
+    let distance_m = 1.2 * bounds.size_m().max_element();
+    let count = POINTS_PER_STATION * sampling.stations;
+    let point_at = |index: u32| {
+        let turn = f64::from(index) / f64::from(count);
+        let (sin, cos) = (turn * std::f64::consts::TAU).sin_cos();
+        let slope = AROUND_ELEVATION_DEG.to_radians().tan();
+        let toward_camera = DVec3::new(cos, sin, slope).normalize();
+        let position_m = middle_m + distance_m * toward_camera;
+        let view =
+            view_along(AROUND_SIZE_PX, AROUND_FOCAL_PX, position_m, -toward_camera, DVec3::NEG_Z);
+        let point = SamplePoint {
+            name: format!("{:.1}° around", 360.0 * turn),
             offset_m: 0.0,
-            chooses: station.is_multiple_of(2),
+            for_selection: index.is_multiple_of(2),
             world_from_rig: None,
             views: vec![view],
             windows: Vec::new(),
         };
-        place.with_windows(station as usize, sampling.window_px, MIDDLE)
+        point.with_windows(index as usize, sampling.window_px, WINDOW_SHARE)
     };
-    (0..AROUND * sampling.stations).map(place_at).collect()
+    (0..count).map(point_at).collect()
 }
 
+/// 1/ρ and 1/ρ² with the plastic number ρ = 1.3247...: multiples of them, modulo 1, cover the unit square
+/// evenly without being regular (Roberts 2018, the R2 sequence).
+const R2_STEPS: [f64; 2] = [0.754_877_666_2, 0.569_840_290_99];
+
+/// More cameras than a rig has: the sequence continues from camera to camera, then from point to point.
+const CAMERAS_PER_POINT: usize = 16;
+
 impl SamplePoint {
-    /// The same with a window in each image, spread evenly over a share of its sides around the middle
-    /// (Roberts 2018: powers of the plastic number's inverse); `index` counts the places.
-    fn with_windows(mut self, index: usize, window_px: [u32; 2], within: f64) -> Self {
+    /// Adds a window in each image. The windows of all points spread evenly over `share` of the image's
+    /// sides, around its middle. `index` is the number of this point.
+    fn with_windows(mut self, index: usize, window_px: [u32; 2], share: f64) -> Self {
         let window = |(camera, view): (usize, &View)| {
-            let i = (index * 16 + camera + 1) as f64;
-            let size_px = [view.camera.width_px, view.camera.height_px];
-            let own_px = [0, 1].map(|axis| window_px[axis].min(size_px[axis]));
-            let at = [0.754_877_666_2, 0.569_840_290_99].map(|step: f64| (0.5 + i * step).fract());
-            let at = [0, 1].map(|axis| {
-                let share = 0.5 + within * (at[axis] - 0.5);
-                (share * f64::from(size_px[axis] - own_px[axis])) as i32
+            let i = (index * CAMERAS_PER_POINT + camera + 1) as f64;
+            let image_px = [view.camera.width_px, view.camera.height_px];
+            let size_px = [0, 1].map(|axis| window_px[axis].min(image_px[axis]));
+            let corner_px = [0, 1].map(|axis| {
+                let in_unit_square = (0.5 + i * R2_STEPS[axis]).fract();
+                let in_image = 0.5 + share * (in_unit_square - 0.5);
+                (in_image * f64::from(image_px[axis] - size_px[axis])) as i32
             });
-            crop_view(*view, at, own_px)
+            crop_view(*view, corner_px, size_px)
         };
         self.windows = self.views.iter().enumerate().map(window).collect();
         self
     }
 
-    /// The same with all images scaled.
+    /// The same point with all images and windows scaled.
     ///
     /// # Errors
-    /// A camera so small cannot be used.
+    /// A camera cannot be scaled to so small an image.
     pub(super) fn scaled(&self, scale: f64) -> Result<Self, CameraError> {
-        let all = |views: &[View]| -> Result<Vec<View>, CameraError> {
+        let scale_all = |views: &[View]| -> Result<Vec<View>, CameraError> {
             views.iter().map(|view| scaled(*view, scale)).collect()
         };
-        Ok(Self { views: all(&self.views)?, windows: all(&self.windows)?, ..self.clone() })
+        Ok(Self {
+            views: scale_all(&self.views)?,
+            windows: scale_all(&self.windows)?,
+            ..self.clone()
+        })
     }
+}
+
+/// A view with the sides of its image and its intrinsics scaled.
+///
+/// # Errors
+/// The camera cannot be scaled to so small an image.
+pub(super) fn scaled(view: View, scale: f64) -> Result<View, CameraError> {
+    let side_px = |px: u32| ((f64::from(px) * scale).round() as u64).max(1);
+    let camera = view.camera;
+    let camera = camera.scaled(side_px(camera.width_px), side_px(camera.height_px))?;
+    Ok(View { camera, ..view })
 }

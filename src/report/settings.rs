@@ -1,325 +1,318 @@
-//! The settings that are compared, one changed at a time, and those that a profile can be made of.
+//! The settings that are compared, each a change of one thing, and combinations that a profile can have.
+//!
+//! **Settings that cannot affect this twin are skipped**, and the page names them: `sky_error` without a
+//! sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is no setting either:
+//! see [`TILE_SIZE_REASON`]; BENCHMARKS.md has what was measured of it.
+//!
+//! **Non-pinhole cameras have two references.** All settings are compared with splats, so that their own
+//! errors show. One more row compares the twin as it is served with a ray for every pixel.
 
 use serde::Serialize;
 
+use super::setting::{Family, ImageEncoding, Setting};
 use wildcity_render::View;
-use wildcity_scene::geometry::CameraError;
-use wildcity_scene::profile::ProfileError;
 use wildcity_scene::sky::{Sky, SkyModel};
 use wildcity_scene::{Manifest, Rays, RecordFormat, RenderProfile};
 
-/// One way to draw a twin.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Setting {
-    /// As `tau_px=2`, unique within a report.
-    pub name: String,
-    /// What it is a step of.
-    pub family: Family,
-    /// Index of the backend among those of the report.
-    pub backend: usize,
-    /// What Gaussians are stored in; as they are, if absent.
-    pub record: Option<RecordFormat>,
-    /// Changes of the twin's own render profile, `key=value`.
-    pub profile: Vec<String>,
-    /// Sides of the images, as a share of the cameras'.
-    pub scale: f64,
-    /// How images are sent; if absent, values are compared before they are rounded to 8 bits, and no
-    /// encoding is timed.
-    pub sent: Option<Sent>,
-    /// What it is compared with: all but those of [`Family::Rays`] with splats, as they are.
-    pub against: Rays,
-}
-
-/// What a ladder is of: what decides which settings can be felt.
+/// Properties of a twin and its cameras that decide which settings can affect it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TwinFeatures {
-    /// How the twin is drawn.
+    /// The twin's render profile.
     pub profile: RenderProfile,
-    /// How it is stored.
-    pub stored: RecordFormat,
+    /// Record format in which its Gaussians are stored.
+    pub record: RecordFormat,
     /// Whether it has levels of detail.
-    pub levels: bool,
-    /// What is behind it.
-    pub behind: BackgroundKind,
-    /// Whether some camera has a lens, a windshield or a rolling shutter while it moves.
-    pub bent: bool,
+    pub has_levels: bool,
+    /// What is behind its Gaussians.
+    pub background: BackgroundKind,
+    /// Whether a camera has a lens, a windshield, or a rolling shutter while it moves.
+    pub has_non_pinhole: bool,
 }
 
-/// What is behind a twin.
+/// What is behind the Gaussians of a twin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BackgroundKind {
-    /// Nothing, or a background of one colour.
-    Nothing,
-    /// A network, which is evaluated or baked.
+    /// No sky: black, or one colour.
+    Plain,
+    /// A sky network, which is evaluated or baked into a map.
     Network,
-    /// Images, which are their own map.
+    /// A sky of images, which are a map already.
     Images,
 }
 
-/// Settings to compare, and what is not among them.
+/// The settings to compare, and those that are skipped.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SettingList {
-    /// The twin as it is served first; names are unique.
+    /// The twin as it is served is the first. Names are unique.
     pub settings: Vec<Setting>,
-    /// What this twin, or this build, cannot feel.
+    /// Settings that cannot affect this twin, or that this build or machine does not have.
     pub skipped: Vec<Skipped>,
 }
 
-/// What is not compared.
+/// A setting that is not compared.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Skipped {
     /// The setting or family.
     pub what: String,
-    /// Why.
-    pub why: String,
+    /// The reason.
+    #[serde(rename = "why")]
+    pub reason: String,
 }
 
 impl Skipped {
-    /// Something that is not compared, and why.
-    pub fn new(what: impl Into<String>, why: impl Into<String>) -> Self {
-        Self { what: what.into(), why: why.into() }
+    /// A setting that is not compared, and the reason.
+    pub fn new(what: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self { what: what.into(), reason: reason.into() }
     }
 }
 
-/// How an image is sent.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Sent {
-    /// In 8 bits.
-    Raw,
-    /// As a JPEG of a quality.
-    Jpeg(u8),
-}
-
-/// What a setting is a step of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Family {
-    /// The twin as it is served.
-    AsServed,
-    /// Who renders.
-    Backend,
-    /// Levels of detail.
-    Detail,
-    /// How far blocks are drawn.
-    Reach,
-    /// How Gaussians are stored.
-    Record,
-    /// What a small splat's opacity is.
-    Antialiasing,
-    /// The smallest alpha that is blended.
-    AlphaCut,
-    /// Where a pixel ends.
-    Stop,
-    /// How exactly a sky is looked up.
-    Sky,
-    /// Splats of bent cameras, against every pixel's own ray.
-    Rays,
-    /// The size of the images.
-    Scale,
-    /// How images are sent.
-    Sent,
-    /// Several at once: what a profile may be made of.
-    Combined,
-}
-
-impl Family {
-    /// All of them, in the order of the report.
-    pub const ALL: [Self; 13] = [
-        Self::AsServed,
-        Self::Backend,
-        Self::Detail,
-        Self::Reach,
-        Self::Record,
-        Self::Antialiasing,
-        Self::AlphaCut,
-        Self::Stop,
-        Self::Sky,
-        Self::Rays,
-        Self::Scale,
-        Self::Sent,
-        Self::Combined,
-    ];
-
-    /// What people call it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::AsServed => "as served",
-            Self::Backend => "backend",
-            Self::Detail => "levels of detail",
-            Self::Reach => "reach",
-            Self::Record => "record",
-            Self::Antialiasing => "antialiasing",
-            Self::AlphaCut => "alpha cut",
-            Self::Stop => "stop",
-            Self::Sky => "sky",
-            Self::Rays => "rays",
-            Self::Scale => "image scale",
-            Self::Sent => "as sent",
-            Self::Combined => "combined",
-        }
-    }
-}
-
-/// Errors on the screen, in pixels.
+/// Values of `tau_px`: largest error of a level of detail on the screen, in pixels.
 const TAUS_PX: [f64; 5] = [0.0, 0.5, 1.0, 2.0, 4.0];
-/// Alphas below which nothing is blended, beside the profile's own 1/255.
-const CUTS: [f64; 3] = [0.008, 0.016, 0.032];
-/// Transmittances that end a pixel, beside the profile's own 1e-4.
+/// Values of `alpha_cut`, beside the default 1/255.
+const ALPHA_CUTS: [f64; 3] = [0.008, 0.016, 0.032];
+/// Values of `stop`, the transmittance that ends a pixel, beside the default 1e-4.
 const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
-/// Errors of a baked sky; 0 evaluates it for every pixel.
+/// Values of `sky_error`: colour error of the baked sky; 0 evaluates it for every pixel.
 const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
-/// Sides of the images.
+/// Scales of the image's sides.
 const SCALES: [f64; 2] = [0.5, 0.25];
-/// Qualities of JPEG; 90 is the server's.
-const QUALITIES: [u8; 4] = [50, 75, 90, 98];
+/// JPEG qualities; 90 is the server's default.
+const JPEG_QUALITIES: [u8; 4] = [50, 75, 90, 98];
+/// `tau_px` and `alpha_cut` of the combined settings, from cautious to coarse.
+const COMBINED: [Combination; 4] = [
+    Combination { tau_px: 2.0, alpha_cut: ALPHA_CUTS[0] },
+    Combination { tau_px: 2.0, alpha_cut: ALPHA_CUTS[1] },
+    Combination { tau_px: 4.0, alpha_cut: ALPHA_CUTS[1] },
+    Combination { tau_px: 4.0, alpha_cut: ALPHA_CUTS[2] },
+];
+/// `stop` of the combined settings.
+const COMBINED_STOP: f64 = STOPS[1];
 
-/// Tiles are no rung: why.
-const TILE: &str = "16 x 16 px by construction: sixteen vectors of 4 x 4 on the cpu, the pixels of a workgroup on \
-                    the gpu; a macro tile has 8 x 4 of them, the bits of a word. The image is the same with any";
+struct Combination {
+    tau_px: f64,
+    alpha_cut: f64,
+}
 
-/// Every setting that the twin can feel: `backends` many backends, of which the first draws all; only
-/// coarser records than the twin's own are compared with it.
+/// Why there is no setting for the tile size.
+const TILE_SIZE_REASON: &str = "16 x 16 px is part of the kernels' design: sixteen vectors of 4 x 4 px on \
+                                the cpu backend, four pixels for each thread of a workgroup on the gpu \
+                                backend. A macro tile has 8 x 4 tiles, one for each bit of a word. Another \
+                                size is another kernel, and the image would be the same";
+
+/// Every setting that can affect the twin. `backends` are names; the first backend renders all settings.
+/// Only record formats coarser than the twin's own are compared with it.
 pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingList {
-    let profile = &twin.profile;
-    let served = Setting {
-        name: "as served".to_owned(),
-        family: Family::AsServed,
-        backend: 0,
-        record: None,
-        profile: Vec::new(),
-        scale: 1.0,
-        sent: None,
-        against: Rays::Splats,
-    };
-    let changed = |family, changes: &[String]| Setting {
-        name: changes.join(" "),
-        family,
-        profile: changes.to_vec(),
-        ..served.clone()
-    };
-    let mut all = vec![served.clone()];
-    let mut skipped = vec![Skipped::new("tile size", TILE)];
-    for (backend, name) in backends.iter().enumerate().skip(1) {
-        let (name, family) = ((*name).to_owned(), Family::Backend);
-        all.push(Setting { name, family, backend, ..served.clone() });
-    }
-    let tau = |tau_px: f64| format!("tau_px={tau_px}");
-    if twin.levels {
-        let taus = TAUS_PX.into_iter().filter(|tau_px| *tau_px != profile.tau_px);
-        all.extend(taus.map(|tau_px| changed(Family::Detail, &[tau(tau_px)])));
-    } else {
-        skipped.push(Skipped::new("tau_px", "the twin has no levels of detail"));
-    }
-    match profile.reach_m {
-        None => skipped.push(Skipped::new("reach_m", "the twin is drawn however far it goes")),
-        Some(_) => all.push(changed(Family::Reach, &["reach_m=none".to_owned()])),
-    }
-    let mut coarser = RecordFormat::ALL
-        .into_iter()
-        .skip_while(|record| *record != twin.stored)
-        .skip(1)
-        .peekable();
-    if coarser.peek().is_none() {
-        skipped.push(Skipped::new("record", "the twin's own is the coarsest"));
-    }
-    all.extend(coarser.map(|record| Setting {
-        name: format!("record {record}"),
-        family: Family::Record,
-        record: Some(record),
-        ..served.clone()
-    }));
-    let other = format!("antialiased={}", !profile.antialiased);
-    all.push(changed(Family::Antialiasing, &[other]));
-    let cut = |cut: f64| format!("alpha_cut={cut}");
-    let cuts = || CUTS.into_iter().filter(|cut| *cut > profile.alpha_cut);
-    all.extend(cuts().map(|alpha| changed(Family::AlphaCut, &[cut(alpha)])));
-    let stop = |stop: f64| format!("stop={stop}");
-    let stops = STOPS.into_iter().filter(|stop| *stop > profile.stop);
-    all.extend(stops.map(|left| changed(Family::Stop, &[stop(left)])));
-    match twin.behind {
-        BackgroundKind::Nothing => skipped.push(Skipped::new("sky_error", "the twin has no sky")),
-        BackgroundKind::Images => {
-            skipped.push(Skipped::new("sky_error", "the sky is images: they are their own map"));
-        }
-        BackgroundKind::Network => {
-            let others = SKY_ERRORS.into_iter().filter(|error| *error != profile.sky_error);
-            all.extend(others.map(|e| changed(Family::Sky, &[format!("sky_error={e}")])));
+    let mut list = ListBuilder::new(twin);
+    list.add_backends(backends);
+    list.add_levels_of_detail();
+    list.add_draw_distance();
+    list.add_records();
+    list.add_blending();
+    list.add_sky();
+    list.add_exact_rays();
+    list.add_scales();
+    list.add_encodings();
+    list.add_combinations();
+    SettingList { settings: list.settings, skipped: list.skipped }
+}
+
+/// Collects settings, family by family, in the order of the report.
+struct ListBuilder<'a> {
+    twin: &'a TwinFeatures,
+    as_served: Setting,
+    settings: Vec<Setting>,
+    skipped: Vec<Skipped>,
+}
+
+impl<'a> ListBuilder<'a> {
+    fn new(twin: &'a TwinFeatures) -> Self {
+        let as_served = Setting {
+            name: "as served".to_owned(),
+            family: Family::AsServed,
+            backend: 0,
+            record: None,
+            profile: Vec::new(),
+            scale: 1.0,
+            encoding: None,
+            reference_rays: Rays::Splats,
+        };
+        Self {
+            twin,
+            settings: vec![as_served.clone()],
+            as_served,
+            skipped: vec![Skipped::new("tile size", TILE_SIZE_REASON)],
         }
     }
-    match twin.bent {
-        false => skipped.push(Skipped::new("rays", "every camera is a pinhole at rest")),
-        true => all.push(Setting {
+
+    /// A setting that changes fields of the profile.
+    fn profile_setting(&self, family: Family, changes: Vec<String>) -> Setting {
+        Setting { name: changes.join(" "), family, profile: changes, ..self.as_served.clone() }
+    }
+
+    fn add_profile_change(&mut self, family: Family, change: String) {
+        let setting = self.profile_setting(family, vec![change]);
+        self.settings.push(setting);
+    }
+
+    fn skip(&mut self, what: &str, reason: &str) {
+        self.skipped.push(Skipped::new(what, reason));
+    }
+
+    fn add_backends(&mut self, backends: &[&str]) {
+        for (backend, name) in backends.iter().enumerate().skip(1) {
+            let name = (*name).to_owned();
+            let family = Family::Backend;
+            self.settings.push(Setting { name, family, backend, ..self.as_served.clone() });
+        }
+    }
+
+    fn add_levels_of_detail(&mut self) {
+        if !self.twin.has_levels {
+            self.skip("tau_px", "the twin has no levels of detail");
+            return;
+        }
+        for tau_px in TAUS_PX.into_iter().filter(|tau_px| *tau_px != self.twin.profile.tau_px) {
+            self.add_profile_change(Family::Detail, tau_change(tau_px));
+        }
+    }
+
+    fn add_draw_distance(&mut self) {
+        match self.twin.profile.reach_m {
+            None => self.skip("reach_m", "the profile does not limit the draw distance"),
+            Some(_) => {
+                self.add_profile_change(Family::DrawDistance, "reach_m=none".to_owned());
+            }
+        }
+    }
+
+    fn add_records(&mut self) {
+        // Records are listed from exact to coarse.
+        let own = self.twin.record;
+        let from_own = RecordFormat::ALL.into_iter().skip_while(|record| *record != own);
+        let coarser: Vec<RecordFormat> = from_own.skip(1).collect();
+        if coarser.is_empty() {
+            self.skip("record", "the twin is stored in the coarsest record format");
+        }
+        for record in coarser {
+            self.settings.push(Setting {
+                name: format!("record {record}"),
+                family: Family::Record,
+                record: Some(record),
+                ..self.as_served.clone()
+            });
+        }
+    }
+
+    /// Antialiasing, the smallest alpha, and the transmittance that ends a pixel.
+    fn add_blending(&mut self) {
+        let profile = self.twin.profile;
+        let antialiased = format!("antialiased={}", !profile.antialiased);
+        self.add_profile_change(Family::Antialiasing, antialiased);
+        for alpha_cut in ALPHA_CUTS.into_iter().filter(|cut| *cut > profile.alpha_cut) {
+            self.add_profile_change(Family::AlphaCut, alpha_cut_change(alpha_cut));
+        }
+        for stop in STOPS.into_iter().filter(|stop| *stop > profile.stop) {
+            self.add_profile_change(Family::Stop, stop_change(stop));
+        }
+    }
+
+    fn add_sky(&mut self) {
+        match self.twin.background {
+            BackgroundKind::Plain => self.skip("sky_error", "the twin has no sky"),
+            BackgroundKind::Images => {
+                self.skip("sky_error", "the sky is made of images, which need no baking");
+            }
+            BackgroundKind::Network => {
+                let own = self.twin.profile.sky_error;
+                for error in SKY_ERRORS.into_iter().filter(|error| *error != own) {
+                    self.add_profile_change(Family::Sky, format!("sky_error={error}"));
+                }
+            }
+        }
+    }
+
+    fn add_exact_rays(&mut self) {
+        if !self.twin.has_non_pinhole {
+            self.skip(
+                "rays",
+                "every camera is a pinhole at rest, for which splats need no correction",
+            );
+            return;
+        }
+        self.settings.push(Setting {
             name: "against every pixel's own ray".to_owned(),
             family: Family::Rays,
-            against: Rays::Exact,
-            ..served.clone()
-        }),
+            reference_rays: Rays::Exact,
+            ..self.as_served.clone()
+        });
     }
-    all.extend(SCALES.map(|scale| Setting {
-        name: format!("scale {scale}"),
-        family: Family::Scale,
-        scale,
-        ..served.clone()
-    }));
-    let sent =
-        |sent, name| Setting { name, family: Family::Sent, sent: Some(sent), ..served.clone() };
-    all.push(sent(Sent::Raw, "8 bits".to_owned()));
-    all.extend(QUALITIES.map(|quality| sent(Sent::Jpeg(quality), format!("jpeg {quality}"))));
-    for (tau_px, alpha) in [(2.0, CUTS[0]), (2.0, CUTS[1]), (4.0, CUTS[1]), (4.0, CUTS[2])] {
-        let mut changes = vec![cut(alpha), stop(STOPS[1])];
-        if twin.levels {
-            changes.insert(0, tau(tau_px));
-        }
-        let combined = changed(Family::Combined, &changes);
-        if all.iter().all(|other| other.name != combined.name) {
-            all.push(combined);
+
+    fn add_scales(&mut self) {
+        let scaled = |scale: f64| Setting {
+            name: format!("scale {scale}"),
+            family: Family::Scale,
+            scale,
+            ..self.as_served.clone()
+        };
+        let scaled = SCALES.map(scaled);
+        self.settings.extend(scaled);
+    }
+
+    fn add_encodings(&mut self) {
+        let encoded = |name: String, encoding: ImageEncoding| Setting {
+            name,
+            family: Family::Encoding,
+            encoding: Some(encoding),
+            ..self.as_served.clone()
+        };
+        let raw = encoded("8 bits".to_owned(), ImageEncoding::Raw);
+        let jpegs = JPEG_QUALITIES
+            .map(|quality| encoded(format!("jpeg {quality}"), ImageEncoding::Jpeg(quality)));
+        self.settings.push(raw);
+        self.settings.extend(jpegs);
+    }
+
+    fn add_combinations(&mut self) {
+        for Combination { tau_px, alpha_cut } in COMBINED {
+            let mut changes = vec![alpha_cut_change(alpha_cut), stop_change(COMBINED_STOP)];
+            if self.twin.has_levels {
+                changes.insert(0, tau_change(tau_px));
+            }
+            let combined = self.profile_setting(Family::Combined, changes);
+            // Without levels of detail two combinations are the same.
+            if self.settings.iter().all(|other| other.name != combined.name) {
+                self.settings.push(combined);
+            }
         }
     }
-    SettingList { settings: all, skipped }
+}
+
+fn tau_change(tau_px: f64) -> String {
+    format!("tau_px={tau_px}")
+}
+
+fn alpha_cut_change(alpha_cut: f64) -> String {
+    format!("alpha_cut={alpha_cut}")
+}
+
+fn stop_change(stop: f64) -> String {
+    format!("stop={stop}")
 }
 
 impl TwinFeatures {
-    /// Of a version of a twin, with the sky that it has, and what looks at it.
-    pub fn of(manifest: &Manifest, sky: Option<&Sky>, views: &[View]) -> Self {
-        let sections = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
+    /// The features of a version of a twin, with its sky and with the cameras of the report.
+    pub fn new(manifest: &Manifest, sky: Option<&Sky>, views: &[View]) -> Self {
+        let mut sections = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
         Self {
             profile: manifest.profile,
-            stored: manifest.record,
-            levels: sections.into_iter().any(|section| section.level > 0),
-            behind: match sky.map(Sky::model) {
-                None => BackgroundKind::Nothing,
+            record: manifest.record,
+            has_levels: sections.any(|section| section.level > 0),
+            background: match sky.map(Sky::model) {
+                None => BackgroundKind::Plain,
                 Some(SkyModel::Network(..)) => BackgroundKind::Network,
                 Some(SkyModel::Cube(_)) => BackgroundKind::Images,
             },
-            bent: views.iter().any(|view| !view.is_static_pinhole()),
+            has_non_pinhole: views.iter().any(|view| !view.is_static_pinhole()),
         }
     }
-}
-
-impl Setting {
-    /// The twin's profile with the setting's changes.
-    ///
-    /// # Errors
-    /// Names the change that cannot be made.
-    pub fn apply(&self, mut profile: RenderProfile) -> Result<RenderProfile, ProfileError> {
-        self.profile.iter().try_for_each(|change| profile.set(change))?;
-        Ok(profile)
-    }
-
-    /// Whether a server can be told to draw so without the twin being stored anew.
-    pub fn can_be_served(&self) -> bool {
-        let as_drawn = self.scale == 1.0 && self.sent.is_none() && self.against == Rays::Splats;
-        self.record.is_none() && as_drawn
-    }
-}
-
-/// A view with sides and intrinsics scaled.
-///
-/// # Errors
-/// The scaled camera cannot be used.
-pub(super) fn scaled(view: View, scale: f64) -> Result<View, CameraError> {
-    let side = |px: u32| ((f64::from(px) * scale).round() as u64).max(1);
-    let View { camera, .. } = view;
-    Ok(View { camera: camera.scaled(side(camera.width_px), side(camera.height_px))?, ..view })
 }

@@ -1,92 +1,114 @@
-//! How long a step takes: in turn with the twin as it is served, since machines are not always as fast.
+//! How long a step takes, measured in turn with a step of the twin as it is served.
+//!
+//! The speed of a machine changes while a report is made. Timed one after another, the last settings took
+//! twice as long as the first, because other programs had begun to compile. A step of the served twin right
+//! after each step of a setting tells how fast the machine was at that moment;
+//! [`super::measurement::normalize_machine_speed`] scales all times to one speed.
 
 use std::time::Instant;
 
 use parking_lot::Mutex;
 
-use super::ReportError;
-use super::settings::Sent;
+use super::error::ReportError;
+use super::setting::ImageEncoding;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 
-/// A step of all cameras: drawn, and encoded if it says how images are sent.
+/// A step of all cameras: rendered, and encoded if it has an encoding.
 #[derive(Clone, Copy)]
 pub(super) struct Step<'a> {
     pub backend: &'a dyn Backend,
     pub scene: &'a Scene,
     pub profile: &'a RenderProfile,
     pub views: &'a [View],
-    pub sent: Option<Sent>,
+    pub encoding: Option<ImageEncoding>,
 }
 
-/// What it takes.
+/// Times of a step, and of the baseline in turn with it.
 #[derive(Default)]
-pub(super) struct Timed {
+pub(super) struct StepTimes {
     /// Time of each step, in milliseconds.
     pub steps_ms: Vec<f64>,
-    /// The same of the twin as served, each right after.
-    pub served_ms: Vec<f64>,
+    /// Time of the baseline's step right after it, in milliseconds.
+    pub baseline_ms: Vec<f64>,
     /// Bytes of a step's images as they are sent.
     pub sent_bytes: u64,
 }
 
+/// One run of a step.
+struct StepRun {
+    ms: f64,
+    sent_bytes: u64,
+}
+
 impl Step<'_> {
-    /// Times it so often, in turn with the twin as served; the first of each makes room, and is not counted.
-    pub(super) fn time(&self, served: &Step<'_>, repeat: u32) -> Result<Timed, ReportError> {
-        let mut timed = Timed::default();
-        let (mut own_images, mut served_images) = (self.images(), served.images());
-        for counted in 0..=repeat {
-            let (own_ms, sent_bytes) = self.run(&mut own_images)?;
-            let (served_ms, _) = served.run(&mut served_images)?;
-            timed.sent_bytes = sent_bytes;
-            if counted > 0 {
-                timed.steps_ms.push(own_ms);
-                timed.served_ms.push(served_ms);
+    /// Times the step `repeat` times, in turn with `baseline`. One more run of each comes first and is not
+    /// counted: it allocates buffers.
+    pub(super) fn time(&self, baseline: &Step<'_>, repeat: u32) -> Result<StepTimes, ReportError> {
+        let mut times = StepTimes::default();
+        let mut own_images = self.empty_images();
+        let mut baseline_images = baseline.empty_images();
+        for run in 0..=repeat {
+            let own_run = self.run(&mut own_images)?;
+            let baseline_run = baseline.run(&mut baseline_images)?;
+            times.sent_bytes = own_run.sent_bytes;
+            let is_warm_up = run == 0;
+            if !is_warm_up {
+                times.steps_ms.push(own_run.ms);
+                times.baseline_ms.push(baseline_run.ms);
             }
         }
-        Ok(timed)
+        Ok(times)
     }
 
-    /// Draws it once.
-    pub(super) fn draw(&self) -> Result<(), ReportError> {
-        self.run(&mut self.images()).map(|_| ())
+    /// Renders the step once.
+    pub(super) fn render(&self) -> Result<(), ReportError> {
+        self.run(&mut self.empty_images())?;
+        Ok(())
     }
 
-    /// Its images, in 8 bits.
-    fn images(&self) -> Vec<Vec<u8>> {
+    /// An 8-bit image for each view.
+    fn empty_images(&self) -> Vec<Vec<u8>> {
         self.views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect()
     }
 
-    /// Draws all images, and encodes them if they are sent so: milliseconds, and bytes to send.
-    fn run(&self, images: &mut [Vec<u8>]) -> Result<(f64, u64), ReportError> {
+    /// Renders all images, and encodes each as soon as it is finished, as a session does.
+    fn run(&self, images: &mut [Vec<u8>]) -> Result<StepRun, ReportError> {
         let target = |rgb8| Target { rgb8: Some(rgb8), ..Target::default() };
         let mut targets: Vec<Target<'_>> =
             images.iter_mut().map(Vec::as_mut_slice).map(target).collect();
-        let sent_bytes = Mutex::new(Ok(0));
-        let finished = |view: usize, target: &Target<'_>| {
+        // Images are finished on several threads. After an error the sum stays that error.
+        let sent_bytes: Mutex<Result<u64, String>> = Mutex::new(Ok(0));
+        let on_finished = |view: usize, target: &Target<'_>| {
             let rgb8 = target.rgb8.as_deref().unwrap_or_default();
-            let file = file(self.sent, &self.views[view], rgb8);
+            let file = encode(self.encoding, &self.views[view], rgb8);
             let bytes = file.map(|file| file.map_or(rgb8.len(), |file| file.len()) as u64);
             let mut sum = sent_bytes.lock();
-            *sum = sum.clone().and_then(|sum: u64| Ok(sum + bytes?));
+            *sum = sum.clone().and_then(|sum| Ok(sum + bytes?));
         };
         let frame = Frame { scene: self.scene, profile: self.profile, views: self.views };
+
         let start = Instant::now();
-        self.backend.render(&frame, &mut targets, &finished)?;
+        self.backend.render(&frame, &mut targets, &on_finished)?;
         let ms = start.elapsed().as_secs_f64() * 1e3;
-        Ok((ms, sent_bytes.into_inner().map_err(|reason| ReportError::Encode { reason })?))
+
+        let sent_bytes = sent_bytes.into_inner();
+        let sent_bytes = sent_bytes.map_err(|reason| ReportError::Encode { reason })?;
+        Ok(StepRun { ms, sent_bytes })
     }
 }
 
-/// A JPEG of an image if it is sent as one.
-pub(super) fn file(
-    sent: Option<Sent>,
+/// The image as a JPEG file, if the encoding is JPEG.
+pub(super) fn encode(
+    encoding: Option<ImageEncoding>,
     view: &View,
     rgb8: &[u8],
 ) -> Result<Option<Vec<u8>>, String> {
-    let (width, height) = (view.camera.width_px, view.camera.height_px);
-    match sent {
-        Some(Sent::Jpeg(quality)) => wildcity_session::jpeg(rgb8, width, height, quality).map(Some),
-        Some(Sent::Raw) | None => Ok(None),
+    match encoding {
+        Some(ImageEncoding::Jpeg(quality)) => {
+            let camera = &view.camera;
+            wildcity_session::jpeg(rgb8, camera.width_px, camera.height_px, quality).map(Some)
+        }
+        Some(ImageEncoding::Raw) | None => Ok(None),
     }
 }

@@ -1,6 +1,6 @@
-//! Who may do what: bearer tokens, with a role and the twins that they reach.
+//! Bearer tokens: each has a role and the twins that it may use.
 //!
-//! A server without tokens listens on this machine alone, and whoever reaches it may do everything.
+//! A server without tokens listens on a loopback address only, and every client may do everything.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -9,31 +9,31 @@ use blake3::Hash;
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 
-use super::fault::Fault;
+use crate::fault::Fault;
 
-/// What a token allows.
+/// What the holder of a token may do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// To open sessions.
+    /// Open sessions.
     Drive,
-    /// To upload and push.
+    /// Upload and push.
     Push,
     /// Everything.
     Admin,
 }
 
-/// Whoever sends requests.
+/// What a client may do.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Grant {
-    /// Of the token; empty where there are none.
-    pub(super) name: String,
+pub(crate) struct Grant {
+    /// Name of the token; empty on a server without tokens.
+    pub(crate) name: String,
     role: Role,
-    /// Twins that it sees; all if none is said.
+    /// Names of the twins that it may use; all twins if there is no list.
     twins: Option<BTreeSet<String>>,
 }
 
-/// The tokens that a server knows.
+/// The tokens that a server accepts.
 #[derive(Clone, Debug)]
 pub struct Tokens(Vec<Token>);
 
@@ -43,21 +43,23 @@ struct Token {
     secret: Secret,
 }
 
-/// BLAKE3 of a token, or of the SHA-256 of one: neither can be turned back, and comparing two of
-/// them takes the same time whatever they are.
+/// A hash of a token. It cannot be inverted, and comparing two hashes takes the same time whether they
+/// are equal or not.
 #[derive(Clone, Debug)]
 enum Secret {
+    /// BLAKE3 of the token.
     OfToken(Hash),
+    /// BLAKE3 of the token's SHA-256.
     OfSha256(Hash),
 }
 
-/// Why a file of tokens cannot be used. Says nothing of the tokens themselves.
+/// Why a file of tokens cannot be used. The message contains no token.
 #[derive(Debug, thiserror::Error)]
-#[error("{place}: {reason}")]
+#[error("{location}: {reason}")]
 pub struct TokensError {
-    /// Where in the file, as `tokens[2].hash`.
-    pub place: String,
-    /// What is wrong, and what must hold instead.
+    /// The location in the file, as `tokens[2].hash`.
+    pub location: String,
+    /// What is wrong, and what is expected.
     pub reason: String,
 }
 
@@ -77,7 +79,7 @@ struct Entry {
     twins: Option<BTreeSet<String>>,
 }
 
-/// Shortest token that cannot be guessed: 16 characters of base64 are 96 bits.
+/// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to guess.
 const MIN_TOKEN_BYTES: usize = 16;
 
 impl Tokens {
@@ -87,21 +89,22 @@ impl Tokens {
     /// # Errors
     /// Names the first entry that cannot be used.
     pub fn parse(text: &[u8]) -> Result<Self, TokensError> {
-        let wrong = |place: String, reason: &str| TokensError { place, reason: reason.to_owned() };
+        let wrong =
+            |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
         let file: File = serde_json::from_slice(text).map_err(|error| {
-            // serde's own words would repeat a token that stands where something else should.
-            let place = format!("line {}, column {}", error.line(), error.column());
-            wrong(place, "not {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}")
+            // serde's message could quote a token that is in the wrong place.
+            let location = format!("line {}, column {}", error.line(), error.column());
+            wrong(location, "not {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}")
         })?;
         if file.tokens.is_empty() {
-            return Err(wrong("tokens".to_owned(), "there is none: nobody could come in"));
+            return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));
         }
         let mut tokens: Vec<Token> = Vec::with_capacity(file.tokens.len());
         for (index, Entry { name, role, token, hash, twins }) in file.tokens.into_iter().enumerate()
         {
-            // Sessions belong to the name.
+            // A session belongs to the name of a token, so that names are unique.
             if name.is_empty() || tokens.iter().any(|other| other.grant.name == name) {
-                let reason = "a name is not empty, and of one token only";
+                let reason = "a name is not empty, and belongs to one token only";
                 return Err(wrong(format!("tokens[{index}].name"), reason));
             }
             let secret = match (token, hash) {
@@ -109,7 +112,7 @@ impl Tokens {
                     Secret::OfToken(blake3::hash(token.as_bytes()))
                 }
                 (Some(_), None) => {
-                    let reason = format!("a token has {MIN_TOKEN_BYTES} characters and more");
+                    let reason = format!("a token has at least {MIN_TOKEN_BYTES} characters");
                     return Err(wrong(format!("tokens[{index}].token"), &reason));
                 }
                 (None, Some(hash)) => Secret::parse(&hash).ok_or_else(|| {
@@ -126,26 +129,26 @@ impl Tokens {
         Ok(Self(tokens))
     }
 
-    /// What the value of an `Authorization` header allows.
+    /// What the token in the value of an `Authorization` header allows.
     ///
     /// # Errors
-    /// [`Fault::Unauthorized`]: there is none, or it is not known.
-    pub(super) fn grant(&self, authorization: Option<&[u8]>) -> Result<Arc<Grant>, Fault> {
+    /// [`Fault::Unauthorized`]: there is no token, or the server does not know it.
+    pub(crate) fn grant(&self, authorization: Option<&[u8]>) -> Result<Arc<Grant>, Fault> {
         let token = authorization.and_then(bearer).ok_or(Fault::Unauthorized)?;
         let of_token = blake3::hash(token);
         let of_sha256 = blake3::hash(&Sha256::digest(token));
-        // All of them, however early one fits: time says nothing of which.
-        let mut found = None;
+        // Compares with all tokens even after a match: the time must not depend on which one it is.
+        let mut matching = None;
         for Token { grant, secret } in &self.0 {
-            let fits = match secret {
+            let is_equal = match secret {
                 Secret::OfToken(hash) => *hash == of_token,
                 Secret::OfSha256(hash) => *hash == of_sha256,
             };
-            if fits {
-                found = Some(grant);
+            if is_equal {
+                matching = Some(grant);
             }
         }
-        found.cloned().ok_or(Fault::Unauthorized)
+        matching.cloned().ok_or(Fault::Unauthorized)
     }
 }
 
@@ -162,14 +165,16 @@ impl Secret {
 }
 
 impl Grant {
-    /// Of whoever reaches a server without tokens.
-    pub(super) fn everything() -> Arc<Self> {
+    /// The grant of every client of a server without tokens.
+    pub(crate) fn everything() -> Arc<Self> {
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None })
     }
 
+    /// Requires a role, which [`Role::Admin`] includes.
+    ///
     /// # Errors
-    /// [`Fault::Forbidden`] if the token is of another role.
-    pub(super) fn may(&self, role: Role) -> Result<(), Fault> {
+    /// [`Fault::Forbidden`] if the token has another role.
+    pub(crate) fn require(&self, role: Role) -> Result<(), Fault> {
         if self.role == role || self.role == Role::Admin {
             return Ok(());
         }
@@ -177,17 +182,19 @@ impl Grant {
         Err(Fault::Forbidden { reason: format!("its role is {}, not {needs}", self.role.name()) })
     }
 
+    /// Requires access to a twin.
+    ///
     /// # Errors
-    /// [`Fault::Forbidden`] if the token does not reach the twin.
-    pub(super) fn reaches(&self, twin: &str) -> Result<(), Fault> {
-        if self.sees(twin) {
+    /// [`Fault::Forbidden`] if the token may not use the twin.
+    pub(crate) fn require_twin(&self, twin: &str) -> Result<(), Fault> {
+        if self.allows_twin(twin) {
             return Ok(());
         }
-        Err(Fault::Forbidden { reason: format!("it does not reach twin {twin:?}") })
+        Err(Fault::Forbidden { reason: format!("it does not include twin {twin:?}") })
     }
 
-    /// Whether the twin is shown to it.
-    pub(super) fn sees(&self, twin: &str) -> bool {
+    /// Whether the token may use the twin. Other twins are not listed either.
+    pub(crate) fn allows_twin(&self, twin: &str) -> bool {
         self.twins.as_ref().is_none_or(|twins| twins.contains(twin))
     }
 }
@@ -202,7 +209,7 @@ impl Role {
     }
 }
 
-/// The token of `Bearer TOKEN` (RFC 6750, section 2.1; the scheme has no case).
+/// The token of `Bearer TOKEN` (RFC 6750, section 2.1; the scheme is case-insensitive).
 fn bearer(authorization: &[u8]) -> Option<&[u8]> {
     let (scheme, token) = authorization.split_at_checked("Bearer ".len())?;
     scheme.eq_ignore_ascii_case(b"Bearer ").then(|| token.trim_ascii())
@@ -214,8 +221,8 @@ mod tests {
 
     #[test]
     fn tokens_are_known_by_themselves_and_by_their_hashes() {
-        let (blake3, sha256) = (blake3::hash(b"one"), Sha256::digest(b"two"));
-        let sha256 = blake3::Hash::from_bytes(sha256.into());
+        let blake3 = blake3::hash(b"one");
+        let sha256 = blake3::Hash::from_bytes(Sha256::digest(b"two").into());
         let text = format!(
             r#"{{"tokens": [
                 {{"name": "a", "role": "drive", "hash": "blake3:{blake3}", "twins": ["street"]}},
@@ -231,16 +238,16 @@ mod tests {
             assert!(matches!(name(bad), Err(Fault::Unauthorized)), "{bad}");
         }
         assert!(matches!(tokens.grant(None), Err(Fault::Unauthorized)));
-        // The hash of a token is none.
+        // The hash of a token is not itself a token.
         assert!(name(&format!("Bearer {blake3}")).is_err());
         let grant = tokens.grant(Some(b"Bearer one")).unwrap();
-        assert!(grant.may(Role::Drive).is_ok() && grant.may(Role::Push).is_err());
-        assert!(grant.sees("street") && !grant.sees("road"));
+        assert!(grant.require(Role::Drive).is_ok() && grant.require(Role::Push).is_err());
+        assert!(grant.allows_twin("street") && !grant.allows_twin("road"));
     }
 
     #[test]
     fn a_file_of_tokens_is_refused_without_repeating_them() {
-        for (text, place) in [
+        for (text, location) in [
             (r#"{"tokens": []}"#, "tokens"),
             (
                 r#"{"tokens": [{"name": "a", "role": "king", "token": "secretsecretsecret"}]}"#,
@@ -264,7 +271,7 @@ mod tests {
             (r#"{"tokens": [{"name": "a", "role": "drive", "hash": "secret"}]}"#, "tokens[0].hash"),
         ] {
             let error = Tokens::parse(text.as_bytes()).unwrap_err().to_string();
-            assert!(error.starts_with(place) && !error.contains("secret"), "{error}");
+            assert!(error.starts_with(location) && !error.contains("secret"), "{error}");
         }
     }
 }

@@ -1,104 +1,106 @@
 //! One agent, in lock step: read a request, answer it.
 //!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
-//! repeats one that was refused; one that was carried out is never carried out again, but its
-//! answer is sent again.
+//! repeats one that was refused. A request that was carried out is never carried out again: if its
+//! number is repeated, the stored answer is sent again.
 
 use std::future::pending;
 use std::sync::Arc;
 
 use tokio::time::{Instant, sleep_until, timeout};
 
+use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
+
+use crate::auth::Grant;
+use crate::convert::{self, Command, Parsed};
+use crate::fault::Fault;
 use crate::limits;
-use wildcity_session::{Observation, Outcome, Session, SessionError};
+use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
+use crate::socket::{Disconnect, Incoming, Socket};
+use crate::state::ServerState;
 
-use super::Server;
-use super::auth::Grant;
-use super::convert::{self, Command, Parsed};
-use super::fault::Fault;
-use super::sessions::{Answer, Place};
-use super::socket::{Incoming, Lost, Socket};
-
-/// Serves a client until it leaves or is turned away. An open session is parked then.
-pub(super) async fn serve(server: Arc<Server>, socket: Socket, grant: Arc<Grant>) {
-    let hello_by = Instant::now() + server.limits.hello;
+/// Serves a client until the connection ends. An open session is parked then.
+pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Grant>) {
+    let hello_deadline = Instant::now() + state.limits.hello;
     let mut connection = Connection {
-        server,
+        state,
         socket,
         grant,
-        hello_by,
-        greeted: false,
-        answered: None,
+        hello_deadline,
+        hello_done: false,
+        answered_seq: None,
         last: None,
-        place: None,
+        slot: None,
     };
-    let lost = connection.run().await;
-    connection.end(lost).await;
+    let reason = connection.run().await;
+    connection.end(reason).await;
 }
 
 struct Connection {
-    server: Arc<Server>,
+    state: Arc<ServerState>,
     socket: Socket,
     grant: Arc<Grant>,
-    /// When `hello` must have come, however much else comes before it.
-    hello_by: Instant,
-    greeted: bool,
+    /// When `hello` must have come, whatever else comes before it.
+    hello_deadline: Instant,
+    hello_done: bool,
     /// Number of the last request answered, refusals included.
-    answered: Option<u64>,
+    answered_seq: Option<u64>,
     /// The last request carried out, and its answer.
-    last: Option<(u64, Answer)>,
-    place: Option<Place>,
+    last: Option<AnsweredRequest>,
+    slot: Option<SlotGuard>,
 }
 
 const NO_SESSION: Fault = Fault::SessionState("no session is open; send open or resume");
 
 impl Connection {
-    async fn run(&mut self) -> Lost {
+    /// Answers requests until the connection ends; returns why it did.
+    async fn run(&mut self) -> Disconnect {
         loop {
             let handled = match self.next_request().await {
                 Ok(text) => self.handle(&text).await,
-                Err(Lost::Fault(fault)) if !fault.is_fatal() => self.refuse(None, &fault).await,
-                Err(lost) => Err(lost),
+                Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {
+                    self.refuse(None, &fault).await
+                }
+                Err(reason) => Err(reason),
             };
-            if let Err(lost) = handled {
-                return lost;
+            if let Err(reason) = handled {
+                return reason;
             }
         }
     }
 
-    async fn next_request(&mut self) -> Result<String, Lost> {
-        let idle = self.server.limits.idle;
-        let (mut deadline, awaited) = if self.greeted {
-            (Instant::now() + idle, "request")
-        } else {
-            (self.hello_by, "hello")
-        };
+    async fn next_request(&mut self) -> Result<String, Disconnect> {
+        let idle = self.state.limits.idle;
+        let awaited = if self.hello_done { "request" } else { "hello" };
+        let mut deadline =
+            if self.hello_done { Instant::now() + idle } else { self.hello_deadline };
         loop {
-            let leave = async {
-                match &self.place {
-                    Some(place) => place.leave.notified().await,
+            let released = async {
+                match &self.slot {
+                    Some(slot) => slot.release.notified().await,
                     None => pending().await,
                 }
             };
             let fault = tokio::select! {
                 incoming = self.socket.receive() => match incoming? {
                     Incoming::Text(text) => return Ok(text),
-                    Incoming::SignOfLife => {
-                        if self.greeted {
+                    Incoming::Alive => {
+                        if self.hello_done {
                             deadline = Instant::now() + idle;
                         }
                         continue;
                     }
                 },
-                () = leave => Fault::Replaced,
-                () = self.server.stopped() => Fault::ShuttingDown,
+                () = released => Fault::Replaced,
+                () = self.state.stopped() => Fault::ShuttingDown,
                 () = sleep_until(deadline) => Fault::TimedOut(awaited),
             };
-            return Err(Lost::Fault(fault));
+            return Err(Disconnect::Fault(fault));
         }
     }
 
-    async fn handle(&mut self, text: &str) -> Result<(), Lost> {
+    /// Answers one request.
+    async fn handle(&mut self, text: &str) -> Result<(), Disconnect> {
         let parsed = if text.len() <= limits::INLINE_REQUEST_BYTES {
             convert::parse(text)
         } else {
@@ -110,20 +112,24 @@ impl Connection {
             Parsed::Numbered { seq, command } => (seq, command),
             Parsed::Unnumbered(fault) => return self.refuse(None, &fault).await,
         };
-        if let Some((last, answer)) = &self.last
-            && *last == seq
+
+        // A repeated request gets the stored answer.
+        if let Some(last) = &self.last
+            && last.seq == seq
         {
-            let answer = answer.clone();
+            let answer = last.answer.clone();
             return self.send(&answer).await;
         }
         if let Err(fault) = self.check_order(seq) {
             return self.refuse(Some(seq), &fault).await;
         }
-        self.answered = Some(seq);
-        if let Some(place) = &mut self.place {
-            place.answered = seq;
+
+        // Carries the request out.
+        self.answered_seq = Some(seq);
+        if let Some(slot) = &mut self.slot {
+            slot.answered_seq = seq;
         }
-        let resumes = matches!(command, Ok(Command::Resume { .. }));
+        let is_resume = matches!(command, Ok(Command::Resume { .. }));
         let carried_out = match command {
             Ok(command) => self.carry_out(seq, command).await,
             Err(fault) => Err(fault),
@@ -132,24 +138,27 @@ impl Connection {
             Ok(answer) => answer,
             Err(fault) => return self.refuse(Some(seq), &fault).await,
         };
-        if let Some(place) = &self.place {
-            place.tell();
+
+        // Stores the answer in the slot too, where it survives the connection.
+        if let Some(slot) = &self.slot {
+            slot.update_view();
         }
-        if resumes {
-            // From here on the numbers are the session's.
-            self.last = self.place.as_ref().and_then(|place| place.last.clone());
-            self.answered = self.place.as_ref().map(|place| place.answered);
+        if is_resume {
+            // From here on requests are numbered as the session's.
+            self.last = self.slot.as_ref().and_then(|slot| slot.last.clone());
+            self.answered_seq = self.slot.as_ref().map(|slot| slot.answered_seq);
         } else {
-            self.last = Some((seq, answer.clone()));
-            if let Some(place) = &mut self.place {
-                (place.last, place.answered) = (self.last.clone(), seq);
+            self.last = Some(AnsweredRequest { seq, answer: answer.clone() });
+            if let Some(slot) = &mut self.slot {
+                slot.last = self.last.clone();
+                slot.answered_seq = seq;
             }
         }
         self.send(&answer).await
     }
 
     fn check_order(&self, seq: u64) -> Result<(), Fault> {
-        let expected = match self.answered {
+        let expected = match self.answered_seq {
             None if seq == 0 => return Ok(()),
             None => "the first request of a connection is 0".to_owned(),
             Some(last) if seq == last || Some(seq) == last.checked_add(1) => return Ok(()),
@@ -161,45 +170,16 @@ impl Connection {
     async fn carry_out(&mut self, seq: u64, command: Command) -> Result<Answer, Fault> {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
-            _ if !self.greeted => Err(Fault::WrongOrder("the first request is hello")),
-            Command::Open { .. } | Command::Resume { .. } if self.place.is_some() => {
+            _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
+            Command::Open { .. } | Command::Resume { .. } if self.slot.is_some() => {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, mut opening } => {
-                opening.profile = opening.profile.or(&self.server.profile);
-                self.grant.reaches(&opening.twin)?;
-                let name =
-                    name.unwrap_or_else(|| format!("s-{}", uuid::Uuid::now_v7().as_simple()));
-                let mut place = self.server.sessions.reserve(name.clone(), &self.grant.name)?;
-                let opened = Session::open(self.server.engine.clone(), name, *opening);
-                let session = timeout(self.server.limits.step, opened)
-                    .await
-                    .map_err(|_| SessionError::DeadlineExceeded)??;
-                let text = convert::opened(seq, &session)?;
-                tracing::info!(session = session.name(), "opened");
-                place.session = Some(session);
-                self.place = Some(place);
-                Ok(Answer::Text(text.into()))
-            }
-            Command::Resume { session, last_seq } => {
-                let patience = self.server.limits.step;
-                let place =
-                    self.server.sessions.resume(&session, &self.grant.name, patience).await?;
-                if last_seq > place.answered {
-                    let expected = format!("{} is the session's last answer", place.answered);
-                    return Err(Fault::SeqOutOfOrder { seq: last_seq, expected });
-                }
-                let carried_out = place.last.as_ref().map_or(place.answered, |(last, _)| *last);
-                let session = place.session.as_ref().ok_or(NO_SESSION)?;
-                let text = convert::resumed(seq, carried_out, session)?;
-                tracing::info!(session = session.name(), "resumed");
-                self.place = Some(place);
-                Ok(Answer::Text(text.into()))
-            }
+            Command::Open { name, opening } => self.open(seq, name, *opening).await,
+            Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
             Command::Step { movement, terminate } => {
                 let begun = Instant::now();
                 let frame = self.session()?.step(movement, terminate).await?;
-                let metrics = &self.server.metrics;
+                let metrics = &self.state.metrics;
                 metrics.steps.inc();
                 metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
                 metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
@@ -218,17 +198,17 @@ impl Connection {
                 self.observation(seq, frame)
             }
             Command::SwitchVersion { version } => {
-                let patience = self.server.limits.step;
-                let switched = timeout(patience, self.session()?.switch_version(version)).await;
+                let max_wait = self.state.limits.step;
+                let switched = timeout(max_wait, self.session()?.switch_version(version)).await;
                 switched.map_err(|_| SessionError::DeadlineExceeded)??;
-                self.server.metrics.versions_switched.inc();
+                self.state.metrics.versions_switched.inc();
                 let text = convert::switched(seq, self.session()?)?;
                 Ok(Answer::Text(text.into()))
             }
             Command::Close => {
-                let session = self.place.as_mut().and_then(|place| place.session.take());
+                let session = self.slot.as_mut().and_then(|slot| slot.session.take());
                 let session = session.ok_or(NO_SESSION)?;
-                self.place = None;
+                self.slot = None;
                 tracing::info!(session = session.name(), "closed");
                 let summary = session.close(Outcome::Completed).await;
                 Ok(Answer::Text(convert::closed(seq, &summary)?.into()))
@@ -237,20 +217,55 @@ impl Connection {
     }
 
     async fn hello(&mut self, seq: u64, client: String) -> Result<Answer, Fault> {
-        if self.greeted {
-            return Err(Fault::WrongOrder("hello was said already"));
+        if self.hello_done {
+            return Err(Fault::WrongOrder("hello was sent already"));
         }
-        let engine = &self.server.engine;
+        let engine = &self.state.engine;
         let mut twins = engine.twins().await?;
-        twins.retain(|twin| self.grant.sees(&twin.name));
-        let text = convert::welcome(seq, &self.server.limits, engine.backend(), &twins)?;
+        twins.retain(|twin| self.grant.allows_twin(&twin.name));
+        let text = convert::welcome(seq, &self.state.limits, engine.backend(), &twins)?;
         tracing::debug!(client, "hello");
-        self.greeted = true;
+        self.hello_done = true;
+        Ok(Answer::Text(text.into()))
+    }
+
+    async fn open(
+        &mut self,
+        seq: u64,
+        name: Option<String>,
+        mut opening: SessionOptions,
+    ) -> Result<Answer, Fault> {
+        opening.profile = opening.profile.or(&self.state.profile);
+        self.grant.require_twin(&opening.twin)?;
+        let name = name.unwrap_or_else(|| format!("s-{}", uuid::Uuid::now_v7().as_simple()));
+        let mut slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+        let opened = Session::open(self.state.engine.clone(), name, opening);
+        let opened = timeout(self.state.limits.step, opened).await;
+        let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
+        let text = convert::opened(seq, &session)?;
+        tracing::info!(session = session.name(), "opened");
+        slot.session = Some(session);
+        self.slot = Some(slot);
+        Ok(Answer::Text(text.into()))
+    }
+
+    async fn resume(&mut self, seq: u64, name: &str, last_seq: u64) -> Result<Answer, Fault> {
+        let max_wait = self.state.limits.step;
+        let slot = self.state.sessions.resume(name, &self.grant.name, max_wait).await?;
+        if last_seq > slot.answered_seq {
+            let expected = format!("{} is the session's last answer", slot.answered_seq);
+            return Err(Fault::SeqOutOfOrder { seq: last_seq, expected });
+        }
+        let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
+        let session = slot.session.as_ref().ok_or(NO_SESSION)?;
+        let text = convert::resumed(seq, carried_out, session)?;
+        tracing::info!(session = session.name(), "resumed");
+        self.slot = Some(slot);
         Ok(Answer::Text(text.into()))
     }
 
     fn session(&mut self) -> Result<&mut Session, Fault> {
-        self.place.as_mut().and_then(|place| place.session.as_mut()).ok_or(NO_SESSION)
+        self.slot.as_mut().and_then(|slot| slot.session.as_mut()).ok_or(NO_SESSION)
     }
 
     fn observation(&mut self, seq: u64, frame: Observation) -> Result<Answer, Fault> {
@@ -258,43 +273,45 @@ impl Connection {
         Ok(Answer::Observation(Arc::new(frame)))
     }
 
-    async fn send(&mut self, answer: &Answer) -> Result<(), Lost> {
+    async fn send(&mut self, answer: &Answer) -> Result<(), Disconnect> {
         match answer {
             Answer::Text(text) => self.socket.send_text(text).await,
             Answer::Observation(frame) => {
                 let bytes = frame.buffer.bytes();
-                self.server.metrics.observation_bytes.inc_by(bytes.len() as u64);
+                self.state.metrics.observation_bytes.inc_by(bytes.len() as u64);
                 self.socket.send_binary(bytes).await
             }
         }
     }
 
-    async fn refuse(&mut self, seq: Option<u64>, fault: &Fault) -> Result<(), Lost> {
+    async fn refuse(&mut self, seq: Option<u64>, fault: &Fault) -> Result<(), Disconnect> {
         tracing::debug!(seq, "refused: {fault}");
-        self.server.metrics.refused(&convert::code(fault));
+        self.state.metrics.refused(&convert::code(fault).0);
         self.socket.send_text(&convert::refused(seq, fault)).await
     }
 
-    async fn end(mut self, lost: Lost) {
-        let (outcome, may_talk) = match &lost {
-            Lost::Gone => (Outcome::AgentLost, true),
-            Lost::Stuck => (Outcome::AgentTimeout, false),
-            Lost::Fault(Fault::TimedOut(_)) => (Outcome::AgentTimeout, true),
-            Lost::Fault(Fault::Replaced) => (Outcome::AgentLost, true),
-            Lost::Fault(Fault::ShuttingDown) => (Outcome::ServerError, true),
-            Lost::Fault(_) => (Outcome::AgentError, true),
+    /// Parks the session, sends the reason to the client if that is possible, and closes the socket.
+    async fn end(mut self, reason: Disconnect) {
+        let can_send = !matches!(reason, Disconnect::SendTimedOut);
+        let outcome = match &reason {
+            Disconnect::PeerLeft | Disconnect::Fault(Fault::Replaced) => Outcome::AgentLost,
+            Disconnect::SendTimedOut | Disconnect::Fault(Fault::TimedOut(_)) => {
+                Outcome::AgentTimeout
+            }
+            Disconnect::Fault(Fault::ShuttingDown) => Outcome::ServerError,
+            Disconnect::Fault(_) => Outcome::AgentError,
         };
-        // The session first: whoever wants to resume it need not wait for a goodbye.
-        if let Some(mut place) = self.place.take() {
-            tracing::info!(?lost, "the connection of a session ended");
-            place.outcome = outcome;
+        // The session first: a client that resumes it need not wait for this connection to close.
+        if let Some(mut slot) = self.slot.take() {
+            tracing::info!(?reason, "the connection of a session ended");
+            slot.outcome = outcome;
         }
-        if let Lost::Fault(fault) = &lost
+        if let Disconnect::Fault(fault) = &reason
             && self.refuse(None, fault).await.is_err()
         {
             return;
         }
-        if may_talk {
+        if can_send {
             self.socket.close().await;
         }
     }

@@ -1,17 +1,18 @@
-//! What a request, or a whole connection, can be refused for. `convert` gives each its wire code.
+//! Why a request or a connection was refused. `convert::fault` gives each fault its wire code and its
+//! HTTP status.
 
 use std::io;
 
+use wildcity_push::PushError;
 use wildcity_scene::appearance::AppearanceError;
 use wildcity_scene::geometry::{CameraError, PoseError};
 use wildcity_scene::rig::RigError;
 use wildcity_session::SessionError;
-use wildcity_twin::ingest::IngestError;
 use wildcity_twin::store::StoreError;
 
-/// Why a request was refused.
+/// Why a request or a connection was refused.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum Fault {
+pub(crate) enum Fault {
     /// Not JSON.
     #[error("not JSON: {0}")]
     MalformedJson(String),
@@ -26,7 +27,7 @@ pub(super) enum Fault {
     /// A binary message.
     #[error("requests are JSON text frames; only the server sends binary ones")]
     UnexpectedBinary,
-    /// More bytes than a request may have.
+    /// A message has more bytes than a request may have.
     #[error("a message of {bytes} bytes; at most {limit} are accepted")]
     MessageTooLarge {
         /// Bytes announced.
@@ -37,7 +38,7 @@ pub(super) enum Fault {
     /// The bytes are not WebSocket.
     #[error("not WebSocket: {0}")]
     BrokenFrame(String),
-    /// A number was left out, or comes again too late.
+    /// The request's number is neither the next one nor a repeated one.
     #[error("seq is {seq}; {expected}")]
     SeqOutOfOrder {
         /// The number given.
@@ -45,33 +46,33 @@ pub(super) enum Fault {
         /// The numbers accepted.
         expected: String,
     },
-    /// Before `hello`, or a second one.
+    /// A request before `hello`, or a second `hello`.
     #[error("{0}")]
     WrongOrder(&'static str),
-    /// No common version.
+    /// Server and client have no protocol version in common.
     #[error("this server speaks {server}; the client offers {}", offered.join(", "))]
     UnsupportedProtocol {
-        /// What the server speaks.
+        /// The server's version.
         server: &'static str,
-        /// What the client speaks.
+        /// The client's versions.
         offered: Vec<String>,
     },
-    /// A session is open, or none.
+    /// A session is open already on this connection, or none is.
     #[error("{0}")]
     SessionState(&'static str),
-    /// Nothing to resume.
+    /// There is no session to resume.
     #[error("there is no session {name:?} to resume; it ended, or was never opened")]
     UnknownSession {
         /// The name asked for.
         name: String,
     },
-    /// The name is taken.
+    /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {
         /// The name asked for.
         name: String,
     },
-    /// Not a name.
+    /// A text is not a name.
     #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
     InvalidName {
         /// The field.
@@ -79,7 +80,7 @@ pub(super) enum Fault {
         /// The refused text.
         name: String,
     },
-    /// Not a pose.
+    /// Numbers are not a pose.
     #[error("{field}: {cause}")]
     Pose {
         /// The pose, as `poses[3]`.
@@ -87,13 +88,13 @@ pub(super) enum Fault {
         /// What is wrong with it.
         cause: PoseError,
     },
-    /// NaN or infinity where JSON has no number.
+    /// NaN or infinity, which JSON cannot express.
     #[error("{field} is not finite; poses and actions need finite numbers")]
     NotFinite {
         /// The number, as `pose.xyz[0]`.
         field: String,
     },
-    /// Not a camera.
+    /// Numbers are not a camera.
     #[error("{field}: {cause}")]
     Camera {
         /// The camera, as `rig.cameras[2]`.
@@ -101,7 +102,7 @@ pub(super) enum Fault {
         /// What is wrong with it.
         cause: CameraError,
     },
-    /// Not what a camera makes of an image.
+    /// The exposure or the overlay of a camera cannot be used.
     #[error("{field}: {cause}")]
     Appearance {
         /// The field, as `rig.cameras[2].overlay`.
@@ -109,7 +110,7 @@ pub(super) enum Fault {
         /// What is wrong with it.
         cause: AppearanceError,
     },
-    /// Not a rig.
+    /// Cameras are not a rig.
     #[error("{cause}")]
     Rig {
         /// The field.
@@ -117,90 +118,76 @@ pub(super) enum Fault {
         /// What is wrong with it.
         cause: RigError,
     },
-    /// Too much at once.
+    /// A count has reached its maximum.
     #[error("there are {limit} {what} already; try again later")]
     Busy {
-        /// Of what.
+        /// What is counted.
         what: &'static str,
-        /// How many there are.
+        /// The maximum.
         limit: usize,
     },
-    /// Silent for too long.
+    /// The client was silent for too long.
     #[error("no {0} came in time")]
     TimedOut(&'static str),
-    /// Somebody resumed the session elsewhere.
+    /// Another connection took over the session or the upload.
     #[error("the session was resumed by another connection")]
     Replaced,
-    /// No token, or one that is not known.
+    /// The request has no token, or one that the server does not know.
     #[error("a token is needed that this server knows: send Authorization: Bearer TOKEN")]
     Unauthorized,
-    /// The token allows less.
+    /// The token's role or twins do not allow the request.
     #[error("this token may not do that: {reason}")]
     Forbidden {
         /// What it lacks.
         reason: String,
     },
-    /// Nothing to append to.
-    #[error("there is no upload {id:?}: it was never begun, did not fit its digest, or is too old")]
+    /// There is no upload of this id.
+    #[error(
+        "there is no upload {id:?}: it was never begun, did not match its digest, or is too old"
+    )]
     UnknownUpload {
         /// The id asked for.
         id: String,
     },
-    /// Bytes for another place.
+    /// The bytes do not continue the upload.
     #[error("the upload has {held} bytes, Upload-Offset is {given}: go on from {held}")]
     UploadOffset {
         /// The offset given.
         given: u64,
-        /// Where it goes on.
+        /// The offset at which the upload continues.
         held: u64,
     },
-    /// Not what was announced.
+    /// An upload is not what was announced.
     #[error("{what} is {found}, but {promised} was promised: send it again")]
     UploadDigest {
-        /// The digest of what, or its size.
+        /// The digest or size that differs.
         what: &'static str,
         /// As announced.
         promised: String,
-        /// As it came.
+        /// As received.
         found: String,
     },
-    /// No room.
+    /// The disk or the space for uploads is full.
     #[error("no room for the upload: {reason}")]
     StorageFull {
         /// What is full.
         reason: String,
     },
-    /// This server keeps none.
+    /// This server has no directory for uploads.
     #[error("this server takes no uploads: {reason}")]
     NoUploads {
         /// Why not.
         reason: String,
-    },
-    /// Nothing to tell.
-    #[error("there is no push {id:?} of twin {twin:?} any more; send it again")]
-    UnknownPush {
-        /// The id asked for.
-        id: String,
-        /// The twin.
-        twin: String,
-    },
-    /// The push's content cannot be accepted.
-    #[error("{reason}")]
-    Content {
-        /// Why not.
-        reason: String,
-        /// The cells at fault, if cells are.
-        cells: Vec<[i32; 2]>,
     },
     /// A field of a body is outside its limits.
     #[error("{field} is {must}")]
     OutOfRange {
         /// The field.
         field: String,
-        /// What it is, and what is accepted.
+        /// Its value, and what is accepted.
         must: String,
     },
-    /// The disk.
+    /// A file of the spool cannot be read or written.
     #[error("cannot {action} the spool: {cause}")]
     Spool {
         /// What was tried.
@@ -214,6 +201,9 @@ pub(super) enum Fault {
     /// The session refused.
     #[error(transparent)]
     Session(#[from] SessionError),
+    /// The push was refused, or failed.
+    #[error(transparent)]
+    Push(#[from] PushError),
     /// A defect of the program.
     #[error("internal: {0}")]
     Internal(String),
@@ -226,19 +216,8 @@ impl From<StoreError> for Fault {
 }
 
 impl Fault {
-    /// Whether what was pushed is at fault, or the base that it was made from: the same again would
-    /// be refused again. Everything else may pass.
-    pub(super) fn is_content(&self) -> bool {
-        match self {
-            Self::Content { .. } | Self::OutOfRange { .. } => true,
-            Self::Session(SessionError::Twin(StoreError::Overlap { .. })) => true,
-            Self::Session(SessionError::Twin(error)) => is_content(error),
-            _ => false,
-        }
-    }
-
     /// Whether the connection cannot go on.
-    pub(super) fn is_fatal(&self) -> bool {
+    pub(crate) fn is_fatal(&self) -> bool {
         matches!(
             self,
             Self::MessageTooLarge { .. }
@@ -250,19 +229,7 @@ impl Fault {
     }
 }
 
-/// Whether a commit was refused for what it holds.
-pub(super) fn is_content(error: &StoreError) -> bool {
-    match error {
-        StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),
-        StoreError::Clamped { .. }
-        | StoreError::Profile(_)
-        | StoreError::FieldMismatch { .. }
-        | StoreError::ManifestSize { .. } => true,
-        _ => false,
-    }
-}
-
-/// Whether a disk, or what somebody may have of it, is full.
-pub(super) fn is_full(cause: &io::Error) -> bool {
+/// Whether an error says that a disk, or a user's quota of it, is full.
+pub(crate) fn is_full(cause: &io::Error) -> bool {
     matches!(cause.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }

@@ -1,7 +1,6 @@
 //! Accepts connections, a bounded number of them.
 
-use std::pin::pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use hyper::server::conn::http1;
@@ -10,126 +9,68 @@ use hyper_util::service::TowerToHyperService;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
-use tokio::time::{Instant, timeout};
 
+use crate::idle_deadline::IdleDeadline;
 use crate::limits;
+use crate::routes;
+use crate::state::ServerState;
 
-use super::{Server, router};
-
-/// Serves connections until the server stops. When all places are taken, further connections wait
+/// Serves connections until the server stops. At the maximum number of connections, further ones wait
 /// in the kernel's backlog.
-pub(super) async fn listen(server: Arc<Server>, listener: TcpListener) {
-    let places = Arc::new(Semaphore::new(server.limits.connections + limits::SPARE_CONNECTIONS));
-    let app = router::router(server.clone());
+pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
+    let permits = Arc::new(Semaphore::new(state.limits.connections + limits::SPARE_CONNECTIONS));
+    let app = routes::router(state.clone());
     loop {
         let accepted = async {
             // The semaphore is never closed.
-            let place = places.clone().acquire_owned().await.ok()?;
-            Some((place, listener.accept().await))
+            let permit = permits.clone().acquire_owned().await.ok()?;
+            Some((permit, listener.accept().await))
         };
-        let (place, stream) = tokio::select! {
-            Some((place, accepted)) = accepted => match accepted {
-                Ok((stream, _)) => (place, stream),
+        let (permit, stream) = tokio::select! {
+            Some((permit, accepted)) = accepted => match accepted {
+                Ok((stream, _)) => (permit, stream),
                 Err(error) => {
-                    // Out of file descriptors, most likely: some will come free.
+                    // Most likely there are no file descriptors left; some will be closed.
                     tracing::warn!("cannot accept a connection: {error}");
                     tokio::time::sleep(Duration::from_millis(100)).await;
                     continue;
                 }
             },
-            () = server.stopped() => return,
+            () = state.stopped() => return,
         };
-        prepare(&stream);
-        // A WebSocket leaves HTTP behind but keeps its place, inside the request.
-        let patience = Arc::new(Patience::new(server.limits.hello + server.limits.send));
+        set_options(&stream);
+        let deadline = Arc::new(IdleDeadline::new(state.limits.hello + state.limits.send));
+        // A WebSocket outlives its HTTP request, and keeps the permit that came with it.
         let app = app
             .clone()
-            .layer(axum::Extension(Arc::new(place)))
-            .layer(axum::Extension(patience.clone()));
+            .layer(axum::Extension(Arc::new(permit)))
+            .layer(axum::Extension(deadline.clone()));
         let connection = http1::Builder::new()
             .timer(TokioTimer::new())
-            .header_read_timeout(server.limits.hello)
+            .header_read_timeout(state.limits.hello)
             .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
             .with_upgrades();
-        let server = server.clone();
+        let state = state.clone();
         tokio::spawn(async move {
             tokio::select! {
-                // The client's fault, and of no interest: it went away, never spoke HTTP, or does
-                // not read.
+                // Errors are the client's fault and not logged: it left, or sent no HTTP.
                 _ = connection => {}
-                () = patience.over() => {}
-                () = server.stopped() => {}
+                () = deadline.passed() => {}
+                () = state.stopped() => {}
             }
         });
     }
 }
 
-/// How long a connection may take for its requests and their answers, from the last time that one of
-/// them showed that it goes on; what becomes a WebSocket is over here by then.
-pub(super) struct Patience {
-    until: Mutex<Instant>,
-    period: Duration,
-}
-
-impl Patience {
-    fn new(period: Duration) -> Self {
-        Self { until: Mutex::new(Instant::now() + period), period }
-    }
-
-    /// A request goes on.
-    pub(super) fn extend(&self) {
-        *self.until.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now() + self.period;
-    }
-
-    /// Does what the client waits for, and whose time is not its own; the request goes on until then.
-    pub(super) async fn during<T>(&self, work: impl Future<Output = T>) -> T {
-        let mut work = pin!(work);
-        loop {
-            self.extend();
-            if let Ok(done) = timeout(self.period / 2, &mut work).await {
-                self.extend();
-                return done;
-            }
-        }
-    }
-
-    async fn over(&self) {
-        loop {
-            let until = *self.until.lock().unwrap_or_else(PoisonError::into_inner);
-            if until <= Instant::now() {
-                return;
-            }
-            tokio::time::sleep_until(until).await;
-        }
-    }
-}
-
-/// Small messages at once, and dead peers noticed.
-fn prepare(stream: &TcpStream) {
-    let (idle, interval, retries) = limits::KEEPALIVE;
-    let keepalive =
-        TcpKeepalive::new().with_time(idle).with_interval(interval).with_retries(retries);
+/// Sends small messages at once, and has the kernel notice dead peers.
+fn set_options(stream: &TcpStream) {
+    let keepalive = TcpKeepalive::new()
+        .with_time(limits::KEEPALIVE_IDLE)
+        .with_interval(limits::KEEPALIVE_INTERVAL)
+        .with_retries(limits::KEEPALIVE_PROBES);
     let set =
         stream.set_nodelay(true).and_then(|()| SockRef::from(stream).set_tcp_keepalive(&keepalive));
     if let Err(error) = set {
         tracing::warn!("cannot set socket options: {error}");
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test]
-    async fn a_client_is_not_cut_off_while_it_waits_for_the_server() {
-        let patience = Patience::new(Duration::from_millis(400));
-        tokio::select! {
-            biased;
-            () = patience.over() => panic!("cut off in the middle of it"),
-            () = patience.during(tokio::time::sleep(Duration::from_millis(1200))) => {}
-        }
-        // Its own silence still is.
-        let silent = timeout(Duration::from_secs(10), patience.over());
-        silent.await.expect("over some time");
     }
 }

@@ -1,13 +1,8 @@
-//! Numbers for Prometheus, of one server: nothing here is global.
+//! Counters and gauges for Prometheus. Each server has its own: nothing here is global.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
-use axum::Extension;
-use axum::extract::{Request, State};
-use axum::http::header;
-use axum::middleware::Next;
-use axum::response::{IntoResponse as _, Response};
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric as _};
@@ -19,27 +14,21 @@ use prometheus_client::registry::{Registry, Unit};
 
 use wildcity_session::Engine;
 
-use super::Server;
-use super::auth::{Grant, Role};
-use super::convert::WireCode;
-use super::fault::Fault;
-use super::refusal::Answered;
-
 /// A counter for each value of one label.
-type By = Family<[(&'static str, String); 1], Counter>;
+type CountersByLabel = Family<[(&'static str, String); 1], Counter>;
 
-/// What a server counts.
-pub(super) struct Metrics {
+/// The counters and gauges of a server.
+pub(crate) struct Metrics {
     registry: Registry,
-    pub(super) steps: Counter,
-    pub(super) step_seconds: Histogram,
-    pub(super) queue_seconds: Histogram,
-    pub(super) uploads_begun: Counter,
-    pub(super) uploaded_bytes: Counter,
-    pub(super) observation_bytes: Counter,
-    pub(super) versions_switched: Counter,
-    refusals: By,
-    pushes: By,
+    pub(crate) steps: Counter,
+    pub(crate) step_seconds: Histogram,
+    pub(crate) queue_seconds: Histogram,
+    pub(crate) uploads_begun: Counter,
+    pub(crate) uploaded_bytes: Counter,
+    pub(crate) observation_bytes: Counter,
+    pub(crate) versions_switched: Counter,
+    refusals: CountersByLabel,
+    pushes: CountersByLabel,
     sessions: Gauge,
     connections: Gauge,
     frames_queued: Gauge,
@@ -48,10 +37,26 @@ pub(super) struct Metrics {
     pushes_open: Gauge,
 }
 
+/// The values of the gauges at one moment.
+pub(crate) struct GaugeValues {
+    /// Sessions, connected or waiting to be resumed.
+    pub(crate) sessions: usize,
+    /// WebSocket connections.
+    pub(crate) connections: usize,
+    /// Frames that wait for the renderer.
+    pub(crate) frames_queued: usize,
+    /// Uploads on disk.
+    pub(crate) uploads: usize,
+    /// Their bytes, as announced.
+    pub(crate) spool_bytes: u64,
+    /// Pushes that wait or run.
+    pub(crate) pushes_open: usize,
+}
+
 impl Metrics {
-    pub(super) fn new(engine: Arc<Engine>) -> Self {
+    pub(crate) fn new(engine: Arc<Engine>) -> Self {
         let mut registry = Registry::with_prefix("wildcity");
-        // 1 ms to 33 s, each twice the one before: a step takes 0.1 s, and at most 60.
+        // 16 buckets from 1 ms to 33 s, each twice the one before: most steps take 0.1 s.
         let seconds = || Histogram::new(exponential_buckets(1e-3, 2.0, 16));
         let metrics = Self {
             registry: Registry::default(),
@@ -62,8 +67,8 @@ impl Metrics {
             uploaded_bytes: Counter::default(),
             observation_bytes: Counter::default(),
             versions_switched: Counter::default(),
-            refusals: By::default(),
-            pushes: By::default(),
+            refusals: CountersByLabel::default(),
+            pushes: CountersByLabel::default(),
             sessions: Gauge::default(),
             connections: Gauge::default(),
             frames_queued: Gauge::default(),
@@ -96,18 +101,34 @@ impl Metrics {
         Self { registry, ..metrics }
     }
 
-    /// A request was refused, of whatever kind.
-    pub(super) fn refused(&self, code: &WireCode) {
-        self.refusals.get_or_create(&[("code", code.0.clone())]).inc();
+    /// All numbers in OpenMetrics' text format; `gauges` are the values of this moment.
+    ///
+    /// # Errors
+    /// A collector failed.
+    pub(crate) fn text(&self, gauges: GaugeValues) -> Result<String, std::fmt::Error> {
+        self.sessions.set(gauges.sessions as i64);
+        self.connections.set(gauges.connections as i64);
+        self.frames_queued.set(gauges.frames_queued as i64);
+        self.uploads.set(gauges.uploads as i64);
+        self.spool_bytes.set(gauges.spool_bytes);
+        self.pushes_open.set(gauges.pushes_open as i64);
+        let mut text = String::new();
+        encode(&mut text, &self.registry)?;
+        Ok(text)
     }
 
-    /// A push ended.
-    pub(super) fn pushed(&self, outcome: &str) {
+    /// Counts a refused request by its wire code.
+    pub(crate) fn refused(&self, code: &str) {
+        self.refusals.get_or_create(&[("code", code.to_owned())]).inc();
+    }
+
+    /// Counts a push that ended, by its outcome.
+    pub(crate) fn push_ended(&self, outcome: &str) {
         self.pushes.get_or_create(&[("outcome", outcome.to_owned())]).inc();
     }
 }
 
-/// What the pager counts by itself, read when it is asked for.
+/// The counters of the pager and the object store, which are read when metrics are requested.
 #[derive(Debug)]
 struct Residency(Arc<Engine>);
 
@@ -152,8 +173,9 @@ impl Collector for Residency {
             }
         }
         let seconds = |duration: std::time::Duration| duration.as_secs_f64();
-        let (name, help) = ("residency_wait_seconds", "How long frames waited, together");
         let counter = ConstCounter::new(seconds(stats.wait_time));
+        let name = "residency_wait_seconds";
+        let help = "How long frames waited, together";
         let kind = counter.metric_type();
         counter.encode(encoder.encode_descriptor(name, help, None, kind)?)?;
         for (name, help, value) in [
@@ -171,38 +193,4 @@ impl Collector for Residency {
         }
         Ok(())
     }
-}
-
-/// `GET /metrics`, in OpenMetrics' text.
-pub(super) async fn show(
-    State(server): State<Arc<Server>>,
-    Extension(grant): Extension<Arc<Grant>>,
-) -> Answered {
-    grant.may(Role::Admin)?;
-    let metrics = &server.metrics;
-    metrics.sessions.set(server.sessions.count() as i64);
-    let free = server.agents.available_permits();
-    metrics.connections.set((server.limits.connections - free) as i64);
-    metrics.frames_queued.set(server.engine.queued_frames() as i64);
-    let (uploads, spool_bytes) = server.spool.as_ref().map_or((0, 0), |spool| spool.load());
-    metrics.uploads.set(uploads as i64);
-    metrics.spool_bytes.set(spool_bytes);
-    metrics.pushes_open.set(server.pushes.open() as i64);
-    let mut text = String::new();
-    encode(&mut text, &metrics.registry).map_err(|error| Fault::Internal(error.to_string()))?;
-    let kind = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-    Ok(([(header::CONTENT_TYPE, kind)], text).into_response())
-}
-
-/// Counts what HTTP refuses.
-pub(super) async fn count(
-    State(server): State<Arc<Server>>,
-    request: Request,
-    next: Next,
-) -> Response {
-    let response = next.run(request).await;
-    if let Some(code) = response.extensions().get::<WireCode>() {
-        server.metrics.refused(code);
-    }
-    response
 }

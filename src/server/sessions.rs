@@ -1,9 +1,10 @@
-//! Who exists, who is connected, who waits to be resumed.
+//! The sessions of a server: those with a connection, and those that wait to be resumed.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
+use parking_lot::Mutex;
 use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
@@ -11,132 +12,165 @@ use wildcity_scene::geometry::Pose;
 use wildcity_session::{Observation, Outcome, Session};
 use wildcity_twin::residency::Viewpoint;
 
-use super::fault::Fault;
+use crate::fault::Fault;
+
+/// How long one attempt to take over a session waits before it asks the old connection again.
+const TAKEOVER_ATTEMPT: Duration = Duration::from_millis(100);
 
 /// All sessions of a server, by name.
-pub(super) struct Sessions {
+pub(crate) struct SessionRegistry {
     limit: usize,
-    grace: Duration,
+    resume_grace: Duration,
     entries: Mutex<BTreeMap<String, Entry>>,
 }
 
 struct Entry {
-    seat: Arc<AsyncMutex<Seat>>,
-    /// Name of the token that opened it.
+    slot: Arc<AsyncMutex<SessionSlot>>,
+    /// Name of the token that opened the session.
     owner: String,
-    /// As it was after the last request; none before the first.
-    about: Option<About>,
-    /// Asks the connection that holds the seat to give it up.
-    leave: Arc<Notify>,
-    /// Since when nobody holds the seat, and what that means for the session.
-    parked: Option<(Instant, Outcome)>,
+    /// The session after its last request; none before the first.
+    view: Option<SessionView>,
+    /// Asks the connection that holds the slot to release it.
+    release: Arc<Notify>,
+    /// Set while no connection holds the slot.
+    parked: Option<Parked>,
 }
 
-/// What others are told of a session.
+/// A session without a connection.
+#[derive(Clone, Copy)]
+struct Parked {
+    since: Instant,
+    /// The outcome of the episode if no client resumes the session.
+    outcome: Outcome,
+}
+
+/// What the rest of the server knows of a session.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct About {
-    pub(super) twin: String,
-    pub(super) version: u64,
-    pub(super) step: u64,
-    pub(super) world_from_rig: Pose,
-    /// What its next frame needs, if it stays where it is.
-    pub(super) eyes: Vec<Viewpoint>,
+pub(crate) struct SessionView {
+    pub(crate) twin: String,
+    pub(crate) version: u64,
+    pub(crate) step: u64,
+    pub(crate) world_from_rig: Pose,
+    /// Viewpoints of the next frame, if the ego stays where it is.
+    pub(crate) viewpoints: Vec<Viewpoint>,
 }
 
-/// A session with what a lost connection must not lose.
+/// An entry of the list of sessions.
+pub(crate) struct ListedSession {
+    pub(crate) name: String,
+    pub(crate) view: SessionView,
+    /// Whether a connection holds the session.
+    pub(crate) connected: bool,
+}
+
+/// A session, and what must survive the loss of its connection.
 #[derive(Default)]
-pub(super) struct Seat {
-    /// `None` while it is opened, and once it is closed.
-    pub(super) session: Option<Session>,
-    /// The last request that the session carried out, and its answer, for when it is repeated.
-    pub(super) last: Option<(u64, Answer)>,
-    /// The last request that was answered, refusals included.
-    pub(super) answered: u64,
+pub(crate) struct SessionSlot {
+    /// `None` while the session is opened, and once it is closed.
+    pub(crate) session: Option<Session>,
+    /// The last request that the session carried out, and its answer, which is sent again if the request
+    /// is repeated.
+    pub(crate) last: Option<AnsweredRequest>,
+    /// Number of the last request that was answered, refusals included.
+    pub(crate) answered_seq: u64,
 }
 
-/// What was sent, and can be sent again.
+/// A request that was carried out.
 #[derive(Clone)]
-pub(super) enum Answer {
+pub(crate) struct AnsweredRequest {
+    pub(crate) seq: u64,
+    pub(crate) answer: Answer,
+}
+
+/// An answer that was sent, and can be sent again.
+#[derive(Clone)]
+pub(crate) enum Answer {
     /// A control message.
     Text(Arc<str>),
     /// An observation.
     Observation(Arc<Observation>),
 }
 
-/// A connection's hold on a seat. Dropping it parks the session, or forgets a closed one.
-pub(super) struct Place {
-    sessions: Arc<Sessions>,
+/// A connection's exclusive access to a slot. Dropping it parks the session, or removes a closed one.
+pub(crate) struct SlotGuard {
+    registry: Arc<SessionRegistry>,
     name: String,
-    /// What the session is if nobody resumes it.
-    pub(super) outcome: Outcome,
-    /// Somebody else wants to resume the session.
-    pub(super) leave: Arc<Notify>,
-    seat: OwnedMutexGuard<Seat>,
+    /// The outcome of the episode if the guard is dropped and no client resumes the session.
+    pub(crate) outcome: Outcome,
+    /// Notified when another connection wants to resume the session.
+    pub(crate) release: Arc<Notify>,
+    slot: OwnedMutexGuard<SessionSlot>,
 }
 
-impl Sessions {
-    pub(super) fn new(limit: usize, grace: Duration) -> Arc<Self> {
-        Arc::new(Self { limit, grace, entries: Mutex::default() })
+impl SessionRegistry {
+    pub(crate) fn new(limit: usize, resume_grace: Duration) -> Arc<Self> {
+        Arc::new(Self { limit, resume_grace, entries: Mutex::default() })
     }
 
-    /// Takes an empty seat under a new name, for whoever a token names.
-    pub(super) fn reserve(self: &Arc<Self>, name: String, owner: &str) -> Result<Place, Fault> {
-        let mut entries = self.lock();
+    /// Adds an empty slot under a new name; `owner` is the name of the client's token.
+    ///
+    /// # Errors
+    /// The name is in use, or there are too many sessions.
+    pub(crate) fn reserve(self: &Arc<Self>, name: String, owner: &str) -> Result<SlotGuard, Fault> {
+        let mut entries = self.entries.lock();
         if entries.contains_key(&name) {
             return Err(Fault::SessionExists { name });
         }
         if entries.len() >= self.limit {
             return Err(Fault::Busy { what: "sessions", limit: self.limit });
         }
-        let (seat, leave) = (Arc::new(AsyncMutex::new(Seat::default())), Arc::new(Notify::new()));
-        let taken = seat.clone().try_lock_owned();
-        let guard = taken.map_err(|_| Fault::Internal("a new seat is taken".to_owned()))?;
-        let owner = owner.to_owned();
-        let entry = Entry { seat, owner, about: None, leave: leave.clone(), parked: None };
+        let slot = Arc::new(AsyncMutex::new(SessionSlot::default()));
+        let release = Arc::new(Notify::new());
+        let guard = slot.clone().try_lock_owned();
+        let guard = guard.map_err(|_| Fault::Internal("a new slot is locked".to_owned()))?;
+        let entry = Entry {
+            slot,
+            owner: owner.to_owned(),
+            view: None,
+            release: release.clone(),
+            parked: None,
+        };
         entries.insert(name.clone(), entry);
         drop(entries);
-        Ok(Place { sessions: self.clone(), name, outcome: Outcome::AgentLost, leave, seat: guard })
+        Ok(self.guard(name, release, guard))
     }
 
-    /// Takes the seat of a session, from its connection if that still holds it: after a network
+    /// Takes the slot of a session, from its connection if that still holds it: after a network
     /// failure the client knows long before the server that the old connection is dead.
-    pub(super) async fn resume(
+    ///
+    /// # Errors
+    /// There is no such session of this owner, or its last step runs for longer than `max_wait`.
+    pub(crate) async fn resume(
         self: &Arc<Self>,
         name: &str,
         owner: &str,
-        patience: Duration,
-    ) -> Result<Place, Fault> {
+        max_wait: Duration,
+    ) -> Result<SlotGuard, Fault> {
         let unknown = || Fault::UnknownSession { name: name.to_owned() };
-        let give_up = Instant::now() + patience;
+        let give_up = Instant::now() + max_wait;
         loop {
-            let seat = {
-                let entries = self.lock();
-                // To others than its owner there is no such session.
+            let slot = {
+                let entries = self.entries.lock();
+                // Other clients must not learn that the session exists.
                 let entry = entries.get(name).filter(|entry| entry.owner == owner);
                 let entry = entry.ok_or_else(unknown)?;
                 if entry.parked.is_none() {
-                    entry.leave.notify_one();
+                    entry.release.notify_one();
                 }
-                entry.seat.clone()
+                entry.slot.clone()
             };
-            // Again and again: another client may have taken the seat in between.
-            if let Ok(guard) = timeout(Duration::from_millis(100), seat.lock_owned()).await {
+            // Each attempt asks again: another client may have taken the slot in between.
+            if let Ok(guard) = timeout(TAKEOVER_ATTEMPT, slot.lock_owned()).await {
                 if guard.session.is_none() {
                     return Err(unknown());
                 }
-                let leave = Arc::new(Notify::new());
-                let mut entries = self.lock();
+                let release = Arc::new(Notify::new());
+                let mut entries = self.entries.lock();
                 let entry = entries.get_mut(name).ok_or_else(unknown)?;
-                (entry.leave, entry.parked) = (leave.clone(), None);
+                entry.release = release.clone();
+                entry.parked = None;
                 drop(entries);
-                let (sessions, name) = (self.clone(), name.to_owned());
-                return Ok(Place {
-                    sessions,
-                    name,
-                    outcome: Outcome::AgentLost,
-                    leave,
-                    seat: guard,
-                });
+                return Ok(self.guard(name.to_owned(), release, guard));
             }
             if Instant::now() >= give_up {
                 return Err(Fault::SessionState("the session's last step is still running"));
@@ -144,107 +178,129 @@ impl Sessions {
         }
     }
 
-    /// How many there are, connected and parked.
-    pub(super) fn count(&self) -> usize {
-        self.lock().len()
+    fn guard(
+        self: &Arc<Self>,
+        name: String,
+        release: Arc<Notify>,
+        slot: OwnedMutexGuard<SessionSlot>,
+    ) -> SlotGuard {
+        SlotGuard { registry: self.clone(), name, outcome: Outcome::AgentLost, release, slot }
     }
 
-    /// All that see something, in order of name, and whether a client is connected to each.
-    pub(super) fn list(&self) -> Vec<(String, About, bool)> {
-        let told = |(name, entry): (&String, &Entry)| {
-            Some((name.clone(), entry.about.clone()?, entry.parked.is_none()))
+    /// Number of sessions, connected and parked.
+    pub(crate) fn count(&self) -> usize {
+        self.entries.lock().len()
+    }
+
+    /// All sessions that were opened, in order of name.
+    pub(crate) fn list(&self) -> Vec<ListedSession> {
+        let listed = |(name, entry): (&String, &Entry)| {
+            let view = entry.view.clone()?;
+            Some(ListedSession { name: name.clone(), view, connected: entry.parked.is_none() })
         };
-        self.lock().iter().filter_map(told).collect()
+        self.entries.lock().iter().filter_map(listed).collect()
     }
 
-    /// Ends sessions whose grace is over, until dropped.
-    pub(super) async fn reap(&self) {
-        let period = (self.grace / 4).clamp(Duration::from_millis(10), Duration::from_secs(5));
+    /// For each session that drives on a twin, the viewpoints of its next frame.
+    pub(crate) fn viewpoints_on(&self, twin: &str) -> Vec<Vec<Viewpoint>> {
+        let entries = self.entries.lock();
+        let views = entries.values().filter_map(|entry| entry.view.as_ref());
+        views.filter(|view| view.twin == twin).map(|view| view.viewpoints.clone()).collect()
+    }
+
+    /// Ends sessions that were not resumed in time, until dropped.
+    pub(crate) async fn end_expired(&self) {
+        let shortest = Duration::from_millis(10);
+        let longest = Duration::from_secs(5);
+        let period = (self.resume_grace / 4).clamp(shortest, longest);
         loop {
             tokio::time::sleep(period).await;
             let now = Instant::now();
-            let overdue = |since: Instant| now.saturating_duration_since(since) >= self.grace;
-            self.end_parked(|since, outcome| overdue(since).then_some(outcome)).await;
+            let expired =
+                |parked: Parked| now.saturating_duration_since(parked.since) >= self.resume_grace;
+            self.end_parked(|parked| expired(parked).then_some(parked.outcome)).await;
         }
     }
 
     /// Ends all sessions that no connection holds, because the server stops.
-    pub(super) async fn end_all_parked(&self) {
-        self.end_parked(|_, _| Some(Outcome::ServerError)).await;
+    pub(crate) async fn end_all_parked(&self) {
+        self.end_parked(|_| Some(Outcome::ServerError)).await;
     }
 
-    async fn end_parked(&self, end: impl Fn(Instant, Outcome) -> Option<Outcome>) {
-        let chosen: Vec<_> = self
-            .lock()
-            .iter()
-            .filter_map(|(name, entry)| {
-                let (since, outcome) = entry.parked?;
-                Some((name.clone(), entry.seat.clone(), since, end(since, outcome)?))
-            })
-            .collect();
-        for (name, seat, since, outcome) in chosen {
-            // Whoever resumes it right now has it.
-            let Ok(mut seat) = seat.try_lock_owned() else { continue };
+    /// Ends the parked sessions that `end` gives an outcome for.
+    async fn end_parked(&self, end: impl Fn(Parked) -> Option<Outcome>) {
+        struct Chosen {
+            name: String,
+            slot: Arc<AsyncMutex<SessionSlot>>,
+            since: Instant,
+            outcome: Outcome,
+        }
+        let choose = |(name, entry): (&String, &Entry)| {
+            let parked = entry.parked?;
+            let outcome = end(parked)?;
+            let slot = entry.slot.clone();
+            Some(Chosen { name: name.clone(), slot, since: parked.since, outcome })
+        };
+        let chosen: Vec<Chosen> = self.entries.lock().iter().filter_map(choose).collect();
+        for Chosen { name, slot, since, outcome } in chosen {
+            // A locked slot is being resumed right now.
+            let Ok(mut slot) = slot.try_lock_owned() else { continue };
             {
-                let mut entries = self.lock();
+                let mut entries = self.entries.lock();
                 let parked = entries.get(&name).and_then(|entry| entry.parked);
-                if parked.is_none_or(|(parked, _)| parked != since) {
+                // It was resumed, and perhaps parked again, since it was chosen.
+                if parked.is_none_or(|parked| parked.since != since) {
                     continue;
                 }
                 entries.remove(&name);
             }
-            if let Some(session) = seat.session.take() {
+            if let Some(session) = slot.session.take() {
                 let summary = session.close(outcome).await;
                 tracing::info!(session = name, ?summary, "session ended without its agent");
             }
         }
     }
-
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Entry>> {
-        // A panic elsewhere leaves nothing half-done behind this lock.
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
-impl Place {
-    /// Lets others know how it stands with the session.
-    pub(super) fn tell(&self) {
-        let Some(session) = &self.seat.session else { return };
+impl SlotGuard {
+    /// Updates what the rest of the server knows of the session.
+    pub(crate) fn update_view(&self) {
+        let Some(session) = &self.slot.session else { return };
         let version = &session.resident().version;
-        let about = About {
+        let view = SessionView {
             twin: version.manifest.twin.clone(),
             version: version.number,
             step: session.episode().step(),
             world_from_rig: session.episode().world_from_rig(),
-            eyes: session.viewpoints(),
+            viewpoints: session.viewpoints(),
         };
-        if let Some(entry) = self.sessions.lock().get_mut(&self.name) {
-            entry.about = Some(about);
+        if let Some(entry) = self.registry.entries.lock().get_mut(&self.name) {
+            entry.view = Some(view);
         }
     }
 }
 
-impl std::ops::Deref for Place {
-    type Target = Seat;
+impl std::ops::Deref for SlotGuard {
+    type Target = SessionSlot;
 
-    fn deref(&self) -> &Seat {
-        &self.seat
+    fn deref(&self) -> &SessionSlot {
+        &self.slot
     }
 }
 
-impl std::ops::DerefMut for Place {
-    fn deref_mut(&mut self) -> &mut Seat {
-        &mut self.seat
+impl std::ops::DerefMut for SlotGuard {
+    fn deref_mut(&mut self) -> &mut SessionSlot {
+        &mut self.slot
     }
 }
 
-impl Drop for Place {
+impl Drop for SlotGuard {
     fn drop(&mut self) {
-        let mut entries = self.sessions.lock();
-        if self.seat.session.is_none() {
+        let mut entries = self.registry.entries.lock();
+        if self.slot.session.is_none() {
             entries.remove(&self.name);
         } else if let Some(entry) = entries.get_mut(&self.name) {
-            entry.parked = Some((Instant::now(), self.outcome));
+            entry.parked = Some(Parked { since: Instant::now(), outcome: self.outcome });
         }
     }
 }

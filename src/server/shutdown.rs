@@ -1,4 +1,4 @@
-//! Stopping without losing what runs.
+//! A running server, and stopping it without losing running steps.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -9,89 +9,92 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
-use super::{Server, listen};
+use crate::listen::listen;
+use crate::state::ServerState;
 
 /// A server that listens. Dropping it stops it without waiting.
 pub struct Running {
-    server: Arc<Server>,
+    state: Arc<ServerState>,
     address: SocketAddr,
     stop: watch::Sender<bool>,
     listening: JoinHandle<()>,
 }
 
-/// Throws away uploads that nobody came back for, until dropped.
-async fn reap_uploads(server: &Server) {
-    let Ok(spool) = &server.spool else { return std::future::pending().await };
+/// Removes uploads that are too old, until dropped.
+async fn remove_old_uploads(state: &ServerState) {
+    let Ok(spool) = &state.spool else { return std::future::pending().await };
     let period = (spool.age() / 4).clamp(Duration::from_millis(10), Duration::from_secs(60));
     loop {
         tokio::time::sleep(period).await;
         let spool = spool.clone();
-        if tokio::task::spawn_blocking(move || spool.reap()).await.is_err() {
-            tracing::error!("old uploads were not thrown away: a task crashed");
+        if tokio::task::spawn_blocking(move || spool.remove_old()).await.is_err() {
+            tracing::error!("old uploads were not removed: a task crashed");
         }
     }
 }
 
-/// Keeps what sessions use from garbage collection, until dropped.
-async fn renew_leases(server: &Server) {
+/// Keeps the versions that sessions use from garbage collection, until dropped.
+async fn renew_leases(state: &ServerState) {
     loop {
         tokio::time::sleep(wildcity_session::limits::LEASE_RENEWAL).await;
-        if let Err(error) = server.engine.renew_leases().await {
+        if let Err(error) = state.engine.renew_leases().await {
             tracing::warn!("leases were not renewed: {error}");
         }
     }
 }
 
 impl Running {
-    pub(super) fn new(
-        server: Arc<Server>,
+    /// Starts the tasks of a server.
+    pub(crate) fn new(
+        state: Arc<ServerState>,
         listener: TcpListener,
         address: SocketAddr,
         stop: watch::Sender<bool>,
     ) -> Self {
-        let listening = tokio::spawn(listen::listen(server.clone(), listener));
-        let reaping = server.clone();
+        let listening = tokio::spawn(listen(state.clone(), listener));
+        let periodic = state.clone();
         tokio::spawn(async move {
             tokio::select! {
-                () = reaping.sessions.reap() => {}
-                () = reap_uploads(&reaping) => {}
-                () = renew_leases(&reaping) => {}
-                () = reaping.stopped() => {}
+                () = periodic.sessions.end_expired() => {}
+                () = remove_old_uploads(&periodic) => {}
+                () = renew_leases(&periodic) => {}
+                () = periodic.stopped() => {}
             }
         });
-        Self { server, address, stop, listening }
+        Self { state, address, stop, listening }
     }
 
-    /// Where it listens.
+    /// The address that the server listens on.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// What agents dial.
+    /// The URL that agents connect to.
     pub fn url(&self) -> String {
         format!("ws://{}/v1/session", self.address)
     }
 
-    /// Sessions at this moment: connected, and waiting to be resumed.
+    /// Number of sessions at this moment: connected, and waiting to be resumed.
     pub fn sessions(&self) -> usize {
-        self.server.sessions.count()
+        self.state.sessions.count()
     }
 
-    /// WebSocket connections at this moment.
+    /// Number of WebSocket connections at this moment.
     pub fn connections(&self) -> usize {
-        self.server.limits.connections - self.server.agents.available_permits()
+        self.state.limits.connections - self.state.websocket_permits.available_permits()
     }
 
-    /// Accepts nobody any more, lets running steps finish, tells every client, ends every session.
+    /// Stops accepting connections, lets running steps finish, notifies every client, and ends every
+    /// session.
     pub async fn stop(self) {
-        // Every receiver may be gone already: nobody is left to be told.
+        // An error means that no task waits for the signal any more.
         let _ = self.stop.send(true);
         if let Err(error) = self.listening.await {
-            tracing::error!("the listener ended badly: {error}");
+            tracing::error!("the listener crashed: {error}");
         }
-        let Server { agents, limits, sessions, .. } = &*self.server;
-        // A connection holds one permit, so that all of them are there when all have ended.
-        let all = agents.acquire_many(limits.connections as u32);
+        let ServerState { websocket_permits, limits, sessions, .. } = &*self.state;
+        // Each connection holds one permit: all permits are free when all connections have ended.
+        let all = websocket_permits.acquire_many(limits.connections as u32);
         if timeout(limits.drain, all).await.is_err() {
             tracing::warn!("some clients did not leave within {:?}", limits.drain);
         }

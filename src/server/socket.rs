@@ -12,99 +12,101 @@ use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message};
 
+use crate::fault::Fault;
 use crate::limits;
 
-use super::fault::Fault;
-
 /// A client's WebSocket.
-pub(super) struct Socket {
+pub(crate) struct Socket {
     stream: WebSocketStream<TcpStream>,
     send_timeout: Duration,
 }
 
-/// What arrived.
-pub(super) enum Incoming {
+/// A message that arrived.
+pub(crate) enum Incoming {
     /// A text message.
     Text(String),
-    /// Something that is no request but shows that the client lives.
-    SignOfLife,
+    /// A ping, a pong or a part of a message: no request, but the client is alive.
+    Alive,
 }
 
-/// Why nothing more will arrive, or can be sent.
+/// Why no more messages can be received or sent.
 #[derive(Debug)]
-pub(super) enum Lost {
-    /// The client left, or the network between.
-    Gone,
-    /// The client does not read. A part of a message may be sent: nothing else can be.
-    Stuck,
-    /// The client did something that it must be told about, and that may end its connection.
+pub(crate) enum Disconnect {
+    /// The client closed the connection, or the network failed.
+    PeerLeft,
+    /// The client did not read in time. A part of a message may have been sent, so that nothing else can
+    /// be sent.
+    SendTimedOut,
+    /// The client made a mistake. It gets an answer, and the connection may end.
     Fault(Fault),
 }
 
 impl Socket {
-    /// Takes a connection over from HTTP, with what HTTP read of it already.
-    pub(super) async fn new(
+    /// Takes over a connection from HTTP; `read_ahead` is what HTTP has read of it already.
+    pub(crate) async fn new(
         stream: TcpStream,
         read_ahead: Vec<u8>,
         send_timeout: Duration,
     ) -> Self {
-        let limits = WebSocketConfig::default()
+        let config = WebSocketConfig::default()
             .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
             .max_frame_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
-            // Requests are short, and 1,000 connections hold a buffer each.
+            // Requests are short, and each of 1,000 connections has a buffer.
             .read_buffer_size(4 << 10)
-            // Answers pass it by: only pongs and the goodbye go through it.
+            // Answers bypass this buffer: only pongs and the close frame go through it.
             .write_buffer_size(0)
             .max_write_buffer_size(limits::PONGS_BYTES);
-        let (role, limits) = (Role::Server, Some(limits));
-        let stream = WebSocketStream::from_partially_read(stream, read_ahead, role, limits).await;
-        Self { stream, send_timeout }
+        let stream =
+            WebSocketStream::from_partially_read(stream, read_ahead, Role::Server, Some(config));
+        Self { stream: stream.await, send_timeout }
     }
 
     /// Waits for the next message. Dropping the future loses no request.
-    pub(super) async fn receive(&mut self) -> Result<Incoming, Lost> {
+    pub(crate) async fn receive(&mut self) -> Result<Incoming, Disconnect> {
         match self.stream.next().await {
             Some(Ok(Message::Text(text))) => Ok(Incoming::Text(text.as_str().to_owned())),
-            Some(Ok(Message::Binary(_))) => Err(Lost::Fault(Fault::UnexpectedBinary)),
-            // Its pong must leave before more is read: who pings and never reads is no sign of life.
+            Some(Ok(Message::Binary(_))) => Err(Disconnect::Fault(Fault::UnexpectedBinary)),
+            // The pong is sent before more is read: a client that pings and never reads is not alive.
             Some(Ok(Message::Ping(_))) => {
                 match timeout(self.send_timeout, self.stream.flush()).await {
-                    Ok(Ok(())) => Ok(Incoming::SignOfLife),
-                    Ok(Err(_)) => Err(Lost::Gone),
-                    Err(_) => Err(Lost::Stuck),
+                    Ok(Ok(())) => Ok(Incoming::Alive),
+                    Ok(Err(_)) => Err(Disconnect::PeerLeft),
+                    Err(_) => Err(Disconnect::SendTimedOut),
                 }
             }
-            Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::SignOfLife),
-            None | Some(Ok(Message::Close(_))) => Err(Lost::Gone),
+            Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::Alive),
+            None | Some(Ok(Message::Close(_))) => Err(Disconnect::PeerLeft),
             Some(Err(error)) => Err(match error {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
-                    Lost::Fault(Fault::MessageTooLarge { bytes: size, limit: max_size })
+                    Disconnect::Fault(Fault::MessageTooLarge { bytes: size, limit: max_size })
                 }
-                // The end of the stream, in a library's words.
-                Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Lost::Gone,
+                // tungstenite's name for the end of the TCP stream.
+                Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => {
+                    Disconnect::PeerLeft
+                }
                 Error::Protocol(_) | Error::Utf8(_) | Error::Capacity(_) => {
-                    Lost::Fault(Fault::BrokenFrame(error.to_string()))
+                    Disconnect::Fault(Fault::BrokenFrame(error.to_string()))
                 }
-                _ => Lost::Gone,
+                _ => Disconnect::PeerLeft,
             }),
         }
     }
 
     /// Sends a text message.
-    pub(super) async fn send_text(&mut self, text: &str) -> Result<(), Lost> {
+    pub(crate) async fn send_text(&mut self, text: &str) -> Result<(), Disconnect> {
         self.send(FINAL_TEXT, text.as_bytes()).await
     }
 
     /// Sends a binary message.
-    pub(super) async fn send_binary(&mut self, payload: &[u8]) -> Result<(), Lost> {
+    pub(crate) async fn send_binary(&mut self, payload: &[u8]) -> Result<(), Disconnect> {
         self.send(FINAL_BINARY, payload).await
     }
 
-    /// Sends a message straight from where it lies: a WebSocket library would copy the megabytes
-    /// into its own buffer first. After an error the connection cannot be used.
-    async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Lost> {
+    /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes into
+    /// its own buffer first. After an error the connection cannot be used.
+    async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Disconnect> {
         let send = async {
-            // A pong may be waiting; frames must not mix.
+            // A pong may be waiting in the library's buffer; frames must not mix.
             self.stream.flush().await.map_err(io::Error::other)?;
             let header = frame_header(first_byte, payload.len());
             let stream = self.stream.get_mut();
@@ -117,24 +119,24 @@ impl Socket {
         };
         match timeout(self.send_timeout, send).await {
             Ok(Ok(())) => Ok(()),
-            Ok(Err(_)) => Err(Lost::Gone),
-            Err(_) => Err(Lost::Stuck),
+            Ok(Err(_)) => Err(Disconnect::PeerLeft),
+            Err(_) => Err(Disconnect::SendTimedOut),
         }
     }
 
-    /// Says goodbye, and reads for a while what the client still sends: closing a socket with
+    /// Closes the connection, and reads for a while what the client still sends: closing a socket with
     /// unread bytes resets the connection, and the client would never see the last answer.
-    pub(super) async fn close(mut self) {
-        let goodbye = async {
+    pub(crate) async fn close(mut self) {
+        let closing = async {
             self.stream.close(None).await.map_err(io::Error::other)?;
             let mut stream = self.stream.into_inner();
             stream.shutdown().await?;
-            let mut thrown_away = vec![0; 64 << 10];
-            while stream.read(&mut thrown_away).await? > 0 {}
+            let mut discarded = vec![0; 64 << 10];
+            while stream.read(&mut discarded).await? > 0 {}
             io::Result::Ok(())
         };
-        // Whether the client heard it does not matter.
-        let _ = timeout(limits::LINGER, goodbye).await;
+        // It does not matter whether the client took part in the closing handshake.
+        let _ = timeout(limits::LINGER, closing).await;
     }
 }
 
@@ -142,7 +144,7 @@ impl Socket {
 const FINAL_TEXT: u8 = 0x81;
 const FINAL_BINARY: u8 = 0x82;
 
-/// The header of an unmasked frame (RFC 6455, section 5.2).
+/// The header of an unmasked frame (RFC 6455, section 5.2): the length takes 7, 16 or 64 bits.
 fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {
     let mut header = vec![first_byte];
     match len {

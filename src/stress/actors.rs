@@ -1,9 +1,9 @@
-//! Actors.
+//! Actors: Gaussians that move and rotate as one.
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::order::evenly;
-use super::{Case, CaseRun, Run};
+use super::order::low_discrepancy;
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
 use wildcity_render::compare::images::max_difference;
@@ -11,29 +11,31 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
 pub(super) const T25: Case = Case {
     number: "T25",
-    what: "colours of SH degree 3 that turn with their actor",
-    bound: "as a camera that turns the other way, within 5e-4; agrees with f64",
-    run: Run::Light(t25),
+    what: "colours of SH degree 3 that rotate with their actor",
+    bound: "equal to a camera that rotates the other way, within 5e-4; agrees with f64",
+    body: CaseBody::Light(t25),
 };
 
-fn t25(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let actor = actor();
-    let (profile, view) = (RenderProfile::default(), forward_view([160, 120], 150.0));
-    let still = trial.agreed("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
-    trial.holds("seen", still.opacity.iter().any(|&o| o > 0.9));
+    let profile = RenderProfile::default();
+    let view = forward_view([160, 120], 150.0);
+    let still =
+        run.render_and_compare("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
+    run.check("seen", still.opacity.iter().any(|&o| o > 0.9));
     for (what, turn) in [
         ("turned about y", DQuat::from_rotation_y(1.1)),
         ("turned about all", DQuat::from_rotation_x(2.5) * DQuat::from_rotation_z(0.4)),
     ] {
-        // Actor and camera turn alike about the origin: nothing changes on the image.
-        let turned = Scene::from_gaussians(&turned(&actor, turn));
+        // The actor and the camera rotate alike about the origin, so the image must not change.
+        let turned = Scene::from_gaussians(&rotated(&actor, turn));
         let mut moved = view;
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
-        let drawing = trial.agreed(what, &turned, &profile, moved)?;
-        let off = max_difference(&still.rgba, &drawing.rgba);
-        // A device keeps colours in steps of 1/32,767 of the largest of 256 neighbours, of 16
-        // coefficients: below 5e-4. The others keep f32.
-        trial.at_most(format!("{what}: off by"), off.into(), 5e-4);
+        let image = run.render_and_compare(what, &turned, &profile, moved)?;
+        let off = max_difference(&still.rgba, &image.rgba);
+        // A device quantizes each of 16 coefficients in steps of 1/32,767 of the largest one of its cluster
+        // of 256, which is below 5e-4 in sum. The other backends keep f32.
+        run.check_at_most(format!("{what}: off by"), off.into(), 5e-4);
     }
     Ok(())
 }
@@ -41,7 +43,7 @@ fn t25(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
 /// Sixty balls of SH degree 3, 4 to 6 m ahead.
 fn actor() -> Gaussians {
     let balls = (0..60).map(|i| {
-        let [x, y, z, ..] = evenly(i);
+        let [x, y, z, ..] = low_discrepancy(i);
         GaussianSpec {
             mean_m: DVec3::new(2.0 * x - 1.0, 1.6 * y - 0.8, 4.0 + 2.0 * z),
             sigma_m: DVec3::new(0.3, 0.1, 0.2),
@@ -53,14 +55,14 @@ fn actor() -> Gaussians {
     actor.raise_sh_degree(3);
     for (i, colour) in actor.sh.chunks_exact_mut(3 * sh::coefficients(3)).enumerate() {
         for (k, value) in colour[3..].iter_mut().enumerate() {
-            *value = (0.4 * (evenly(i * 45 + k)[3] - 0.5)) as f32;
+            *value = (0.4 * (low_discrepancy(i * 45 + k)[3] - 0.5)) as f32;
         }
     }
     actor
 }
 
-/// The same Gaussians turned about the origin, colours included.
-fn turned(actor: &Gaussians, turn: DQuat) -> Gaussians {
+/// The same Gaussians rotated about the origin, with their colours.
+fn rotated(actor: &Gaussians, turn: DQuat) -> Gaussians {
     let mut turned = actor.clone();
     let colours = sh::ShRotation::new(DMat3::from_quat(turn), 3);
     for mean in &mut turned.means_m {

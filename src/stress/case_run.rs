@@ -1,4 +1,4 @@
-//! A case on its way through one backend: what it draws, and which bounds it looked at.
+//! One run of a case on one backend: what it renders, and the checks it makes.
 
 use std::fmt;
 
@@ -26,13 +26,15 @@ pub struct Check {
     bound: Bound,
 }
 
+/// What a measured value must satisfy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Bound {
-    Most(f64),
-    /// In dB.
-    LeastDb(f64),
-    /// The value is 1 if it is so.
-    So,
+    /// At most this.
+    AtMost(f64),
+    /// At least so many dB.
+    AtLeastDb(f64),
+    /// The value is 1 for true.
+    True,
 }
 
 impl<'a> CaseRun<'a> {
@@ -40,12 +42,12 @@ impl<'a> CaseRun<'a> {
         Self { backend, checks: Vec::new(), refused: None, reduced_to: None }
     }
 
-    /// Everything that was looked at.
+    /// All checks, in order.
     pub(super) fn into_checks(self) -> Vec<Check> {
         self.checks
     }
 
-    /// How it went, in the end.
+    /// The outcome of the run, given how its function ended.
     pub(super) fn outcome(self, case: &Case, ended: Result<(), RenderError>) -> Outcome {
         let (verdict, detail, bound_usage) = match (self.verdict(), &self.refused, ended) {
             (_, _, Err(error)) => (Verdict::Missed, error.to_string(), f64::INFINITY),
@@ -56,7 +58,9 @@ impl<'a> CaseRun<'a> {
             (Some(check), None, _) => (Verdict::Held, check.to_string(), check.bound_usage()),
             (None, None, _) => (Verdict::Missed, "nothing was compared".to_owned(), f64::INFINITY),
         };
-        let (case, backend, checks) = (case.number, self.backend.name(), self.checks.len());
+        let case = case.number;
+        let backend = self.backend.name();
+        let checks = self.checks.len();
         Outcome {
             case,
             backend,
@@ -69,7 +73,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    /// The first bound that does not hold, else the one that is closest to not holding.
+    /// The first check that failed, or else the one closest to its bound.
     pub(super) fn verdict(&self) -> Option<&Check> {
         let missed = self.checks.iter().find(|check| !check.holds());
         let closest =
@@ -77,25 +81,25 @@ impl<'a> CaseRun<'a> {
         missed.or_else(closest)
     }
 
-    /// Looks at a value that must be at most `most`. NaN is not.
-    pub(super) fn at_most(&mut self, what: impl Into<String>, measured: f64, most: f64) {
-        self.checks.push(Check { what: what.into(), measured, bound: Bound::Most(most) });
+    /// Checks that a value is at most `most`. A NaN is not.
+    pub(super) fn check_at_most(&mut self, what: impl Into<String>, measured: f64, most: f64) {
+        self.checks.push(Check { what: what.into(), measured, bound: Bound::AtMost(most) });
     }
 
-    /// Looks at decibels that must be at least `least`. NaN is not.
-    pub(super) fn at_least_db(&mut self, what: impl Into<String>, measured: f64, least: f64) {
-        self.checks.push(Check { what: what.into(), measured, bound: Bound::LeastDb(least) });
+    /// Checks that a value in dB is at least `least`. A NaN is not.
+    pub(super) fn check_at_least_db(&mut self, what: impl Into<String>, measured: f64, least: f64) {
+        self.checks.push(Check { what: what.into(), measured, bound: Bound::AtLeastDb(least) });
     }
 
-    /// Looks at something that is so or not.
-    pub(super) fn holds(&mut self, what: impl Into<String>, holds: bool) {
+    /// Checks that a statement is true.
+    pub(super) fn check(&mut self, what: impl Into<String>, holds: bool) {
         let measured = f64::from(u8::from(holds));
-        self.checks.push(Check { what: what.into(), measured, bound: Bound::So });
+        self.checks.push(Check { what: what.into(), measured, bound: Bound::True });
     }
 
-    /// Takes a refusal that names how much fits for the limit that it is. Devices have such limits and nothing
-    /// else has: of another backend it is an error as any other.
-    pub(super) fn refused(&mut self, error: RenderError) -> Result<(), RenderError> {
+    /// Accepts an error that names a limit of the device ([`RenderError::TooMany`]): the verdict is then
+    /// [`Verdict::Refused`]. Only devices have such limits; from another backend it is an error like any other.
+    pub(super) fn accept_limit(&mut self, error: RenderError) -> Result<(), RenderError> {
         if !matches!(error, RenderError::TooMany { .. }) || self.backend.name() != "gpu" {
             return Err(error);
         }
@@ -103,18 +107,18 @@ impl<'a> CaseRun<'a> {
         Ok(())
     }
 
-    /// Says what is drawn, where that is less than what the case says.
+    /// Records what is rendered instead, if it is less than what the case states.
     pub(super) fn reduce_to(&mut self, what: impl Into<String>) {
         self.reduced_to = Some(what.into());
     }
 
-    /// Whether this is the definition itself.
+    /// Whether the backend is the reference backend.
     pub(super) fn is_reference(&self) -> bool {
         self.backend.name() == Reference.name()
     }
 
-    /// What the backend draws of a view.
-    pub(super) fn draw(
+    /// The backend's images of one view.
+    pub(super) fn render(
         &self,
         scene: &Scene,
         profile: &RenderProfile,
@@ -123,7 +127,7 @@ impl<'a> CaseRun<'a> {
         Ok(render_images(self.backend, scene, profile, &[view])?.remove(0))
     }
 
-    /// What a frame of a view costs.
+    /// The time and work of a frame of one view.
     pub(super) fn stats(
         &self,
         scene: &Scene,
@@ -136,8 +140,8 @@ impl<'a> CaseRun<'a> {
         self.backend.render(&frame, &mut [target], &|_, _| {})
     }
 
-    /// What it draws of several in one frame.
-    pub(super) fn draw_all(
+    /// The backend's images of several views, rendered in one frame.
+    pub(super) fn render_all(
         &self,
         scene: &Scene,
         profile: &RenderProfile,
@@ -146,8 +150,8 @@ impl<'a> CaseRun<'a> {
         render_images(self.backend, scene, profile, views)
     }
 
-    /// The definition's drawing.
-    pub(super) fn truth(
+    /// The reference backend's images of one view.
+    pub(super) fn render_reference(
         &self,
         scene: &Scene,
         profile: &RenderProfile,
@@ -156,58 +160,62 @@ impl<'a> CaseRun<'a> {
         Ok(render_images(&Reference, scene, profile, &[view])?.remove(0))
     }
 
-    /// The backend's drawing, after it was looked at whether it is finite, and whether the definition's is
-    /// the same. The definition is not compared with itself: of it a case holds what it says in numbers.
-    pub(super) fn agreed(
+    /// The backend's images of one view, after checks that every value is finite and that the reference
+    /// backend's images agree. The reference backend is not compared with itself; its images must satisfy
+    /// what a case states in numbers.
+    pub(super) fn render_and_compare(
         &mut self,
         what: impl Into<String>,
         scene: &Scene,
         profile: &RenderProfile,
         view: View,
     ) -> Result<RenderedImage, RenderError> {
-        let (what, drawing) = (what.into(), self.draw(scene, profile, view)?);
-        let RenderedImage { rgba, depth_m, opacity, .. } = &drawing;
+        let what = what.into();
+        let image = self.render(scene, profile, view)?;
+        let RenderedImage { rgba, depth_m, opacity, .. } = &image;
         let mut values = rgba.iter().chain(depth_m).chain(opacity);
-        self.holds(format!("{what}: every value is finite"), values.all(|v| v.is_finite()));
+        self.check(format!("{what}: every value is finite"), values.all(|v| v.is_finite()));
         if !self.is_reference() {
-            let truth = self.truth(scene, profile, view)?;
-            self.compare(what, &drawing, &truth);
+            let truth = self.render_reference(scene, profile, view)?;
+            self.check_agreement(what, &image, &truth);
         }
-        Ok(drawing)
+        Ok(image)
     }
 
-    /// Looks at whether two drawings are of one thing.
-    pub(super) fn compare(
+    /// Checks that two images agree ([`agree`]).
+    pub(super) fn check_agreement(
         &mut self,
         what: impl Into<String>,
-        drawing: &RenderedImage,
+        image: &RenderedImage,
         truth: &RenderedImage,
     ) {
-        match agree(drawing, truth) {
-            Ok(db) => self.at_least_db(format!("{}: as f64, dB", what.into()), db, AGREEMENT_DB),
-            Err(off) => self.holds(format!("{}: as f64, {off}", what.into()), false),
+        match agree(image, truth) {
+            Ok(db) => {
+                self.check_at_least_db(format!("{}: as f64, dB", what.into()), db, AGREEMENT_DB)
+            }
+            Err(off) => self.check(format!("{}: as f64, {off}", what.into()), false),
         }
     }
 }
 
 impl Check {
-    /// Whether the value is within its bound; NaN never is.
+    /// Whether the value satisfies its bound; a NaN never does.
     pub fn holds(&self) -> bool {
         match self.bound {
-            Bound::Most(most) => self.measured <= most,
-            Bound::LeastDb(least) => self.measured >= least,
-            Bound::So => self.measured == 1.0,
+            Bound::AtMost(most) => self.measured <= most,
+            Bound::AtLeastDb(least) => self.measured >= least,
+            Bound::True => self.measured == 1.0,
         }
     }
 
-    /// How much of its bound the value takes: 1 is all of it. Of decibels it is the error that counts, a tenth
-    /// for every 20 dB.
+    /// The share of its bound that the value takes: 1 is all of it. In dB the error counts: 20 dB are a
+    /// factor of ten.
     pub fn bound_usage(&self) -> f64 {
         match self.bound {
-            Bound::Most(0.0) => self.measured,
-            Bound::Most(most) => self.measured / most,
-            Bound::LeastDb(least) => 10.0_f64.powf((least - self.measured) / 20.0),
-            Bound::So => 0.0,
+            Bound::AtMost(0.0) => self.measured,
+            Bound::AtMost(most) => self.measured / most,
+            Bound::AtLeastDb(least) => 10.0_f64.powf((least - self.measured) / 20.0),
+            Bound::True => 0.0,
         }
     }
 }
@@ -223,12 +231,12 @@ impl fmt::Display for Check {
             v => format!("{v}"),
         };
         match *bound {
-            Bound::Most(most) => {
+            Bound::AtMost(most) => {
                 write!(f, "{what} {}, at most {}", number(*measured), number(most))
             }
-            Bound::So if self.holds() => write!(f, "{what}"),
-            Bound::So => write!(f, "not: {what}"),
-            Bound::LeastDb(least) => {
+            Bound::True if self.holds() => write!(f, "{what}"),
+            Bound::True => write!(f, "not: {what}"),
+            Bound::AtLeastDb(least) => {
                 write!(f, "{what} {}, at least {}", number(*measured), number(least))
             }
         }
@@ -245,21 +253,21 @@ mod tests {
 
     #[test]
     fn bound_usage_is_the_share_of_the_bound() {
-        assert_eq!(bound_usage(0.5, Bound::Most(2.0)), 0.25);
-        assert_eq!(bound_usage(70.0, Bound::LeastDb(70.0)), 1.0);
-        assert!((bound_usage(110.0, Bound::LeastDb(70.0)) - 0.01).abs() < 1e-15);
-        assert!((bound_usage(50.0, Bound::LeastDb(70.0)) - 10.0).abs() < 1e-12);
-        assert_eq!(bound_usage(f64::INFINITY, Bound::LeastDb(70.0)), 0.0);
+        assert_eq!(bound_usage(0.5, Bound::AtMost(2.0)), 0.25);
+        assert_eq!(bound_usage(70.0, Bound::AtLeastDb(70.0)), 1.0);
+        assert!((bound_usage(110.0, Bound::AtLeastDb(70.0)) - 0.01).abs() < 1e-15);
+        assert!((bound_usage(50.0, Bound::AtLeastDb(70.0)) - 10.0).abs() < 1e-12);
+        assert_eq!(bound_usage(f64::INFINITY, Bound::AtLeastDb(70.0)), 0.0);
     }
 
     #[test]
     fn the_detail_is_the_check_that_is_closest_to_its_bound() {
-        let mut trial = CaseRun::new(&Reference);
-        trial.at_least_db("far from its bound, dB", 145.0, 70.0);
-        trial.at_most("close to it", 3e-4, 5e-4);
-        trial.at_least_db("closer, dB", 71.0, 70.0);
-        assert_eq!(trial.verdict().unwrap().what, "closer, dB");
-        trial.at_most("beyond", f64::NAN, 5e-4);
-        assert_eq!(trial.verdict().unwrap().what, "beyond");
+        let mut run = CaseRun::new(&Reference);
+        run.check_at_least_db("far from its bound, dB", 145.0, 70.0);
+        run.check_at_most("close to it", 3e-4, 5e-4);
+        run.check_at_least_db("closer, dB", 71.0, 70.0);
+        assert_eq!(run.verdict().unwrap().what, "closer, dB");
+        run.check_at_most("beyond", f64::NAN, 5e-4);
+        assert_eq!(run.verdict().unwrap().what, "beyond");
     }
 }

@@ -1,9 +1,9 @@
-//! Lenses beyond a half circle, and shutters that roll.
+//! Lenses that see more than 180°, and rolling shutters.
 
 use glam::{DQuat, DVec2, DVec3};
 
-use super::order::evenly;
-use super::{Case, CaseRun, Run};
+use super::order::low_discrepancy;
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
 use wildcity_render::compare::images::crop_view;
 use wildcity_render::compare::psnr::psnr_db;
@@ -14,39 +14,41 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 
 pub(super) const T22: Case = Case {
     number: "T22",
-    what: "a Gaussian an eighth as deep as it is far, through a fisheye: six points for all of it",
+    what: "a Gaussian with a standard deviation of an eighth of its distance, through a fisheye: six points",
     bound: "agrees with f64; centre within 0.2 px and spread within 3 % of 20,000 points of it",
-    run: Run::Light(t22),
+    body: CaseBody::Light(t22),
 };
 
-/// A fisheye of 160 x 120 px, and what is wide and close before it.
-fn wide() -> (Camera, GaussianSpec) {
+/// A fisheye camera of 160 x 120 px, and a wide Gaussian close to it.
+fn fisheye_and_gaussian() -> (Camera, GaussianSpec) {
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 80.0, cy: 60.0 };
     let lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
-    let blob = GaussianSpec {
+    let gaussian = GaussianSpec {
         mean_m: DVec3::new(0.8, 0.3, 2.0),
         rotation: DQuat::from_rotation_y(0.5),
         sigma_m: DVec3::new(0.2, 0.12, 0.25),
         ..GaussianSpec::default()
     };
-    (Camera { lens, ..Camera::from_pinhole(160, 120, pinhole) }, blob)
+    (Camera { lens, ..Camera::from_pinhole(160, 120, pinhole) }, gaussian)
 }
 
-fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (camera, blob) = wide();
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
-    let drawing = trial.agreed("six points", &scene_of(&[blob]), &profile, view)?;
-    let pixels = drawing.opacity.iter().enumerate().map(|(pixel, &opacity)| {
+fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let (camera, gaussian) = fisheye_and_gaussian();
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
+    let image = run.render_and_compare("six points", &scene_of(&[gaussian]), &profile, view)?;
+    let pixels = image.opacity.iter().enumerate().map(|(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         (f64::from(opacity), at_px)
     });
     let (drawn_px, drawn_px2) = moments(pixels);
-    let (point_px, point_px2) = sampled(&camera, &blob);
+    let (point_px, point_px2) = sampled(&camera, &gaussian);
 
-    trial.at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
-    // What is drawn ends where alpha is below the cut, at r² = 2 ln(opacity / cut): a Gaussian up to r has
-    // 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. And the renderer blurs.
-    let left = profile.alpha_cut / blob.opacity;
+    run.check_at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
+    // The image of a splat ends where alpha is below the cut, at r² = 2 ln(opacity / cut) in standard
+    // deviations. A 2D Gaussian truncated at r has 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. The
+    // renderer's blur adds to it.
+    let left = profile.alpha_cut / gaussian.opacity;
     let share = 1.0 + left.ln() * left / (1.0 - left);
     let size_px2 = point_px2[0] + point_px2[1];
     for (axis, (drawn, point)) in
@@ -54,25 +56,30 @@ fn t22(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
     {
         let blur = if axis == "xy" { 0.0 } else { profile.blur };
         let off = (drawn / share - blur - point).abs() / size_px2;
-        trial.at_most(format!("spread along {axis} off by"), off, 0.03);
+        run.check_at_most(format!("spread along {axis} off by"), off, 0.03);
     }
     Ok(())
 }
 
-/// Mean and variances on the image of 20,000 points of a blob.
-fn sampled(camera: &Camera, blob: &GaussianSpec) -> (DVec2, [f64; 3]) {
+/// Mean and covariance on the image of 20,000 points that are distributed like a Gaussian.
+fn sampled(camera: &Camera, gaussian: &GaussianSpec) -> (DVec2, [f64; 3]) {
     const POINTS: usize = 20_000;
-    // Box and Muller's normal numbers, of fractions that fill the cube evenly.
+    // Normal numbers by Box and Muller, from a low-discrepancy sequence.
     let normal = |u: f64, v: f64| (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos();
     let point = |i: usize| {
-        let [a, b, c, d, e, f] = evenly(i);
+        let [a, b, c, d, e, f] = low_discrepancy(i);
         let unit = DVec3::new(normal(a, b), normal(c, d), normal(e, f));
-        (1.0, camera.project_extrapolated(blob.mean_m + blob.rotation * (blob.sigma_m * unit)))
+        (
+            1.0,
+            camera.project_extrapolated(
+                gaussian.mean_m + gaussian.rotation * (gaussian.sigma_m * unit),
+            ),
+        )
     };
     moments((0..POINTS).map(point))
 }
 
-/// Mean of weighted places, and their variances along x, along y, and mixed.
+/// Mean of weighted points, and their covariance: along x, along y, and mixed.
 fn moments(places: impl Iterator<Item = (f64, DVec2)> + Clone) -> (DVec2, [f64; 3]) {
     let sum: f64 = places.clone().map(|(weight, _)| weight).sum();
     let mean = places.clone().map(|(weight, at)| weight * at).sum::<DVec2>() / sum;
@@ -84,75 +91,83 @@ fn moments(places: impl Iterator<Item = (f64, DVec2)> + Clone) -> (DVec2, [f64; 
 
 pub(super) const T23: Case = Case {
     number: "T23",
-    what: "a fisheye of 220°, with something behind it and all around it; what is beyond the fold of OpenCV's lens",
-    bound: "agrees with f64; what the lens does not see is exactly nothing; nothing is mirrored at a fold",
-    run: Run::Light(t23),
+    what: "a fisheye of 220°, with Gaussians behind it and all around it; Gaussians beyond the fold of an OpenCV lens",
+    bound: "agrees with f64; pixels outside of the field are exactly 0; nothing is mirrored at a fold",
+    body: CaseBody::Light(t23),
 };
 
-fn t23(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
     let camera = Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) };
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
     let ball = |mean_m: DVec3| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
 
-    let behind = trial.draw(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
-    trial.holds("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
+    let behind = run.render(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
+    run.check("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
     let (sin, cos) = 100_f64.to_radians().sin_cos();
-    let beside = trial.agreed("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
-    trial.holds("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
+    let beside =
+        run.render_and_compare("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
+    run.check("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
 
     let wall =
         GaussianSpec { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..GaussianSpec::default() };
-    let wall = trial.agreed("all around", &scene_of(&[wall]), &profile, view)?;
+    let wall = run.render_and_compare("all around", &scene_of(&[wall]), &profile, view)?;
     let wrong = wall.opacity.iter().enumerate().filter(|&(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
         (opacity > 0.0) != camera.unproject(at_px).is_some()
     });
-    trial.at_most("pixels wrong about the lens' field:", wrong.count() as f64, 0.0);
-    folded(trial)
+    run.check_at_most("pixels wrong about the lens' field:", wrong.count() as f64, 0.0);
+    folded(run)
 }
 
-/// Balls within and beyond the fold of a lens whose image turns back there.
-fn folded(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // r (1 + k3 r⁶) rises up to a slope of r = 0.8, where it is 6/7 of it; at 1.107 it is back at the axis.
+/// Balls within and beyond the fold of a lens: the angle at which its polynomial's radius begins to fall.
+fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    // r (1 + k3 r⁶) rises up to r = 0.8, where it is 6/7 of r, and falls to 0 at r = 1.107.
     const FOLD: f64 = 0.8;
     const FOCAL_PX: f64 = 80.0;
     let k3 = -1.0 / (7.0 * FOLD.powi(6));
     let lens = OpenCv::new([0.0, 0.0, k3, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: FOCAL_PX, fy: FOCAL_PX, cx: 80.0, cy: 60.0 };
     let camera = Camera { lens: Lens::opencv(lens), ..Camera::from_pinhole(160, 120, pinhole) };
-    let (profile, view) = (RenderProfile::DEFAULT, View::new(camera, Pose::IDENTITY));
+    let profile = RenderProfile::DEFAULT;
+    let view = View::new(camera, Pose::IDENTITY);
     let ball = |slope: f64, around: f64| GaussianSpec {
         mean_m: 5.0 * DVec3::new(slope * around.cos(), slope * around.sin(), 1.0),
         sigma_m: DVec3::splat(0.02),
         ..GaussianSpec::default()
     };
-    let within = trial.agreed("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
-    trial.holds("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
-    // As if there were no fold they would land within 0.65 focal lengths of the axis. What is beyond the field
-    // may reach over its edge, which is at 0.68, by as much as the blur.
+    let within =
+        run.render_and_compare("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
+    run.check("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
+    // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball beyond the
+    // field may reach over the edge of the field, which is at 0.68, by as much as the blur.
     let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
     let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
-    let drawing =
-        trial.agreed("beyond the fold", &scene_of(&beyond.collect::<Vec<_>>()), &profile, view)?;
-    let mirrored = drawing.opacity.iter().enumerate().filter(|&(pixel, _)| {
+    let image = run.render_and_compare(
+        "beyond the fold",
+        &scene_of(&beyond.collect::<Vec<_>>()),
+        &profile,
+        view,
+    )?;
+    let mirrored = image.opacity.iter().enumerate().filter(|&(pixel, _)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         at_px.distance(DVec2::new(80.0, 60.0)) < 0.65 * FOCAL_PX
     });
     let most = mirrored.fold(0.0_f32, |most, (_, &opacity)| most.max(opacity));
-    trial.at_most("beyond the fold: opacity of what is mirrored", most.into(), 0.0);
+    run.check_at_most("beyond the fold: opacity of what is mirrored", most.into(), 0.0);
     Ok(())
 }
 
 pub(super) const T24: Case = Case {
     number: "T24",
     what: "rolling shutter at 30 m/s and 30 ms, in a curve",
-    bound: "agrees with f64; at least 42 dB of every row by itself, from where the camera then stands, by rays",
-    run: Run::Light(t24),
+    bound: "agrees with f64; at least 42 dB against exact rays of each row from the camera's pose at that moment",
+    body: CaseBody::Light(t24),
 };
 
-fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t24(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     const SIZE_PX: [u32; 2] = [96, 64];
     let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 48.0, cy: 32.0 };
     let camera = Camera::from_pinhole(SIZE_PX[0], SIZE_PX[1], pinhole);
@@ -166,27 +181,28 @@ fn t24(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         };
         let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first });
         let view = View { rolling_shutter, ..View::new(camera, Pose::IDENTITY) };
-        let drawing = trial.agreed(format!("{direction:?}"), &balls, &profile, view)?;
-        let (mut drawn, mut truth) = (Vec::new(), Vec::new());
+        let image = run.render_and_compare(format!("{direction:?}"), &balls, &profile, view)?;
+        let mut drawn = Vec::new();
+        let mut truth = Vec::new();
         for row in (0..SIZE_PX[1]).step_by(5) {
             let at_px = DVec2::splat(f64::from(row) + 0.5);
             let still = View::new(camera, view.world_from_camera_at(at_px));
             let own = crop_view(still, [0, row as i32], [SIZE_PX[0], 1]);
-            truth.extend(trial.truth(&balls, &exact, own)?.rgba);
+            truth.extend(run.render_reference(&balls, &exact, own)?.rgba);
             let first = 4 * (row * SIZE_PX[0]) as usize;
-            drawn.extend_from_slice(&drawing.rgba[first..first + 4 * SIZE_PX[0] as usize]);
+            drawn.extend_from_slice(&image.rgba[first..first + 4 * SIZE_PX[0] as usize]);
         }
         let what = format!("{direction:?}, row by row: dB");
         let differences = drawn.iter().zip(&truth).map(|(a, b)| f64::from(a - b));
-        trial.at_least_db(what, psnr_db(differences), 42.0);
+        run.check_at_least_db(what, psnr_db(differences), 42.0);
     }
     Ok(())
 }
 
-/// Balls of 15 cm to 45 cm, 5 m to 20 m ahead: nothing that passes at 30 m/s is closer.
+/// Balls with standard deviations of 15 to 45 cm, 5 to 20 m ahead, as objects at 30 m/s.
 fn balls() -> Scene {
     let ball = |i: usize| {
-        let [x, y, z, size, ..] = evenly(i);
+        let [x, y, z, size, ..] = low_discrepancy(i);
         let away_m = 5.0 + 15.0 * z;
         GaussianSpec {
             mean_m: away_m * DVec3::new(1.4 * x - 0.7, 0.9 * y - 0.45, 1.0),
@@ -202,19 +218,22 @@ fn balls() -> Scene {
 mod tests {
     use super::*;
 
-    /// Mean and variances on the image by the scaled unscented transform (Wan and van der Merwe 2000), with
-    /// kappa 0: of points `alpha √3` standard deviations off, and of the centre, whose weight comes first. With
-    /// alpha 1 and beta 0, six points are left, as the renderer has them.
+    /// The scaled unscented transform (Wan and van der Merwe 2000) with kappa 0: of six points at `alpha √3`
+    /// standard deviations, and of the centre. Returns the weight of the centre, and mean and covariance on
+    /// the image. With alpha 1 and beta 0 the centre has no weight, as in the renderer.
     fn unscented(
         camera: &Camera,
-        blob: &GaussianSpec,
+        gaussian: &GaussianSpec,
         alpha: f64,
         beta: f64,
     ) -> (f64, DVec2, [f64; 3]) {
         let scale = 3.0 * alpha * alpha;
-        let (w0, w) = ((scale - 3.0) / scale, 0.5 / scale);
+        let w0 = (scale - 3.0) / scale;
+        let w = 0.5 / scale;
         let land = |unit: DVec3| {
-            camera.project_extrapolated(blob.mean_m + blob.rotation * (blob.sigma_m * unit))
+            camera.project_extrapolated(
+                gaussian.mean_m + gaussian.rotation * (gaussian.sigma_m * unit),
+            )
         };
         let side = |i: usize| if i.is_multiple_of(2) { scale.sqrt() } else { -scale.sqrt() };
         let center_px = land(DVec3::ZERO);
@@ -228,28 +247,30 @@ mod tests {
         (w0, mean_px, px2)
     }
 
-    /// How far off 20,000 points a rule is: its centre in pixels, and the worst of its spreads as a share.
+    /// How far a rule's mean and covariance are from those of 20,000 points: in pixels, and as a share of the
+    /// size.
     fn off(mean_m: DVec3, [alpha, beta]: [f64; 2]) -> (f64, f64) {
-        let (camera, blob) = wide();
-        let blob = GaussianSpec { mean_m, ..blob };
-        let (point_px, point_px2) = sampled(&camera, &blob);
-        let (_, mean_px, px2) = unscented(&camera, &blob, alpha, beta);
+        let (camera, gaussian) = fisheye_and_gaussian();
+        let gaussian = GaussianSpec { mean_m, ..gaussian };
+        let (point_px, point_px2) = sampled(&camera, &gaussian);
+        let (_, mean_px, px2) = unscented(&camera, &gaussian, alpha, beta);
         let size_px2 = point_px2[0] + point_px2[1];
         let spreads = px2.iter().zip(point_px2).map(|(a, b)| (a - b).abs() / size_px2);
         (mean_px.distance(point_px), spreads.fold(0.0, f64::max))
     }
 
-    /// gsplat's weights, with alpha 0.1, beta 2 and so -99 at the centre, hold T22 as well, and closer than six
-    /// points without a centre. They follow the lens at the centre alone: of what is as wide as it is far,
-    /// 135° off the axis, they are 2,000 px off, where six points are 150.
+    /// gsplat's weights (alpha 0.1, beta 2, and so -99 at the centre) keep T22, too, and are closer than six
+    /// points without a centre. But they follow the lens only near the centre: for a Gaussian as wide as it
+    /// is far, 135° off the axis, they are off by 2,000 px, and six points by 150 px.
     #[test]
-    fn what_weights_of_minus_99_would_do() {
-        let (camera, blob) = wide();
-        let (six, taylor) = ([1.0, 0.0], [0.1, 2.0]);
-        assert_eq!(unscented(&camera, &blob, six[0], six[1]).0, 0.0);
-        assert!((unscented(&camera, &blob, taylor[0], taylor[1]).0 + 99.0).abs() < 1e-9);
+    fn a_weight_of_minus_99_fails_far_off_the_axis() {
+        let (camera, gaussian) = fisheye_and_gaussian();
+        let six = [1.0, 0.0];
+        let taylor = [0.1, 2.0];
+        assert_eq!(unscented(&camera, &gaussian, six[0], six[1]).0, 0.0);
+        assert!((unscented(&camera, &gaussian, taylor[0], taylor[1]).0 + 99.0).abs() < 1e-9);
         for (rule, most_px, most) in [(six, 0.01, 0.02), (taylor, 0.001, 0.01)] {
-            let (center_px, spread) = off(blob.mean_m, rule);
+            let (center_px, spread) = off(gaussian.mean_m, rule);
             assert!(center_px < most_px && spread < most, "{rule:?}: {center_px} px, {spread}");
         }
         let beside_m = DVec3::new(0.1, 0.0, -0.1);

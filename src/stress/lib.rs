@@ -1,18 +1,33 @@
-//! The stress table: stiff and extreme scenes, each of which has broken a published renderer, with the
-//! bound that every backend must keep. `wildcity stress` prints it, and tests run it.
+//! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that every
+//! backend must keep. `wildcity stress` runs them and prints the table, and tests run them: a driver that is
+//! wrong on one machine is found on that machine.
 //!
 //! ```text
-//! shapes     needles, dust, walls, what lies beside the view        T1 T2 T3 T13 T26
-//! places     closer than a hand, behind, 4,500 km off, 10 km deep   T4 T5 T7 T9 T10
+//! shapes     needles, dust, walls, Gaussians beside the view        T1 T2 T3 T13 T26
+//! places     centimetres away, behind, 4,500 km off, 10 km deep     T4 T5 T7 T9 T10
 //! order      equal depths, duplicates, popping, millions of keys    T6 T8 T20 T21 T27
-//! opacities  every opacity, poison, the stop rule                   T11 T12 T19 T28
+//! opacities  every opacity, NaN and infinity, the stop rule         T11 T12 T19 T28
 //! sizes      nothing, one pixel, 8K, growing buffers, crops         T14 to T18
-//! lenses     a wide splat, beyond a half circle, rolling shutters   T22 T23 T24
-//! actors     what turns with its colours                            T25
+//! lenses     a wide splat, more than 180°, rolling shutters         T22 T23 T24
+//! actors     colours that rotate with an actor                      T25
 //! ```
+//!
+//! The reference backend is not compared with itself: its images must be finite, and keep what a case states
+//! in numbers.
+//!
+//! # How to add a case
+//!
+//! 1. Write a constant `TN: Case` and a function `tN(run: &mut CaseRun<'_>)` in the file of its family. The
+//!    function builds a scene ([`GaussianSpec`](wildcity_render::compare::gaussians::GaussianSpec) is the
+//!    short form), renders it with `run.render_and_compare`, which also checks that every value is finite and
+//!    that the reference backend agrees, and states further bounds with `run.check_at_most`,
+//!    `run.check_at_least_db` and `run.check`. Each check's text must say what was measured and where.
+//! 2. Add it to [`CASES`], in order of numbers. A case that takes gigabytes or minutes is a
+//!    `CaseBody::Heavy`, which runs only with `--heavy`.
+//! 3. Add a mutation to `tests/stress/mutations.rs` for every check: a faulty backend with which the check
+//!    must fail. A test fails for a check without one, since a bound that no fault exceeds proves nothing.
 
 mod actors;
-
 mod case_run;
 mod lenses;
 mod opacities;
@@ -33,27 +48,27 @@ pub use case_run::{CaseRun, Check};
 /// One row of the table.
 #[derive(Clone, Copy, Debug)]
 pub struct Case {
-    /// Its number in the table of the design, as `T1`; from T26 on, what was found here.
+    /// Its number, such as `T1`. T1 to T25 are those of the project's design; the others were found later.
     pub number: &'static str,
-    /// What is drawn.
+    /// The scene and the views.
     pub what: &'static str,
-    /// What must hold.
+    /// The bound, in words.
     pub bound: &'static str,
-    run: Run,
+    body: CaseBody,
 }
 
-/// How a case is run.
+/// What a case runs, and how much it takes.
 #[derive(Clone, Copy, Debug)]
-enum Run {
+enum CaseBody {
     /// Seconds, and little memory.
     Light(Body),
-    /// Gigabytes and minutes: only if asked for.
+    /// Gigabytes and minutes: run only on request.
     Heavy(Body),
 }
 
 type Body = fn(&mut CaseRun<'_>) -> Result<(), RenderError>;
 
-/// Every case, in order of their numbers.
+/// All cases, in order of their numbers.
 pub static CASES: [Case; 28] = [
     shapes::T1,
     shapes::T2,
@@ -85,39 +100,40 @@ pub static CASES: [Case; 28] = [
     opacities::T28,
 ];
 
-/// How a case went on one backend.
+/// The result of a case on one backend.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Outcome {
     /// The case's number.
     pub case: &'static str,
     /// The backend's name.
     pub backend: &'static str,
-    /// Whether it was run, and how it went.
+    /// Whether it was run, and whether its bounds held.
     pub verdict: Verdict,
-    /// What was drawn, where that is less than what the case says.
+    /// What was rendered instead, if it is less than what the case states.
     #[serde(rename = "only")]
     pub reduced_to: Option<String>,
-    /// What was compared, the first miss first, else what came closest to its bound; or what was refused.
+    /// The first check that failed; or else the check closest to its bound, the limit of the device, or why
+    /// the case was not run.
     #[serde(rename = "told")]
     pub detail: String,
-    /// How much of its bound that took: 1 is all of it, 0 none or nothing that has a size.
+    /// The share of its bound that this check's value takes: 1 is all of it; 0 for a check without a size.
     #[serde(rename = "strain")]
     pub bound_usage: f64,
-    /// How many bounds were looked at.
+    /// Number of checks.
     pub checks: usize,
-    /// How long it took.
+    /// Wall time in seconds.
     pub seconds: f64,
 }
 
-/// How a case went.
+/// The verdict on a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Within its bounds.
+    /// All bounds hold.
     Held,
-    /// Out of one, or the frame failed.
+    /// A bound does not hold, or a frame failed.
     Missed,
-    /// More than the device may hold, which it said with how much fits: a limit, and no miss.
+    /// The frame exceeds a limit of the device, which the device named. This is not a failure.
     Refused,
     /// Not run: `detail` says why.
     NotRun,
@@ -126,30 +142,30 @@ pub enum Verdict {
 impl Case {
     /// Runs the case on a backend; a heavy one only if `heavy`.
     pub fn run(&self, backend: &dyn Backend, heavy: bool) -> Outcome {
-        let body = match self.run {
-            Run::Heavy(_) if !heavy => {
+        let body = match self.body {
+            CaseBody::Heavy(_) if !heavy => {
                 return self.not_run(backend.name(), "takes gigabytes and minutes: add --heavy");
             }
-            Run::Light(body) | Run::Heavy(body) => body,
+            CaseBody::Light(body) | CaseBody::Heavy(body) => body,
         };
         let start = Instant::now();
-        let mut trial = CaseRun::new(backend);
-        let ended = body(&mut trial);
-        Outcome { seconds: start.elapsed().as_secs_f64(), ..trial.outcome(self, ended) }
+        let mut run = CaseRun::new(backend);
+        let ended = body(&mut run);
+        Outcome { seconds: start.elapsed().as_secs_f64(), ..run.outcome(self, ended) }
     }
 
-    /// Everything that it looks at on a backend, in order.
+    /// All checks of the case on a backend, in order.
     ///
     /// # Errors
     /// A frame failed.
     pub fn checks(&self, backend: &dyn Backend) -> Result<Vec<Check>, RenderError> {
-        let (Run::Light(body) | Run::Heavy(body)) = self.run;
-        let mut trial = CaseRun::new(backend);
-        body(&mut trial)?;
-        Ok(trial.into_checks())
+        let (CaseBody::Light(body) | CaseBody::Heavy(body)) = self.body;
+        let mut run = CaseRun::new(backend);
+        body(&mut run)?;
+        Ok(run.into_checks())
     }
 
-    /// The outcome where it could not be run.
+    /// The outcome if the case was not run.
     pub fn not_run(&self, backend: &'static str, why: &str) -> Outcome {
         Outcome {
             case: self.number,
@@ -165,7 +181,7 @@ impl Case {
 }
 
 impl Outcome {
-    /// Its verdict in a word, with what was drawn where that is less than what the case says.
+    /// The verdict in a word, with what was rendered instead if it is less than what the case states.
     pub fn word(&self) -> String {
         match &self.reduced_to {
             Some(reduced_to) => format!("{} ({reduced_to})", self.verdict.word()),

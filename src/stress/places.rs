@@ -1,8 +1,9 @@
-//! Closer than a hand, around and behind the camera, ten kilometres deep, and far from the origin.
+//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far from the
+//! origin.
 
 use glam::DVec3;
 
-use super::{Case, CaseRun, Run};
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
@@ -14,10 +15,10 @@ pub(super) const T4: Case = Case {
     number: "T4",
     what: "centres 0.01 to 0.21 m ahead, near 0.01 and 0.2 m",
     bound: "agrees with f64; drawn if and only if beyond near",
-    run: Run::Light(t4),
+    body: CaseBody::Light(t4),
 };
 
-fn t4(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for near in [0.01, 0.2] {
         let profile = RenderProfile { near, ..RenderProfile::default() };
         for z in [0.0100001, 0.011, 0.05, 0.19, 0.21] {
@@ -28,9 +29,9 @@ fn t4(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
             }]);
             let what = format!("{z} m, near {near} m");
             let view = forward_view([160, 120], 1800.0);
-            let drawing = trial.agreed(what.clone(), &close, &profile, view)?;
-            let drawn = drawing.opacity.iter().any(|&o| o > 0.0);
-            trial.holds(format!("{what}: drawn as near says"), drawn == (z > near));
+            let image = run.render_and_compare(what.clone(), &close, &profile, view)?;
+            let drawn = image.opacity.iter().any(|&o| o > 0.0);
+            run.check(format!("{what}: drawn as near says"), drawn == (z > near));
         }
     }
     Ok(())
@@ -39,22 +40,23 @@ fn t4(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T5: Case = Case {
     number: "T5",
     what: "the camera inside a Gaussian; a centre behind it",
-    bound: "agrees with f64; nothing of what is behind",
-    run: Run::Light(t5),
+    bound: "agrees with f64; the centre behind is not drawn",
+    body: CaseBody::Light(t5),
 };
 
-fn t5(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), forward_view([160, 120], 100.0));
+fn t5(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let view = forward_view([160, 120], 100.0);
     let at = |z, sigma_m| GaussianSpec {
         mean_m: DVec3::new(0.1, 0.0, z),
         sigma_m: DVec3::splat(sigma_m),
         ..GaussianSpec::default()
     };
-    let inside = trial.agreed("inside", &scene_of(&[at(0.3, 2.0)]), &profile, view)?;
-    trial.holds("inside: seen", inside.opacity.iter().any(|&o| o > 0.5));
-    let behind = trial.agreed("behind", &scene_of(&[at(-1.0, 3.0)]), &profile, view)?;
+    let inside = run.render_and_compare("inside", &scene_of(&[at(0.3, 2.0)]), &profile, view)?;
+    run.check("inside: seen", inside.opacity.iter().any(|&o| o > 0.5));
+    let behind = run.render_and_compare("behind", &scene_of(&[at(-1.0, 3.0)]), &profile, view)?;
     let most = behind.opacity.iter().fold(0.0_f32, |most, &o| most.max(o));
-    trial.at_most("behind: opacity", most.into(), 0.0);
+    run.check_at_most("behind: opacity", most.into(), 0.0);
     Ok(())
 }
 
@@ -62,17 +64,18 @@ pub(super) const T7: Case = Case {
     number: "T7",
     what: "pairs one step of f32 apart, from 1 cm to 10 km",
     bound: "agrees with f64; the nearer one of each pair is in front",
-    run: Run::Light(t7),
+    body: CaseBody::Light(t7),
 };
 
-fn t7(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (mut blobs, mut centers) = (Vec::new(), Vec::new());
-    // Along +x, where chunks follow each other, so that centres keep their f32.
+fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let mut specs = Vec::new();
+    let mut centers = Vec::new();
+    // The pairs lie along +x, where each chunk holds its own part, so that centres keep their f32 values.
     for (i, x) in [0.0101_f32, 0.5, 3.0, 70.0, 1000.0, 9999.0].into_iter().enumerate() {
         let slope = (i as f64 - 2.5) * 0.3;
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
             let x = f64::from(x);
-            blobs.push(GaussianSpec {
+            specs.push(GaussianSpec {
                 mean_m: DVec3::new(x, -slope * x, 0.0),
                 sigma_m: DVec3::splat(0.02 * x),
                 rgb,
@@ -83,10 +86,11 @@ fn t7(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }
     let view = view_along([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
-    let drawing = trial.agreed("pairs", &scene_of(&blobs), &RenderProfile::default(), view)?;
+    let image =
+        run.render_and_compare("pairs", &scene_of(&specs), &RenderProfile::default(), view)?;
     for (x, pixel) in centers {
-        let [red, green] = [0, 1].map(|channel| drawing.rgba[4 * pixel + channel]);
-        trial.holds(format!("{x} m: the nearer one is in front"), red > 0.8 && green < 0.2);
+        let [red, green] = [0, 1].map(|channel| image.rgba[4 * pixel + channel]);
+        run.check(format!("{x} m: the nearer one is in front"), red > 0.8 && green < 0.2);
     }
     Ok(())
 }
@@ -94,17 +98,18 @@ fn t7(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T9: Case = Case {
     number: "T9",
     what: "the twin's origin 1e4, 5e5 and 4.5e6 m away",
-    bound: "equal to the origin's within 1/255",
-    run: Run::Light(t9),
+    bound: "equal to the image at the origin within 1/255",
+    body: CaseBody::Light(t9),
 };
 
-fn t9(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (near, view) = (wildcity_generate::canyon(10_000, &mut |_, _| {}), street_view([200, 120]));
+fn t9(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let near = wildcity_generate::canyon(10_000, &mut |_, _| {});
+    let view = street_view([200, 120]);
     let profile = RenderProfile::default();
-    let here = trial.draw(&Scene::from_gaussians(&near), &profile, view)?;
-    trial.holds("something is seen", here.opacity.iter().any(|&o| o > 0.9));
+    let here = run.render(&Scene::from_gaussians(&near), &profile, view)?;
+    run.check("something is seen", here.opacity.iter().any(|&o| o > 0.9));
     for away_m in [1e4, 5e5, 4.5e6] {
-        // Multiples of a cell, so that the chunks hold the same numbers.
+        // Multiples of a cell's size, so that the chunks hold the same numbers.
         let away = DVec3::new(1.0, -1.0, 1.0) * (away_m / 64.0_f64).round() * 64.0;
         let mut far = near.clone();
         for mean in &mut far.means_m {
@@ -112,26 +117,26 @@ fn t9(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
         }
         let mut moved = view;
         moved.world_from_camera.position_m += away;
-        let there = trial.draw(&Scene::from_gaussians(&far), &profile, moved)?;
+        let there = run.render(&Scene::from_gaussians(&far), &profile, moved)?;
         let off = max_difference(&here.rgba, &there.rgba);
-        trial.at_most(format!("{away_m:e} m: off by"), off.into(), 1.0 / 255.0);
+        run.check_at_most(format!("{away_m:e} m: off by"), off.into(), 1.0 / 255.0);
     }
     Ok(())
 }
 
 pub(super) const T10: Case = Case {
     number: "T10",
-    what: "a street 1,000 km off through the record of 32 B",
+    what: "a street 1,000 km from the origin, encoded in the record of 32 B",
     bound: "centres within half a step of 2^-16 m, drawn at 60 dB or more",
-    run: Run::Light(t10),
+    body: CaseBody::Light(t10),
 };
 
-fn t10(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    through(trial, RecordFormat::Q32)
+fn t10(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    encoded_street(run, RecordFormat::Q32)
 }
 
-/// A street through a record.
-fn through(trial: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), RenderError> {
+/// T10 with any record.
+fn encoded_street(run: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), RenderError> {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
     let away = DVec3::new(64.0 * 15_625.0, 64.0 * 15_625.0, 0.0);
     for mean in &mut street.means_m {
@@ -146,19 +151,20 @@ fn through(trial: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), RenderEr
             off_m = off_m.max((chunk.value(index, column) - again.value(index, column)).abs());
         }
     }
-    // A cell is 64 m wide and its range a power of two: steps of 64 / 2^23 m, as the range is from
-    // -32 to 32 m and no wider than a cell.
-    trial.at_most("centres off by m", off_m.into(), 0.5 * 128.0 / f64::from(1 << 23));
+    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The bound is
+    // half a step of 128 m / 2^23 = 2^-16 m.
+    run.check_at_most("centres off by m", off_m.into(), 0.5 * 128.0 / f64::from(1 << 23));
     let mut view = street_view([200, 120]);
     view.world_from_camera.position_m += away;
     let profile = RenderProfile::default();
-    let (right, drawn) = (trial.draw(&scene, &profile, view)?, trial.draw(&coded, &profile, view)?);
+    let right = run.render(&scene, &profile, view)?;
+    let drawn = run.render(&coded, &profile, view)?;
     let pairs = right.rgba.iter().zip(&drawn.rgba).map(|(a, b)| f64::from(a - b));
-    trial.at_least_db("drawn: dB", wildcity_render::compare::psnr::psnr_db(pairs), 60.0);
+    run.check_at_least_db("drawn: dB", wildcity_render::compare::psnr::psnr_db(pairs), 60.0);
     Ok(())
 }
 
-/// A camera in the middle of [`wildcity_generate::canyon`], along it.
+/// A camera in the middle of [`wildcity_generate::canyon`] that looks along it.
 pub(super) fn street_view(size_px: [u32; 2]) -> View {
     let focal_px = 0.75 * f64::from(size_px[0]);
     view_along(size_px, focal_px, DVec3::new(-20.0, 0.3, 1.6), DVec3::X, DVec3::NEG_Z)
@@ -171,10 +177,10 @@ mod tests {
 
     #[test]
     fn a_coarser_record_misses_the_bound_of_centres() {
-        let mut trial = CaseRun::new(&Reference);
-        through(&mut trial, RecordFormat::Q24).unwrap();
+        let mut run = CaseRun::new(&Reference);
+        encoded_street(&mut run, RecordFormat::Q24).unwrap();
         let missed: Vec<String> =
-            trial.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();
+            run.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();
         assert!(missed.contains(&"centres off by m".to_owned()), "{missed:?}");
     }
 }

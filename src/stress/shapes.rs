@@ -1,8 +1,8 @@
-//! Needles, dust, walls, and what lies beside the view.
+//! Needles, dust, walls, and Gaussians beside the view.
 
 use glam::{DQuat, DVec3};
 
-use super::{Case, CaseRun, Run};
+use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
 use wildcity_render::compare::images::max_difference;
@@ -12,12 +12,13 @@ use wildcity_scene::RenderProfile;
 pub(super) const T1: Case = Case {
     number: "T1",
     what: "needles of 1,000 to 10,000 px, all angles",
-    bound: "opacity within 2e-3 of f64, but for 1/255 where one finds it just below the cut; none culled",
-    run: Run::Light(t1),
+    bound: "opacity within 2e-3 of f64, except for 1/255 where only one finds it above the cut; none culled",
+    body: CaseBody::Light(t1),
 };
 
-fn t1(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (profile, view) = (RenderProfile::default(), forward_view([320, 240], 500.0));
+fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let view = forward_view([320, 240], 500.0);
     for sigma_px in [1e3, 3e3, 1e4] {
         for degrees in (0..180).step_by(2) {
             let needle = scene_of(&[GaussianSpec {
@@ -25,21 +26,21 @@ fn t1(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
                 ..GaussianSpec::default()
             }]);
-            let drawing = trial.draw(&needle, &profile, view)?;
+            let image = run.render(&needle, &profile, view)?;
             let what = format!("{sigma_px} px at {degrees}°");
-            trial.holds(format!("{what}: seen"), drawing.opacity.iter().any(|&o| o > 0.5));
-            if !trial.is_reference() {
-                let truth = trial.truth(&needle, &profile, view)?;
-                let [drawn, decided] = apart(&drawing.opacity, &truth.opacity);
-                trial.at_most(format!("{what}: opacity off by"), drawn, 2e-3);
-                trial.at_most(format!("{what}: the cut off by"), decided, 1.01 / 255.0);
+            run.check(format!("{what}: seen"), image.opacity.iter().any(|&o| o > 0.5));
+            if !run.is_reference() {
+                let truth = run.render_reference(&needle, &profile, view)?;
+                let [drawn, decided] = apart(&image.opacity, &truth.opacity);
+                run.check_at_most(format!("{what}: opacity off by"), drawn, 2e-3);
+                run.check_at_most(format!("{what}: the cut off by"), decided, 1.01 / 255.0);
             }
         }
     }
     Ok(())
 }
 
-/// Largest difference where both are drawn, and where only one is.
+/// The largest difference where both opacities are above 0, and where only one is.
 fn apart(a: &[f32], b: &[f32]) -> [f64; 2] {
     let both = |(a, b): &(&f32, &f32)| (**a > 0.0) == (**b > 0.0);
     let most = |is_both: bool| {
@@ -54,11 +55,12 @@ pub(super) const T2: Case = Case {
     number: "T2",
     what: "centres beside the image, long enough to reach into it",
     bound: "agrees with f64 (70 dB, 2/255)",
-    run: Run::Light(t2),
+    body: CaseBody::Light(t2),
 };
 
-fn t2(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let (profile, mut some_seen) = (RenderProfile::default(), false);
+fn t2(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let mut some_seen = false;
     for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 7.0], [9.0, -7.0]] {
         for angle in [0.0, 0.5, 1.2, 2.5] {
             let long = scene_of(&[GaussianSpec {
@@ -68,45 +70,51 @@ fn t2(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 ..GaussianSpec::default()
             }]);
             let what = format!("({x}, {y}) m at {angle} rad");
-            let drawing = trial.agreed(what, &long, &profile, forward_view([320, 240], 200.0))?;
-            some_seen |= drawing.opacity.iter().any(|&o| o > 0.5);
+            let image =
+                run.render_and_compare(what, &long, &profile, forward_view([320, 240], 200.0))?;
+            some_seen |= image.opacity.iter().any(|&o| o > 0.5);
         }
     }
-    trial.holds("some reach into the image", some_seen);
+    run.check("some reach into the image", some_seen);
     Ok(())
 }
 
 pub(super) const T3: Case = Case {
     number: "T3",
     what: "splats larger than the screen",
-    bound: "agrees with f64; covers every pixel alike; once in the list of each tile",
-    run: Run::Light(t3),
+    bound: "agrees with f64; covers every pixel evenly; once in the list of each tile",
+    body: CaseBody::Light(t3),
 };
 
-fn t3(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     for sigma_m in [10.0, 1e3, 1e4] {
         let wall = GaussianSpec { sigma_m: DVec3::splat(sigma_m), ..GaussianSpec::default() };
         let what = format!("{sigma_m} m");
         let view = forward_view([333, 250], 300.0);
-        let drawing = trial.agreed(what.clone(), &scene_of(&[wall]), &profile, view)?;
-        let off = drawing.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
-        trial.at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
-        // Forty of them, on 4 x 5 macro tiles of a device: a whole workgroup lists them.
+        let image = run.render_and_compare(what.clone(), &scene_of(&[wall]), &profile, view)?;
+        let off = image.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
+        run.check_at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
+        // Forty walls on the 4 x 5 macro tiles of a device, so that a whole workgroup lists them.
         let walls = (0..40_u32).map(|i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i), 0.0, 5.0 + 0.1 * f64::from(i)),
             opacity: 0.03,
             ..wall
         });
         let walls = scene_of(&walls.collect::<Vec<_>>());
-        let (what, view) = (format!("forty of {sigma_m} m"), forward_view([444, 280], 300.0));
-        trial.agreed(what.clone(), &walls, &profile, view)?;
-        // The definition has no tiles.
-        if !trial.is_reference() {
+        let what = format!("forty of {sigma_m} m");
+        let view = forward_view([444, 280], 300.0);
+        run.render_and_compare(what.clone(), &walls, &profile, view)?;
+        // The reference backend has no tiles.
+        if !run.is_reference() {
             let tiles = 444_u32.div_ceil(TILE_PX) * 280_u32.div_ceil(TILE_PX);
-            let listed = trial.stats(&walls, &profile, view)?.instances;
+            let listed = run.stats(&walls, &profile, view)?.instances;
             let off = listed.abs_diff(u64::from(40 * tiles));
-            trial.at_most(format!("{what}: off once in the list of each tile by"), off as f64, 0.0);
+            run.check_at_most(
+                format!("{what}: off once in the list of each tile by"),
+                off as f64,
+                0.0,
+            );
         }
     }
     Ok(())
@@ -115,21 +123,26 @@ fn t3(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
 pub(super) const T13: Case = Case {
     number: "T13",
     what: "scales of 1e-8 m, ratios of 1e6",
-    bound: "as wide as the blur: agrees with f64, a centre keeps its opacity within 1e-4",
-    run: Run::Light(t13),
+    bound: "as wide as the blur: agrees with f64; the opacity at the centre is kept within 1e-4",
+    body: CaseBody::Light(t13),
 };
 
-fn t13(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t13(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     for sigma_m in [DVec3::splat(1e-8), DVec3::new(1.0, 1e-6, 1e-6), DVec3::new(1e-8, 1e-2, 1e-8)] {
         let thin = scene_of(&[GaussianSpec { sigma_m, ..GaussianSpec::default() }]);
-        trial.agreed(format!("{sigma_m} m"), &thin, &profile, forward_view([96, 96], 120.0))?;
+        run.render_and_compare(
+            format!("{sigma_m} m"),
+            &thin,
+            &profile,
+            forward_view([96, 96], 120.0),
+        )?;
     }
     let dust = scene_of(&[GaussianSpec { sigma_m: DVec3::splat(1e-8), ..GaussianSpec::default() }]);
-    let drawing = trial.agreed("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
-    // The middle of 9 px is the centre of a pixel, which has all of it.
-    let off = (drawing.opacity[4 * 9 + 4] - 0.9).abs();
-    trial.at_most("dust: its centre's opacity from 0.9", off.into(), 1e-4);
+    let image = run.render_and_compare("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
+    // The middle of an image of 9 px is the centre of a pixel, where alpha is the full opacity.
+    let off = (image.opacity[4 * 9 + 4] - 0.9).abs();
+    run.check_at_most("dust: its centre's opacity from 0.9", off.into(), 1e-4);
     Ok(())
 }
 
@@ -137,11 +150,12 @@ pub(super) const T26: Case = Case {
     number: "T26",
     what: "a needle of two thousand million pixels",
     bound: "agrees with f64",
-    run: Run::Light(t26),
+    body: CaseBody::Light(t26),
 };
 
-fn t26(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // 22 km long, 1 mm thin, a centimetre before a lens of 1,000 px: xx² is 1e37.
+fn t26(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal length of
+    // 1,000 px: xx² is 1e37.
     for angle in [0.0, 0.4, 0.8, 1.3] {
         let needle = scene_of(&[GaussianSpec {
             mean_m: DVec3::new(0.0, 0.0, 0.0101),
@@ -149,10 +163,11 @@ fn t26(trial: &mut CaseRun<'_>) -> Result<(), RenderError> {
             sigma_m: DVec3::new(2.2e4, 1e-3, 1e-3),
             ..GaussianSpec::default()
         }]);
-        let (what, view) = (format!("at {angle} rad"), forward_view([160, 120], 1000.0));
-        let drawing = trial.agreed(what, &needle, &RenderProfile::default(), view)?;
-        let seen = drawing.opacity.iter().any(|&o| o > 0.5);
-        trial.holds(format!("at {angle} rad: seen"), seen);
+        let what = format!("at {angle} rad");
+        let view = forward_view([160, 120], 1000.0);
+        let image = run.render_and_compare(what, &needle, &RenderProfile::default(), view)?;
+        let seen = image.opacity.iter().any(|&o| o > 0.5);
+        run.check(format!("at {angle} rad: seen"), seen);
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Cases on backends, as one table.
+//! The results of cases on backends, as one table.
 
 use std::fmt;
 
@@ -7,10 +7,10 @@ use serde::Serialize;
 use super::{Case, Outcome, Verdict};
 use wildcity_render::Backend;
 
-/// What cases were run on what, and how they went.
+/// The results of cases (rows) on backends (columns).
 #[derive(Clone, Debug, Serialize)]
 pub struct Table {
-    /// The backends, in order of the columns.
+    /// The backends.
     pub backends: Vec<Column>,
     /// One row per case.
     pub rows: Vec<Row>,
@@ -21,28 +21,28 @@ pub struct Table {
 pub struct Column {
     /// Its name.
     pub backend: &'static str,
-    /// The device or instruction set, or why it is not there.
+    /// The device or instruction set, or why the backend is not available.
     pub detail: String,
 }
 
-/// A case, and how it went on each backend, in order of the columns.
+/// A case, and its outcome on each backend.
 #[derive(Clone, Debug, Serialize)]
 pub struct Row {
     /// The case's number.
     pub case: &'static str,
-    /// What is drawn.
+    /// The scene and the views.
     pub what: &'static str,
-    /// What must hold.
+    /// The bound, in words.
     pub bound: &'static str,
-    /// One per backend.
+    /// One per backend, in order of the columns.
     pub outcomes: Vec<Outcome>,
 }
 
-/// A backend to run cases on, or its name and why it is not there.
+/// A backend to run cases on, or its name and why it is not available.
 pub type Candidate = Result<Box<dyn Backend>, (&'static str, String)>;
 
-/// Runs cases on backends; heavy ones only if `heavy`. Tells `progress` before each run how many are
-/// done, and which case is next.
+/// Runs cases on backends; heavy cases only if `heavy`. Before each run it calls `progress` with the number
+/// of finished runs and the number of the next case.
 pub fn run(
     cases: &[&Case],
     backends: &[Candidate],
@@ -71,13 +71,13 @@ pub fn run(
 }
 
 impl Table {
-    /// How many runs went so.
+    /// Number of outcomes with a verdict.
     pub fn count(&self, verdict: Verdict) -> usize {
         let outcomes = self.rows.iter().flat_map(|row| &row.outcomes);
         outcomes.filter(|outcome| outcome.verdict == verdict).count()
     }
 
-    /// Characters of a backend's column, and two between it and the next.
+    /// Width of a backend's column in characters, with a gap of two.
     fn width(&self, backend: usize) -> usize {
         let words = self.rows.iter().filter_map(|row| Some(row.outcomes.get(backend)?.word()));
         words.map(|word| word.chars().count()).fold(8, usize::max) + 2
@@ -85,8 +85,8 @@ impl Table {
 }
 
 impl Row {
-    /// What is worth telling of the row: the first miss, else what came closest to its bound, else why
-    /// nothing was run.
+    /// The outcome to print: the first that missed its bound, or else the one closest to its bound, or else
+    /// one that was not run.
     pub fn tightest(&self) -> Option<&Outcome> {
         let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
         let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);
@@ -97,7 +97,7 @@ impl Row {
 }
 
 impl Verdict {
-    /// A word for it.
+    /// The verdict in a word, as in the table.
     pub fn word(self) -> &'static str {
         match self {
             Self::Held => "held",

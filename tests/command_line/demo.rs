@@ -1,4 +1,4 @@
-//! The demo twin is built once, healed when it is damaged, and never put over somebody's own.
+//! The demo twin is built once, rebuilt when it is damaged, and never replaces a user's twin of that name.
 
 use std::fs;
 use std::path::Path;
@@ -29,7 +29,7 @@ fn a_twin_of_the_same_name_is_left_alone() {
         said.contains("twin \"demo\" in ") && said.contains("is not the demo street"),
         "{said}"
     );
-    assert!(said.contains("give --twins another directory"), "{said}");
+    assert!(said.contains("give another directory with --twins"), "{said}");
     assert_eq!(Catalog::open(&twins).unwrap().version("demo", None).unwrap(), mine.unwrap());
 }
 
@@ -50,9 +50,9 @@ fn a_damaged_demo_twin_is_built_again() {
         let mut bytes = fs::read(object(hash)).unwrap();
         bytes[40] ^= 1;
         fs::write(object(hash), bytes).unwrap();
-        assert!(drive().contains("(again, since it is damaged)"));
+        assert!(drive().contains("(its files are damaged)"));
         fs::remove_file(object(hash)).unwrap();
-        assert!(drive().contains("(again, since it is damaged)"));
+        assert!(drive().contains("(its files are damaged)"));
         assert_eq!(catalog.version("demo", None).unwrap(), version);
         assert_eq!(catalog.verify("demo", &mut |_, _| {}).unwrap().damaged.len(), 0);
     }

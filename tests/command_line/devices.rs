@@ -34,7 +34,7 @@ fn software_is_not_taken_for_hardware() {
     }
 }
 
-/// Whoever names a device wants the gpu backend: another one is not taken in silence.
+/// Naming a device asks for the gpu backend: another backend is never used silently.
 #[test]
 fn a_device_is_for_the_gpu_backend() {
     let directory = tempfile::tempdir().unwrap();
@@ -55,13 +55,14 @@ fn a_device_is_for_the_gpu_backend() {
 #[test]
 fn a_shader_that_does_not_compile_is_an_error() {
     let broken = wildcity_render::gpu::shaders::Shaders::default();
-    let broken =
-        broken.with_mutation("ranges", "let own = macros[i];", "let own = nothing[i];").unwrap();
+    let broken = broken
+        .with_mutation("ranges", "let own = touch_macro_tiles[i];", "let own = nothing[i];")
+        .unwrap();
     let error = Gpu::with_shaders(&AdapterChoice::Best, 1, broken).unwrap_err();
     assert!(error.to_string().contains("nothing"), "{error}");
 }
 
-/// Processes of their own, whose loader finds no driver.
+/// Separate processes with a loader that finds no driver.
 #[test]
 fn without_a_driver_it_is_an_ordinary_error() {
     let without = |program: &str, arguments: &[&str]| {

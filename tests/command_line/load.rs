@@ -13,7 +13,7 @@ use wildcity_server::Limits;
 
 use crate::support::{self, Agent, Reply, TestServer, pose, refused};
 
-/// `wildcity serve` as a process of its own, whose memory can be measured.
+/// `wildcity serve` as a separate process, so that its memory can be measured.
 struct Served {
     child: Child,
     address: SocketAddr,

@@ -45,7 +45,6 @@ mod generate;
 mod import;
 mod kills;
 mod load;
-mod memory;
 mod push;
 mod remote;
 mod replay;

@@ -11,7 +11,7 @@ use wildcity_scene::{ProfileOverrides, RenderProfile};
 
 use crate::reported::{commit, drive};
 
-/// A library that only some machines need is opened by whoever needs it.
+/// A library that only some backends need is loaded only by those.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
@@ -50,17 +50,17 @@ fn report_of(dir: &Path, more: &[&str]) -> Output {
 }
 
 #[test]
-fn wishes_that_cannot_be_meant_are_refused_at_once() {
+fn invalid_options_are_rejected_early() {
     let nowhere = tempfile::tempdir().unwrap();
     for (given, fix) in [
-        ("--at-least-db=-inf", "expected 0 to 1000 dB, as 40"),
-        ("--at-least-db=NaN", "expected 0 to 1000 dB, as 40"),
-        ("--at-most-ms=-5", "expected milliseconds, more than 0, as 20"),
-        ("--at-most-ms=inf", "expected milliseconds, more than 0, as 20"),
+        ("--at-least-db=-inf", "expected 0 to 1000 dB, for example 40"),
+        ("--at-least-db=NaN", "expected 0 to 1000 dB, for example 40"),
+        ("--at-most-ms=-5", "expected milliseconds above 0, for example 20"),
+        ("--at-most-ms=inf", "expected milliseconds above 0, for example 20"),
         ("--backend=reference", "[possible values: cpu, gpu]"),
         ("--backend=cpu,cpu", "name each once"),
     ] {
-        // There is no twin, which is looked for only afterwards.
+        // The twin does not exist, but options are checked first.
         let refused = Command::new(env!("CARGO_BIN_EXE_wildcity"))
             .args(["report", "street", given, "--twins"])
             .arg(nowhere.path())
@@ -72,7 +72,7 @@ fn wishes_that_cannot_be_meant_are_refused_at_once() {
 }
 
 #[test]
-fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes() {
+fn the_command_writes_a_self_contained_page_and_a_profile_that_serve_reads() {
     let dir = tempfile::tempdir().unwrap();
     commit(dir.path(), vec![drive()]);
     let out = dir.path().join("report");
@@ -88,7 +88,7 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     let settings = report["settings"].as_array().unwrap();
     assert_eq!(read("report.csv").lines().count(), settings.len() + 1);
-    // The CSV says what JSON says, in the same words.
+    // CSV and JSON have the same values, and the same words for infinity and NaN.
     let csv = read("report.csv");
     let mut lines = csv.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let names = lines.next().unwrap();
@@ -129,7 +129,7 @@ fn the_command_writes_a_page_that_needs_nothing_and_a_profile_that_serve_takes()
     assert_eq!((&report["wanted"], &report["unmet"]), (&best["wanted"], &Value::Null));
     assert_eq!(best["measured"], "what is rendered, before images are encoded");
     assert_eq!(best["encoded"][3]["sent"], "jpeg 90");
-    // On the page and on standard output, with the whole line to use.
+    // The page and standard output have the whole command to use.
     let said = String::from_utf8_lossy(&run.stdout);
     let file = out.join("profile.json");
     let line = format!("wildcity serve --backend cpu --profile {}", file.display());
@@ -184,7 +184,7 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
     );
     assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
     assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
-    // Of one that nothing was asked of neither.
+    // Nor is a profile left if there is no goal.
     an_earlier_one();
     assert!(report_of(dir.path(), &[]).status.success() && !file.exists());
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();

@@ -53,5 +53,8 @@ fn on_the_command_line() {
     assert_eq!(code, Some(2), "neither a sky nor --remove: {error}");
     let (code, _, error) = run(&["twin", "sky", "street", "--sky", ply]);
     assert_eq!(code, Some(1));
-    assert!(error.contains("scene.ply: sky header, start: it is no safetensors file"), "{error}");
+    assert!(
+        error.contains("scene.ply: sky header, start: it is not a safetensors file"),
+        "{error}"
+    );
 }

@@ -173,8 +173,8 @@ fn a_bad_rig_or_drive_is_named_with_its_file_before_the_scene_is_read() {
     for (option, text, wanted) in [
         ("--rig", rig.to_owned(), "settings.json: camera \"front\": width is 0"),
         ("--rig", rig.replace("car", "Car"), "settings.json: \"Car\" is not a name"),
-        ("--rig", "[]".into(), "settings.json is a JSON list; one object is read"),
-        ("--trajectory", " []".into(), "settings.json is a JSON list; one object is read"),
+        ("--rig", "[]".into(), "settings.json is a JSON list, but must be one JSON object"),
+        ("--trajectory", " []".into(), "settings.json is a JSON list, but must be one JSON object"),
         ("--trajectory", drive.replace("log", "a/b"), "settings.json: \"a/b\" is not a name"),
         ("--trajectory", r#"{"name": "log", "keyframes": []}"#.into(), "has no keyframes"),
         ("--trajectory", drive.to_owned(), "settings.json: two trajectories are named \"log\""),
@@ -232,7 +232,7 @@ fn what_the_options_made_of_a_sound_file_is_said_to_be_their_doing() {
 fn help_teaches_with_examples() {
     for (command, wanted) in [
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
-        ("import", "Memory: twice what the scene takes uncompressed"),
+        ("import", "Memory: twice the uncompressed scene"),
         ("import", "streamed SOG        lod-meta.json, or one .zip"),
         ("inspect", "wildcity inspect street@2"),
         ("twin fsck", "wildcity twin fsck street"),
@@ -240,7 +240,7 @@ fn help_teaches_with_examples() {
     ] {
         let command = command.split(' ');
         let said = stdout(&wildcity().args(command).arg("--help").output().unwrap());
-        assert!(said.contains(wanted) && said.contains("--twins <PLACE>"), "{said}");
+        assert!(said.contains(wanted) && said.contains("--twins <DIR_OR_URL>"), "{said}");
     }
 }
 

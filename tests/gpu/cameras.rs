@@ -1,5 +1,5 @@
-//! Lenses and rolling shutters on the device: as the cpu backend draws them, and nothing of them for a
-//! pinhole.
+//! Lenses and rolling shutters on the device against the cpu backend. For static pinhole cameras, nothing
+//! for lenses is compiled.
 
 use glam::DVec3;
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -13,7 +13,10 @@ use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, psnr, render, render_one, try_render, view_along};
-use crate::lenses::{driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of};
+use crate::lenses::{
+    check_against_exact_rays, check_projections, lenses, rolling_view, scaled_and_cropped,
+    sideways_rolling_view,
+};
 use crate::streets::{demo_street, street};
 
 /// Along a street, as [`crate::streets::street_views`] are.
@@ -22,8 +25,9 @@ fn straight() -> View {
     view_along([150, 90], 110.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y)
 }
 
-/// Every lens at rest, and shutters that roll all four ways; one windshield is given the other way round.
-pub(crate) fn bent_views() -> Vec<View> {
+/// Every lens at rest, and rolling shutters in all four directions. One windshield is given by its inverse
+/// polynomials.
+pub(crate) fn lens_views() -> Vec<View> {
     let lenses = lenses();
     let camera = |name: &str| lenses.iter().find(|(known, _)| *known == name).unwrap().1;
     let behind = camera("fisheye behind a windshield");
@@ -34,10 +38,10 @@ pub(crate) fn bent_views() -> Vec<View> {
     let pose = straight().world_from_camera;
     let still = lenses.iter().map(|(_, camera)| View::new(*camera, pose));
     let rolling_shutter = [
-        driven(straight().camera, pose, ShutterDirection::TopToBottom),
-        driven(camera("opencv"), pose, ShutterDirection::BottomToTop),
-        driven(behind, pose, ShutterDirection::LeftToRight),
-        driven(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
+        rolling_view(straight().camera, pose, ShutterDirection::TopToBottom),
+        rolling_view(camera("opencv"), pose, ShutterDirection::BottomToTop),
+        rolling_view(behind, pose, ShutterDirection::LeftToRight),
+        rolling_view(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
     ];
     still.chain(rolling_shutter).collect()
 }
@@ -46,7 +50,7 @@ pub(crate) fn bent_views() -> Vec<View> {
 fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     let gpu = gpu();
     let street = Scene::from_gaussians(&street(20_000, 1, 31));
-    let views: Vec<View> = bent_views().into_iter().chain([straight()]).collect();
+    let views: Vec<View> = lens_views().into_iter().chain([straight()]).collect();
     for setting in ["near=0.01", "antialiased=true", "near=3", "far=30", "blur=0.1"] {
         let mut profile = RenderProfile::default();
         profile.set(setting).unwrap();
@@ -60,7 +64,7 @@ fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     }
 }
 
-/// Thousands of surfels of one plane: seen by z, by distance, and by a camera that moves meanwhile.
+/// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving camera.
 #[test]
 fn the_demo_street_through_lenses_and_shutters() {
     let (street, views) = demo_street();
@@ -97,22 +101,22 @@ fn the_demo_street_through_lenses_and_shutters() {
 
 #[test]
 fn every_lens_draws_what_each_pixels_ray_meets() {
-    meets_what_each_pixels_ray_meets(&gpu());
+    check_against_exact_rays(&gpu());
 }
 
 #[test]
 fn known_points_land_where_the_model_says() {
     let gpu = gpu();
     for (name, camera) in lenses() {
-        for camera in sizes_of(&camera) {
-            let points = lands(&gpu, name, camera, 0.6);
+        for camera in scaled_and_cropped(&camera) {
+            let points = check_projections(&gpu, name, camera, 0.6);
             assert!(points >= 2, "{name}: {points} points");
         }
     }
 }
 
 #[test]
-fn what_passes_close_is_drawn_as_by_the_cpu() {
+fn gaussians_that_pass_close_are_drawn_as_by_the_cpu() {
     let ball = |k: i32| GaussianSpec {
         mean_m: DVec3::new(0.5 * f64::from(k) - 1.5, 0.1, 1.5),
         sigma_m: DVec3::splat(0.05),
@@ -120,11 +124,11 @@ fn what_passes_close_is_drawn_as_by_the_cpu() {
     };
     let balls = scene_of(&[0, 1, 2, 3, 4].map(ball));
     let profile = RenderProfile::default();
-    let truth = render_one(&cpu(), &balls, &profile, passing());
-    agree(&render_one(&*gpu(), &balls, &profile, passing()), &truth).unwrap();
+    let truth = render_one(&cpu(), &balls, &profile, sideways_rolling_view());
+    agree(&render_one(&*gpu(), &balls, &profile, sideways_rolling_view()), &truth).unwrap();
 }
 
-/// The f-theta cameras of a real car, at full size and at that which a model reads.
+/// The f-theta cameras of a real car, at full size and at the input size of a driving model.
 #[test]
 fn a_real_cars_points_land_where_its_lenses_say() {
     let gpu = gpu();
@@ -139,28 +143,30 @@ fn a_real_cars_points_land_where_its_lenses_say() {
     }
 }
 
-/// What is not compiled cannot fail: the projection of lenses does not parse here.
+/// A shader that is not compiled cannot fail. Here the projection of lenses does not parse.
 #[test]
 fn without_a_lens_nothing_of_it_is_compiled() {
     let broken = || {
         let shaders = Shaders::default();
-        shaders.with_mutation("project_bent", "struct Exposed {", "struct Nothing {").unwrap()
+        shaders
+            .with_mutation("project_unscented", "struct ProjectedPoint {", "struct Nothing {")
+            .unwrap()
     };
     let (street, profile) = (Scene::from_gaussians(&street(300, 0, 1)), RenderProfile::default());
     render_one(&gpu_with(broken()), &street, &profile, straight());
-    // Nobody listens here: this one is to fail.
+    // Without the log watch of `gpu_with`, since this one must fail.
     let gpu = Gpu::with_shaders(&AdapterChoice::Best, 0, broken()).unwrap();
-    let failed = try_render(&gpu, &street, &profile, &bent_views()[..1]);
+    let failed = try_render(&gpu, &street, &profile, &lens_views()[..1]);
     assert!(matches!(failed, Err(RenderError::Device { .. })), "{failed:?}");
 }
 
 #[test]
-fn a_pinhole_beside_a_lens_is_drawn_to_the_byte() {
+fn a_pinhole_next_to_a_lens_is_drawn_to_the_same_bytes() {
     let (street, profile) = (Scene::from_gaussians(&street(5_000, 1, 2)), RenderProfile::default());
     let gpu = gpu();
     let alone = render(&gpu, &street, &profile, &[straight()]);
     let pipelines = gpu.usage().unwrap().totals.pipelines;
-    let [before, after] = [bent_views()[1], bent_views()[7]];
+    let [before, after] = [lens_views()[1], lens_views()[7]];
     let together = render(&gpu, &street, &profile, &[before, straight(), after]);
     assert!(together[1..2] == alone);
     assert_eq!(gpu.usage().unwrap().totals.pipelines, pipelines + 2, "cull and project");

@@ -1,5 +1,5 @@
-//! What each stage must do, in f64, one thing after the other: every tile and every pixel is asked
-//! about every splat.
+//! The definition of each stage in f64, as simple as possible: every tile and every pixel is tested against
+//! every splat.
 
 use glam::DVec2;
 use wildcity_render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
@@ -15,7 +15,7 @@ use crate::images::Image;
 pub(crate) struct Splat {
     pub(crate) view: usize,
     pub(crate) mean_px: [f64; 2],
-    /// Half-size of the box that alpha_cut reaches, without slack.
+    /// Half-size of the box in which alpha reaches alpha_cut, without slack, in pixels.
     pub(crate) reach_px: [f64; 2],
     pub(crate) factor: [f64; 3],
     pub(crate) log2_opacity: f64,
@@ -37,7 +37,7 @@ impl Splat {
         }
     }
 
-    /// The factor of `½ log2(e)` times the conic: `(l0 dx + l1 dy)² + (l2 dy)²`.
+    /// The Cholesky factor of `½ log2(e)` times the conic: `(l0 dx + l1 dy)² + (l2 dy)²`.
     fn of_reference(view: usize, splat: &reference::Splat) -> Self {
         let [xx, xy, yy] = (0.5 * std::f64::consts::LOG2_E * splat.conic).to_array();
         let l0 = xx.sqrt();
@@ -52,7 +52,8 @@ impl Splat {
         }
     }
 
-    /// How far its box reaches over the nearest edge's pixel centres; below 0 it is culled.
+    /// How far its box reaches inside the image beyond the pixel centres at the nearest edge, in pixels.
+    /// Below 0 the splat is culled.
     pub(crate) fn inside_px(&self, camera: &Camera) -> f64 {
         let [width, height] = [camera.width_px, camera.height_px].map(f64::from);
         let axis = |k: usize, size: f64| {
@@ -71,14 +72,14 @@ impl Splat {
     }
 }
 
-/// What a backend's stage project left.
+/// The splats that a backend's stage project wrote.
 pub(crate) fn splats(between: &StageOutputs) -> Vec<Splat> {
     let pairs = between.keys.iter().zip(&between.splats);
     pairs.map(|(&key, splat)| Splat::of_backend(key, splat)).collect()
 }
 
-/// Stage project, by numerical differentiation: all splats in order of (view, global id), those
-/// beside the image too.
+/// Stage project by numerical differentiation: all splats in order of (view, global id), including those
+/// outside of the image.
 pub(crate) fn project(frame: &Frame<'_>) -> Vec<Splat> {
     let mut all = Vec::new();
     for (index, view) in frame.views.iter().enumerate() {
@@ -109,8 +110,8 @@ pub(crate) fn bin(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> Vec<Vec
             for left in (0..width_px).step_by(TILE_PX as usize) {
                 let rows = top..height_px.min(top + TILE_PX);
                 let columns = left..width_px.min(left + TILE_PX);
-                let touches = |place: &&u32| {
-                    let splat = &splats[**place as usize];
+                let touches = |splat_index: &&u32| {
+                    let splat = &splats[**splat_index as usize];
                     let reaches =
                         |row| columns.clone().any(|column| splat.log2_alpha(column, row) >= cut);
                     splat.view == index && rows.clone().any(reaches)
@@ -125,7 +126,7 @@ pub(crate) fn bin(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> Vec<Vec
 /// Stages rasterize and resolve: every pixel against all splats of its view.
 pub(crate) fn rasterize(splats: &[Splat], order: &[u32], frame: &Frame<'_>) -> Vec<Image> {
     let images = frame.views.iter().enumerate().map(|(index, view)| {
-        let here: Vec<Splat> = order.iter().map(|&place| splats[place as usize]).collect();
+        let here: Vec<Splat> = order.iter().map(|&index| splats[index as usize]).collect();
         let here: Vec<Splat> = here.into_iter().filter(|splat| splat.view == index).collect();
         let mut image =
             Image { rgba: Vec::new(), rgb8: Vec::new(), depth_m: Vec::new(), opacity: Vec::new() };
@@ -148,9 +149,11 @@ fn pixel(
 ) {
     let log2_cut = frame.profile.alpha_cut.log2();
     let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
-    // What a lens does not see is nothing.
+    // A pixel that the lens does not see is empty.
     let splats = camera.unproject(at_px).map_or(&[][..], |_| splats);
-    let (mut rgb, mut depth_m, mut transmittance) = ([0.0; 3], 0.0, 1.0);
+    let mut rgb = [0.0; 3];
+    let mut depth_m = 0.0;
+    let mut transmittance = 1.0;
     for splat in splats {
         let log2_alpha = splat.log2_alpha(column, row);
         if log2_alpha < log2_cut {

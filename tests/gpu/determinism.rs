@@ -1,4 +1,4 @@
-//! The same input, the same bytes.
+//! The same input yields the same bytes.
 
 use std::io::Write;
 
@@ -12,9 +12,10 @@ use crate::scene_files::gaussians;
 use crate::streets::{street, turning_views as views};
 
 #[test]
-fn a_hundred_repeats_are_equal_to_the_bit() {
+fn a_hundred_repeats_are_bit_identical() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 11));
-    let (backend, profile) = (gpu(), RenderProfile::default());
+    let backend = gpu();
+    let profile = RenderProfile::default();
     let first = render(&backend, &scene, &profile, &views());
     for repeat in 1..100 {
         assert!(render(&backend, &scene, &profile, &views()) == first, "repeat {repeat}");
@@ -23,9 +24,10 @@ fn a_hundred_repeats_are_equal_to_the_bit() {
 
 #[test]
 fn a_frame_that_outgrows_its_buffers_is_the_same_frame() {
-    // 300,000 splats do not fit the first buffers, and no frame of the second backend does better.
+    // 300,000 splats do not fit the initial buffers.
     let scene = Scene::from_gaussians(&street(300_000, 1, 12));
-    let (profile, backend) = (RenderProfile::default(), gpu());
+    let profile = RenderProfile::default();
+    let backend = gpu();
     let grown = render(&backend, &scene, &profile, &views());
     let retries = backend.usage().unwrap().retries;
     assert!(retries >= 3, "splats, touches and instances did not all grow: {retries} retries");
@@ -35,9 +37,10 @@ fn a_frame_that_outgrows_its_buffers_is_the_same_frame() {
 }
 
 #[test]
-fn a_view_does_not_see_its_neighbours() {
+fn a_view_does_not_depend_on_the_other_views() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 13));
-    let (backend, profile) = (gpu(), RenderProfile::default());
+    let backend = gpu();
+    let profile = RenderProfile::default();
     let together = render(&backend, &scene, &profile, &views());
     for (view, image) in views().into_iter().zip(&together) {
         assert!(render_one(&backend, &scene, &profile, view) == *image);
@@ -45,18 +48,19 @@ fn a_view_does_not_see_its_neighbours() {
 }
 
 #[test]
-fn a_frame_leaves_nothing_for_the_next() {
+fn a_frame_does_not_depend_on_the_previous_one() {
     let street = Scene::from_gaussians(&street(20_000, 1, 14));
     let cloud = Scene::from_gaussians(&gaussians(5_000, 3, 4.0, 15));
-    let (backend, profile) = (gpu(), RenderProfile::default());
+    let backend = gpu();
+    let profile = RenderProfile::default();
     let fresh = render(&gpu(), &street, &profile, &views());
     render(&backend, &cloud, &profile, &views()[..2]);
     assert!(render(&backend, &street, &profile, &views()) == fresh);
 }
 
-/// Lavapipe takes the width of its subgroups from the environment: 4, 8 and 16 threads. On other
-/// devices the variable does nothing. A process of its own, since a driver reads it once, and says
-/// what it found.
+/// Lavapipe takes the size of its subgroups from an environment variable: 4, 8, and 16 threads. On other
+/// devices the variable has no effect. Each size runs in its own process, since a driver reads the variable
+/// once; the process prints the size that it found.
 #[test]
 fn subgroups_of_any_size() {
     let is_lavapipe = devices()[0].name.contains("llvmpipe");
@@ -74,7 +78,7 @@ fn subgroups_of_any_size() {
 }
 
 #[test]
-#[ignore = "a process of its own, started by subgroups_of_any_size"]
+#[ignore = "runs in its own process, started by subgroups_of_any_size"]
 fn one_size_of_subgroups() {
     streets_of_every_sh_degree();
     let threads = devices()[0].subgroup_threads.clone();

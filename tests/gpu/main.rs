@@ -1,4 +1,4 @@
-//! The gpu backend against the others, on any Vulkan device; lavapipe is enough.
+//! Tests of the gpu backend against the other backends, on any Vulkan device; lavapipe is enough.
 
 #[path = "../support/data.rs"]
 mod data;
@@ -21,12 +21,12 @@ mod cameras;
 mod definition;
 mod determinism;
 mod encoding;
-mod flat;
+mod frames_in_flight;
+mod memory_growth;
 mod mirror;
 mod mutations;
-mod overlap;
 mod parity;
-mod parts;
+mod regions;
 mod sky;
 mod stages;
 mod twins;

@@ -1,4 +1,4 @@
-//! What of a twin is in the device's memory.
+//! The Gaussians in the device's memory: bytes per Gaussian, eviction, and limits.
 
 use std::sync::Arc;
 
@@ -16,8 +16,8 @@ use crate::streets::{street, turning_views};
 /// Most bytes per resident Gaussian of SH degree 1.
 const BYTES: f64 = 64.0;
 
-/// The demo street as a twin has it, in blocks of 16 m, each at the coarsest level whose error is at most
-/// a pixel in a camera of so many pixels of focal length that stands at the street's start.
+/// The demo street in blocks of 16 m as in a twin. Each block is at the coarsest level of detail whose error
+/// is at most one pixel in a camera with this focal length at the start of the street.
 fn demo(focal_px: f32) -> Scene {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let (gaussians, eye_m) = (street.gaussians, street.trajectory.at_station(0.0).position_m);
@@ -52,7 +52,7 @@ fn bytes_per_gaussian(scene: &Scene) -> f64 {
 
 #[test]
 fn a_gaussian_of_a_twin_takes_at_most_64_bytes() {
-    // All of it, what a camera of 1440 pixels sees of it, and one of a fifth of that.
+    // At full detail, for a camera of 1440 pixels, and for one of a fifth of that.
     let [full, sharp, small] = [f32::INFINITY, 1_200.0, 240.0].map(demo);
     let counts = [&full, &sharp, &small].map(Scene::gaussians);
     assert!(counts[1] < counts[0] && counts[2] < counts[0] / 2, "{counts:?}");
@@ -63,7 +63,7 @@ fn a_gaussian_of_a_twin_takes_at_most_64_bytes() {
 }
 
 #[test]
-fn memory_is_what_is_resident() {
+fn memory_is_proportional_to_the_resident_gaussians() {
     let (backend, profile) = (gpu(), RenderProfile::default());
     let bytes = || backend.usage().unwrap().mirror_bytes;
     let street_of = |seed| Scene::from_gaussians(&street(40_000, 1, seed));
@@ -77,7 +77,7 @@ fn memory_is_what_is_resident() {
     }
 }
 
-/// Cells of a route, of which a few are drawn at a time.
+/// Cells along a route, of which a few are drawn at a time.
 fn route() -> Vec<Scene> {
     let mut cells: Vec<Gaussians> =
         (0..8).map(|seed| street(5_000 + 700 * seed as usize, 1, seed)).collect();
@@ -87,10 +87,10 @@ fn route() -> Vec<Scene> {
     cells.iter().map(Scene::from_gaussians).collect()
 }
 
-/// A drive to and fro, and jumps, under every limit: the bytes never exceed it, and the images are those
-/// without any.
+/// A drive back and forth with jumps, under several limits: memory never exceeds the limit, and the images
+/// equal those without a limit.
 #[test]
-fn what_was_not_drawn_for_longest_makes_room() {
+fn the_least_recently_drawn_chunks_are_evicted() {
     let (cells, profile) = (route(), RenderProfile::default());
     let window = |at: usize| {
         let chunks = cells[at..at + 3].iter().flat_map(|cell| cell.chunks.iter().cloned());
@@ -101,7 +101,7 @@ fn what_was_not_drawn_for_longest_makes_room() {
         view_along([96, 64], 60.0, eye_m, DVec3::new(1.0, 0.1, 0.2), DVec3::Y)
     };
     let free = gpu();
-    // Small bindings too, so that a scene lies on many pages.
+    // Also with small bindings, so that a scene lies on many pages.
     for bound in [MemoryLimits::default(), bindings(256 << 10)] {
         let alone = (0..6).map(|at| {
             let backend = gpu_with_limits(bound);
@@ -125,7 +125,7 @@ fn what_was_not_drawn_for_longest_makes_room() {
 #[test]
 fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     let profile = RenderProfile::default();
-    // Every cell fits alone, and all of them do not.
+    // Each cell fits alone, but not all of them together.
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
     let (small, large) = (&cells[0], &Scene { chunks: all.collect(), sky: None });

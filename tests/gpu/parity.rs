@@ -1,4 +1,4 @@
-//! Whole images: gpu against cpu, and against images that others made.
+//! Whole images: gpu against cpu, and against images of independent renderers.
 
 use glam::DVec3;
 use wildcity_render::View;
@@ -22,9 +22,9 @@ fn compare(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
     }
 }
 
-/// Compares colour and opacity alone. In dense scenes, where one alpha lies at the cut or one
-/// transmittance at the stop, two backends may decide otherwise: a hundredth of a pixel's colour,
-/// but the depth that is behind it may be anything.
+/// Compares colour and opacity only. In dense scenes, an alpha may lie at the cut or a transmittance at the
+/// stop, and two backends may decide differently. That changes a pixel's colour by at most a hundredth, but
+/// its depth by any amount.
 fn compare_colors(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
     let images = render(&gpu(), scene, profile, views);
     let truths = render(&cpu(), scene, profile, views);
@@ -48,7 +48,8 @@ pub(crate) fn streets_of_every_sh_degree() {
 fn the_demo_street_from_its_own_cameras() {
     let (street, views) = demo_street();
     let scene = Scene::from_gaussians(&street);
-    // Thousands of surfels of one plane: only depths that are rounded once put them in one order.
+    // Thousands of surfels of one plane: both backends order them equally only if depths are rounded
+    // once.
     compare_colors(&scene, &RenderProfile::default(), &views, "the demo street");
 }
 
@@ -131,7 +132,7 @@ fn real_captures() {
 }
 
 #[test]
-fn gsplat_is_met() {
+fn images_equal_those_of_gsplat() {
     let Some(truth) = gsplat() else { return };
     let image = render_one(&gpu(), &truth.scene, &truth.profile, truth.view);
     let off = max_difference(&image.rgba, &truth.rgba);
@@ -139,16 +140,16 @@ fn gsplat_is_met() {
 }
 
 #[test]
-fn an_independent_renderer_of_a_real_capture_is_met() {
+fn an_image_of_a_real_capture_equals_that_of_an_independent_renderer() {
     let Some(truth) = skull_front() else { return };
     let image = render_one(&gpu(), &truth.scene, &truth.profile, truth.view);
     let db = psnr(&image.rgba, &truth.rgba);
     assert!(db >= 60.0, "{db:.1} dB");
 }
 
-/// The long way round: gpu against the definition, without the cpu between them.
+/// The gpu directly against the definition, without the cpu backend.
 #[test]
-fn the_definition_is_met() {
+fn the_gpu_draws_what_the_definition_draws() {
     let scene = Scene::from_gaussians(&street(5_000, 3, 9));
     let view = street_views()[0];
     let image = render_one(&gpu(), &scene, &RenderProfile::default(), view);

@@ -1,4 +1,4 @@
-//! Skies on the device, against the cpu backend; and nothing of it without one.
+//! Skies on the device against the cpu backend. Without a sky, nothing for skies is compiled.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use wildcity_scene::geometry::camera::{Lens, OpenCv, Pinhole};
 use wildcity_scene::sky::{CubeMap, SkyModel};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 
-use crate::cameras::bent_views;
+use crate::cameras::lens_views;
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
 use crate::images::{agree, cpu, max_difference, render, render_one, try_render, view_along};
 use crate::skies::{SKY_FROM_WORLD, appearance, demo_model, draw_seen, empty, network, sky};
@@ -79,7 +79,7 @@ fn an_evaluated_sky_is_that_of_the_definition() {
 #[test]
 fn a_sky_behind_lenses_and_shutters() {
     let demo = empty(Arc::new(Sky::new(demo_model(None), DMat3::IDENTITY)));
-    let mut views: Vec<View> = bent_views().into_iter().chain([street_views()[1]]).collect();
+    let mut views: Vec<View> = lens_views().into_iter().chain([street_views()[1]]).collect();
     // Where Newton's steps alone, from the middle or the end, would lead nowhere.
     let far = OpenCv::new([0.75, -0.27, -0.096, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: 33.0, fy: 33.0, cx: 50.0, cy: 50.0 };
@@ -151,7 +151,7 @@ fn a_sky_behind_gaussians() {
 }
 
 #[test]
-fn a_sky_that_no_binding_holds_is_refused() {
+fn a_sky_larger_than_a_binding_is_refused() {
     let view = all_around()[0];
     let small = gpu_with_limits(bindings(64 << 10));
     let refused = try_render(&small, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
@@ -160,7 +160,7 @@ fn a_sky_that_no_binding_holds_is_refused() {
 }
 
 #[test]
-fn what_cameras_make_of_colours() {
+fn exposures_and_overlays() {
     let views = street_views();
     let street = Scene::from_gaussians(&street(10_000, 1, 4));
     let gpu = gpu();
@@ -170,7 +170,7 @@ fn what_cameras_make_of_colours() {
             let [image, truth] =
                 [&*gpu as &dyn Backend, &cpu()].map(|b| draw_seen(b, &scene, view, &seen));
             agree(&image, &truth).unwrap();
-            // Another hood of its size takes its place.
+            // Another overlay of the same size replaces it.
             let hood = seen.overlay.as_ref().unwrap();
             let rgba8 = hood.rgba8().iter().map(|value| 255 - value).collect();
             let other = Arc::new(Overlay::new(hood.size_px()[0], rgba8).unwrap());
@@ -178,7 +178,7 @@ fn what_cameras_make_of_colours() {
             let [image, truth] =
                 [&*gpu as &dyn Backend, &cpu()].map(|b| draw_seen(b, &scene, view, &other));
             agree(&image, &truth).unwrap();
-            // Without one, none is left over.
+            // Without an overlay, none of them remains.
             let plain = render_one(&*gpu, &scene, &RenderProfile::DEFAULT, view);
             let truth = render_one(&cpu(), &scene, &RenderProfile::DEFAULT, view);
             agree(&plain, &truth).unwrap();
@@ -186,7 +186,7 @@ fn what_cameras_make_of_colours() {
     }
 }
 
-/// What is not compiled cannot fail: the variant of `rasterize` with a sky does not parse here.
+/// A shader that is not compiled cannot fail. Here the variant of `rasterize` with a sky does not parse.
 #[test]
 fn without_a_sky_nothing_of_it_is_compiled() {
     let broken = || {
@@ -195,7 +195,7 @@ fn without_a_sky_nothing_of_it_is_compiled() {
     };
     let view = all_around()[0];
     render_one(&gpu_with(broken()), &Scene::default(), &RenderProfile::DEFAULT, view);
-    // Nobody listens here: this one is to fail.
+    // Without the log watch of `gpu_with`, since this one must fail.
     let gpu = Gpu::with_shaders(&AdapterChoice::Best, 0, broken()).unwrap();
     let failed = try_render(&gpu, &empty(sky()), &RenderProfile::DEFAULT, &[view]);
     assert!(matches!(failed, Err(RenderError::Device { .. })), "{failed:?}");
@@ -203,38 +203,48 @@ fn without_a_sky_nothing_of_it_is_compiled() {
 
 /// A comparison that cannot fail proves nothing.
 #[test]
-fn slips_are_caught() {
-    let caught = |variant, profile: &RenderProfile, views: &[View], slips: &[(&str, &str)]| {
+fn mutations_are_detected() {
+    let detects = |variant, profile: &RenderProfile, views: &[View], mutations: &[(&str, &str)]| {
         let truths = render(&cpu(), &empty(sky()), profile, views);
-        for (part, slip) in slips {
-            let shaders = Shaders::default().with_mutation(variant, part, slip).expect(part);
+        for (original, replacement) in mutations {
+            let shaders = Shaders::default().with_mutation(variant, original, replacement);
+            let shaders = shaders.expect(original);
             let images = render(&gpu_with(shaders), &empty(sky()), profile, views);
             let off = images.iter().zip(&truths).map(|(a, b)| max_difference(&a.rgba, &b.rgba));
-            assert!(off.fold(0.0, f32::max) > 1e-3, "{part} went unnoticed");
+            assert!(off.fold(0.0, f32::max) > 1e-3, "{original} was not detected");
         }
     };
-    let straight = [
+    let map = [
         ("bits.x >> 16u", "bits.x >> 17u"),
         ("select(vec4u(3u), vec4u(2u), north)", "vec4u(2u)"),
         ("v[k] - row[k]", "u[k] - column[k]"),
         ("rows[1].y * at_px.y", "rows[1].x * at_px.y"),
     ];
-    caught("rasterize_map", &RenderProfile::DEFAULT, &all_around(), &straight);
+    detects("rasterize_map", &RenderProfile::DEFAULT, &all_around(), &map);
     let network = [
-        ("weight.w * values[place + 3u]", "weight.w * values[place + 2u]"),
-        ("select(0u, encoded, behind.skip != 0u)", "0u"),
+        ("weight.w * values[index + 3u]", "weight.w * values[index + 2u]"),
+        ("select(0u, encoded, background.skip != 0u)", "0u"),
         ("select(0.0, 0.5, wave", "select(0.0, 0.0, wave"),
-        ("wave % behind.octaves", "wave % 1u"),
+        ("wave % background.octaves", "wave % 1u"),
     ];
-    caught("rasterize_network", &EXACT, &all_around(), &network);
-    let bent = [
-        ("lenses[of_view].bent == 0u", "true"),
+    detects("rasterize_network", &EXACT, &all_around(), &network);
+    let lens = [
+        ("lenses[view_index].non_pinhole == 0u", "true"),
         ("vec2f(f32(k), 0.0)", "vec2f(0.0)"),
-        ("-still_to_come(of_view, own_px)", "still_to_come(of_view, own_px)"),
-        ("distort(of_view, next) - plane", "distort(of_view, next)"),
-        ("off_axis_by(fall(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
-        ("off_axis_by(rise(of_view, length(plane)), plane)", "off_axis_by(length(plane), plane)"),
-        ("turn(of_view, inside, OUTWARDS)", "turn(of_view, inside, INWARDS)"),
+        ("-remaining_exposure(view_index, pixel_px)", "remaining_exposure(view_index, pixel_px)"),
+        ("distort(view_index, next) - plane", "distort(view_index, next)"),
+        (
+            "off_axis_by(polynomial_inverse(view_index, length(plane)), plane)",
+            "off_axis_by(length(plane), plane)",
+        ),
+        (
+            "off_axis_by(polynomial_extrapolated(view_index, length(plane)), plane)",
+            "off_axis_by(length(plane), plane)",
+        ),
+        (
+            "through_windshield(view_index, inside, BACKWARD)",
+            "through_windshield(view_index, inside, FORWARD)",
+        ),
     ];
-    caught("rasterize_map_bent", &RenderProfile::DEFAULT, &bent_views(), &bent);
+    detects("rasterize_map_lens", &RenderProfile::DEFAULT, &lens_views(), &lens);
 }

@@ -1,5 +1,6 @@
-//! Every stage alone, on the buffers that the cpu backend left: gpu against cpu and against f64. Each
-//! comparison must be able to fail, and to tell the stage that is wrong from those that are not.
+//! Each stage alone, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
+//! Mutation tests check that each comparison can fail, and that it distinguishes the wrong stage from the
+//! right ones.
 
 use std::sync::LazyLock;
 
@@ -13,34 +14,36 @@ use wildcity_render::stage::{Stage, StageOutputs};
 use wildcity_render::{Backend, Frame, RenderError, View};
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::cameras::bent_views;
+use crate::cameras::lens_views;
 use crate::definition::{self, Splat};
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{Image, agree, cpu, render};
-use crate::mutations::{LENS_MUTATIONS, MUTATIONS, misty_street, wide_views};
+use crate::mutations::{LENS_MUTATIONS, MUTATIONS, Mutation, misty_street, wide_views};
 use crate::streets::{demo_street, street, street_views};
 
-/// One frame, what the cpu backend makes of it, and what the definition makes of the same buffers.
+/// One frame, the outputs of the cpu backend's stages, and those of the definition on the same input.
 struct Truth {
     scene: Scene,
     profile: RenderProfile,
     views: Vec<View>,
-    /// What the cpu left after project, sort and bin.
+    /// The outputs of the cpu's stages project, sort, and bin.
     cpu: [StageOutputs; 3],
     images: Vec<Image>,
-    /// By definition, in f64.
+    /// The definition's splats, in f64.
     splats: Vec<Splat>,
-    /// Like all that follows, of the buffers that the cpu left.
+    /// The definition's order of the cpu's splats.
     order: Vec<u32>,
+    /// The definition's lists of the cpu's splats.
     tiles: Vec<Vec<u32>>,
+    /// The definition's images of the cpu's splats.
     pixels: Vec<Image>,
 }
 
-/// Seconds of asking every pixel about every splat, so once for all tests.
+/// Testing every splat against every pixel takes seconds, so it is done once for all tests.
 static TRUTH: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 12_000, wide_views()));
 
-/// The same street through every lens, and by shutters that roll.
-static BENT: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 8_000, bent_views()));
+/// The same street with every lens and with rolling shutters.
+static LENSES: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 8_000, lens_views()));
 
 impl Truth {
     fn new(cpu: &Cpu, gaussians: usize, views: Vec<View>) -> Self {
@@ -67,13 +70,13 @@ impl Truth {
         Frame { scene: &self.scene, profile: &self.profile, views: &self.views }
     }
 
-    /// The stages of a gpu that are wrong, by name, and what its twins on the cpu and in f64 object to.
-    fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Objections)> {
+    /// The names of a gpu's wrong stages, with their differences from the twins on the cpu and in f64.
+    fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Differences)> {
         let [project, sort, bin] = &self.cpu;
-        let object = |done, last, objections: &dyn Fn(&StageOutputs) -> Objections| {
+        let compare = |done, last, differences: &dyn Fn(&StageOutputs) -> Differences| {
             match gpu.run_through(&self.frame(), done, last) {
-                Ok(found) => objections(&found),
-                // A stage that counts wrong may ask for more than there is.
+                Ok(found) => differences(&found),
+                // A stage that counts wrong may need more than there is room for.
                 Err(error @ RenderError::TooMany { .. }) => {
                     [(); 2].map(|()| Some(error.to_string()))
                 }
@@ -81,20 +84,20 @@ impl Truth {
             }
         };
         let all = [
-            ("project", object(None, Stage::Project, &|found| self.object_to_project(found))),
-            ("sort", object(Some(project), Stage::Sort, &|found| self.object_to_sort(found))),
-            ("bin", object(Some(sort), Stage::Bin, &|found| self.object_to_bin(found))),
-            ("rasterize", self.object_to_rasterize(&self.drawn(gpu, bin))),
+            ("project", compare(None, Stage::Project, &|found| self.compare_project(found))),
+            ("sort", compare(Some(project), Stage::Sort, &|found| self.compare_sort(found))),
+            ("bin", compare(Some(sort), Stage::Bin, &|found| self.compare_bin(found))),
+            ("rasterize", self.compare_rasterize(&self.drawn(gpu, bin))),
         ];
         all.into_iter().filter(|(_, twins)| twins.iter().any(Option::is_some)).collect()
     }
 
-    /// The images that a gpu makes of what was left after a stage.
+    /// The images that a gpu draws from the outputs of a stage.
     fn drawn(&self, gpu: &Gpu, between: &StageOutputs) -> Vec<Image> {
-        render(&GoOn { gpu, between }, &self.scene, &self.profile, &self.views)
+        render(&ResumedGpu { gpu, between }, &self.scene, &self.profile, &self.views)
     }
 
-    fn object_to_project(&self, found: &StageOutputs) -> Objections {
+    fn compare_project(&self, found: &StageOutputs) -> Differences {
         let splats = definition::splats(found);
         let cpu = definition::splats(&self.cpu[0]);
         [&cpu, &self.splats].map(|truths| {
@@ -103,10 +106,11 @@ impl Truth {
         })
     }
 
-    /// Walks along both lists. Truths within 0.01 px of an image's edge may be missing.
+    /// Compares two lists in order. Expected splats within 0.01 px of an image's edge may be missing.
     fn same_splats(&self, found: &[Splat], truths: &[Splat]) -> Result<(), String> {
         let mut next = found.iter().enumerate().peekable();
-        let (mut exact, mut at_edge) = (0, 0);
+        let mut exact = 0;
+        let mut at_edge = 0;
         for truth in truths {
             let inside_px = truth.inside_px(&self.views[truth.view].camera);
             let view = &self.views[truth.view];
@@ -126,7 +130,7 @@ impl Truth {
         match next.next() {
             Some(left) => Err(format!("{left:?} is not visible")),
             None if at_edge > 3 => Err(format!("{at_edge} missing at the edge")),
-            // The order of surfels of one plane hangs on it.
+            // The order of surfels of one plane depends on it.
             None if exact * 1000 < found.len() * 999 => {
                 Err(format!("{exact} of {} depths rounded once", found.len()))
             }
@@ -134,7 +138,7 @@ impl Truth {
         }
     }
 
-    fn object_to_sort(&self, found: &StageOutputs) -> Objections {
+    fn compare_sort(&self, found: &StageOutputs) -> Differences {
         [self.cpu[1].order.as_ref(), Some(&self.order)].map(|order| {
             let kept = found.keys == self.cpu[0].keys && found.splats == self.cpu[0].splats;
             let is_equal = found.order.as_ref() == order;
@@ -143,14 +147,16 @@ impl Truth {
         })
     }
 
-    /// Like the cpu's but for a few roundings; nothing missing that f64 finds, and little in vain.
-    fn object_to_bin(&self, found: &StageOutputs) -> Objections {
-        let (found, cpu) = (found.tiles.as_ref().unwrap(), self.cpu[2].tiles.as_ref().unwrap());
+    /// The lists must equal the cpu's except for a few roundings. They must contain all splats that f64
+    /// finds, and at most 1 % more.
+    fn compare_bin(&self, found: &StageOutputs) -> Differences {
+        let found = found.tiles.as_ref().unwrap();
+        let cpu = self.cpu[2].tiles.as_ref().unwrap();
         let mut ranks = vec![None; self.order.len()];
-        for (rank, &place) in self.order.iter().enumerate() {
-            ranks[place as usize] = Some(rank);
+        for (rank, &splat) in self.order.iter().enumerate() {
+            ranks[splat as usize] = Some(rank);
         }
-        let rank = |place: &u32| ranks.get(*place as usize).copied().flatten();
+        let rank = |splat: &u32| ranks.get(*splat as usize).copied().flatten();
         let lists: Vec<&[u32]> = (0..found.ranges.len()).map(|tile| found.list(tile)).collect();
         let in_order =
             |list: &&[u32]| list.iter().map(rank).is_sorted_by(|a, b| a.is_some() && a < b);
@@ -167,10 +173,12 @@ impl Truth {
             return [(); 2].map(|()| Some(reason.clone()));
         }
         let lacks = |list: &[u32], of: &[u32]| {
-            let has = |place: &&u32| list.binary_search_by_key(&rank(place), rank).is_ok();
+            let has = |splat: &&u32| list.binary_search_by_key(&rank(splat), rank).is_ok();
             of.len() - of.iter().filter(has).count()
         };
-        let (mut unlike, mut missing, mut needed) = (0, 0, 0);
+        let mut unlike = 0;
+        let mut missing = 0;
+        let mut needed = 0;
         for (tile, (list, truth)) in lists.iter().zip(&self.tiles).enumerate() {
             unlike += lacks(list, cpu.list(tile)) + lacks(cpu.list(tile), list);
             missing += lacks(list, truth);
@@ -184,15 +192,15 @@ impl Truth {
         ]
     }
 
-    fn object_to_rasterize(&self, images: &[Image]) -> Objections {
+    fn compare_rasterize(&self, images: &[Image]) -> Differences {
         [&self.images, &self.pixels].map(|truths| {
             images.iter().zip(truths).find_map(|(image, truth)| agree(image, truth).err())
         })
     }
 }
 
-/// What the cpu and f64 object to.
-type Objections = [Option<String>; 2];
+/// The first difference from the cpu and from f64, if any.
+type Differences = [Option<String>; 2];
 
 fn check_keys(found: &StageOutputs, cutoffs: &Cutoffs) -> Result<(), String> {
     let splats = definition::splats(found);
@@ -205,13 +213,13 @@ fn check_keys(found: &StageOutputs, cutoffs: &Cutoffs) -> Result<(), String> {
     Ok(())
 }
 
-/// The rest of a frame as a backend.
-struct GoOn<'a> {
+/// A backend that draws the rest of a frame from the outputs of a stage.
+struct ResumedGpu<'a> {
     gpu: &'a Gpu,
     between: &'a StageOutputs,
 }
 
-impl Backend for GoOn<'_> {
+impl Backend for ResumedGpu<'_> {
     fn name(&self) -> &'static str {
         "the rest on the gpu"
     }
@@ -226,19 +234,19 @@ impl Backend for GoOn<'_> {
     }
 }
 
-/// How far a camera-space x or y may be off, in metres, as a share of the depth: a sum of f32, of
-/// which three products lose half a step at 64 m, where the centres of a chunk end: 3 x 1.9e-6 m.
+/// Largest error of a camera-space x or y, in metres, divided by the depth. It is a sum of f32 with three
+/// products, each of which loses half a step at 64 m, the largest coordinate in a chunk: 3 x 1.9e-6 m.
 fn slope_bound(truth: &Splat) -> f64 {
     6e-6 / truth.depth_m
 }
 
-/// One step of f32. While a shutter rolls, a camera goes 0.9 m here, and the row that sees a point is known
-/// to a millionth of that.
+/// Largest error of a depth: one step of f32. With a rolling shutter the camera moves 0.9 m here, and the row
+/// that sees a point is known to a millionth of that.
 fn depth_bound_m(truth: &Splat, view: &View) -> f64 {
     1.2e-7 * truth.depth_m + if view.rolling_shutter.is_some() { 1e-6 } else { 0.0 }
 }
 
-/// Whether two splats can only be the same Gaussian's.
+/// Whether two splats are so close that they must be of the same Gaussian.
 fn is_same(a: &Splat, b: &Splat, view: &View) -> bool {
     let near_px = 0.05 + slope_bound(b) * (b.mean_px[0].abs() + b.mean_px[1].abs());
     let near = |k: usize| (a.mean_px[k] - b.mean_px[k]).abs() <= near_px;
@@ -252,7 +260,7 @@ fn close(found: &Splat, truth: &Splat, view: &View) -> Result<(), String> {
     let [l0, l1, l2] = truth.factor;
     let step = slope_bound(truth);
     let mean = |k: usize| 2e-3 + step * (truth.mean_px[k].abs() + 200.0);
-    // Mist around the camera is six points all over the image of a lens.
+    // Large Gaussians around the camera have sigma points all over the image of a lens.
     let wide = if view.is_static_pinhole() { 1e-5 } else { 1e-4 };
     let reach = |k: usize| 1e-3 + (wide + 2.0 * step) * truth.reach_px[k];
     let factor = |of: f64| (1e-4 + 2.0 * step) * of;
@@ -285,44 +293,48 @@ fn each_stage_does_what_its_twins_do() {
     assert_eq!(truth.wrong(&gpu()), []);
 }
 
-/// What is wrong with a lens is seen where lenses are projected; no other stage has its shader.
+/// A fault of a lens must be detected in stage project; no other stage uses that shader.
 #[test]
-fn a_slip_in_a_lens_fails_its_projection() {
-    assert_eq!(BENT.wrong(&gpu()), []);
-    let noticed = |(part, text): &&(&str, &str)| {
-        let broken = Shaders::default().with_mutation("project_bent", part, text);
-        let broken = gpu_with(broken.unwrap_or_else(|| panic!("{part:?} has no place")));
-        let found = broken.run_through(&BENT.frame(), None, Stage::Project).unwrap();
-        BENT.object_to_project(&found).iter().all(Option::is_some)
+fn a_mutation_of_a_lens_fails_its_projection() {
+    assert_eq!(LENSES.wrong(&gpu()), []);
+    let is_detected = |(original, replacement): &&(&str, &str)| {
+        let broken = Shaders::default().with_mutation("project_unscented", original, replacement);
+        let broken = broken.unwrap_or_else(|| panic!("the shader has no text {original:?}"));
+        let broken = gpu_with(broken);
+        let found = broken.run_through(&LENSES.frame(), None, Stage::Project).unwrap();
+        LENSES.compare_project(&found).iter().all(Option::is_some)
     };
-    let unnoticed: Vec<&(&str, &str)> =
-        LENS_MUTATIONS.iter().filter(|slip| !noticed(slip)).collect();
-    assert!(unnoticed.is_empty(), "{unnoticed:#?}");
+    let undetected: Vec<&(&str, &str)> =
+        LENS_MUTATIONS.iter().filter(|mutation| !is_detected(mutation)).collect();
+    assert!(undetected.is_empty(), "{undetected:#?}");
 }
 
 #[test]
-fn a_slip_fails_its_own_stage_alone_and_the_bisection_names_it() {
-    let (cpu, truth) = (cpu(), &*TRUTH);
-    for slip in MUTATIONS {
-        let broken = Shaders::default().with_mutation(slip.shader, slip.part, slip.text);
-        let broken = gpu_with(broken.unwrap_or_else(|| panic!("{slip:?} has no place")));
+fn a_mutation_fails_its_own_stage_alone_and_the_bisection_names_it() {
+    let cpu = cpu();
+    let truth = &*TRUTH;
+    for mutation in MUTATIONS {
+        let Mutation { shader, original, replacement, stages } = *mutation;
+        let broken = Shaders::default().with_mutation(shader, original, replacement);
+        let broken = broken.unwrap_or_else(|| panic!("{mutation:?}: the shader has no such text"));
+        let broken = gpu_with(broken);
         let wrong = truth.wrong(&broken);
         let names: Vec<&str> = wrong.iter().map(|(name, _)| *name).collect();
-        assert_eq!(names, slip.stages, "{slip:?}: {wrong:?}");
+        assert_eq!(names, stages, "{mutation:?}: {wrong:?}");
         let both = wrong.iter().all(|(_, twins)| twins.iter().all(Option::is_some));
-        assert!(both, "{slip:?} is seen by one twin alone: {wrong:?}");
+        assert!(both, "{mutation:?}: only one twin detects it: {wrong:?}");
         let bisection = bisect(&cpu, &broken, &truth.frame()).unwrap();
-        // Where several stages are wrong, the last one keeps the image wrong for longest. Depth is
-        // not compared.
-        let is_depth = slip.part.starts_with("sums.depth");
-        let last = slip.stages.last().copied().filter(|_| !is_depth);
-        assert_eq!(bisection.wrong(), last, "{slip:?}: {bisection:?}");
+        // If several stages are wrong, the image stays wrong until the last of them runs on the cpu.
+        // The bisection does not compare depth.
+        let is_depth = original.starts_with("sums.depth");
+        let last = stages.last().copied().filter(|_| !is_depth);
+        assert_eq!(bisection.wrong(), last, "{mutation:?}: {bisection:?}");
     }
 }
 
-/// Some 115 dB on this street: no whole image tells.
+/// Wrong rounding changes the image of this street to 115 dB only, which no comparison of images detects.
 #[test]
-fn depths_that_are_not_rounded_once_are_seen() {
+fn depths_that_are_not_rounded_once_are_detected() {
     let truth = &*TRUTH;
     let broken = Shaders::default().with_mutation("project", "exact_m.x + exact_m.y", "exact_m.x");
     let broken = gpu_with(broken.unwrap());
@@ -332,7 +344,7 @@ fn depths_that_are_not_rounded_once_are_seen() {
 }
 
 #[test]
-fn a_healthy_gpu_is_right_from_every_stage_on() {
+fn a_correct_gpu_is_right_from_every_stage_on() {
     let street = street(30_000, 3, 5);
     let (demo, demo_views) = demo_street();
     for (gaussians, views) in [(street, &street_views()[..]), (demo, &demo_views[..])] {
@@ -345,14 +357,14 @@ fn a_healthy_gpu_is_right_from_every_stage_on() {
     }
 }
 
-/// With every output, growing buffers, and another frame before that must leave nothing behind.
+/// With all outputs, with buffers that grow, and after another frame, of which nothing may remain.
 #[test]
 fn a_hybrid_draws_what_the_cpu_draws() {
     let scene = Scene::from_gaussians(&street(100_000, 1, 43));
     let (profile, views) = (RenderProfile::default(), street_views());
     let truths = render(&cpu(), &scene, &profile, &views);
     let other = Scene::from_gaussians(&street(3_000, 1, 44));
-    // Listens to what the others cause too.
+    // It also watches the log for errors of the other devices.
     let _watched = gpu();
     for stage in Stage::ALL {
         let hybrid = HybridBackend::new(cpu(), Gpu::new(&AdapterChoice::Best, 0).unwrap(), stage);
@@ -366,7 +378,7 @@ fn a_hybrid_draws_what_the_cpu_draws() {
 }
 
 #[test]
-fn a_gpu_that_hands_over_to_itself_changes_nothing() {
+fn a_gpu_that_resumes_from_its_own_outputs_draws_the_same() {
     let truth = &*TRUTH;
     let gpu = gpu();
     let images = render(&gpu, &truth.scene, &truth.profile, &truth.views);

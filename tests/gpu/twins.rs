@@ -1,5 +1,5 @@
-//! Rust and WGSL write constants and layouts down twice; naga compares them, and sees that nothing
-//! was left out.
+//! Constants and layouts are declared both in Rust and in WGSL. These tests parse the WGSL with naga and
+//! check that both sides declare the same ones, with equal values, offsets, and sizes.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use wildcity_render::{MAX_VIEWS, constants};
 use wildcity_scene::chunk;
 use wildcity_scene::sky::SKY_CUT;
 
-/// The shared files alone: whatever they declare has a twin.
+/// The shared files: everything that they declare must have a twin in Rust.
 fn shared() -> Module {
     let shared = concat!(
         include_str!("../../shaders/shared/constants.wgsl"),
@@ -29,7 +29,7 @@ fn constants_are_the_same() {
         ("MAX_VIEWS", Literal::U32(MAX_VIEWS as u32)),
         ("SKY_CUT", Literal::F32(SKY_CUT as f32)),
         ("CLUSTER", Literal::U32(chunk::CLUSTER as u32)),
-        ("STRIP", Literal::U32(layout::STRIP)),
+        ("SOA_BLOCK", Literal::U32(layout::SOA_BLOCK)),
         ("GEOMETRY_WORDS", Literal::U32(layout::GEOMETRY_WORDS)),
         ("WORKGROUP", Literal::U32(layout::WORKGROUP)),
         ("SCAN_BLOCK", Literal::U32(layout::SCAN_BLOCK)),
@@ -39,7 +39,7 @@ fn constants_are_the_same() {
         ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
         ("MACRO_COLUMNS", Literal::U32(layout::MACRO_COLUMNS)),
         ("MACRO_ROWS", Literal::U32(layout::MACRO_ROWS)),
-        ("BIG_SPLAT_MACROS", Literal::U32(layout::BIG_SPLAT_MACROS)),
+        ("LARGE_SPLAT_MACRO_TILES", Literal::U32(layout::LARGE_SPLAT_MACRO_TILES)),
         ("EXPAND_BATCH", Literal::U32(layout::EXPAND_BATCH)),
     ]);
     let module = shared();
@@ -74,23 +74,24 @@ macro_rules! layouts {
 #[test]
 fn layouts_are_the_same() {
     let mut rust: Vec<Layout> = layouts! {
-        FrameView { size_px, columns, first_tile, macro_columns, first_macro, rows }
+        FrameView { size_px, columns, first_tile, macro_columns, first_macro_tile, rows }
         Frame {
-            splat_capacity, touch_capacity, instance_capacity, views, tiles, macros, near_m, far_m,
+            splat_capacity, touch_capacity, instance_capacity, views, tiles, macro_tiles, near_m, far_m,
             blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
         }
-        Behind {
+        Background {
             scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,
         }
-        Seen { exposure, overlay_px, first_overlay, exposed }
+        CameraAppearance { exposure, overlay_px, first_overlay, has_exposure }
         ChunkView {
             camera_from_chunk, depth_high, depth_low, camera_m, view, focal_px, center_px, slope_min, slope_max,
         }
         Lens {
             center_px, model, windshield, linear, end, end_value, end_slope, end_rad, widest_rad, by_distance,
-            bent, pad0, c, bend, rolls, moved_m, pad1, moved_world_m, pad2, turned,
+            non_pinhole, pad0, coefficients, windshield_shift, remaining_exposure, moved_m, pad1,
+            moved_world_m, pad2, axis_angle,
         }
-        Item { line, chunk_view }
+        ClusterView { line, chunk_view }
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }

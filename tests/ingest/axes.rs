@@ -50,7 +50,7 @@ fn shapes_and_colours_move_with_the_axes() {
     let mirrored = "-0.36,-0.48,0.8,-0.8,0.6,0,0.48,0.64,0.6";
     for axes in PRESETS.into_iter().chain([turned, mirrored]) {
         let (plain, moved) = moved(axes, 0.5);
-        // The matrix, read off three centres rather than off the code under test.
+        // The matrix, from three moved centres, independent of the code under test.
         let columns =
             |g: &Gaussians| DMat3::from_cols_array_2d(&[g.means_m[0], g.means_m[1], g.means_m[2]]);
         let matrix = columns(&moved) * columns(&plain).inverse() / 0.5;
@@ -81,11 +81,11 @@ fn identity_changes_no_bit() {
 }
 
 #[test]
-fn what_is_no_frame_is_refused_with_the_reason() {
+fn invalid_axes_are_refused_with_the_reason() {
     let refused = |axes: &str| axes.parse::<Axes>().unwrap_err().to_string();
     assert!(refused("sideways").contains("y-down-z-forward (OpenCV"), "{}", refused("sideways"));
     assert!(refused("1 0 0 0 1 0 0 0").contains("nine numbers"));
-    assert!(refused("2 0 0 0 1 0 0 0 1").contains("length 1 and at right angles"));
+    assert!(refused("2 0 0 0 1 0 0 0 1").contains("length 1 and be at right angles"));
     assert!(refused("1 0 0 1 0 0 0 0 1").contains("at right angles"));
     assert!(refused("NaN 0 0 0 1 0 0 0 1").contains("at right angles"));
     for scale in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e9] {

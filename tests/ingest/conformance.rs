@@ -1,4 +1,5 @@
-//! The same skull in every format: each Gaussian within the steps of the format, and images of it.
+//! One scene, a skull, in every format: each Gaussian is within the steps of the format, and images
+//! reach a PSNR.
 
 use std::collections::HashMap;
 
@@ -10,7 +11,7 @@ use wildcity_twin::ingest::{self, Axes};
 use crate::data;
 use crate::images::{cpu, psnr, render, view_along};
 
-/// How far a number may be from the original's.
+/// Tolerances to the original's numbers.
 #[derive(Clone, Copy, Debug)]
 struct Steps {
     mean_m: f64,
@@ -21,26 +22,27 @@ struct Steps {
     opacity: f32,
     dc: f32,
     sh: f32,
-    /// What the format does to numbers that it cannot hold.
+    /// Clamps numbers as the format does.
     fit: fn(&mut Gaussians),
 }
 
-/// What images must reach, in dB.
+/// The least PSNR of images, in dB.
 struct Loss {
-    /// Against the original with what the format cannot hold cut off: what bytes lose.
+    /// Against the original, clamped as in the format: the loss by quantisation.
     fitted: f64,
     /// Against the original.
     whole: f64,
 }
 
-/// The file's axes in the original's.
+/// The file's axes, in the original's.
 const SAME: &str = "identity";
 const RUB: &str = "1 0 0 0 -1 0 0 0 -1";
 const KHR: &str = "-1 0 0 0 -1 0 0 0 1";
 
 #[test]
 fn splat() {
-    // f32 positions and scales; bytes that were cut, not rounded. Colours end at 0 and 1.
+    // f32 positions and scales; bytes that were truncated, not rounded. Colours are clamped to 0
+    // and 1.
     let steps = Steps {
         mean_m: 0.0,
         quat: 1.5 / 128.0,
@@ -64,7 +66,7 @@ fn splat() {
 fn spz() {
     let two = Steps {
         mean_m: 0.51 / 4096.0,
-        // x, y and z within 0.51/127.5 = 0.004; w, which is what they leave to length 1, within
+        // x, y, and z are within 0.51/127.5 = 0.004; w, which follows from length 1, is within
         // √(2 √3 0.004) = 0.118 where it is nearly 0.
         quat: 0.118,
         ln_scale: 0.51 / 16.0,
@@ -80,7 +82,8 @@ fn spz() {
             }
         },
     };
-    // The largest is what the others leave, so off by three times as much where all are 0.5.
+    // The largest component follows from the others, so it is off by three times as much where all
+    // are 0.5.
     let three = Steps { quat: 3.0 * 0.51 * 0.7072 / 511.0, ..two };
     for (file, axes, steps) in [
         ("skull.rub.v2.spz", RUB, two),
@@ -94,7 +97,7 @@ fn spz() {
 
 #[test]
 fn another_capture_in_spz() {
-    // Both were quantised: the compressed PLY's steps are what is left of a chunk's extremes.
+    // Both were quantised: the steps of the compressed PLY depend on a chunk's range.
     let steps = Steps {
         mean_m: 1e-3,
         quat: 4e-3,
@@ -111,7 +114,7 @@ fn another_capture_in_spz() {
 
 #[test]
 fn sog() {
-    // The PLY was made of this very file, less what floats around: only f32 was rounded between.
+    // The PLY was made from this file, without floaters: only rounding to f32 lies between.
     let exact = Steps {
         mean_m: 1e-7,
         quat: 1e-6,
@@ -129,7 +132,7 @@ fn sog() {
         exact,
         Loss { fitted: 150.0, whole: 150.0 },
     );
-    // Cut rather than rounded; scales by a codebook, colours by the centroid of similar ones.
+    // Truncated, not rounded; scales from a codebook, colours from the centroid of similar ones.
     let again = Steps {
         mean_m: 3e-5,
         quat: 3.0 * 1.01 * 1.4143 / 255.0,
@@ -151,7 +154,7 @@ fn sog() {
 
 #[test]
 fn gltf() {
-    // f32 throughout; scales and opacities were made linear and are made raw again.
+    // f32 throughout; scales and opacities were activated, and are converted back.
     let steps = Steps {
         mean_m: 1e-9,
         quat: 1e-7,
@@ -173,7 +176,7 @@ fn gltf() {
 
 #[test]
 fn ksplat() {
-    // Level 0: f32, but for colour and opacity.
+    // Level 0: f32, except for colour and opacity.
     let steps = Steps {
         mean_m: 1e-7,
         quat: 1e-6,
@@ -186,7 +189,8 @@ fn ksplat() {
             dc.for_each(|c| *c = c.clamp(-1.7725, 1.7725));
         },
     };
-    // What is brighter than 1 before the higher degrees darken it, a fifth of all blue, is cut to 1.
+    // Colours above 1 before the higher degrees darken them, a fifth of all blue values, are
+    // clamped to 1.
     check(
         "skull_small.c0.sh2.ksplat",
         SAME,
@@ -221,7 +225,7 @@ fn nurec() {
 }
 
 /// Reads a file of the conformance set, and compares it with the original, Gaussian by Gaussian and
-/// as images: at least so many dB. Where one of the two is a part of the other, with that part.
+/// as images. If one of the two is a part of the other, only that part is compared.
 fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at_least_db: Loss) {
     let Some(path) = data::real(&format!("conformance/{file}")) else { return };
     let mut read = ingest::read(&path, &mut |_, _| {}).unwrap_or_else(|e| panic!("{file}: {e}"));
@@ -231,15 +235,15 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
     let original = cut(&original, sh_degree);
     let mut fitted = original.clone();
     (steps.fit)(&mut fitted);
-    // The same Gaussians of both, in one order.
+    // The matching Gaussians of both, in one order.
     let find = |few: &Gaussians, many: &Gaussians| {
         matches(few, many, steps).unwrap_or_else(|strange| panic!("{file}: {strange}"))
     };
     let (read, fitted, original) = if read.len() > original.len() {
-        (pick(&read, &find(&fitted, &read)), fitted, original)
+        (read.select(find(&fitted, &read)), fitted, original)
     } else {
         let found = find(&read, &fitted);
-        (read, pick(&fitted, &found), pick(&original, &found))
+        (read, fitted.select(found.iter().copied()), original.select(found.iter().copied()))
     };
     let off = |i: usize| off(&read, i, &fitted, i, steps);
     let most = (0..read.len()).map(off).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
@@ -251,25 +255,13 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
     }
 }
 
-/// Some Gaussians, in that order.
-fn pick(g: &Gaussians, indices: &[usize]) -> Gaussians {
-    Gaussians {
-        sh_degree: g.sh_degree,
-        means_m: indices.iter().map(|&i| g.means_m[i]).collect(),
-        quats_wxyz: indices.iter().map(|&i| g.quats_wxyz[i]).collect(),
-        ln_scales: indices.iter().map(|&i| g.ln_scales[i]).collect(),
-        logit_opacities: indices.iter().map(|&i| g.logit_opacities[i]).collect(),
-        sh: indices.iter().flat_map(|&i| g.sh_of(i)).copied().collect(),
-    }
-}
-
-/// The same with colours of a lower degree.
+/// The same Gaussians with colours of a lower degree.
 fn cut(g: &Gaussians, sh_degree: u8) -> Gaussians {
     let sh = (0..g.len()).flat_map(|i| &g.sh_of(i)[..3 * sh::coefficients(sh_degree)]).copied();
     Gaussians { sh_degree, sh: sh.collect(), ..g.clone() }
 }
 
-/// For every Gaussian the one of the other scene that is within the steps; in any order.
+/// For every Gaussian, the one of the other scene within the tolerances, in any order.
 fn matches(few: &Gaussians, many: &Gaussians, steps: Steps) -> Result<Vec<usize>, String> {
     const CELL_M: f64 = 0.01;
     let cell = |m: &[f64; 3]| m.map(|x| (x / CELL_M).round() as i32);
@@ -293,7 +285,7 @@ fn matches(few: &Gaussians, many: &Gaussians, steps: Steps) -> Result<Vec<usize>
     (0..few.len()).map(find).collect()
 }
 
-/// By how many steps two Gaussians differ at most, and where.
+/// The largest difference of two Gaussians, in tolerances, and its field.
 fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, &'static str) {
     let widest = |a: &[f32], b: &[f32], step: f32| {
         let apart = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs()));
@@ -303,7 +295,8 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
         let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
         q.map(|q| q / length)
     };
-    let (p, q) = (unit(a.quats_wxyz[i]), unit(b.quats_wxyz[j]));
+    let p = unit(a.quats_wxyz[i]);
+    let q = unit(b.quats_wxyz[j]);
     // An ellipsoid is the same after half a turn around one of its own axes, and as -q.
     let [w, x, y, z] = q;
     let turned = [[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]];
@@ -311,7 +304,7 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
     let quat = turned.map(|q| widest(&p, &q, steps.quat)).fold(f64::INFINITY, f64::min);
     let opacity = |logit: f32| 1.0 / (1.0 + (-logit).exp());
     let opacity = [opacity(a.logit_opacities[i]), opacity(b.logit_opacities[j])];
-    // What brighter and darker colours than a byte of the format holds became.
+    // Colours beyond the range of the format's byte were clamped.
     let dc = |g: &Gaussians, i: usize| -> [f32; 3] { std::array::from_fn(|c| g.sh_of(i)[c]) };
     let mean = (0..3).map(|k| (a.means_m[i][k] - b.means_m[j][k]).abs()).fold(0.0, f64::max);
     [
@@ -326,7 +319,7 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
     .fold((0.0, ""), |most, next| if next.0 > most.0 { next } else { most })
 }
 
-/// PSNR of images of the two, from the front and from above at one side.
+/// PSNR of images of the two, from the front and obliquely from above.
 fn losses_db(read: &Gaussians, original: &Gaussians) -> Vec<f64> {
     let views = [DVec3::new(0.0, 0.0, -1.0), DVec3::new(0.8, -0.5, -0.4)].map(|side| -> View {
         let centre_m = DVec3::new(0.0, -0.53, 0.04);

@@ -1,4 +1,4 @@
-//! One small scene in every format, open to damage beneath its checksums.
+//! One small scene in every format, which tests can damage beneath its checksums.
 
 use std::path::Path;
 
@@ -11,15 +11,15 @@ use crate::format_files::{
 use crate::formats::streamed;
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
 
-/// A scene's files, the first of which is given.
+/// A scene's files. The first one is the file that is given to the reader.
 pub(crate) struct Case {
     pub(crate) name: &'static str,
     pub(crate) files: Files,
-    /// What is done to the first file after it was damaged, so that no checksum notices.
+    /// Repairs the checksums of the first file after it was damaged.
     wrap: fn(Vec<u8>) -> Vec<u8>,
 }
 
-/// Gaussians of every case.
+/// Number of Gaussians of every case.
 pub(crate) const COUNT: usize = 6;
 
 /// A scene of one file without a checksum.
@@ -68,7 +68,7 @@ impl Case {
         ingest::read(&folder.join(&self.files[0].0), &mut |_, _| {})
     }
 
-    /// Writes all files as they are.
+    /// Writes all files unchanged.
     pub(crate) fn write(&self, folder: &Path) {
         for (index, (name, bytes)) in self.files.iter().enumerate() {
             let path = folder.join(name);

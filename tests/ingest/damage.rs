@@ -1,4 +1,4 @@
-//! Every kind of damage with the error that it must give.
+//! Every kind of damage, with the error that it must give.
 
 use wildcity_scene::Gaussians;
 
@@ -9,7 +9,7 @@ use crate::{read, refusal};
 
 type Spoil = fn(&mut Gaussians);
 
-/// What is done to Gaussian 17 of 20 of degree 2, and what PLY and safetensors say about it.
+/// A change to Gaussian 17 of 20 of degree 2, and the errors of PLY and safetensors for it.
 const SPOILS: [(Spoil, &str, &str); 12] = [
     (|g| g.means_m[17][1] = f64::NAN, "y is NaN", "means[1] is NaN"),
     (|g| g.means_m[17][2] = f64::INFINITY, "z is inf", "means[2] is inf"),
@@ -65,7 +65,7 @@ fn a_missing_column_is_named_though_the_size_is_wrong_too() {
 }
 
 #[test]
-fn what_is_no_regular_file_is_refused_at_once() {
+fn pipes_and_directories_are_refused_at_once() {
     for (path, found) in [("/dev/zero", "a device"), ("/", "a directory")] {
         let scene = wildcity_twin::ingest::read(path.as_ref(), &mut |_, _| {}).unwrap_err();
         let cameras = wildcity_twin::ingest::cameras::read(path.as_ref()).unwrap_err();
@@ -98,7 +98,7 @@ fn camera_lists_say_what_is_wrong() {
         "position": [0, 0, 0], "R_world_to_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"#;
     let refusal = |text: String| {
         std::fs::write(&path, text).unwrap();
-        // As the command line prints it: with every source behind it.
+        // As the command line prints it, with every source.
         let error = wildcity_twin::ingest::cameras::read(&path).unwrap_err();
         let sources = std::iter::successors(std::error::Error::source(&error), |e| e.source());
         sources.fold(error.to_string(), |text, source| format!("{text}: {source}"))
@@ -113,7 +113,7 @@ fn camera_lists_say_what_is_wrong() {
     assert!(hidden.ends_with("not starting with ."), "{hidden}");
     for field in ["shutter", "exposure", "overlay"] {
         let of_rigs = refusal(good.replacen('{', &format!("{{\"{field}\": {{}}, "), 1));
-        assert!(of_rigs.starts_with("camera \"a\": a camera list has no "), "{of_rigs}");
+        assert!(of_rigs.starts_with("camera \"a\": a camera in a list has no "), "{of_rigs}");
         assert!(of_rigs.contains(&format!("leave {field} out")), "{of_rigs}");
     }
     assert_eq!(refusal("[]".into()), "the camera list is empty");
@@ -133,7 +133,7 @@ fn a_ply_of_another_size_is_refused_with_the_numbers() {
 }
 
 #[test]
-fn a_count_that_no_file_holds_is_refused_before_memory_is_asked_for() {
+fn a_count_that_no_file_holds_is_refused_before_memory_is_allocated() {
     let columns = inria_columns(3, false);
     for count in ["1152921504606846976", "18446744073709551615"] {
         let header = ply_header(1, &columns).replace("vertex 1", &format!("vertex {count}"));
@@ -147,7 +147,7 @@ fn a_count_that_no_file_holds_is_refused_before_memory_is_asked_for() {
 }
 
 #[test]
-fn a_ply_header_that_means_nothing_is_named_by_line() {
+fn an_error_in_a_ply_header_names_the_line() {
     let good = ply_header(0, &inria_columns(1, false));
     let changed = |from: &str, to: &str| refusal(good.replacen(from, to, 1).as_bytes());
     let cases = [
@@ -155,8 +155,8 @@ fn a_ply_header_that_means_nothing_is_named_by_line() {
         (changed("float y", "list uchar int y"), "line 6: \"property list uchar int y\": lists"),
         (changed("float y", "half y"), "line 6: \"half\" is not a type"),
         (changed("float y", "float x"), "line 6: property x occurs twice"),
-        (changed("float y", "float y y"), "line 6: \"property float y y\" means nothing"),
-        (changed("element vertex 0\n", ""), "line 4: a property comes after its element"),
+        (changed("float y", "float y y"), "line 6: \"property float y y\" is unknown in a header"),
+        (changed("element vertex 0\n", ""), "line 4: there is no element before the property"),
         (changed("element vertex", "element point"), "end: there is no element vertex"),
         (changed("format binary_little_endian 1.0\n", ""), "end: there is no line format"),
         (changed("property float rot_2\n", ""), "element vertex: there is no property rot_2"),
@@ -171,7 +171,7 @@ fn a_ply_header_that_means_nothing_is_named_by_line() {
 }
 
 #[test]
-fn tensors_that_do_not_fit_each_other_are_named() {
+fn tensors_with_shapes_that_do_not_match_are_named() {
     let scene = gaussians(20, 1, 1.0, 1);
     let changed = |change: &dyn Fn(&mut Vec<Tensor>), doubles: &[&str]| {
         let mut tensors = gsplat_tensors(&scene);
@@ -235,7 +235,7 @@ fn damaged_safetensors_are_refused_with_the_numbers() {
 }
 
 #[test]
-fn a_file_that_is_not_there_is_an_error() {
+fn a_missing_file_is_an_error() {
     let path = std::path::Path::new("/nonexistent/scene.ply");
     let text = wildcity_twin::ingest::read(path, &mut |_, _| {}).unwrap_err().to_string();
     assert!(text.starts_with("cannot read: "), "{text}");

@@ -1,4 +1,5 @@
-//! What small writers of every format wrote comes back, within what the format keeps.
+//! Scenes written by small writers of every format are read back, within the precision of the
+//! format.
 
 use wildcity_scene::Gaussians;
 use wildcity_twin::ingest;
@@ -9,7 +10,7 @@ use crate::format_files::{
 use crate::scene_files::gaussians;
 use crate::{read, refusal};
 
-/// How far numbers may be off.
+/// Tolerances.
 #[derive(Clone, Copy)]
 struct Within {
     mean_m: f64,
@@ -32,14 +33,16 @@ fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &st
     };
     for i in 0..read.len() {
         for axis in 0..3 {
-            let (a, b) = (read.means_m[i][axis], written.means_m[i][axis]);
+            let a = read.means_m[i][axis];
+            let b = written.means_m[i][axis];
             assert!((a - b).abs() <= within.mean_m, "{name}: position is {a}, not {b}");
         }
         let unit = |q: [f32; 4]| {
             let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
             q.map(|q| q / length)
         };
-        let (p, q) = (unit(read.quats_wxyz[i]), unit(written.quats_wxyz[i]));
+        let p = unit(read.quats_wxyz[i]);
+        let q = unit(written.quats_wxyz[i]);
         let same_side = p.iter().zip(q).map(|(p, q)| p * q).sum::<f32>() > 0.0;
         near(&p, &q.map(|q| if same_side { q } else { -q }), within.quat, "rotation");
         near(&read.ln_scales[i], &written.ln_scales[i], within.ln_scale, "ln scale");
@@ -50,7 +53,7 @@ fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &st
     }
 }
 
-/// Reads a scene of several files, and says the hash.
+/// Reads a scene of several files. Also returns its hash.
 fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError> {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
@@ -64,7 +67,7 @@ fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError>
 #[test]
 fn splat_comes_back() {
     let g = gaussians(50, 0, 20.0, 1);
-    // A byte of colour is 1/255 of 1/0.282; rotations are cut.
+    // A step of colour is 1/255 of 1/0.282; rotations are truncated.
     let within = Within { quat: 0.02, opacity: 0.002, dc: 0.007, ..EXACT };
     assert_alike(&read(&splat(&g)).unwrap(), &g, within, ".splat");
 }
@@ -81,7 +84,8 @@ fn spz_comes_back() {
             dc: 0.0131,
             sh: 0.0079,
         };
-        // w is what x, y and z leave to length 1: off by √(2 √3 0.5/127.5) where it is nearly 0.
+        // w follows from x, y, z and length 1: where it is nearly 0, it is off by √(2 √3
+        // 0.5/127.5).
         let two = Within { quat: 0.118, ..within };
         for (name, file, within) in [
             ("2", gzip(&spz_plain(&g, 2)), two),
@@ -98,7 +102,7 @@ fn spz_comes_back() {
 #[test]
 fn ksplat_comes_back() {
     for sh_degree in 0..=2 {
-        // 50 is no multiple of the bucket's 4.
+        // 50 is not a multiple of the bucket size 4.
         let g = gaussians(50, sh_degree, 20.0, 3);
         let zero = Within { opacity: 0.002, dc: 0.007, ..EXACT };
         let one =
@@ -129,7 +133,7 @@ fn gltf_comes_back_in_one_file_and_in_two() {
 }
 
 #[test]
-fn nodes_turn_scale_and_move_splats() {
+fn nodes_rotate_scale_and_move_splats() {
     let g = gaussians(50, 1, 20.0, 5);
     // A quarter turn around z: x to y, y to -x; twice as large; 10 m up.
     let node = r#","translation":[0,0,10],"rotation":[0,0,0.7071067811865476,0.7071067811865476],
@@ -143,9 +147,9 @@ fn nodes_turn_scale_and_move_splats() {
     assert_alike(&read, &wanted, within, "node");
 
     let text = refusal(&glb(gltf(&g, r#","scale":[1,2,1]"#, "")));
-    assert!(text.starts_with("glTF header, node 0: its matrix is no rotation"), "{text}");
+    assert!(text.starts_with("glTF header, node 0: its matrix is not a rotation"), "{text}");
     let text = refusal(&glb(gltf(&g, r#","children":[0]"#, "")));
-    assert_eq!(text, "glTF header, node 0: is reached twice; a tree has one way to each");
+    assert_eq!(text, "glTF header, node 0: is reached twice; in a tree, each node has one parent");
 }
 
 #[test]
@@ -153,7 +157,7 @@ fn sog_comes_back_as_folder_and_archive() {
     for (version, sh_degree) in [1, 2].into_iter().flat_map(|v| (0..=3).map(move |d| (v, d))) {
         let g = gaussians(50, sh_degree, 20.0, 6);
         let within = Within {
-            // 16 bits of twice ln(21) = 6.1, times 21 of the way back.
+            // 16 bits over a range of twice ln(21) = 6.1, times 21, the derivative of the inverse.
             mean_m: 0.51 * 6.1 / 65535.0 * 21.0,
             quat: 0.01,
             ln_scale: 0.51 * 7.1 / 255.0,
@@ -175,7 +179,8 @@ fn sog_comes_back_as_folder_and_archive() {
     }
 }
 
-/// Two blocks with two levels, 50 Gaussians of which the finest has 20 + 20, and an environment.
+/// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an
+/// environment.
 pub(crate) fn streamed() -> Files {
     let place = |file: usize, offset: usize, count: usize| {
         format!(r#"{{"file":{file},"offset":{offset},"count":{count}}}"#)
@@ -209,18 +214,19 @@ fn streamed_sog_gives_its_finest_level_and_its_environment() {
         });
         read_files(&part.collect()).unwrap().0
     };
-    let (fine, sky) = (sog_in("0/"), sog_in("sky/"));
+    let fine = sog_in("0/");
+    let sky = sog_in("sky/");
     assert_eq!(all.means_m[..40], fine.means_m[..40]);
     assert_eq!(all.sh[..40 * 27], fine.sh[..40 * 27]);
     assert_eq!(all.means_m[40..], sky.means_m[..]);
-    // The sky has no higher degrees: zeros.
+    // The environment has no higher degrees, so they are zero.
     assert!((40..50).all(|i| all.sh_of(i)[..3] == *sky.sh_of(i - 40)));
     assert!((40..50).all(|i| all.sh_of(i)[3..].iter().all(|&c| c == 0.0)));
     assert_eq!(read(&zip_of(&files, true)).unwrap(), all);
 }
 
 #[test]
-fn nurec_comes_back_without_what_moves() {
+fn nurec_comes_back_without_tracked_objects() {
     for sh_degree in 0..=3 {
         let g = gaussians(50, sh_degree, 20.0, 8);
         let within =
@@ -241,7 +247,7 @@ fn progress_of_every_format_ends_at_all_bytes() {
         let first = dir.path().join(&case.files[0].0);
         ingest::read(&first, &mut |done, total| reports.push((done, total))).unwrap();
         assert!(reports.is_sorted(), "{}: {reports:?}", case.name);
-        // Of a coarse level nothing is read.
+        // Files of coarse levels are not read.
         let read = case.files.iter().filter(|(name, _)| !name.starts_with("coarse/"));
         let bytes = read.map(|(name, _)| dir.path().join(name).metadata().unwrap().len()).sum();
         assert_eq!(reports.last(), Some(&(bytes, bytes)), "{}", case.name);

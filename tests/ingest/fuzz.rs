@@ -1,10 +1,11 @@
-//! Arbitrary and nearly right bytes never panic and never ask for absurd memory.
+//! Arbitrary and nearly valid bytes never cause a panic or an absurd allocation.
 //!
-//! [`every_parser_survives_what_chance_makes`] is the fuzz target of every parser: it damages the
-//! corpus, one small scene per format and a mesh, beneath checksums. By default for a second; for a night:
+//! [`every_parser_survives_random_damage`] is the fuzz target of every parser: it damages the
+//! corpus, one small scene per format and a mesh, beneath checksums. It runs for a second by
+//! default; to run it for a night:
 //!
 //! ```text
-//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release --test ingest chance
+//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release -p wildcity-twin --test ingest random_damage
 //! ```
 //!
 //! A failure prints seed, round, format and the damaged file's bytes in hex.
@@ -21,7 +22,7 @@ use crate::scene_files::Random;
 use crate::read;
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
 
-/// Words of a PLY header, so that random ones get past the first line.
+/// Words of a PLY header, so that random headers get past the first line.
 fn header_line() -> impl Strategy<Value = String> {
     let word = prop_oneof![
         Just("element".to_owned()),
@@ -76,12 +77,12 @@ proptest! {
     }
 }
 
-/// A number of the environment.
+/// A number from an environment variable.
 fn setting(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().unwrap())
 }
 
-/// Bytes that formats are afraid of.
+/// Byte values at which formats tend to fail.
 const WORDS: [&[u8]; 10] = [
     &[0],
     &[0xff],
@@ -124,7 +125,7 @@ fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
 }
 
 #[test]
-fn every_parser_survives_what_chance_makes() {
+fn every_parser_survives_random_damage() {
     let seed = setting("WILDCITY_FUZZ_SEED", 1);
     let end = Instant::now() + Duration::from_secs(setting("WILDCITY_FUZZ_SECONDS", 1));
     let mut random = Random(seed);
@@ -144,7 +145,8 @@ fn every_parser_survives_what_chance_makes() {
                 Ok(g) => {
                     let colours = 3 * wildcity_scene::sh::coefficients(g.sh_degree);
                     assert_eq!(g.sh.len(), g.len() * colours);
-                    // A mesh has as many as are allowed it, however little it covers.
+                    // A mesh always gets the full number of Gaussians, however small its surface
+                    // is.
                     let most = if case.name == "mesh" { 210_000 } else { 10_000 };
                     assert!(g.len() < most, "{} Gaussians", g.len());
                 }
@@ -155,7 +157,7 @@ fn every_parser_survives_what_chance_makes() {
                 let name = &case.files[part].0;
                 panic!("seed {seed}, round {rounds}, {}, {name}: {hex}", case.name);
             }
-            // As it was, for the other parts' turns.
+            // Restored before the other files are damaged.
             let _ = case.read_with(folder.path(), part, &case.files[part].1);
         }
         rounds += 1;

@@ -1,4 +1,4 @@
-//! Files that were cut, flipped, or made to harm.
+//! Files that were truncated, changed, or made to do harm.
 
 use wildcity_scene::Gaussians;
 
@@ -11,7 +11,7 @@ use crate::refusal;
 use crate::scene_files::gaussians;
 
 #[test]
-fn every_case_is_sound_before_it_is_damaged() {
+fn every_case_is_valid_before_it_is_damaged() {
     for case in corpus() {
         let dir = tempfile::tempdir().unwrap();
         case.write(dir.path());
@@ -22,16 +22,17 @@ fn every_case_is_sound_before_it_is_damaged() {
 }
 
 #[test]
-fn what_was_cut_off_anywhere_is_refused() {
+fn files_truncated_anywhere_are_refused() {
     for case in corpus() {
         let dir = tempfile::tempdir().unwrap();
         case.write(dir.path());
         for (part, (name, bytes)) in case.files.iter().enumerate() {
-            // All ends of small files; of larger ones some, and not always the same of a word.
+            // Small files are cut at every byte; larger ones at some, at varying offsets within
+            // words.
             for end in (0..bytes.len()).step_by((bytes.len() / 40) | 1) {
-                // A record less is a smaller scene: the format has no count.
+                // One record less is a smaller scene, because the format has no count.
                 let is_whole = case.name == ".splat" && end > 0 && end % 32 == 0;
-                // Of a coarse level nothing is read.
+                // Files of coarse levels are not read.
                 let is_whole = is_whole || name.starts_with("coarse/");
                 let read = case.read_with(dir.path(), part, &bytes[..end]);
                 let place = format!("{}, {name} cut to {end} of {}", case.name, bytes.len());
@@ -65,7 +66,7 @@ fn a_flipped_bit_is_refused_or_changes_numbers_only() {
     }
 }
 
-/// All columns are equally long, and every number is within the gate.
+/// Checks that all columns are equally long, and every number is valid.
 fn assert_columns(g: &Gaussians, place: &str) {
     let n = g.len();
     let colours = n * 3 * wildcity_scene::sh::coefficients(g.sh_degree);
@@ -76,7 +77,7 @@ fn assert_columns(g: &Gaussians, place: &str) {
 }
 
 #[test]
-fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
+fn counts_that_no_file_holds_are_refused_before_memory_is_allocated() {
     let g = gaussians(COUNT, 0, 20.0, 1);
     let changed = |mut file: Vec<u8>, at: usize, bytes: &[u8]| {
         file[at..at + bytes.len()].copy_from_slice(bytes);
@@ -93,7 +94,10 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
             changed(spz4(&g), 44, &(1u64 << 60).to_le_bytes()),
             "SPZ body: the header promises 1152921",
         ),
-        (changed(spz4(&g), 16, &huge), "SPZ header, bytes 16 to 19: 4294967295 is no place"),
+        (
+            changed(spz4(&g), 16, &huge),
+            "SPZ header, bytes 16 to 19: the table cannot be at 4294967295",
+        ),
         (changed(ksplat(&g, 0), 4, &huge), ".ksplat body: the header promises 4398046514176 bytes"),
         (
             changed(ksplat(&g, 0), 4096, &huge),
@@ -125,7 +129,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
         ),
         (
             json(r#""bufferView":0"#, r#""bufferView":99"#),
-            "accessor 0 has no bufferView that is there",
+            "accessor 0 has no bufferView that exists",
         ),
         (
             json(r#""buffer":0"#, r#""buffer":0,"byteStride":4"#),
@@ -138,7 +142,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
         ),
         (
             json(r#""kernel":"ellipse""#, r#""extensions":{"KHR_x_compression_spz_2":{}}"#),
-            "is packed by KHR_x_compression_spz_2",
+            "is compressed by KHR_x_compression_spz_2",
         ),
     ] {
         let text = refusal(&file);
@@ -147,7 +151,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_asked_for() {
     }
 }
 
-/// What is said about a scene of several files, one of which was changed.
+/// The error of a scene of several files, one of which was changed.
 fn refusal_of(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
@@ -219,7 +223,7 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
     let text = image("quats.webp", &[[0, 0, 0, 251]; 6]);
     assert!(text.starts_with("SOG body, quats.webp: Gaussian 0: alpha is 251"), "{text}");
     let text = refusal_of(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
-    assert!(text.starts_with("SOG body, quats.webp: is no sound WebP image: "), "{text}");
+    assert!(text.starts_with("SOG body, quats.webp: is a damaged WebP image: "), "{text}");
 
     let files = streamed();
     let meta = |from: &str, to: &str| refusal_of(&files, "lod-meta.json", &text_change(from, to));
@@ -230,7 +234,7 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
         ),
         (
             meta(r#""file":1,"offset":0"#, r#""file":1,"offset":1"#),
-            "SOG header, lod-meta.json: two leaves have",
+            "SOG header, lod-meta.json: two leaves share",
         ),
         (meta(r#""offset":20"#, r#""offset":26"#), "SOG header, lod-meta.json: Gaussians to 46 of"),
         (
@@ -251,7 +255,7 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
 }
 
 #[test]
-fn archives_and_payloads_say_what_they_lack() {
+fn errors_of_archives_and_payloads_say_what_is_missing() {
     let g = gaussians(COUNT, 0, 20.0, 1);
     let file = |name: &str, bytes: &[u8]| vec![(name.to_owned(), bytes.to_vec())];
     let text = refusal(&zip_of(&file("readme.txt", b"hello"), false));
@@ -300,7 +304,7 @@ fn archives_and_payloads_say_what_they_lack() {
 }
 
 #[test]
-fn a_splat_is_told_by_its_first_record() {
+fn a_splat_file_is_detected_by_its_first_record() {
     let g = gaussians(4, 0, 20.0, 1);
     let file = splat(&g);
     let text = refusal(&file[..100]);
@@ -319,6 +323,9 @@ fn a_splat_is_told_by_its_first_record() {
     for text in
         ["0.1234 0.5678 0.9012 0.3456 0.7890 0.1234", "id;x;y;z;opacity;1;2;3;4;5;6;7;8;9;10"]
     {
-        assert!(refusal(text.as_bytes()).contains("as no format does that is read"), "{text}");
+        assert!(
+            refusal(text.as_bytes()).contains("which is none of the formats that can be read"),
+            "{text}"
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Reading outside formats: what is written comes back, what is damaged is refused by name.
+//! Reading formats of other programs: what is written is read back, and damage is refused with an
+//! error that names it.
 
 #[path = "../support/data.rs"]
 mod data;
@@ -32,7 +33,7 @@ fn read(bytes: &[u8]) -> Result<Gaussians, IngestError> {
     ingest::read(&path, &mut |_, _| {})
 }
 
-/// What is said about a file with these bytes.
+/// The error of a file with these bytes.
 fn refusal(bytes: &[u8]) -> String {
     read(bytes).unwrap_err().to_string()
 }

@@ -7,8 +7,9 @@ use wildcity_twin::ingest;
 use crate::format_files::glb;
 use crate::{data, read, refusal};
 
-/// A square of 2 m at z = 1 with red and green at the left corners and blue at the right ones, of two
-/// triangles with indices; `primitive` and `more` are JSON within the primitive and the document.
+/// A square of 2 m at z = 1 with red and green at the left corners and blue at the right ones, of
+/// two triangles with indices; `primitive` and `more` are JSON within the primitive and the
+/// document.
 pub(crate) fn square(primitive: &str, more: &str) -> Vec<u8> {
     let positions: [[f32; 3]; 4] =
         [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]];
@@ -64,7 +65,7 @@ fn vehicles_have_their_size_and_their_colours() {
         let along = || truck.means_m.iter().map(|m| m[axis]);
         along().fold(f64::NEG_INFINITY, f64::max) - along().fold(f64::INFINITY, f64::min)
     };
-    // glTF: y is up. The data's own words: 4.9 x 3.0 x 2.8 m.
+    // In glTF, y is up. The data's README says 4.9 x 3.0 x 2.8 m.
     let size_m = [bound(2), bound(0), bound(1)];
     assert!((190_000..300_000).contains(&truck.len()), "{}", truck.len());
     let mut sides_m = size_m;
@@ -82,7 +83,7 @@ fn vehicles_have_their_size_and_their_colours() {
 }
 
 #[test]
-fn what_is_wrong_with_a_mesh_is_said() {
+fn errors_of_meshes_name_the_cause() {
     let replaced = |from: &str, to: &str| {
         assert_eq!(from.len(), to.len());
         let mut file = square("", "");
@@ -103,7 +104,7 @@ fn what_is_wrong_with_a_mesh_is_said() {
     ] {
         assert!(said.contains(wanted) && said.starts_with("glTF"), "{said}");
     }
-    // An index beyond the corners, and corners that are nowhere.
+    // An index beyond the corners, and corners without positions.
     let with = |from_end: usize, bytes: &[u8]| {
         let mut file = square("", "");
         let at = file.len() - from_end;
@@ -111,12 +112,13 @@ fn what_is_wrong_with_a_mesh_is_said() {
         refusal(&file)
     };
     // Two bytes pad 102 to 104.
-    assert!(with(3, &[4]).contains("a corner of [0, 2, 4] is not there"));
+    assert!(with(3, &[4]).contains("a corner of [0, 2, 4] does not exist"));
     let nowhere = with(104, &f32::NAN.to_le_bytes().repeat(12));
     assert!(nowhere.contains("neither splats nor triangles with an area"), "{nowhere}");
 }
 
-/// Slivers of no area beside a square: many, and as long as can be. None of them is kept.
+/// Many slivers without area, and as long as possible, beside a square. None of them becomes a
+/// Gaussian.
 #[test]
 fn slivers_take_no_memory() {
     let mut sliver = square("", "");
@@ -134,7 +136,7 @@ fn slivers_take_no_memory() {
     assert!(peak_bytes() < 1 << 30, "{} B", peak_bytes());
 }
 
-/// The most memory that this process ever had.
+/// The peak memory of this process.
 fn peak_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
@@ -142,12 +144,12 @@ fn peak_bytes() -> u64 {
 }
 
 #[test]
-fn damaged_meshes_end_in_an_answer() {
+fn damaged_meshes_never_panic() {
     let whole = square("", "");
     for end in (0..whole.len()).step_by(7) {
         refusal(&whole[..end]);
     }
-    // The document's part that is about numbers, digit by digit.
+    // Every digit of the part of the document that has numbers.
     let first = whole.windows(9).position(|part| part == b"accessors").unwrap();
     for at in (first..whole.len() - 104).filter(|&at| whole[at].is_ascii_digit()) {
         for digit in [b'0', b'9'] {

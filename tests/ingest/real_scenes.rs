@@ -1,4 +1,4 @@
-//! Files that others made, read in place.
+//! Files made by other programs.
 
 use std::collections::HashMap;
 
@@ -61,7 +61,7 @@ fn three_gaussians_of_train_are_read() {
 /// The compressed skull is the skull: same Gaussians within the steps of its quantisation, though
 /// in another order, so each is compared with its nearest of the original.
 #[test]
-fn compressed_ply_is_what_it_was_made_of() {
+fn compressed_ply_matches_its_source() {
     let Some(skull) = read("scenes/skull/skull.ply") else { return };
     let Some(compressed) = read("conformance/skull.compressed.ply") else { return };
     assert_eq!((compressed.len(), compressed.sh_degree), (82_621, 3));
@@ -91,7 +91,8 @@ fn is_alike(a: &Gaussians, i: usize, b: &Gaussians, j: usize) -> bool {
         let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
         q.map(|q| q / length)
     };
-    let (p, q) = (unit(a.quats_wxyz[i]), unit(b.quats_wxyz[j]));
+    let p = unit(a.quats_wxyz[i]);
+    let q = unit(b.quats_wxyz[j]);
     let dot: f32 = p.iter().zip(q).map(|(p, q)| p * q).sum();
     let sigmoid = |logit: f32| 1.0 / (1.0 + (-logit).exp());
     let apart = |axis: usize| (a.means_m[i][axis] - b.means_m[j][axis]).abs();
@@ -122,9 +123,10 @@ fn a_sog_of_the_first_version_is_read() {
     let Some(logo) = read("scenes/playcanvas-logo/meta.json") else { return };
     assert_eq!((logo.len(), logo.sh_degree), (307_128, 0));
     // What meta.json says, of logarithms: exp(0.93) - 1 = 1.535, and so on.
-    let (low, high) = ([-1.535, -2.782, -0.577], [1.535, 0.296, 0.577]);
+    let low = [-1.535, -2.782, -0.577];
+    let high = [1.535, 0.296, 0.577];
     assert!(is_within(&logo, low, high));
-    // The extremes are there, so nothing is squeezed.
+    // The extremes occur, so the range is used fully.
     let most = |axis: usize| logo.means_m.iter().map(|m| m[axis]).fold(f64::MIN, f64::max);
     for (axis, wanted) in [(0, 1.5348), (1, 0.2957), (2, 0.5768)] {
         assert!((most(axis) - wanted).abs() < 1e-4, "{}", most(axis));
@@ -135,7 +137,8 @@ fn a_sog_of_the_first_version_is_read() {
 fn a_streamed_sog_is_read_in_full_detail() {
     let Some(playbot) = read("scenes/playbot/lod-meta.json") else { return };
     assert_eq!((playbot.len(), playbot.sh_degree), (500_000, 2));
-    let (low, high) = ([-1.033496, -1.083135, -1.039343], [1.03509, 0.05205518, 1.042389]);
+    let low = [-1.033496, -1.083135, -1.039343];
+    let high = [1.03509, 0.05205518, 1.042389];
     assert!(is_within(&playbot, low, high));
     // The finest level alone, in one file, is the same.
     let finest = read("scenes/playbot/0_0/meta.json").unwrap();
@@ -143,7 +146,7 @@ fn a_streamed_sog_is_read_in_full_detail() {
 }
 
 #[test]
-fn small_files_of_other_tools_are_read() {
+fn small_files_of_other_programs_are_read() {
     // Four corners of a square of 1, at opacity 0.9 (230/255), with a deviation of 0.1.
     let four = "conformance/splat-transform-fixtures/splat/minimal";
     for (file, z) in [
@@ -190,7 +193,8 @@ fn every_component_type_of_gltf_is_read() {
         assert!(g.means_m.iter().all(|m| *m == [1.0, 2.0, 3.0]));
         // x alone, as f32 and as normalised i8 and i16.
         assert!(g.quats_wxyz.iter().all(|q| *q == [0.0, 1.0, 0.0, 0.0]));
-        // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised i16.
+        // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised
+        // i16.
         let scales = [[0.2, -0.1, 0.7], [1., -2., 3.], [1., 0., -1.], [2., -3., 4.], [1., 0., -1.]];
         assert_eq!(g.ln_scales[3..8], scales);
         let opacities = g.logit_opacities.iter().map(|logit| 1.0 / (1.0 + (-logit).exp()));

@@ -41,7 +41,7 @@ fn integer_columns_and_other_elements_are_skipped() {
     let plain = ply(&written, &inria_columns(1, false));
     let header_end = plain.windows(11).position(|w| w == b"end_header\n").unwrap();
     let header = String::from_utf8(plain[..header_end].to_vec()).unwrap();
-    // An element before, a column of one byte in front, an element after; Windows' line ends.
+    // An element before, a column of one byte first, an element after; line ends of Windows.
     let header = header
         .replace("element vertex", "element camera 2\nproperty short id\nelement vertex")
         .replace("property float x", "property uchar label\nproperty float x")
@@ -99,7 +99,8 @@ fn progress_ends_at_the_file_size() {
 fn the_hash_is_that_of_the_bytes_that_were_read() {
     let scene = gaussians(20_000, 1, 1.0, 6);
     let mut tensors = gsplat_tensors(&scene);
-    // In another order than they are needed, with a stranger in the middle and one at the end.
+    // Tensors in another order than they are needed, with unknown ones in the middle and at the
+    // end.
     tensors.reverse();
     tensors.insert(2, ("step", vec![1], vec![30_000.0]));
     tensors.push(("seed", vec![3], vec![1.0; 3]));
@@ -116,7 +117,7 @@ fn the_hash_is_that_of_the_bytes_that_were_read() {
 }
 
 #[test]
-fn progress_is_told_now_and_then_whatever_comes_first() {
+fn progress_is_reported_regularly_in_any_order_of_elements() {
     let scene = gaussians(1, 0, 1.0, 5);
     let plain = ply(&scene, &inria_columns(0, false));
     let header_end = plain.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
@@ -133,8 +134,8 @@ fn progress_is_told_now_and_then_whatever_comes_first() {
 }
 
 #[test]
-fn the_name_of_a_file_says_nothing() {
-    // `read` writes to a file without extension; what counts is how it starts.
+fn the_format_does_not_depend_on_the_name_of_a_file() {
+    // `read` uses a file without extension: the format is detected from the content.
     let text = refusal(b"x y z 1.0 2.0 3.0\n");
     assert!(
         text.contains("starts with \"x y z 1.0\"")

@@ -1,4 +1,4 @@
-//! Skies from outside: networks and images, right and wrong.
+//! Skies from other programs: networks and images, valid and invalid.
 
 use std::path::Path;
 
@@ -51,7 +51,7 @@ fn map(model: &SkyModel) -> &CubeMap {
 }
 
 #[test]
-fn sizes_are_read_off_the_shapes() {
+fn sizes_follow_from_the_shapes() {
     let file = read(&safetensors(&tensors(), &[]), None).unwrap();
     let mean = network(&file.model);
     assert_eq!((mean.octaves(), mean.identity(), mean.skip()), (2, true, true));
@@ -62,14 +62,14 @@ fn sizes_are_read_off_the_shapes() {
     }
     let second = read(&safetensors(&tensors(), &[]), Some(1)).unwrap();
     assert_eq!(network(&second.model).appearance()[2], rows[6] as f32);
-    // What is kept is the sky alone, and reads as the same.
+    // Only the sky's tensors are stored, and they decode to the same sky.
     assert!(file.bytes.len() < safetensors(&tensors(), &[]).len());
     assert_eq!(network(&decode(&file.bytes, Some(1)).unwrap()), network(&second.model));
     assert_eq!(read(&file.bytes, None).unwrap().bytes, file.bytes);
 }
 
 #[test]
-fn networks_that_cannot_be_are_refused_by_name() {
+fn invalid_networks_are_refused_by_name() {
     type Slip = fn(&mut Vec<Tensor>);
     let slips: [(Slip, &str); 8] = [
         (|t| drop(t.remove(3)), "tensor sky_head.layers.1.bias: is missing"),
@@ -119,7 +119,7 @@ fn png(image: &RgbImage) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// How far a map is off at most, in steps of 8 bits.
+/// The largest error of a map, in steps of 8 bits.
 fn off(map: &CubeMap) -> f64 {
     let mut worst: f64 = 0.0;
     for face in 0..6 {
@@ -134,9 +134,9 @@ fn off(map: &CubeMap) -> f64 {
 }
 
 #[test]
-fn images_of_every_shape_are_the_same_sky() {
+fn images_of_every_layout_are_the_same_sky() {
     let side = 32;
-    // Columns and rows of faces, and where each lies.
+    // Columns and rows of faces, and the position of each.
     let cross = [[2, 1], [0, 1], [1, 0], [1, 2], [1, 1], [3, 1]];
     let row = [0, 1, 2, 3, 4, 5].map(|k| [k, 0]);
     let column = [0, 1, 2, 3, 4, 5].map(|k| [0, k]);
@@ -152,10 +152,10 @@ fn images_of_every_shape_are_the_same_sky() {
         }
         let file = read(&png(&whole), None).unwrap();
         assert!(off(map(&file.model)) < 3.0, "{size:?}: {}", off(map(&file.model)));
-        // What is kept reads as the same.
+        // What is stored decodes to the same sky.
         assert_eq!(map(&decode(&file.bytes, None).unwrap()), map(&file.model));
     }
-    // Upright, -z lies below the bottom and stands on its head.
+    // In an upright cross, -z is below the bottom face, and upside down.
     let mut upright = RgbImage::new(3 * side, 4 * side);
     for (k, [x, y]) in [[2, 1], [0, 1], [1, 0], [1, 2], [1, 1], [1, 3]].into_iter().enumerate() {
         let face = if k == 5 { image::imageops::rotate180(&face(k, side)) } else { face(k, side) };
@@ -193,9 +193,9 @@ fn six_images_of_a_folder() {
 }
 
 #[test]
-fn images_that_cannot_be_are_refused() {
+fn invalid_images_are_refused() {
     let said = read(&png(&RgbImage::new(50, 40)), None).unwrap_err();
-    assert!(said.contains("50 x 40 pixels are neither a panorama"), "{said}");
+    assert!(said.contains("50 x 40 pixels are not a panorama"), "{said}");
     let side = CubeMap::MAX_SIDE_PX as u32 + 1;
     let said = read(&png(&RgbImage::new(side, 6 * side)), None).unwrap_err();
     assert!(said.contains("1537 pixels wide; 1 to 1536"), "{said}");

@@ -25,7 +25,7 @@ fn levels(manifest: &Manifest, needed: &[SectionRef]) -> Vec<u8> {
 }
 
 #[test]
-fn the_set_is_one_level_of_every_block_and_follows_from_the_table() {
+fn demand_is_one_level_of_every_block_and_follows_from_the_table() {
     let manifest = manifest();
     let blocks: usize = manifest
         .chunks
@@ -43,7 +43,7 @@ fn the_set_is_one_level_of_every_block_and_follows_from_the_table() {
         let needed = demand(&manifest, &eyes, &tau(tau_px));
         assert_eq!(needed, demand(&manifest, &[eyes[1], eyes[0]], &tau(tau_px)));
         assert_eq!(needed.len(), blocks);
-        // The rule once more, section by section.
+        // The rule again, section by section.
         for n in &needed {
             let chunk = &manifest.chunks[n.chunk];
             let section = &chunk.sections[n.section];
@@ -61,7 +61,7 @@ fn the_set_is_one_level_of_every_block_and_follows_from_the_table() {
 }
 
 #[test]
-fn nearer_eyes_longer_lenses_and_smaller_errors_need_more() {
+fn nearer_viewpoints_longer_focal_lengths_and_smaller_errors_need_more() {
     let manifest = manifest();
     let count =
         |eyes: &[Viewpoint], tau_px| gaussians(&manifest, &demand(&manifest, eyes, &tau(tau_px)));
@@ -84,5 +84,5 @@ fn what_is_out_of_reach_is_not_drawn() {
         let bounds = chunk.section_bounds(&chunk.sections[n.section]);
         assert!(bounds.distance_m(eyes[0].position_m) <= 50.0);
     }
-    assert_eq!(demand(&manifest, &[], &near), [], "nobody sees nothing");
+    assert_eq!(demand(&manifest, &[], &near), [], "without a viewpoint, nothing is drawn");
 }

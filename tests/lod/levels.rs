@@ -49,8 +49,8 @@ fn tau_zero_is_level_zero_everywhere() {
 
 #[test]
 fn a_pixel_of_error_is_hardly_seen_on_the_street() {
-    // All six cameras at a quarter of their size: at their full size, a pixel is so small that hardly
-    // anything of a street of 300 m is merged.
+    // All six cameras at a quarter of their size: at their full size, a pixel is so small that
+    // hardly anything of a street of 300 m is merged.
     let (scene, _) = streets::demo_street();
     let views = quarter_rig();
     let truth = Scene::from_gaussians(&scene);
@@ -79,21 +79,23 @@ fn quarter_rig() -> Vec<View> {
 }
 
 #[test]
-fn every_level_keeps_its_word() {
+fn every_level_keeps_its_error_bound() {
     let (scene, _) = streets::demo_street();
     let mut checked = 0;
     for block in blocks(&scene).iter().filter(|block| block.len() > 500).step_by(9) {
         let leaves = moments(block);
         let whole: f64 = leaves.iter().map(|leaf| leaf.2).sum();
-        let (mut error_m, mut count) = (0.0, block.len());
+        let mut error_m = 0.0;
+        let mut count = block.len();
         for level in lod::levels(block) {
             assert!(level.error_m >= error_m && level.chunk.len() < count);
-            (error_m, count) = (level.error_m, level.chunk.len());
+            error_m = level.error_m;
+            count = level.chunk.len();
             let nodes = moments(&level.chunk);
-            // Nothing of what covers the picture is lost.
+            // Opacity times area is conserved.
             let now: f64 = nodes.iter().map(|node| node.2).sum();
             assert!((now / whole - 1.0).abs() < 1e-4, "{now} of {whole}");
-            // Everything has somebody near and wide enough that may stand for it.
+            // Each Gaussian has a near and wide enough one that represents it.
             for (mean, sigma, _) in &leaves {
                 let nearest = nodes.iter().map(|(node, node_sigma, _)| {
                     node.distance(*mean) + 3.0 * (sigma - node_sigma).max(0.0)

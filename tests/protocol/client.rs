@@ -11,14 +11,14 @@ use wildcity_protocol::message::{Open, Outcome, Pose, Request};
 use super::fake_server::{FakeServer, Reply, seq_of};
 use super::read;
 
-/// Whether an error is the right one.
+/// Whether an error is the expected one.
 type Refusal = fn(&ClientError) -> bool;
 
 const HERE: Pose = Pose { xyz: [12.5, -3.25, 0.125], q: [0.8, 0.0, 0.0, 0.6] };
 
 const HELLO: Reply = Reply::Golden("welcome");
 const OPEN: Reply = Reply::Golden("opened");
-const SEEN: Reply = Reply::Observation(0);
+const OBSERVATION: Reply = Reply::Observation(0);
 
 async fn opened(scripts: Vec<Vec<Reply>>) -> (FakeServer, Client) {
     let server = FakeServer::start(scripts).await;
@@ -32,15 +32,25 @@ fn seqs(requests: &[Request]) -> Vec<u64> {
 }
 
 #[tokio::test]
-async fn a_whole_conversation() {
-    let (ok, closed) = (Reply::Golden("ok"), Reply::Golden("closed"));
-    let (server, mut client) =
-        opened(vec![vec![HELLO, OPEN, SEEN, SEEN, SEEN, SEEN, ok, closed]]).await;
+async fn a_whole_session() {
+    let ok = Reply::Golden("ok");
+    let closed = Reply::Golden("closed");
+    let (server, mut client) = opened(vec![vec![
+        HELLO,
+        OPEN,
+        OBSERVATION,
+        OBSERVATION,
+        OBSERVATION,
+        OBSERVATION,
+        ok,
+        closed,
+    ]])
+    .await;
     assert_eq!(client.welcome().twins[0].name, "street");
     assert_eq!(client.reset(7, None).await.unwrap().metadata().seq, 2);
-    let seen = client.step(HERE).await.unwrap();
-    assert_eq!(seen.camera("rear").unwrap().rgb().unwrap().len(), 4 * 3 * 3);
-    assert!(seen.camera("left").is_none());
+    let observation = client.step(HERE).await.unwrap();
+    assert_eq!(observation.camera("rear").unwrap().rgb().unwrap().len(), 4 * 3 * 3);
+    assert!(observation.camera("left").is_none());
     client.last_step(HERE).await.unwrap();
     client.observe(&[HERE, HERE]).await.unwrap();
     client.prefetch(&[HERE]).await.unwrap();
@@ -55,7 +65,8 @@ async fn a_whole_conversation() {
 
 #[tokio::test]
 async fn a_refused_request_keeps_its_number() {
-    let (server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Golden("error"), SEEN]]).await;
+    let (server, mut client) =
+        opened(vec![vec![HELLO, OPEN, Reply::Golden("error"), OBSERVATION]]).await;
     let Err(ClientError::Refused { code, field, fatal: false, .. }) = client.step(HERE).await
     else {
         panic!("the server refused");
@@ -79,8 +90,9 @@ async fn a_fatal_error_ends_the_connection() {
 #[tokio::test]
 async fn a_lost_answer_is_fetched_after_reconnecting() {
     let resumed = Reply::Golden("resumed");
-    let first = vec![HELLO, OPEN, SEEN, SEEN, Reply::HangUp];
-    let (server, mut client) = opened(vec![first, vec![HELLO, resumed, SEEN, SEEN]]).await;
+    let first = vec![HELLO, OPEN, OBSERVATION, OBSERVATION, Reply::HangUp];
+    let (server, mut client) =
+        opened(vec![first, vec![HELLO, resumed, OBSERVATION, OBSERVATION]]).await;
     client.reset(0, None).await.unwrap();
     client.step(HERE).await.unwrap();
     let lost = client.step(HERE).await;
@@ -101,8 +113,9 @@ async fn a_lost_answer_is_fetched_after_reconnecting() {
 #[tokio::test]
 async fn a_new_session_can_follow_one_that_is_gone() {
     let gone = r#"{"type":"error","seq":1,"code":"unknown_session","message":"","fatal":false}"#;
-    let second = vec![HELLO, Reply::Text(gone.into()), OPEN, SEEN];
-    let (server, mut client) = opened(vec![vec![HELLO, OPEN, SEEN, Reply::HangUp], second]).await;
+    let second = vec![HELLO, Reply::Text(gone.into()), OPEN, OBSERVATION];
+    let (server, mut client) =
+        opened(vec![vec![HELLO, OPEN, OBSERVATION, Reply::HangUp], second]).await;
     client.step(HERE).await.unwrap();
     client.step(HERE).await.unwrap_err();
     let refused = client.reconnect().await;
@@ -117,8 +130,8 @@ async fn a_new_session_can_follow_one_that_is_gone() {
 }
 
 #[tokio::test]
-async fn another_client_can_take_a_session_over() {
-    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed"), SEEN]]).await;
+async fn another_client_can_resume_a_session() {
+    let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed"), OBSERVATION]]).await;
     let mut client = Client::connect(&server.url, "test").await.unwrap();
     let resumed = client.resume("run-17", 4).await.unwrap();
     assert_eq!((resumed.last_seq, client.next_seq()), (4, 5));
@@ -126,16 +139,16 @@ async fn another_client_can_take_a_session_over() {
 }
 
 #[tokio::test]
-async fn numbers_have_an_end() {
+async fn the_largest_number_does_not_overflow() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
     let mut client = Client::connect(&server.url, "test").await.unwrap();
     let result = client.resume("run-17", u64::MAX).await;
     assert!(matches!(result, Err(ClientError::UnexpectedAnswer { .. })), "{result:?}");
 }
 
-/// Why a connection was lost is still known to the call after the failed `reconnect`.
+/// A call after a failed `reconnect` reports why the connection was lost.
 #[tokio::test]
-async fn a_refused_resume_says_why() {
+async fn a_refused_resume_is_reported_by_the_next_call() {
     let busy = r#"{"type":"error","seq":1,"code":"busy","message":"full","fatal":false}"#;
     let first = vec![HELLO, OPEN, Reply::HangUp];
     let (_server, mut client) = opened(vec![first, vec![HELLO, Reply::Text(busy.into())]]).await;
@@ -149,7 +162,7 @@ async fn a_refused_resume_says_why() {
 }
 
 #[tokio::test]
-async fn a_session_that_is_elsewhere_is_not_taken_over() {
+async fn a_session_at_another_request_is_not_resumed() {
     let server = FakeServer::start(vec![vec![HELLO, Reply::Golden("resumed")]]).await;
     let mut client = Client::connect(&server.url, "test").await.unwrap();
     let result = client.resume("run-17", 2).await;
@@ -175,7 +188,7 @@ async fn a_dropped_call_gives_the_connection_up() {
 }
 
 #[tokio::test]
-async fn what_is_no_answer_is_named() {
+async fn invalid_answers_are_named() {
     let damaged = read("vectors/damaged/overlap.bin");
     let cases: [(Reply, Refusal); 5] = [
         (Reply::Observation(1), |e| {
@@ -197,7 +210,7 @@ async fn what_is_no_answer_is_named() {
 }
 
 #[tokio::test]
-async fn nobody_there_is_no_connection() {
+async fn connecting_without_a_server_fails() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("ws://{}/v1/session", listener.local_addr().unwrap());
     drop(listener);

@@ -1,4 +1,4 @@
-//! Frames that are no observations: each is refused, for its own reason.
+//! Damaged frames: each is refused with an error that names its damage.
 
 use std::fs;
 
@@ -10,15 +10,15 @@ use super::frames::{Frame, assemble, png};
 use super::observations::{png_frame, raw_frame};
 use super::{check_file, check_json, protocol_path, read};
 
-/// Whether an error is the right one.
+/// Whether an error is the expected one.
 type Refusal = fn(&FrameError) -> bool;
 
-/// A damaged frame, and what the client must say.
+/// A damaged frame, and the error that it must cause.
 struct Damaged {
     name: &'static str,
     what: &'static str,
     bytes: Vec<u8>,
-    /// Whether only the image is damaged, which shows when it is decoded.
+    /// Whether only the image is damaged, so that decoding the frame succeeds and decoding the image fails.
     image_only: bool,
     refused: Refusal,
 }
@@ -50,8 +50,8 @@ fn damaged_frames_are_refused() {
     assert_eq!(files, index.len() + 1);
 }
 
-/// Whatever is cut off or flipped, the answer is an error or an observation, never a panic; and a
-/// flipped byte never changes a pixel unseen.
+/// A cut frame is an error. A flipped byte is an error, or an observation with the same pixels, or one that
+/// `verify` refuses. Nothing panics.
 #[test]
 fn no_prefix_and_no_flipped_byte_panics() {
     let frame = png_frame();
@@ -69,7 +69,7 @@ fn no_prefix_and_no_flipped_byte_panics() {
         flipped[position] ^= 0x15;
         let Ok(observation) = Observation::decode(flipped) else { continue };
         let verified = observation.verify();
-        // Some bytes of a PNG file, as its last checksum, have no say in its pixels.
+        // Some bytes of a PNG file, for example its last checksum, do not affect its pixels.
         if position >= bytes.len() - images_bytes && verified.is_ok() {
             assert_eq!(pixels(&observation), good, "byte {position} was flipped");
         }
@@ -112,7 +112,7 @@ fn damaged() -> Vec<Damaged> {
     cases
 }
 
-/// The header is JSON, but its tensors cannot be.
+/// The header is JSON, but its tensor table is invalid.
 fn damaged_tables() -> Vec<Damaged> {
     let edits: [(&str, &str, &str, Value, Refusal); 11] = [
         (
@@ -204,12 +204,12 @@ fn damaged_tables() -> Vec<Damaged> {
         })
         .collect();
 
-    let mut nameless = raw_frame();
-    nameless.metadata.images[1].tensor = "camera/left/rgb".into();
+    let mut unnamed = raw_frame();
+    unnamed.metadata.images[1].tensor = "camera/left/rgb".into();
     cases.push(Damaged {
         name: "missing_tensor",
-        what: "an image whose tensor is not there",
-        bytes: nameless.bytes(),
+        what: "an image that names a missing tensor",
+        bytes: unnamed.bytes(),
         image_only: false,
         refused: |e| matches!(e, FrameError::Missing { name } if name == "camera/left/rgb"),
     });
@@ -226,11 +226,11 @@ fn damaged_tables() -> Vec<Damaged> {
     cases
 }
 
-/// The frame is good, but the PNG in it is not.
+/// The frame is valid, but the PNG file in it is damaged.
 fn damaged_images() -> [Damaged; 2] {
     let with_file = |bytes: Vec<u8>| {
         let mut frame: Frame = png_frame();
-        // The rest is the same whatever the encoder wrote: one camera, no other PNG.
+        // One camera and no other PNG file, so that the frame does not depend on the encoder.
         frame.tensors.truncate(3);
         frame.metadata.images.truncate(1);
         frame.tensors[2].shape = vec![bytes.len() as u64];

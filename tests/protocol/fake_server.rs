@@ -1,8 +1,10 @@
-//! A server of a few lines that answers from a script, in golden messages.
+//! A WebSocket server that answers from a script of golden messages, with or without TLS.
 
 use futures_util::{SinkExt, StreamExt};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
+use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::accept_hdr_async;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::handshake::server::{Request as Upgrade, Response};
@@ -17,17 +19,17 @@ use super::read;
 /// What the server does with one request.
 #[derive(Clone)]
 pub(crate) enum Reply {
-    /// A golden answer, with the request's number.
+    /// Sends a golden answer with the request's number.
     Golden(&'static str),
-    /// The golden raw frame, with the request's number and this much more.
+    /// Sends the golden raw frame with the request's number plus this offset.
     Observation(u64),
-    /// These very bytes.
+    /// Sends exactly this text.
     Text(String),
-    /// These very bytes.
+    /// Sends exactly these bytes.
     Binary(Vec<u8>),
-    /// Says nothing, and keeps the connection.
+    /// Sends nothing, and keeps the connection open.
     Silence,
-    /// Drops the connection without a word.
+    /// Closes the connection without a message.
     HangUp,
 }
 
@@ -37,7 +39,7 @@ pub(crate) struct FakeServer {
 }
 
 impl FakeServer {
-    /// Answers one connection after the other by its script.
+    /// Accepts one connection per script, one after the other.
     pub(crate) async fn start(scripts: Vec<Vec<Reply>>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("ws://{}/v1/session", listener.local_addr().unwrap());
@@ -52,22 +54,39 @@ impl FakeServer {
         Self { url, task }
     }
 
-    /// What came in, by connection, once all scripts are done and their clients gone.
+    /// As [`FakeServer::start`], with TLS. A failed handshake uses up no script.
+    pub(crate) async fn start_tls(scripts: Vec<Vec<Reply>>, acceptor: TlsAcceptor) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("wss://localhost:{}/v1/session", listener.local_addr().unwrap().port());
+        let task = tokio::spawn(async move {
+            let mut requests = Vec::new();
+            let mut scripts = scripts.into_iter();
+            while scripts.len() > 0 {
+                let (stream, _) = listener.accept().await.unwrap();
+                let Ok(stream) = acceptor.accept(stream).await else { continue };
+                requests.push(follow(stream, scripts.next().unwrap()).await);
+            }
+            requests
+        });
+        Self { url, task }
+    }
+
+    /// The requests of each connection. Waits until all scripts are done and their clients are gone.
     pub(crate) async fn requests(self) -> Vec<Vec<Request>> {
         self.task.await.unwrap()
     }
 }
 
 #[expect(clippy::result_large_err, reason = "the type of tungstenite's callback")]
-async fn follow(stream: TcpStream, script: Vec<Reply>) -> Vec<Request> {
-    let choose = |upgrade: &Upgrade, mut response: Response| {
+async fn follow(stream: impl AsyncRead + AsyncWrite + Unpin, script: Vec<Reply>) -> Vec<Request> {
+    let choose_subprotocol = |upgrade: &Upgrade, mut response: Response| {
         assert_eq!(upgrade.uri().path(), "/v1/session");
         assert_eq!(upgrade.headers()["Sec-WebSocket-Protocol"], PROTOCOL);
         let chosen = HeaderValue::from_static(PROTOCOL);
         response.headers_mut().insert("Sec-WebSocket-Protocol", chosen);
         Ok(response)
     };
-    let mut socket = accept_hdr_async(stream, choose).await.unwrap();
+    let mut socket = accept_hdr_async(stream, choose_subprotocol).await.unwrap();
     let mut requests = Vec::new();
     for reply in script {
         let Some(Ok(Message::Text(text))) = socket.next().await else { return requests };
@@ -80,7 +99,7 @@ async fn follow(stream: TcpStream, script: Vec<Reply>) -> Vec<Request> {
             None => {}
         }
     }
-    // Until the client leaves. What is not in the script gets no answer, but is noted.
+    // Until the client disconnects. Requests beyond the script are recorded and get no answer.
     while let Some(Ok(message)) = socket.next().await {
         if let Message::Text(text) = message {
             requests.push(serde_json::from_str(&text).unwrap());
@@ -99,9 +118,9 @@ fn answer(reply: &Reply, seq: u64) -> Option<Message> {
             }
             Some(Message::text(value.to_string()))
         }
-        Reply::Observation(off) => {
+        Reply::Observation(offset) => {
             let mut frame: Frame = raw_frame();
-            frame.metadata.seq = seq + off;
+            frame.metadata.seq = seq + offset;
             Some(Message::binary(frame.bytes()))
         }
         Reply::Text(text) => Some(Message::text(text.clone())),

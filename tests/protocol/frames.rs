@@ -1,4 +1,4 @@
-//! Small observations, and the layout they travel in, written by another hand than the server's.
+//! Small observations and an encoder of their binary layout, independent of the server's.
 
 use serde_json::{Map, Value, json};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
@@ -6,7 +6,7 @@ use wildcity_protocol::observation::{Ego, Image, ObservationMetadata, Residency,
 
 use super::messages::{front, rear};
 
-/// A tensor of a frame that is being put together.
+/// A tensor of a frame under construction.
 #[derive(Clone)]
 pub(crate) struct Tensor {
     pub(crate) name: String,
@@ -15,25 +15,25 @@ pub(crate) struct Tensor {
     pub(crate) bytes: Vec<u8>,
 }
 
-/// A frame in its parts.
+/// The parts of a frame.
 #[derive(Clone)]
 pub(crate) struct Frame {
     pub(crate) metadata: ObservationMetadata,
     pub(crate) tensors: Vec<Tensor>,
 }
 
-/// What a frame is made of.
+/// What a frame contains.
 #[derive(Clone, Copy)]
 pub(crate) struct Recipe {
     pub(crate) encoding: Encoding,
     pub(crate) poses: u64,
     pub(crate) cameras: usize,
     pub(crate) depth: bool,
-    /// Earlier frames of each camera.
+    /// Number of earlier frames of each camera.
     pub(crate) history: u64,
 }
 
-/// Colour of a pixel. JPEG blurs, so its pixels are grey and change slowly.
+/// Colour of a pixel. JPEG is lossy, so its pixels are grey and change slowly.
 pub(crate) fn color(recipe: Recipe, image: u64, x: u64, y: u64) -> [u8; 3] {
     let channels = match recipe.encoding {
         Encoding::Jpeg => [100 + 8 * x + 4 * y + 20 * image; 3],
@@ -66,7 +66,8 @@ impl Frame {
             f32_tensor("ego.history_xyz", vec![16, 3], &xyz),
             f32_tensor("ego.history_rot", vec![16, 3, 3], &rot),
         ];
-        let (mut images, mut hashes) = (Vec::new(), blake3::Hasher::new());
+        let mut images = Vec::new();
+        let mut hashes = blake3::Hasher::new();
         let cameras = [front(), rear()];
         for pose in 0..recipe.poses {
             for (index, camera) in cameras[..recipe.cameras].iter().enumerate() {
@@ -131,7 +132,7 @@ impl Frame {
     }
 }
 
-/// Length, header padded with spaces to a multiple of eight, data.
+/// A frame: header length, header padded with spaces to a multiple of 8, data.
 pub(crate) fn assemble(header: &str, data: &[u8]) -> Vec<u8> {
     let padded = header.len().next_multiple_of(8);
     let mut bytes = (padded as u64).to_le_bytes().to_vec();
@@ -148,7 +149,8 @@ fn pixels(recipe: Recipe, image: u64, camera: &RigCamera) -> Vec<u8> {
 }
 
 fn color_tensor(recipe: Recipe, stem: &str, camera: &RigCamera, pixels: Vec<u8>) -> Tensor {
-    let (width, height) = (camera.width as u16, camera.height as u16);
+    let width = camera.width as u16;
+    let height = camera.height as u16;
     let bytes = match recipe.encoding {
         Encoding::Raw => pixels,
         Encoding::Png => png(&pixels, width.into(), height.into()),
@@ -156,8 +158,8 @@ fn color_tensor(recipe: Recipe, stem: &str, camera: &RigCamera, pixels: Vec<u8>)
             let mut bytes = Vec::new();
             let encoder = jpeg_encoder::Encoder::new(&mut bytes, 95);
             encoder.encode(&pixels, width, height, jpeg_encoder::ColorType::Rgb).unwrap();
-            // So that what comes behind it does not lie on a multiple of four bytes. Decoders stop
-            // at the end marker.
+            // An odd length, so that the tensors after it are not aligned to 4 bytes. Decoders stop at
+            // the end marker.
             if bytes.len().is_multiple_of(2) {
                 bytes.push(0);
             }
@@ -206,7 +208,6 @@ fn image(
     hash: String,
 ) -> Image {
     let RigCamera { name, width, height, cx, cy, lens, windshield, shutter, .. } = camera.clone();
-    let (fx, fy) = (camera.fx.unwrap_or_default(), camera.fy.unwrap_or_default());
     let exposed_us = shutter.map_or(0, |shutter| shutter.duration_us);
     let seen = lens.map(|_| 0.75);
     Image {
@@ -218,8 +219,8 @@ fn image(
         encoding: recipe.encoding,
         width,
         height,
-        fx,
-        fy,
+        fx: camera.fx.unwrap_or_default(),
+        fy: camera.fy.unwrap_or_default(),
         cx,
         cy,
         lens,

@@ -1,17 +1,19 @@
-//! The wire: schemas, golden vectors, damaged frames, and the Rust client against a server that
-//! speaks from the vectors.
+//! The protocol: schemas, golden vectors, damaged frames, and the Rust client against a server that answers
+//! with the golden vectors.
 //!
-//! Schemas and vectors are generated from the types by these tests. After a change of the wire:
-//! `WILDCITY_BLESS=1 cargo test --release --test protocol`, and look at the difference.
+//! Schemas and vectors are generated from the types by these tests. After a change of the types run
+//! `WILDCITY_BLESS=1 cargo test -p wildcity-client --test protocol`, and review the difference.
 
 mod client;
 mod damaged;
+mod dependencies;
 mod fake_server;
 mod frames;
 mod messages;
 mod observations;
 mod readme;
 mod schema;
+mod tls;
 
 use std::fs;
 use std::path::PathBuf;
@@ -21,7 +23,7 @@ fn protocol_path(name: &str) -> PathBuf {
     root().join("protocol").join(name)
 }
 
-/// Whether files are to be written rather than compared.
+/// Whether the tests write the files instead of comparing them.
 fn blessing() -> bool {
     std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1")
 }
@@ -32,7 +34,7 @@ fn read(name: &str) -> Vec<u8> {
     fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// Writes a file when blessing; else compares it.
+/// Compares a file with its expected contents, or writes it when blessing.
 fn check_file(name: &str, contents: &[u8]) {
     let path = protocol_path(name);
     if blessing() {
@@ -42,13 +44,13 @@ fn check_file(name: &str, contents: &[u8]) {
     }
     assert!(
         fs::read(&path).is_ok_and(|found| found == contents),
-        "{} is not what the types in protocol/src give. If the wire was meant to change: \
-         WILDCITY_BLESS=1 cargo test --release --test protocol",
+        "{} differs from what the types in protocol/src give. If that is intended: \
+         WILDCITY_BLESS=1 cargo test -p wildcity-client --test protocol",
         path.display()
     );
 }
 
-/// As [`check_file`], for a value as JSON for people to read.
+/// As [`check_file`], for a value as indented JSON.
 fn check_json(name: &str, value: &impl serde::Serialize) {
     let mut text = serde_json::to_string_pretty(value).unwrap();
     text.push('\n');

@@ -27,7 +27,7 @@ fn answers_are_the_golden_ones() {
 }
 
 #[test]
-fn what_may_be_left_out_has_a_default() {
+fn absent_fields_have_defaults() {
     let open = Request::Open(Box::new(Open { seq: 1, ..Open::twin("street") }));
     let parse = |text: &str| serde_json::from_str::<Request>(text);
     assert_eq!(parse(r#"{"type":"open","seq":1,"twin":"street"}"#).unwrap(), open);
@@ -36,12 +36,12 @@ fn what_may_be_left_out_has_a_default() {
     assert!(matches!(step, Request::Step { terminate: false, .. }));
     let reset = parse(r#"{"type":"reset","seq":3}"#).unwrap();
     assert_eq!(reset, Request::Reset { seq: 3, seed: 0, start: None });
-    // Unknown fields are mistakes, not extensions.
+    // Unknown fields of requests are mistakes, not extensions.
     let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
     assert!(parse(&unknown).unwrap_err().to_string().contains("speed"));
 }
 
-/// A server of next year may say more, at any depth.
+/// A newer server may add fields, at any depth.
 #[test]
 fn answers_with_unknown_fields_are_the_same_answers() {
     for (name, answer) in answers() {
@@ -52,7 +52,7 @@ fn answers_with_unknown_fields_are_the_same_answers() {
     }
 }
 
-/// Adds a field to every object but a profile and times by camera, whose fields are all known as none is.
+/// Adds a field to every object, except `profile` and `period_us`: they are maps, so any field is known.
 pub(crate) fn add_unknown_fields(value: &mut Value) {
     match value {
         Value::Object(fields) => {
@@ -178,7 +178,7 @@ fn requests() -> Vec<(&'static str, Request)> {
     };
     let ahead =
         |time_us, x_m| TimedPose { time_us, pose: pose([x_m, 0.5, 0.0], [1.0, 0.0, 0.0, 0.0]) };
-    let way = vec![ahead(100_000, 1.5), ahead(200_000, 3.25)];
+    let planned = vec![ahead(100_000, 1.5), ahead(200_000, 3.25)];
     let action = Action { acceleration: -1.5, curvature: 0.025 };
     let there = pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]);
     let above = pose([12.5, -3.25, 30.0], [1.0, 0.0, 0.0, 0.0]);
@@ -193,7 +193,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("open_model", Request::Open(Box::new(model))),
         ("step", step(3, Some(there), None, None, false)),
         ("step_terminate", step(4, Some(there), None, None, true)),
-        ("step_trajectory", step(3, None, Some(way), None, false)),
+        ("step_trajectory", step(3, None, Some(planned), None, false)),
         ("step_action", step(3, None, None, Some(action), false)),
         ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
         ("prefetch", Request::Prefetch { seq: 6, poses: vec![there, above] }),
@@ -273,8 +273,13 @@ fn answers() -> Vec<(&'static str, Answer)> {
         profile: opened.profile.clone(),
     };
     let session = "run-17".to_owned();
-    let (outcome, least_trust) = (Outcome::OffModel, Some(0.0625));
-    let summary = Summary { outcome, steps: 2, time_us: 200_000, distance_m: 1.75, least_trust };
+    let summary = Summary {
+        outcome: Outcome::OffModel,
+        steps: 2,
+        time_us: 200_000,
+        distance_m: 1.75,
+        least_trust: Some(0.0625),
+    };
     let refused = Answer::Error {
         seq: Some(3),
         code: Code::PoseNotFinite,

@@ -1,4 +1,4 @@
-//! Golden observations: the frame, and what a client must find in it.
+//! Golden observations: frames, and the contents that a client must find in them.
 
 use serde_json::{Value, json};
 use wildcity_client::{FrameError, ImageView, Observation};
@@ -7,7 +7,7 @@ use wildcity_protocol::message::Encoding;
 use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
-/// The golden frames; `seq` is that of the request vector that it answers.
+/// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
 fn golden() -> [(&'static str, u64, Recipe); 5] {
     let raw = Recipe { encoding: Encoding::Raw, poses: 1, cameras: 2, depth: true, history: 0 };
     [
@@ -19,7 +19,7 @@ fn golden() -> [(&'static str, u64, Recipe); 5] {
     ]
 }
 
-/// A frame whose every pixel is known.
+/// A frame of raw images with known pixels.
 pub(crate) fn raw_frame() -> Frame {
     let (_, seq, recipe) = golden()[0];
     Frame::new(seq, recipe)
@@ -32,11 +32,11 @@ pub(crate) fn png_frame() -> Frame {
 }
 
 #[test]
-fn golden_frames_decode_to_what_went_in() {
+fn golden_frames_decode_to_their_contents() {
     for (name, seq, recipe) in golden() {
         let frame = Frame::new(seq, recipe);
         let file = format!("vectors/observations/{name}.bin");
-        // Encoded images may change with their encoder, and stay good.
+        // Another version of the encoder may write other files with the same pixels.
         if blessing() || recipe.encoding == Encoding::Raw {
             check_file(&file, &frame.bytes());
         }
@@ -64,7 +64,7 @@ fn the_last_frames_of_a_camera_are_in_the_order_they_were_taken() {
     let frames = observation.frames("front");
     let times: Vec<_> = frames.iter().map(|frame| frame.metadata().shutter_end_us).collect();
     assert_eq!(times, [0, 100_000, 200_000]);
-    // The image of now is number 0, those before it 1 and 2.
+    // The current image is number 0, the earlier ones are 1 and 2.
     for (frame, number) in frames.iter().zip([2, 1, 0]) {
         assert_eq!(frame.rgb().unwrap()[..3], frames::color(recipe, number, 0, 0).as_slice()[..3]);
     }
@@ -123,11 +123,13 @@ fn check_history(observation: &Observation) {
 
 fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
     let rgb = image.rgb().unwrap();
-    let (depth_m, opacity) = (image.depth_m(), image.opacity());
+    let depth_m = image.depth_m();
+    let opacity = image.opacity();
     assert_eq!(depth_m.is_some(), recipe.depth);
     assert_eq!(opacity.is_some(), recipe.depth);
     for (pixel, rgb) in rgb.chunks_exact(3).enumerate() {
-        let (x, y) = (pixel as u64 % 4, pixel as u64 / 4);
+        let x = pixel as u64 % 4;
+        let y = pixel as u64 / 4;
         let expected = frames::color(recipe, number, x, y);
         let close = rgb.iter().zip(expected).all(|(&a, b)| a.abs_diff(b) <= tolerance(recipe));
         assert!(close, "pixel ({x}, {y}) of image {number}: {rgb:?}, not {expected:?}");
@@ -141,18 +143,18 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
     assert_eq!(rgb.len(), 4 * 3 * 3);
 }
 
-/// How far a decoded channel may be off.
+/// Largest accepted error of a decoded channel.
 fn tolerance(recipe: Recipe) -> u8 {
     if recipe.encoding == Encoding::Jpeg { 4 } else { 0 }
 }
 
-/// What a client in any language can compare with; a few pixels of each image.
+/// The contents that a client in any language can compare with: metadata, and a few pixels of each image.
 fn expected(frame: &Frame, recipe: Recipe) -> Value {
     let tensors: Vec<Value> = frame
         .tensors
         .iter()
         .map(|t| {
-            // How long a JPEG or PNG file is belongs to its encoder.
+            // The length of a JPEG or PNG file depends on its encoder.
             let file = t.name.ends_with("/rgb") && recipe.encoding != Encoding::Raw;
             let shape = if file { Value::Null } else { json!(t.shape) };
             json!({"name": t.name, "dtype": t.dtype, "shape": shape})

@@ -1,4 +1,4 @@
-//! `protocol/README.md` shows messages and bytes that are really so.
+//! The examples in `protocol/README.md` are valid messages and bytes.
 
 use schemars::schema_for;
 use serde::de::DeserializeOwned;
@@ -18,7 +18,7 @@ fn every_json_example_is_a_message() {
         ("answer", parses::<Answer>),
         ("observation", parses::<ObservationMetadata>),
     ];
-    // Each request but the two of `open` once, each answer once.
+    // Every request has one example and `open` two; `step` has three. Every answer has one.
     assert_eq!(counted(page, kinds), [12, 7, 1]);
     let kinds: [Kind; 6] = [
         ("new upload", parses::<http::NewUpload>),
@@ -31,10 +31,10 @@ fn every_json_example_is_a_message() {
     assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1]);
 }
 
-/// A kind of message, and what keeps a text from being one.
+/// A kind of message, and a parser that returns the error if a text is not one.
 type Kind = (&'static str, fn(&str) -> Option<String>);
 
-/// How many examples there are of each kind; every example is of exactly one.
+/// Number of examples of each kind. Every example is of exactly one kind.
 fn counted<const N: usize>(page: &str, kinds: [Kind; N]) -> [usize; N] {
     let mut counts = [0; N];
     for example in blocks(page, "json") {
@@ -50,7 +50,8 @@ fn counted<const N: usize>(page: &str, kinds: [Kind; N]) -> [usize; N] {
 
 #[test]
 fn the_hex_example_is_the_golden_frame() {
-    let (page, frame) = (page(), read("vectors/observations/raw.bin"));
+    let page = page();
+    let frame = read("vectors/observations/raw.bin");
     let dump: Vec<&str> = blocks(&page, "hex").flat_map(str::lines).collect();
     assert_eq!(dump.len(), 6);
     for line in dump {
@@ -64,7 +65,7 @@ fn the_hex_example_is_the_golden_frame() {
     assert_eq!((frame.len(), &frame[..8]), (3384, &2344_u64.to_le_bytes()[..]));
 }
 
-/// Every code is explained, and no other.
+/// The table of errors has every code, and no other.
 #[test]
 fn every_error_code_has_its_row() {
     let page = page();
@@ -93,7 +94,7 @@ fn blocks<'a>(page: &'a str, language: &str) -> impl Iterator<Item = &'a str> {
         .filter_map(move |block| block.strip_prefix(&fence[3..]))
 }
 
-/// What keeps a text from being of a type.
+/// The error if a text is not of a type.
 fn parses<T: DeserializeOwned>(text: &str) -> Option<String> {
     serde_json::from_str::<T>(text).err().map(|error| error.to_string())
 }

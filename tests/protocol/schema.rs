@@ -1,4 +1,4 @@
-//! `protocol/schema` is what the types say.
+//! `protocol/schema` is generated from the types.
 
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema, schema_for};
@@ -7,8 +7,8 @@ use wildcity_protocol::{http, message, observation};
 use super::check_json;
 
 #[test]
-fn schemas_are_fresh() {
-    // The server refuses unknown fields, at any depth; clients ignore them.
+fn schemas_are_up_to_date() {
+    // The server refuses unknown fields at any depth; clients ignore them.
     check_closed::<message::Request>("request");
     check_closed::<http::NewUpload>("new_upload");
     check_closed::<http::NewPush>("new_push");

@@ -1,4 +1,4 @@
-//! Exposure and overlays: what they do to colours, and that they do nothing else.
+//! Exposure and overlays: they change colours as specified, and nothing else.
 
 use std::sync::Arc;
 
@@ -21,9 +21,11 @@ fn draw(backend: &dyn Backend, scene: &Scene, seen: &Appearance) -> Image {
 
 #[test]
 fn an_exposure_follows_the_sky_and_precedes_the_overlay() {
-    let (scene, view) = (scene(), street_views()[2]);
+    let scene = scene();
+    let view = street_views()[2];
     let seen = appearance(view);
-    let (exposure, overlay) = (seen.exposure.unwrap(), seen.overlay.as_ref().unwrap());
+    let exposure = seen.exposure.unwrap();
+    let overlay = seen.overlay.as_ref().unwrap();
     for backend in [&cpu() as &dyn Backend, &Reference] {
         let plain = render_one(backend, &scene, &RenderProfile::DEFAULT, view);
         let image = draw(backend, &scene, &seen);
@@ -42,7 +44,7 @@ fn an_exposure_follows_the_sky_and_precedes_the_overlay() {
             changed += usize::from(seen[0] != plain[0]);
         }
         assert!(changed > image.opacity.len() / 2, "{changed}");
-        // 8 bit are made of the same colours.
+        // The 8-bit image has the same colours.
         for (byte, linear) in image.rgb8.chunks(3).zip(image.rgba.chunks(4)) {
             for c in 0..3 {
                 let wanted = 255.0 * linear[c].clamp(0.0, 1.0);
@@ -54,13 +56,15 @@ fn an_exposure_follows_the_sky_and_precedes_the_overlay() {
 
 #[test]
 fn both_backends_agree() {
-    let (scene, seen) = (scene(), appearance(street_views()[2]));
+    let scene = scene();
+    let seen = appearance(street_views()[2]);
     agree(&draw(&cpu(), &scene, &seen), &draw(&Reference, &scene, &seen)).unwrap();
 }
 
 #[test]
 fn a_plain_appearance_changes_no_bit() {
-    let (scene, view) = (scene(), street_views()[2]);
+    let scene = scene();
+    let view = street_views()[2];
     let plain = render_one(&cpu(), &scene, &RenderProfile::DEFAULT, view);
     assert_eq!(draw(&cpu(), &scene, &Appearance::default()), plain);
     let identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
@@ -87,8 +91,9 @@ fn what_cannot_be_is_refused() {
         let error = Appearance { exposure: Some(exposure), overlay: None }.check([1, 1]);
         assert!(matches!(error, Err(AppearanceError::Exposure { field: "offset", .. })));
     }
-    // A backend does not trust whoever did not check.
-    let (scene, views) = (Scene::default(), street_views());
+    // A backend checks the overlay itself, whether the caller did or not.
+    let scene = Scene::default();
+    let views = street_views();
     let frame = Frame { scene: &scene, profile: &RenderProfile::DEFAULT, views: &views[2..] };
     let mut rgb8 = vec![0; 3 * views[2].camera.pixels()];
     let target = Target { rgb8: Some(&mut rgb8), appearance: Some(&seen), ..Target::default() };

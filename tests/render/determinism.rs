@@ -1,4 +1,4 @@
-//! The same input, the same bytes.
+//! The same input gives the same bytes: at any number of threads, in any order of views, after any other frame.
 
 use std::sync::Mutex;
 
@@ -13,7 +13,8 @@ use crate::streets::{street, turning_views as views};
 #[test]
 fn a_hundred_repeats_are_equal_to_the_bit() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 11));
-    let (backend, profile) = (cpu(), RenderProfile::default());
+    let backend = cpu();
+    let profile = RenderProfile::default();
     let first = render(&backend, &scene, &profile, &views());
     for repeat in 1..100 {
         assert!(render(&backend, &scene, &profile, &views()) == first, "repeat {repeat}");
@@ -41,7 +42,8 @@ fn more_threads_than_any_machine_has_are_refused_before_they_start() {
 #[test]
 fn a_view_does_not_see_its_neighbours() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 13));
-    let (backend, profile) = (cpu(), RenderProfile::default());
+    let backend = cpu();
+    let profile = RenderProfile::default();
     let together = render(&backend, &scene, &profile, &views());
     for (view, image) in views().into_iter().zip(&together) {
         assert!(render_one(&backend, &scene, &profile, view) == *image);
@@ -57,7 +59,8 @@ fn a_view_does_not_see_its_neighbours() {
 fn a_frame_leaves_nothing_for_the_next() {
     let street = Scene::from_gaussians(&street(20_000, 1, 14));
     let cloud = Scene::from_gaussians(&gaussians(5_000, 3, 4.0, 15));
-    let (backend, profile) = (cpu(), RenderProfile::default());
+    let backend = cpu();
+    let profile = RenderProfile::default();
     let fresh = render(&cpu(), &street, &profile, &views());
     render(&backend, &cloud, &profile, &views()[..2]);
     assert!(render(&backend, &street, &profile, &views()) == fresh);
@@ -66,7 +69,8 @@ fn a_frame_leaves_nothing_for_the_next() {
 #[test]
 fn every_view_is_told_of_once_when_it_is_done() {
     let scene = Scene::from_gaussians(&street(5_000, 0, 16));
-    let (profile, views) = (RenderProfile::default(), views());
+    let profile = RenderProfile::default();
+    let views = views();
     let alone = render(&cpu(), &scene, &profile, &views);
     let mut images: Vec<Vec<u8>> = views.iter().map(|v| vec![0; 3 * v.camera.pixels()]).collect();
     let mut targets: Vec<Target<'_>> =
@@ -87,7 +91,8 @@ fn every_view_is_told_of_once_when_it_is_done() {
 #[test]
 fn targets_of_another_size_are_refused() {
     let scene = Scene::default();
-    let (profile, views) = (RenderProfile::default(), views());
+    let profile = RenderProfile::default();
+    let views = views();
     let frame = Frame { scene: &scene, profile: &profile, views: &views[..1] };
     let mut short = vec![0; 10];
     let target = Target { rgb8: Some(&mut short), ..Target::default() };

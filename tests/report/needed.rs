@@ -1,4 +1,4 @@
-//! Only what is needed: the matrix of features on a device, and a base that pays for none of them.
+//! What each feature of a scene costs on a device, and that the base scene pays for none of them.
 
 use std::cell::Cell;
 
@@ -20,11 +20,12 @@ use crate::images::{cpu, render_one, view_along};
 use crate::skies::sky;
 use crate::streets::street;
 
-/// Kernels that the base compiles, and that a step of it starts: one more is one that it does not need.
+/// Pipelines that the base scene compiles, and dispatches of a step. One more would be one that it does not
+/// need.
 const BASE: [u64; 2] = [26, 45];
 
 #[test]
-fn a_report_tells_what_a_device_holds_of_what_it_draws() {
+fn a_report_has_the_device_memory_of_each_setting() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
     let scene = street(20_000, 1, 5);
@@ -38,18 +39,23 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
     let places = sample_points(manifest, &[], Sampling { stations: 2, window_px: [32, 32] });
     let open = || Gpu::new(&AdapterChoice::Best, 0).ok();
     let backends: [Box<dyn Backend>; 2] = [Box::new(cpu()), Box::new(open().unwrap())];
-    let twin = TwinFeatures::of(manifest, None, &places[0].views);
+    let twin = TwinFeatures::new(manifest, None, &places[0].views);
     let SettingList { settings, .. } = settings_to_compare(&twin, &["cpu", "gpu"]);
     let held_bytes = |name: &str, device: &dyn Fn() -> Option<Gpu>| {
-        let (backends, places) = (&backends[..], &places[..]);
-        let bench = Benchmark { resident: &resident, backends, places, repeat: 1, device };
-        let truth = bench.truth(Rays::Splats, &mut |_| {}).unwrap();
+        let bench = Benchmark {
+            resident: &resident,
+            backends: &backends,
+            sample_points: &places,
+            repeat: 1,
+            open_device: device,
+        };
+        let truth = bench.render_reference(Rays::Splats, &mut |_| {}).unwrap();
         let setting = settings.iter().find(|setting| setting.name == name).unwrap();
         bench.measure(setting, &truth).unwrap().cost.device_bytes
     };
     assert_eq!(held_bytes("as served", &open), None);
     assert_eq!(held_bytes("gpu", &|| None), None);
-    // As much as the same images take on a device of the test's own: the Gaussians, and what stages need.
+    // The same images take as much on a device that the test opens: the Gaussians, and buffers of stages.
     let (device, scene) = (open().unwrap(), Scene::from_gaussians(&scene));
     let mut rgb8 = vec![0; 3 * 640 * 480];
     for place in &places {
@@ -66,17 +72,18 @@ fn a_report_tells_what_a_device_holds_of_what_it_draws() {
 }
 
 #[test]
-fn features_pay_for_themselves_and_the_base_for_none() {
+fn each_feature_costs_and_the_base_scene_pays_for_none() {
     let opened = Cell::new(0);
     let open = || {
         opened.set(opened.get() + 1);
         Gpu::new(&AdapterChoice::Best, 0).ok()
     };
     let rows = feature_costs::count_features(&cpu(), &open).unwrap();
-    rows.iter().for_each(|row| eprintln!("| {} | {} |", row.with, row.counts.texts().join(" | ")));
-    // Each on a device that drew nothing else.
+    rows.iter()
+        .for_each(|row| eprintln!("| {} | {} |", row.feature, row.counts.cells().join(" | ")));
+    // Each row has its own device, which renders nothing else.
     assert_eq!(opened.get(), rows.len());
-    let of = |with: &str| rows.iter().find(|row| row.with == with).unwrap().counts.device;
+    let of = |with: &str| rows.iter().find(|row| row.feature == with).unwrap().counts.device;
     let base = counted(of("nothing else"));
     assert_eq!([base[0], base[2]], BASE);
     let beyond = |with: &str| {
@@ -94,10 +101,10 @@ fn features_pay_for_themselves_and_the_base_for_none() {
     ] {
         assert_eq!(beyond(with), [0, 0, 0, 4 * planes], "{with}");
     }
-    // Fewer Gaussians, and perhaps a buffer that need not grow.
+    // Fewer Gaussians, so that a buffer may not have to grow.
     let [pipelines, buffers, dispatches, planes] = beyond("levels of detail, 1 m");
     assert!(buffers <= 0 && [pipelines, dispatches, planes] == [0; 3]);
-    // Other kernels in the places of the last and of the first one, with more buffers.
+    // Other pipelines replace the last and the first one, with more buffers.
     for with in [
         "background",
         "sky of images",
@@ -112,8 +119,8 @@ fn features_pay_for_themselves_and_the_base_for_none() {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }
-    let bytes = |with: &str| of(with).unwrap().gaussian_bytes;
-    // Colours of SH are halves: 9 values, and 45.
+    let bytes = |with: &str| of(with).unwrap().bytes_per_gaussian;
+    // SH coefficients are f16: 9 values, and 45.
     let colours = ["SH degree 1", "SH degree 3"].map(|with| bytes(with) - bytes("nothing else"));
     assert!(
         (15.0..19.0).contains(&colours[0]) && (86.0..92.0).contains(&colours[1]),
@@ -121,15 +128,15 @@ fn features_pay_for_themselves_and_the_base_for_none() {
     );
 }
 
-/// Pipelines, buffers, dispatches, and bytes of a pixel that go back.
+/// Pipelines, buffers, dispatches, and bytes per pixel that are read back.
 fn counted(counts: Option<DeviceCounts>) -> [u64; 4] {
     let counts = counts.unwrap();
-    [counts.pipelines, counts.buffers, counts.dispatches, counts.pixel_bytes]
+    [counts.pipelines, counts.buffers, counts.dispatches, counts.read_back_bytes_per_pixel]
 }
 
-/// What others had on the same device before is not the base's either.
+/// The base scene does not pay for features that the same device rendered before.
 #[test]
-fn after_all_features_the_base_is_as_before() {
+fn after_other_features_the_base_scene_costs_the_same() {
     let gpu = gpu();
     let base = Scene::from_gaussians(&street(5_000, 0, 3));
     let rich = Scene { sky: Some(sky()), ..Scene::from_gaussians(&street(5_000, 1, 3)) };

@@ -1,4 +1,4 @@
-//! Who may open a session, and what it can rely on.
+//! Admission: which sessions may open, and what an open session can rely on.
 
 use std::sync::Arc;
 use std::sync::mpsc::channel;
@@ -10,17 +10,17 @@ use wildcity_twin::residency::{Cache, ResidencyError, RigExtent, SectionRef};
 use crate::scene_files::{Random, gaussians};
 use crate::streaming::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
 
-const LENS: RigExtent = RigExtent { focal_px: 70.0, radius_m: 1.7 };
+const EXTENT: RigExtent = RigExtent { focal_px: 70.0, radius_m: 1.7 };
 
 #[test]
 fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
-    let worst_case_bytes = unlimited().open("demo", None).unwrap().worst_case_bytes(LENS);
+    let worst_case_bytes = unlimited().open("demo", None).unwrap().worst_case_bytes(EXTENT);
     let limit_bytes = 2 * worst_case_bytes + 1;
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     let resident = cache.open("demo", None).unwrap();
     assert!(limit_bytes < resident.total_bytes(), "else there is room for everything");
-    let held = [resident.reserve(LENS).unwrap(), resident.reserve(LENS).unwrap()];
-    let refused = resident.reserve(LENS).unwrap_err();
+    let held = [resident.reserve(EXTENT).unwrap(), resident.reserve(EXTENT).unwrap()];
+    let refused = resident.reserve(EXTENT).unwrap_err();
     match &refused {
         ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes: limit } => {
             let said = (twin.as_str(), *needed_bytes, *held_bytes, *limit);
@@ -31,12 +31,12 @@ fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
     assert!(refused.to_string().contains("--memory-gib"), "{refused}");
     assert_eq!(cache.stats().reserved_bytes, 2 * worst_case_bytes);
     drop(held);
-    assert!(resident.reserve(LENS).is_ok(), "what is given back is there again");
+    assert!(resident.reserve(EXTENT).is_ok(), "what is given back is there again");
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 
 #[test]
-fn another_version_takes_the_room_of_the_one_before() {
+fn an_exchanged_version_takes_the_memory_of_the_one_before() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = gaussians(20_000, 1, 600.0, 1);
     commit(dir.path(), "street", &scene);
@@ -44,14 +44,14 @@ fn another_version_takes_the_room_of_the_one_before() {
     commit(dir.path(), "street", &scene);
     let catalog = wildcity_twin::store::Catalog::open(dir.path()).unwrap();
     let all = Cache::new(catalog.clone()).open("street", None).unwrap();
-    let limit_bytes = all.worst_case_bytes(LENS) * 3 / 2;
+    let limit_bytes = all.worst_case_bytes(EXTENT) * 3 / 2;
     assert!(limit_bytes < all.total_bytes());
     let cache = Cache::limited(catalog, Some(limit_bytes));
     let [old, new] = [1, 2].map(|number| cache.open("street", Some(number)).unwrap());
-    let mut reservation = old.reserve(LENS).unwrap();
-    assert!(new.reserve(LENS).is_err(), "there is no room for both");
-    reservation.exchange(new.clone(), new.worst_case_bytes(LENS)).unwrap();
-    // Refused, it stays what it is.
+    let mut reservation = old.reserve(EXTENT).unwrap();
+    assert!(new.reserve(EXTENT).is_err(), "there is no room for both");
+    reservation.exchange(new.clone(), new.worst_case_bytes(EXTENT)).unwrap();
+    // A refused exchange changes nothing.
     assert!(reservation.exchange(old, limit_bytes + 1).is_err());
     assert!(Arc::ptr_eq(reservation.resident(), &new));
     assert_eq!(new.stats().reserved_bytes, reservation.bytes());
@@ -64,7 +64,7 @@ fn a_twin_that_fits_as_a_whole_has_room_for_any_number_of_sessions() {
     let total_bytes = unlimited().open("demo", None).unwrap().total_bytes();
     let cache = Cache::limited(demo().catalog(), Some(total_bytes));
     let resident = cache.open("demo", None).unwrap();
-    let held: Vec<_> = (0..100).map(|_| resident.reserve(LENS).unwrap()).collect();
+    let held: Vec<_> = (0..100).map(|_| resident.reserve(EXTENT).unwrap()).collect();
     assert_eq!(cache.stats().reserved_bytes, total_bytes);
     drop(held);
 }
@@ -72,7 +72,7 @@ fn a_twin_that_fits_as_a_whole_has_room_for_any_number_of_sessions() {
 #[test]
 fn as_many_sessions_as_there_is_room_for_race_without_a_deadlock() {
     let all = unlimited().open("demo", None).unwrap();
-    let limit_bytes = 3 * all.worst_case_bytes(LENS);
+    let limit_bytes = 3 * all.worst_case_bytes(EXTENT);
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     let resident = cache.open("demo", None).unwrap();
     race(&resident, 3, true);
@@ -81,16 +81,16 @@ fn as_many_sessions_as_there_is_room_for_race_without_a_deadlock() {
 }
 
 #[test]
-fn askers_that_nobody_admitted_get_on_one_after_the_other() {
-    // Room for the worst frame, and eight that want another one each.
+fn frames_without_admission_are_drawn_one_after_the_other() {
+    // Room for one worst frame, and eight threads that each draw another frame.
     let all = unlimited().open("demo", None).unwrap();
-    let limit_bytes = all.worst_case_bytes(LENS);
+    let limit_bytes = all.worst_case_bytes(EXTENT);
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     race(&cache.open("demo", None).unwrap(), 8, false);
     assert!(cache.stats().held_bytes <= limit_bytes);
 }
 
-/// Whoever lets go of what fills the memory wakes up who waits for room: nobody has to look again.
+/// The end of a frame that fills the memory wakes the load that waits for room, without polling.
 #[test]
 fn the_end_of_a_frame_makes_room_at_once() {
     let all = unlimited().open("demo", None).unwrap();
@@ -101,7 +101,7 @@ fn the_end_of_a_frame_makes_room_at_once() {
         let count = |n: &SectionRef| chunks[n.chunk].sections[n.section].count;
         needed.iter().map(|n| Chunk::bytes_of(1, count(n).into())).sum()
     };
-    // Either fits, and both together do not.
+    // Each of the two fits, but not both together.
     let limit_bytes = bytes(0.0).max(bytes(500.0)) + bytes(0.0) / 4;
     assert!(limit_bytes < bytes(0.0) + bytes(500.0));
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
@@ -110,7 +110,9 @@ fn the_end_of_a_frame_makes_room_at_once() {
     for _ in 0..5 {
         let first = resident.scene(&frame(0.0), &PROFILE).unwrap();
         let (tell, told) = channel();
-        let (other, eyes, before) = (resident.clone(), frame(500.0), cache.stats().waits);
+        let other = resident.clone();
+        let eyes = frame(500.0);
+        let before = cache.stats().waits;
         let waiting = std::thread::spawn(move || {
             let second = other.scene(&eyes, &PROFILE).unwrap();
             tell.send(Instant::now()).unwrap();
@@ -119,7 +121,8 @@ fn the_end_of_a_frame_makes_room_at_once() {
         while cache.stats().waits == before {
             std::thread::yield_now();
         }
-        // Time to find that there is no room, and to fall asleep; a loader that is late finds room.
+        // Time for the loader to find that there is no room, and to sleep. (A loader that is late
+        // finds room.)
         std::thread::sleep(wildcity_twin::limits::ROOM_POLL / 4);
         let dropped = Instant::now();
         drop(first);
@@ -129,13 +132,14 @@ fn the_end_of_a_frame_makes_room_at_once() {
     assert!(slowest < wildcity_twin::limits::ROOM_POLL / 4, "{slowest:?}");
 }
 
-/// Threads that each draw forty frames in places of their own.
+/// Starts threads that each draw forty frames at different places.
 fn race(resident: &Arc<wildcity_twin::residency::Resident>, threads: u64, admitted: bool) {
     let (tell, told) = channel();
     for thread in 0..threads {
-        let (resident, tell) = (resident.clone(), tell.clone());
+        let resident = resident.clone();
+        let tell = tell.clone();
         std::thread::spawn(move || {
-            let _reservation = admitted.then(|| resident.reserve(LENS).unwrap());
+            let _reservation = admitted.then(|| resident.reserve(EXTENT).unwrap());
             let mut random = Random(thread + 1);
             for _ in 0..40 {
                 let pose = demo().at(600.0 * random.unit());

@@ -1,4 +1,4 @@
-//! A city, driven from end to end with memory for a small part of it.
+//! Drives through a city from end to end, with memory for a small part of it.
 
 use wildcity_scene::route::Route;
 use wildcity_twin::residency::Cache;
@@ -8,7 +8,7 @@ use crate::city_twin::{City, city};
 use crate::streaming::{PROFILE, bytes, eyes, pixels, views};
 
 #[test]
-fn two_kilometres_in_the_memory_of_their_worst_frame_look_as_with_all_of_it() {
+fn two_kilometres_with_the_memory_of_the_worst_frame_look_as_with_unlimited_memory() {
     let City { dir, drive } = city();
     let open = |limit_bytes: Option<u64>| {
         let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), limit_bytes);

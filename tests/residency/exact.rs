@@ -1,4 +1,5 @@
-//! The set that is drawn is a function of the pose: memory changes when, and never what.
+//! The drawn sections are a function of the pose: the amount of memory changes when a frame is
+//! drawn, never its pixels.
 
 use wildcity_scene::RenderProfile;
 use wildcity_twin::residency::{BlockIndex, Cache, Resident, RigExtent, demand};
@@ -6,7 +7,7 @@ use wildcity_twin::residency::{BlockIndex, Cache, Resident, RigExtent, demand};
 use crate::scene_files::Random;
 use crate::streaming::{PROFILE, bytes, demo, eyes, need_bytes, pixels, unlimited, views};
 
-/// A frame's pixels, and that nothing is held beyond the limit meanwhile.
+/// A frame's pixels. Checks that the memory stays within its limit.
 fn drawn(resident: &std::sync::Arc<Resident>, station_m: f64) -> Vec<Vec<u8>> {
     let pose = demo().at(station_m);
     let scene = resident.scene(&eyes(&views(pose)), &PROFILE).unwrap();
@@ -45,7 +46,7 @@ fn two_hundred_teleports_under_random_budgets_draw_what_the_whole_twin_does() {
         let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
         let resident = cache.open("demo", None).unwrap();
         for _ in 0..40 {
-            // On a grid, so that what everything in memory draws is drawn once for many.
+            // Poses on a grid, so that one image drawn with unlimited memory serves many of them.
             let station_m = 10.0 * (random.unit() * 59.0).floor();
             assert_eq!(drawn(&resident, station_m), drawn(&all, station_m), "at {station_m} m");
         }
@@ -76,7 +77,7 @@ fn the_index_finds_what_looking_at_every_block_finds() {
     }
 }
 
-/// The rule without an index.
+/// The rule, computed without an index.
 fn plain_walk(
     manifest: &wildcity_scene::Manifest,
     eyes: &[wildcity_twin::residency::Viewpoint],

@@ -1,4 +1,5 @@
-//! One bad section stops nobody but the frames that need it, and those only for as long as it is bad.
+//! A section that cannot be read stops only the frames that need it, and only for as long as it
+//! cannot be read.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
@@ -25,7 +26,8 @@ fn broken(fault: Fault) -> Broken {
     let cache = Cache::with_source(demo().catalog(), source.clone(), None);
     let resident = cache.open("demo", None).unwrap();
     let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
-    let (near, far) = (at(0.0), at(300.0));
+    let near = at(0.0);
+    let far = at(300.0);
     let only_far: Vec<_> = far.into_iter().filter(|n| !near.contains(n)).collect();
     let SectionRef { chunk, section } = only_far[only_far.len() / 2];
     let chunk = &resident.version.manifest.chunks[chunk];
@@ -58,7 +60,7 @@ impl Broken {
 }
 
 #[test]
-fn a_bad_section_is_named_tried_again_counted_and_forgotten() {
+fn a_bad_section_is_retried_counted_and_named_in_the_error() {
     let failures = [
         (Fault::Unreadable, "the disk is away"),
         (Fault::Damaged, "a bit was flipped"),
@@ -85,7 +87,7 @@ fn a_bad_section_is_named_tried_again_counted_and_forgotten() {
         let attempts = u64::from(wildcity_twin::limits::LOAD_ATTEMPTS);
         let stats = broken.cache.stats();
         assert_eq!((count(&stats), stats.retries), (attempts, attempts - 1), "{stats:?}");
-        // Others drive on, and it is tried again by every frame that needs it.
+        // Other frames are drawn, and every frame that needs the section tries it again.
         broken.assert_draws(0.0);
         assert!(broken.frame(300.0).is_err());
         assert_eq!(broken.source.reads(broken.place), 2 * wildcity_twin::limits::LOAD_ATTEMPTS);
@@ -98,7 +100,7 @@ fn a_bad_section_is_named_tried_again_counted_and_forgotten() {
 }
 
 #[test]
-fn a_section_that_fails_once_delays_the_frame_and_no_more() {
+fn a_section_that_fails_once_only_delays_the_frame() {
     let broken = broken(Fault::Unreadable);
     let (_ticket, told) = broken.ask(300.0);
     broken.source.await_read(broken.place);
@@ -108,12 +110,12 @@ fn a_section_that_fails_once_delays_the_frame_and_no_more() {
 }
 
 #[test]
-fn a_section_that_hangs_holds_up_only_who_needs_it() {
+fn a_section_that_hangs_delays_only_frames_that_need_it() {
     let broken = broken(Fault::Hangs);
     let (request, told) = broken.ask(300.0);
     broken.source.await_read(broken.place);
     broken.assert_draws(0.0);
-    assert!(told.recv_timeout(Duration::from_millis(50)).is_err(), "it is not there");
+    assert!(told.recv_timeout(Duration::from_millis(50)).is_err(), "the section is not loaded");
     match request.timeout_error() {
         ResidencyError::TimedOut { twin, missing, needed, waited } => {
             assert_eq!(twin, "demo");
@@ -124,7 +126,7 @@ fn a_section_that_hangs_holds_up_only_who_needs_it() {
     }
     drop(request);
     assert_eq!(broken.cache.stats().waits_given_up, 1);
-    // The load goes on: whoever comes next does not start it again.
+    // The load continues: the next frame does not start it again.
     let (_ticket, told) = broken.ask(300.0);
     broken.source.heal();
     assert!(told.recv_timeout(PATIENCE).unwrap().is_ok());

@@ -1,5 +1,5 @@
-//! Streaming: whatever is in memory, a frame is the same; and nothing that fails, waits or races
-//! stops the others.
+//! Streaming: a frame is the same whatever is in memory, and no failure, wait, or race of one
+//! session stops the others.
 
 #[path = "../support/city.rs"]
 mod city_twin;

@@ -1,4 +1,4 @@
-//! One copy in memory of what several have: sessions, and versions.
+//! Sections that several sessions or versions share are in memory once.
 
 use std::sync::Arc;
 
@@ -42,7 +42,7 @@ fn two_sessions_on_one_road_load_it_once() {
 }
 
 #[test]
-fn versions_share_the_memory_of_what_they_share() {
+fn versions_share_the_memory_of_common_sections() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = gaussians(20_000, 1, 300.0, 1);
     commit(dir.path(), "street", &scene);
@@ -53,7 +53,7 @@ fn versions_share_the_memory_of_what_they_share() {
     let old_bytes = cache.stats().held_bytes;
     assert_eq!(old_bytes, old.bytes() as u64, "what is accounted for is what is held");
 
-    // Another opinion of one Gaussian: a block of one cell changes.
+    // One Gaussian changes, and so one block of one cell.
     scene.sh[0] += 0.5;
     commit(dir.path(), "street", &scene);
     let second = cache.open("street", None).unwrap();
@@ -64,7 +64,8 @@ fn versions_share_the_memory_of_what_they_share() {
     let changed = new.chunks.iter().find(|c| !old.chunks.iter().any(|o| Arc::ptr_eq(o, c)));
     assert_eq!(cache.stats().held_bytes - old_bytes, changed.unwrap().bytes() as u64);
 
-    // The old version still is what it was, and one that comes back finds its memory.
+    // The old version is unchanged, and a version that is opened again finds its sections in
+    // memory.
     let loads = cache.stats().loads;
     drop((old, first, new, second));
     let again = all_of(&cache.open("street", Some(1)).unwrap());
@@ -73,7 +74,7 @@ fn versions_share_the_memory_of_what_they_share() {
 }
 
 #[test]
-fn what_a_section_is_said_to_take_is_what_it_takes() {
+fn a_section_takes_the_memory_that_is_computed_for_it() {
     let resident = unlimited().open("demo", None).unwrap();
     let scene = all_of(&resident);
     for chunk in &scene.chunks {

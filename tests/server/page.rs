@@ -14,13 +14,13 @@ fn limits_are_those_of_the_configuration() {
         format!("| poses of one `trajectory` | {} |", wildcity_sim::limits::PATH_POSES),
         format!("| time of a `trajectory` | {} s |", wildcity_sim::limits::PATH_US / 1_000_000),
         format!(
-            "±{} m/s², and curvature of the rear axle's way, ±{} 1/m",
+            "±{} m/s², and curvature of the rear axle's path, ±{} 1/m",
             wildcity_sim::limits::EGO_ACCELERATION_M_S2,
             wildcity_sim::limits::EGO_CURVATURE_1_M
         ),
         format!("by at most {:.2} rad", wildcity_sim::limits::EGO_STEERING_RAD),
-        format!("Both go {} m/s at most", wildcity_sim::limits::EGO_SPEED_M_S),
-        format!("go back, {} m/s at most", wildcity_sim::limits::EGO_REVERSE_M_S),
+        format!("Both are limited to {} m/s", wildcity_sim::limits::EGO_SPEED_M_S),
+        format!("drive backwards, at most {} m/s", wildcity_sim::limits::EGO_REVERSE_M_S),
         format!("recorded drive within {} m", wildcity_sim::limits::GROUND_NEAR_M),
         format!("| cameras of a rig | {} |", wildcity_scene::Rig::MAX_CAMERAS),
         format!(
@@ -50,12 +50,12 @@ fn limits_are_those_of_the_configuration() {
             seconds(wildcity_server::limits::UPLOAD_SILENCE)
         ),
         format!(
-            "| an upload that nobody goes on with | {} h |",
+            "| age of an abandoned upload | {} h |",
             seconds(wildcity_server::limits::UPLOAD_AGE) / 3600
         ),
-        format!("| pushes that wait or run | {} |", wildcity_server::limits::PUSHES),
-        format!("| files of a push | {} |", wildcity_server::limits::PUSH_FILES),
-        format!("| poses compared | {} |", wildcity_server::limits::GOLDEN_POSES),
+        format!("| pushes that wait or run | {} |", wildcity_push::limits::OPEN_PUSHES),
+        format!("| files of a push | {} |", wildcity_push::limits::PUSH_FILES),
+        format!("| poses compared | {} |", wildcity_push::limits::PREVIEW_POSES),
         format!(
             "frames up to {} GiB",
             wildcity_protocol::limits::OBSERVATION_BYTES as f64 / f64::from(1 << 30)

@@ -1,4 +1,4 @@
-//! Versions in the making: put part by part, published at once, rebased, refused, rolled back.
+//! Commits: put part by part, published at once, rebased, refused, rolled back.
 
 use std::collections::BTreeSet;
 
@@ -13,7 +13,7 @@ use crate::support::{commit, files, street, turn};
 
 const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels: false };
 
-/// VersionSettings as `street` has them.
+/// The settings of `street`.
 fn settings() -> VersionSettings {
     let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
     VersionSettings { profile, rig, trajectories, sky, provenance }
@@ -28,10 +28,10 @@ static EMPTY: Gaussians = Gaussians {
     sh: Vec::new(),
 };
 
-/// A change of cells alone, by `who`.
-fn change(who: &str) -> VersionChange {
+/// A change of cells alone, with `source` as its provenance.
+fn change(source: &str) -> VersionChange {
     let mut provenance = settings().provenance;
-    provenance.source = who.to_owned();
+    provenance.source = source.to_owned();
     VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
 }
 
@@ -75,7 +75,8 @@ fn object(manifest: &Manifest, cell: [i32; 2]) -> &str {
 
 #[test]
 fn part_by_part_is_the_same_version_as_at_once() {
-    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
     let scene = gaussians(5_000, 1, 150.0, 3);
     let storage = StorageOptions::default();
     let whole = commit(one.path(), NewVersion { storage, ..street(&scene) }).unwrap();
@@ -85,7 +86,7 @@ fn part_by_part_is_the_same_version_as_at_once() {
     let cells: Vec<_> = whole.manifest.chunks.iter().map(|chunk| chunk.cell).collect();
     assert!(cells.len() > 9);
     let mut left_out = 0;
-    // Not in order, and each part of the whole scene.
+    // Cells are out of order, and each part is selected from the whole scene.
     for cells in cells.chunks(4).rev() {
         let only: BTreeSet<_> = cells.iter().copied().collect();
         let mut seen = (0, 0);
@@ -102,13 +103,14 @@ fn part_by_part_is_the_same_version_as_at_once() {
 }
 
 #[test]
-fn a_dropped_commit_leaves_nothing_and_is_in_nobodys_way() {
+fn a_dropped_commit_leaves_nothing_and_does_not_affect_others() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     let before = files(dir.path());
-    let (one, two) = (changed(&catalog, &[[0, 0]], 2), changed(&catalog, &[[0, 0]], 3));
+    let one = changed(&catalog, &[[0, 0]], 2);
+    let two = changed(&catalog, &[[0, 0]], 3);
     assert_ne!(one.id(), two.id());
-    // Others that start sweep what was abandoned, and nothing else.
+    // Another start removes what was abandoned, and nothing else.
     assert_eq!(Catalog::open(dir.path()).unwrap().version("street", None).unwrap(), first);
     assert!(files(dir.path()).len() > before.len());
     drop(one);
@@ -132,7 +134,7 @@ fn a_change_keeps_every_other_cell() {
     assert_ne!(object(&first.manifest, [1, 0]), object(&second.manifest, [1, 0]));
     let cells: Vec<_> = second.manifest.chunks.iter().map(|chunk| chunk.cell).collect();
     assert_eq!(cells, [[5, -2], [0, 0], [1, 0], [2, 0]], "in order of (y, x)");
-    // What the twin would be if it had been put whole.
+    // The same twin, put whole.
     let other = tempfile::tempdir().unwrap();
     let mut whole =
         Catalog::open(other.path()).unwrap().begin("street", CommitKind::Import, EXACT).unwrap();
@@ -177,12 +179,12 @@ fn changes_of_other_cells_are_both_in_and_of_the_same_are_refused() {
     let left: Vec<_> =
         files(dir.path()).into_iter().filter(|path| !before.contains(path)).collect();
     assert_eq!(left, [""; 0].map(std::path::PathBuf::from), "commit {late_id}");
-    // Made again from the latest, it is one.
+    // Made again from the latest version, it is accepted.
     let fourth = changed(&catalog, &[[1, 0], [2, 0]], 4).change(3, change("late")).unwrap();
     assert_eq!(fourth.number, 4);
 }
 
-/// A twin in preparation, whole: cells (0, 0) and (1, 0), and of another profile if told so.
+/// A whole twin in preparation: cells (0, 0) and (1, 0), with another profile if given.
 fn whole(catalog: &Catalog, near: Option<&str>) -> (Commit, VersionSettings) {
     let mut commit = catalog.begin("street", CommitKind::Push, EXACT).unwrap();
     for x in 0..2 {
@@ -195,7 +197,7 @@ fn whole(catalog: &Catalog, near: Option<&str>) -> (Commit, VersionSettings) {
 }
 
 #[test]
-fn a_whole_replaces_nothing_that_came_since_its_base() {
+fn a_whole_version_replaces_nothing_that_changed_since_its_base() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     let [(late, settings), (unaware, same)] = [(); 2].map(|()| whole(&catalog, None));
@@ -211,10 +213,11 @@ fn a_whole_replaces_nothing_that_came_since_its_base() {
     };
     assert_eq!((&cells[..], &settings[..]), (&[[1, 0], [8, 8]][..], &["profile"][..]));
     assert_eq!(files(dir.path()).len(), before.len() - STAGED_OF_ONE);
-    // What came back to what it was is what the base was.
+    // Cells that were changed back equal the base.
     assert_eq!(catalog.rollback("street", 1).unwrap().hash, first.hash);
     assert_eq!(unaware.replace(Some(1), same).unwrap().number, 4);
-    // Without a base, whatever is there goes; with the latest, too.
+    // Without a base, the latest version is replaced, whatever it contains; so it is with the
+    // latest as base.
     let (commit, settings) = whole(&catalog, Some("near=0.4"));
     assert_eq!(commit.replace(None, settings).unwrap().number, 5);
     let (commit, settings) = whole(&catalog, Some("near=0.5"));
@@ -225,11 +228,11 @@ fn a_whole_replaces_nothing_that_came_since_its_base() {
     assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
 }
 
-/// What `whole` has staged: two cells and its lock.
+/// Number of files that `whole` has staged: two cells and the lock.
 const STAGED_OF_ONE: usize = 3;
 
 #[test]
-fn the_same_again_from_the_same_base_is_what_was_made_of_it() {
+fn the_same_change_from_the_same_base_makes_no_new_version() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, _) = three(&dir);
     let mut near = RenderProfile::default();
@@ -237,7 +240,7 @@ fn the_same_again_from_the_same_base_is_what_was_made_of_it() {
     let again = || VersionChange { profile: Some(near), ..change("one") };
     let second = changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap();
     assert_eq!(changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap(), second);
-    // Others came since, in other cells; in the same cell it is refused.
+    // Changes of other cells since then are kept; a change of the same cell is refused.
     changed(&catalog, &[[2, 0]], 3).change(2, change("other")).unwrap();
     let fourth = changed(&catalog, &[[1, 0], [7, 7]], 2).change(1, again()).unwrap();
     assert_eq!(catalog.diff("street", 3, 4).unwrap().cells, []);
@@ -253,7 +256,7 @@ fn the_same_again_from_the_same_base_is_what_was_made_of_it() {
 }
 
 #[test]
-fn the_latest_number_is_known_whatever_became_of_the_records() {
+fn the_latest_number_is_known_even_if_records_are_damaged() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, _) = three(&dir);
     changed(&catalog, &[[0, 0]], 2).change(1, change("two")).unwrap();
@@ -265,7 +268,7 @@ fn the_latest_number_is_known_whatever_became_of_the_records() {
 }
 
 #[test]
-fn what_is_removed_while_a_rollback_waits_for_its_turn_does_not_come_back() {
+fn a_rollback_that_waited_for_garbage_collection_does_not_restore_removed_objects() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     changed(&catalog, &[[0, 0]], 2).change(1, change("push")).unwrap();
@@ -326,7 +329,8 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
     let said = twice.put(&gaussians(9, 2, 1.0, 1), None, &mut |_, _| {}).unwrap_err().to_string();
     assert_eq!(
         said,
-        "sh_degree is 2, but twin \"street\" has 0: store them so, or replace the whole twin"
+        "sh_degree is 2, but twin \"street\" has 0: store the Gaussians with 0, or replace \
+         the whole twin"
     );
     drop(twice);
 
@@ -354,7 +358,7 @@ fn what_does_not_fit_the_twin_is_refused_and_leaves_nothing() {
 }
 
 #[test]
-fn an_old_version_comes_back_under_a_new_number_and_the_log_says_so() {
+fn a_rollback_gives_an_old_version_a_new_number_in_the_log() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     let push = changed(&catalog, &[[0, 0]], 2);
@@ -365,14 +369,15 @@ fn an_old_version_comes_back_under_a_new_number_and_the_log_says_so() {
     assert_eq!((third.number, &third.hash, &third.manifest), (3, &first.hash, &first.manifest));
     assert_eq!(files(dir.path()).len(), before + 1, "the record alone");
     assert_eq!(catalog.version("street", None).unwrap(), third);
-    // The latest is what it is already.
+    // The latest version itself makes no new version.
     assert_eq!(catalog.rollback("street", 1).unwrap(), third);
     assert_eq!(catalog.rollback("street", 2).unwrap().number, 4);
 
     let log = catalog.versions("street").unwrap();
-    let told: Vec<_> = log.iter().map(|entry| (entry.number, entry.kind, entry.parent)).collect();
+    let entries: Vec<_> =
+        log.iter().map(|entry| (entry.number, entry.kind, entry.parent)).collect();
     assert_eq!(
-        told,
+        entries,
         [
             (1, CommitKind::Import, None),
             (2, CommitKind::Push, Some(1)),
@@ -388,7 +393,7 @@ fn an_old_version_comes_back_under_a_new_number_and_the_log_says_so() {
 }
 
 #[test]
-fn a_version_that_lost_an_object_does_not_come_back() {
+fn a_version_that_lost_an_object_is_not_restored() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     changed(&catalog, &[[0, 0]], 2).change(1, change("push")).unwrap();

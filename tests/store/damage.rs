@@ -1,4 +1,4 @@
-//! Bytes that changed on disk are found, named, and healed by the same import.
+//! Bytes that changed on disk are found and named, and importing the same scene again repairs them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ impl Twin {
         self.dir.path().join("street/objects").join(&hash[..2]).join(hash)
     }
 
-    /// What each way of reading says about an object that is not what it was.
+    /// The errors of each way of reading a changed object.
     fn assert_found(&self, hash: &str, wanted: &str) {
         self.assert_verify_finds(hash);
         let catalog = Catalog::open(self.dir.path()).unwrap();
@@ -75,7 +75,8 @@ fn one_flipped_bit_anywhere_in_a_chunk_is_found() {
     let hash = twin.version.manifest.chunks[2].object.clone();
     let path = twin.object(&hash);
     let size = fs::metadata(&path).unwrap().len() as usize;
-    // Magic, format, the table's length, hash, padding and itself: nobody needs them to draw.
+    // Magic, format, the table's length, hash, and padding, and the table itself: drawing does not
+    // need them.
     for byte in [0, 8, 12, 17, 4000, 4096, 4500] {
         flip(&path, byte);
         twin.assert_verify_finds(&hash);
@@ -117,7 +118,7 @@ fn a_changed_manifest_or_table_is_found() {
 }
 
 #[test]
-fn a_changed_log_record_is_no_path_out_of_the_twin() {
+fn a_changed_log_record_cannot_name_a_path_outside_the_twin() {
     let twin = twin();
     let record = twin.dir.path().join("street/log/0000000001");
     for text in ["", "{}", r#"{"manifest":"../../../etc/passwd","created_us":0}"#] {
@@ -125,7 +126,7 @@ fn a_changed_log_record_is_no_path_out_of_the_twin() {
         let error = Catalog::open(twin.dir.path()).unwrap().version("street", None).unwrap_err();
         assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
     }
-    // The next import makes a new version past the damaged record.
+    // The next import makes a new version after the damaged record.
     assert_eq!(commit(twin.dir.path(), street(&twin.scene)).unwrap().number, 2);
 }
 

@@ -1,4 +1,4 @@
-//! What holds of twins in a directory holds of those in an object store: the same tests on both.
+//! Tests that run on a directory and on an object store alike.
 
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,7 @@ fn a_version_comes_back() {
         assert_eq!(catalog.twins().unwrap()[0].hash, first.hash);
         assert_eq!(read_all(&catalog, &first), 3_000);
         assert_eq!(place.objects().len(), first.manifest.chunks.len() + 2);
-        // The same again is the same; what is not there is not.
+        // The same content is the same version; a missing version is an error.
         assert_eq!(commit(&catalog, &scene), first);
         let error = catalog.version("avenue", None).unwrap_err();
         assert!(matches!(&error, StoreError::NoTwin { known, .. } if known == &["street"]));
@@ -82,7 +82,8 @@ fn the_same_cell_is_refused_and_an_old_version_comes_back() {
     everywhere(|place| {
         let catalog = place.catalog();
         let first = commit(&catalog, &gaussians(1_000, 0, 40.0, 1));
-        let (one, two) = (change(&catalog, [3, 3], 1), change(&catalog, [3, 3], 2));
+        let one = change(&catalog, [3, 3], 1);
+        let two = change(&catalog, [3, 3], 2);
         one.change(1, cells_alone()).unwrap();
         let error = two.change(1, cells_alone()).unwrap_err();
         let StoreError::Overlap { cells, latest: 2, .. } = &error else { panic!("{error}") };
@@ -98,7 +99,7 @@ fn the_same_cell_is_refused_and_an_old_version_comes_back() {
 }
 
 #[test]
-fn damage_is_found_and_healed_by_the_same_again() {
+fn damage_is_found_and_repaired_by_the_same_import() {
     everywhere(|place| {
         let catalog = place.catalog();
         let scene = gaussians(2_000, 0, 100.0, 1);

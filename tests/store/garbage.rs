@@ -22,19 +22,19 @@ fn twin(place: &Place, versions: u64) -> Catalog {
     catalog
 }
 
-/// What a version consists of that no other does: its manifest, table and chunk of (3, 3).
+/// Objects that only one version names: its manifest, its table, and the chunk of (3, 3).
 const OWN: u64 = 3;
 
 #[test]
-fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
+fn garbage_is_removed_in_two_steps_and_kept_versions_are_not() {
     everywhere(|place| {
         let catalog = twin(place, 5);
         let before = place.objects();
         let keep = |versions, grace| Retention { versions, grace };
-        // Seen, but nothing done.
+        // A dry run.
         let dry = catalog.collect("street", keep(2, NOW), true).unwrap();
         assert_eq!((&dry.kept[..], dry.removed), (&[4, 5][..], ObjectTotals::default()));
-        // Of the first version, which had no cell (3, 3), the manifest and the table.
+        // The first version had no cell (3, 3), so it has only a manifest and a table.
         assert_eq!(dry.noted.objects, 2 + 2 * OWN);
         assert_eq!(catalog.collect("street", keep(2, NOW), true).unwrap(), dry);
 
@@ -65,7 +65,7 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
             (&checked.collected[..], checked.unreferenced),
             (&[1, 2, 3][..], ObjectTotals::default())
         );
-        // And a killed commit's rest can still be told from it.
+        // What a killed commit left is still distinguished from it.
         assert_eq!(change(&catalog, [9, 9], 1).change(5, cells_alone()).unwrap().number, 6);
         let listed = catalog.versions("street").unwrap();
         assert_eq!(listed.len(), 6, "the log stays");
@@ -73,14 +73,14 @@ fn garbage_goes_in_two_steps_and_what_is_kept_stays() {
 }
 
 #[test]
-fn a_version_in_use_stays_however_old() {
+fn a_leased_version_is_kept_however_old() {
     everywhere(|place| {
         let catalog = twin(place, 4);
         let keep = Retention { versions: 1, grace: NOW };
-        let error = catalog.lease("street", 9, "nobody", DAY).unwrap_err();
+        let error = catalog.lease("street", 9, "test", DAY).unwrap_err();
         assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
         let mut lease = catalog.lease("street", 2, "a test", DAY).unwrap();
-        // One that ended without being dropped.
+        // A lease that expired without being dropped.
         std::mem::forget(catalog.lease("street", 3, "killed", Duration::ZERO).unwrap());
         lease.renew().unwrap();
         for _ in 0..2 {
@@ -104,7 +104,7 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
         let catalog = twin(place, 3);
         let keep = Retention { versions: 1, grace: NOW };
         catalog.collect("street", keep, false).unwrap();
-        // The cell of version 2 comes again, and its object with it.
+        // The cell of version 2 is put again, and its object with it.
         let again = change(&catalog, [3, 3], 2).change(3, cells_alone()).unwrap();
         assert_eq!(again.number, 4);
         catalog.collect("street", keep, false).unwrap();
@@ -116,13 +116,15 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
-/// In a directory; elsewhere, only the grace period keeps what no version names yet.
+/// Holds in a directory. In an object store, only the grace period protects objects that no version
+/// names yet.
 #[test]
 fn a_commit_in_preparation_is_not_disturbed() {
     let place = Place::Directory(tempfile::tempdir().unwrap());
     let catalog = twin(&place, 3);
-    // One of a new object, and one of an object that goes meanwhile.
-    let (new, old) = (change(&catalog, [5, 5], 7), change(&catalog, [3, 3], 2));
+    // One commit with a new object, and one with an object that is removed meanwhile.
+    let new = change(&catalog, [5, 5], 7);
+    let old = change(&catalog, [3, 3], 2);
     let keep = Retention { versions: 1, grace: NOW };
     let removed: u64 = (0..3)
         .map(|_| place.catalog().collect("street", keep, false).unwrap().removed.objects)
@@ -135,7 +137,7 @@ fn a_commit_in_preparation_is_not_disturbed() {
 }
 
 #[test]
-fn a_version_that_is_leased_while_garbage_waits_to_be_removed_stays() {
+fn a_version_leased_just_before_the_removal_is_kept() {
     let place = Place::Directory(tempfile::tempdir().unwrap());
     let catalog = twin(&place, 4);
     let keep = Retention { versions: 1, grace: NOW };
@@ -160,7 +162,7 @@ fn a_version_that_is_leased_while_garbage_waits_to_be_removed_stays() {
 }
 
 #[test]
-fn a_version_that_is_no_more_is_not_leased() {
+fn a_collected_version_cannot_be_leased() {
     everywhere(|place| {
         let catalog = twin(place, 3);
         let mut ended = catalog.lease("street", 2, "late", Duration::ZERO).unwrap();
@@ -175,10 +177,10 @@ fn a_version_that_is_no_more_is_not_leased() {
 }
 
 #[test]
-fn what_is_no_name_is_not_looked_for() {
+fn invalid_names_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
-    // Beside the twins, and neither a note nor an object.
+    // A file outside of the twins, which is neither a side file nor an object.
     let outside = dir.path().join("outside");
     std::fs::create_dir_all(outside.join("gc/collected")).unwrap();
     std::fs::create_dir_all(outside.join("gc/candidates")).unwrap();
@@ -196,7 +198,7 @@ fn what_is_no_name_is_not_looked_for() {
 }
 
 #[test]
-fn a_note_that_could_not_be_read_again_is_not_written() {
+fn a_side_file_too_large_to_be_read_is_not_written() {
     everywhere(|place| {
         let catalog = twin(place, 1);
         let holder = "x".repeat(16 << 20);
@@ -206,7 +208,7 @@ fn a_note_that_could_not_be_read_again_is_not_written() {
 }
 
 #[test]
-fn fsck_names_what_the_log_lost() {
+fn fsck_names_gaps_in_the_log() {
     everywhere(|place| {
         let catalog = twin(place, 4);
         let log = place.twins().join("street/log");

@@ -1,4 +1,4 @@
-//! Twins on disk: what is committed comes back, and whatever goes wrong leaves old or nothing.
+//! Twins on disk: what is committed is read back, and a failure leaves the old version or nothing.
 
 #[path = "../support/places.rs"]
 mod places;

@@ -1,4 +1,5 @@
-//! An object store that fails: waited for, asked again, and told from one that has lost something.
+//! An object store that fails: time-outs, retries, and the difference between a failing store and a
+//! lost object.
 
 use std::time::{Duration, Instant};
 
@@ -22,12 +23,13 @@ fn numbers(catalog: &Catalog) -> Vec<u64> {
 }
 
 #[test]
-fn a_commit_whose_answer_is_lost_is_one() {
+fn a_commit_with_a_lost_answer_is_committed_once() {
     let s3 = S3::start();
     let catalog = s3.catalog();
     commit(&catalog, &gaussians(200, 0, 20.0, 1)).unwrap();
-    // However it is lost: the connection breaks, or something on the way says what is not so. A change
-    // of cells that somebody else changed since would be refused, and here that was itself.
+    // The answer is lost in several ways: the connection breaks, or a proxy answers with an error.
+    // A change of cells that another commit changed since would be refused; here, the other commit
+    // is this one's first attempt.
     let faults = [Fault::AnswerLost, Fault::Denied(500), Fault::Denied(409), Fault::Denied(412)];
     for (base, fault) in (1..).zip(faults) {
         s3.fail("PUT", "street/log/", 1, fault);
@@ -38,10 +40,11 @@ fn a_commit_whose_answer_is_lost_is_one() {
 }
 
 #[test]
-fn a_commit_that_was_not_done_is_done_again() {
+fn a_failed_put_of_a_record_is_retried() {
     let s3 = S3::start();
     let catalog = s3.catalog();
-    // 409: somebody else puts the same right now; who wins is not said, and here nobody did.
+    // 409: another client writes the same key at this moment. It is unknown which one wins; here,
+    // neither does.
     for (number, status) in (1..).zip([500, 503, 409, 412]) {
         s3.fail("PUT", "street/log/", 2, Fault::Status(status));
         let version = commit(&catalog, &gaussians(200, 0, 20.0, number)).unwrap();
@@ -53,7 +56,7 @@ fn a_commit_that_was_not_done_is_done_again() {
 }
 
 #[test]
-fn a_record_that_nobody_can_ask_for_is_said_to_be_unknown() {
+fn the_outcome_is_unknown_if_the_record_cannot_be_read() {
     let s3 = S3::start();
     let catalog = s3.catalog();
     commit(&catalog, &gaussians(200, 0, 20.0, 1)).unwrap();
@@ -61,12 +64,12 @@ fn a_record_that_nobody_can_ask_for_is_said_to_be_unknown() {
     s3.fail("GET", "street/log/0000000002", 3, Fault::Status(500));
     let error = commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap_err();
     assert!(matches!(error, StoreError::OutcomeUnknown { number: 2, .. }), "{error}");
-    // As it happens, it is there, and the same again is the same.
+    // In fact it was committed, so the same import makes no new version.
     assert_eq!(commit(&catalog, &gaussians(200, 0, 20.0, 2)).unwrap().number, 2);
 }
 
 #[test]
-fn an_object_that_cannot_be_put_fails_the_commit_and_nobody_sees_any_of_it() {
+fn an_object_that_cannot_be_put_fails_the_commit_without_a_trace() {
     let s3 = S3::start();
     let catalog = s3.catalog();
     let first = commit(&catalog, &gaussians(2_000, 0, 150.0, 1)).unwrap();
@@ -87,7 +90,7 @@ fn an_object_that_cannot_be_put_fails_the_commit_and_nobody_sees_any_of_it() {
 }
 
 #[test]
-fn what_is_damaged_on_the_way_is_read_again() {
+fn bytes_damaged_in_transit_are_read_again() {
     let s3 = S3::start();
     let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
     let catalog = s3.catalog();
@@ -109,7 +112,7 @@ fn what_is_damaged_on_the_way_is_read_again() {
         assert_eq!((after.retries - before.retries, s3.to_fail()), (1, 0), "{fault:?}");
         assert_eq!(after.failures, before.failures, "{fault:?}");
     }
-    // Not for ever: each kind becomes the error that it is.
+    // Retries are bounded: each kind of failure becomes its error.
     s3.fail("GET", "/objects/", 3, Fault::Flipped);
     let error = read().unwrap_err();
     assert!(matches!(error, StoreError::Damaged { .. }), "{error}");
@@ -124,19 +127,19 @@ fn what_is_damaged_on_the_way_is_read_again() {
     let StoreError::Io { cause, .. } = &error else { panic!("{error}") };
     assert_eq!(cause.kind(), std::io::ErrorKind::TimedOut, "{error}");
     assert!(began.elapsed() < 3 * quick().timeout + Duration::from_secs(5));
-    // 403 is not asked again.
+    // 403 is not retried.
     let before = catalog.traffic().unwrap().requests;
     s3.fail("GET", "/objects/", 1, Fault::Status(403));
     let error = read().unwrap_err();
     let StoreError::Io { cause, .. } = &error else { panic!("{error}") };
     assert_eq!(cause.kind(), std::io::ErrorKind::PermissionDenied, "{error}");
     assert_eq!(catalog.traffic().unwrap().requests, before + 1);
-    // And then it is as if nothing had been.
+    // Afterwards, everything works again.
     assert_eq!(read().unwrap().len(), sound);
 }
 
 #[test]
-fn what_the_disk_has_is_not_asked_for() {
+fn cached_parts_are_not_requested() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
     let version = commit(&s3.catalog(), &gaussians(2_000, 0, 100.0, 1)).unwrap();
@@ -151,7 +154,7 @@ fn what_the_disk_has_is_not_asked_for() {
         version
     };
     assert_eq!(read_all(&s3.cached(Some(&cache)).unwrap()), version);
-    // Another process, as it were: only the log is asked for.
+    // As another process would: only the log is requested.
     s3.fail("GET", "/objects/", 1_000, Fault::Status(500));
     let again = s3.cached(Some(&cache)).unwrap();
     assert_eq!(read_all(&again), version);
@@ -161,7 +164,7 @@ fn what_the_disk_has_is_not_asked_for() {
 }
 
 #[test]
-fn what_only_the_disk_has_is_lost() {
+fn fsck_finds_objects_that_only_the_cache_has() {
     let s3 = S3::start();
     let dir = tempfile::tempdir().unwrap();
     let cache = DiskCacheSettings { dir: dir.path().join("cache"), limit_bytes: 64 << 20 };
@@ -183,12 +186,13 @@ fn what_only_the_disk_has_is_lost() {
 }
 
 #[test]
-fn a_section_is_not_waited_for_as_long_as_a_cell() {
+fn a_section_has_a_shorter_time_out_than_a_cell() {
     let s3 = S3::start();
     let version = commit(&s3.catalog(), &gaussians(500, 0, 50.0, 1)).unwrap();
-    let (section_timeout, section_tries) = (Duration::from_millis(200), 2);
-    let patience = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
-    let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, patience).unwrap();
+    let section_timeout = Duration::from_millis(200);
+    let section_tries = 2;
+    let retry = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
+    let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, retry).unwrap();
     let chunk = &version.manifest.chunks[0];
     assert_eq!(catalog.read_and_discard(&version, chunk).unwrap(), chunk.bytes);
     s3.fail("GET", "/objects/", 2, Fault::Silence);
@@ -204,12 +208,12 @@ fn sections(version: &Version) -> usize {
 }
 
 #[test]
-fn from_within_a_runtime_it_is_as_from_without() {
+fn requests_work_from_threads_of_another_runtime() {
     let s3 = S3::start();
     let catalog = s3.catalog();
     commit(&catalog, &gaussians(100, 0, 10.0, 1)).unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    // The catalog is dropped there, too.
+    // The catalog is dropped within the runtime, too.
     let number = runtime.block_on(async move { catalog.version("street", None).unwrap().number });
     assert_eq!(number, 1);
 }

@@ -10,7 +10,7 @@ use crate::scene_files::gaussians;
 use crate::support::{commit, files, street};
 
 #[test]
-fn what_is_committed_comes_back_bit_by_bit() {
+fn what_is_committed_is_read_back_bit_by_bit() {
     for sh_degree in 0..=3 {
         let dir = tempfile::tempdir().unwrap();
         let mut scene = gaussians(5_000, sh_degree, 150.0, 1);
@@ -27,7 +27,7 @@ fn what_is_committed_comes_back_bit_by_bit() {
         assert!(wanted.chunks.len() > 9, "the scene has several cells");
         assert_eq!(wanted.chunks.len(), version.manifest.chunks.len());
         for (wanted, entry) in wanted.chunks.iter().zip(&version.manifest.chunks) {
-            // Cells of a scene in memory have the order of the blocks of a twin.
+            // The cells of a scene in memory are in the same order as the blocks of a twin.
             let mut place = 0;
             for section in &entry.sections {
                 let read = catalog.section(&version, entry, section).unwrap();
@@ -49,7 +49,8 @@ fn what_is_committed_comes_back_bit_by_bit() {
 
 #[test]
 fn the_same_content_is_the_same_version() {
-    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
     let scene = gaussians(2_000, 1, 100.0, 1);
     let first = commit(one.path(), street(&scene)).unwrap();
     let elsewhere = commit(two.path(), street(&scene)).unwrap();
@@ -80,7 +81,7 @@ fn the_same_content_is_the_same_version() {
 }
 
 #[test]
-fn boxes_hold_three_sigma_and_chunks_their_cells() {
+fn bounding_boxes_hold_three_sigma_and_chunks_their_cells() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = gaussians(1, 0, 1.0, 1);
     scene.means_m = vec![[70.0, -130.0, 5.0]];
@@ -111,7 +112,7 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
     let mut profile = street(&good).profile;
     profile.blur = f64::NAN;
     let cases = [
-        (NewVersion { name: "../etc", ..street(&good) }, "\"../etc\" is not a name of a twin"),
+        (NewVersion { name: "../etc", ..street(&good) }, "\"../etc\" cannot be the name of a twin"),
         (street(&bad), "Gaussian 3: ln_scales[2] is NaN"),
         (NewVersion { profile, ..street(&good) }, "profile field blur is NaN"),
         (NewVersion { trajectories: vec![empty], ..street(&good) }, "has no keyframes"),
@@ -132,7 +133,7 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
 }
 
 #[test]
-fn what_is_not_there_is_said_with_what_is() {
+fn errors_for_missing_twins_and_versions_name_the_existing_ones() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(&dir.path().join("not/yet")).unwrap();
     assert_eq!(catalog.twins().unwrap(), []);

@@ -1,4 +1,4 @@
-//! The sky of a version: kept, shared, replaced, taken away, damaged, collected.
+//! The sky of a version: kept, shared, replaced, removed, damaged, collected.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,7 +27,7 @@ fn with_sky(change: Option<NewSky>) -> VersionChange {
     VersionChange { sky: Some(change), ..cells_alone() }
 }
 
-/// The storage of twins by `street`.
+/// The storage options of `street`.
 fn storage() -> StorageOptions {
     street(&gaussians(0, 0, 1.0, 1)).storage
 }
@@ -44,7 +44,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         let named = first.manifest.sky.clone().unwrap();
         assert_eq!(named.bytes, sky_bytes(1).bytes.len() as u64);
 
-        // What a change does not name stays; another one takes its place; and none.
+        // A change keeps the sky, replaces it, or removes it.
         let change = |base, change| {
             let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
             commit.change(base, change).unwrap()
@@ -72,7 +72,7 @@ fn a_sky_comes_back_and_versions_share_it() {
         assert_eq!(three.sky().unwrap().rgb(direction), rgb(2));
         assert!(Arc::ptr_eq(one.sky().unwrap(), two.sky().unwrap()), "one sky, one memory");
         assert!(four.sky().is_none());
-        // What frames draw has it, and its memory counts.
+        // Frames have it, and its memory is counted.
         let drawn = one.scene(&[], &RenderProfile::DEFAULT).unwrap();
         assert!(Arc::ptr_eq(drawn.sky.as_ref().unwrap(), one.sky().unwrap()));
         assert!(four.scene(&[], &RenderProfile::DEFAULT).unwrap().sky.is_none());
@@ -83,7 +83,7 @@ fn a_sky_comes_back_and_versions_share_it() {
 }
 
 #[test]
-fn garbage_collection_and_fsck_know_it() {
+fn garbage_collection_and_fsck_include_the_sky() {
     everywhere(|place| {
         let catalog = place.catalog();
         let scene = gaussians(300, 0, 10.0, 1);
@@ -107,7 +107,7 @@ fn garbage_collection_and_fsck_know_it() {
 }
 
 #[test]
-fn a_damaged_sky_is_found_and_healed() {
+fn a_damaged_sky_is_found_and_repaired() {
     let dir = tempfile::tempdir().unwrap();
     let scene = gaussians(300, 0, 10.0, 1);
     let new = || NewVersion { sky: Some(NewSky::Put(sky_bytes(1))), ..street(&scene) };
@@ -144,7 +144,7 @@ fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
     let image = SkyBytes { image: Some(0), ..sky_bytes(1) };
     for (sky, wanted) in [
         (sharp, "set sky_error to"),
-        (garbage, "it is no safetensors file, no PNG and no JPEG"),
+        (garbage, "it is not a safetensors file, a PNG, or a JPEG"),
         (image, "there is no image 0"),
     ] {
         let new = NewVersion { sky: Some(NewSky::Put(sky)), ..street(&scene) };

@@ -1,4 +1,5 @@
-//! A GPU for tests. Lavapipe counts as one, so every machine can have one and no test skips.
+//! A GPU for tests. Lavapipe, a software device, counts as one, so that every machine can run the tests and
+//! none is skipped.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -15,22 +16,22 @@ pub(crate) fn gpu() -> Watched {
     gpu_with(Shaders::default())
 }
 
-/// The same with so many threads, on a device that was chosen.
+/// A device of choice, with this number of threads.
 pub(crate) fn gpu_on(choice: &AdapterChoice, threads: usize) -> Watched {
     watched(|| Gpu::new(choice, threads))
 }
 
-/// The same with other shaders.
+/// The best device with other shaders.
 pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
     watched(|| Gpu::with_shaders(&AdapterChoice::Best, 0, shaders))
 }
 
-/// Bindings of so many bytes.
+/// Limits that allow bindings of this many bytes.
 pub(crate) fn bindings(binding_bytes: u64) -> MemoryLimits {
     MemoryLimits { binding_bytes, ..MemoryLimits::default() }
 }
 
-/// The same with less of the device than it has.
+/// The best device with limits on its memory.
 pub(crate) fn gpu_with_limits(limits: MemoryLimits) -> Watched {
     watched(|| Gpu::with_limits(&AdapterChoice::Best, 0, limits))
 }
@@ -48,9 +49,9 @@ fn watched(open: impl FnOnce() -> Result<Gpu, GpuError>) -> Watched {
     })))
 }
 
-/// A backend whose test fails if wgpu, its validation or Vulkan's has had anything to say: with
-/// `WGPU_VALIDATION=1` Vulkan's validation layer speaks too, where it is installed. It holds a GPU
-/// until it is dropped: what is said of objects that outlive their device is heard too.
+/// A backend that fails its test if wgpu or its validation logs a warning or an error. With
+/// `WGPU_VALIDATION=1` that includes Vulkan's validation layer, if it is installed. The GPU is dropped
+/// before the log is checked, so that messages about objects that outlive their device count, too.
 #[derive(Debug)]
 pub(crate) struct Watched(Option<Gpu>);
 
@@ -99,7 +100,7 @@ impl Drop for Watched {
     }
 }
 
-/// Makes sure that another process succeeded, and had neither a warning nor an error to tell.
+/// Asserts that another process succeeded and printed neither a warning nor an error.
 pub(crate) fn assert_quiet(output: &Output) {
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
@@ -110,7 +111,7 @@ pub(crate) fn assert_quiet(output: &Output) {
     assert_eq!(said.lines().find(is_bad), None, "{said}");
 }
 
-/// Warnings and errors of this process' tests.
+/// Warnings and errors of the tests of this process.
 static SAID: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
 struct Listener;

@@ -28,10 +28,8 @@ const FILES: &[&str] = &[
     "src/twin/residency/budget.rs",
     "src/twin/ingest",
     "src/session/record",
-    "src/server/lib.rs",
-    "src/server/config",
-    "src/server/spool.rs",
-    "src/push",
+    "src/server/start.rs",
+    "src/server/spool",
     "clients/rust/src/upload.rs",
     "src/cli",
 ];

@@ -1,4 +1,4 @@
-"""Drives straight ahead through a twin and saves what the cameras see.
+"""Drives straight ahead through a twin by teleport, and saves the images of all cameras.
 
     python drive.py ws://127.0.0.1:8080/v1/session TWIN [OUT]
 """
@@ -15,17 +15,19 @@ from wildcity import Outputs, Pose
 def main(url: str, twin: str, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with wildcity.connect(url) as client, client.open(twin, outputs=Outputs(depth=True)) as session:
-        (x, y, z), (qw, qx, qy, qz) = session.opened.start.xyz, session.opened.start.q
+        x, y, z = session.opened.start.xyz
+        qw, qx, qy, qz = session.opened.start.q
         yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
         session.reset(seed=1)
         for step in range(1, 21):
             ahead = 0.5 * step  # metres: 5 m/s at 10 Hz
             position = (x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z)
-            seen = session.step(Pose(position, (qw, qx, qy, qz)))
-            camera, image = next(iter(seen.images.items()))
-            print(f"{seen}: {camera} {image.shape}, farthest {seen.depth[camera].max():.1f} m")
+            observation = session.step(Pose(position, (qw, qx, qy, qz)))
+            camera, image = next(iter(observation.images.items()))
+            farthest_m = observation.depth[camera].max()
+            print(f"{observation}: {camera} {image.shape}, farthest {farthest_m:.1f} m")
             if step % 10 == 0:
-                for camera, image in seen.images.items():
+                for camera, image in observation.images.items():
                     Image.fromarray(image).save(out / f"{step:03}_{camera}.png")
         print(session.close())
 

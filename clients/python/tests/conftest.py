@@ -1,4 +1,4 @@
-"""What the tests share: the golden vectors, and both clients behind one face."""
+"""Shared by the tests: the golden vectors, and both clients with one blocking interface."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def frame(name: str) -> bytes:
 
 @pytest.fixture(params=["sync", "aio"])
 def connect(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
-    """Either client's `connect`; clients left open are closed."""
+    """`connect` of both clients in turn. Clients that are still open are closed at the end."""
     clients = []
     loop = asyncio.new_event_loop()
 
@@ -36,8 +36,8 @@ def connect(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
         if request.param == "sync":
             client: Any = wildcity.connect(url, **options)
         else:
-            dialing = wildcity.aio.connect(url, **options)
-            client = Blocking(loop.run_until_complete(dialing), loop)
+            connecting = wildcity.aio.connect(url, **options)
+            client = Blocking(loop.run_until_complete(connecting), loop)
         clients.append(client)
         return client
 
@@ -48,7 +48,7 @@ def connect(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
 
 
 class Blocking:
-    """An asyncio object whose methods are waited for."""
+    """An asyncio object with blocking methods."""
 
     def __init__(self, inner: Any, loop: asyncio.AbstractEventLoop) -> None:
         self._inner, self._loop = inner, loop
@@ -71,4 +71,3 @@ class Blocking:
 
     def __exit__(self, *error: Any) -> None:
         self._loop.run_until_complete(self._inner.__aexit__(*error))
-

@@ -1,4 +1,4 @@
-"""A server of a few lines that answers from a script, in golden messages."""
+"""A small server that answers from a script of golden messages."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 from wildcity.protocol import PROTOCOL
 
-SEEN = "an observation"
+OBSERVATION = "an observation"
 SILENCE = "silence"
 HANG_UP = "hang up"
 
 
 class FakeServer:
-    """Answers connection after connection by its script; `requests` is what came in on each.
+    """Accepts one connection per script. `requests` has the requests of each connection.
 
-    An entry of a script is SEEN, SILENCE, HANG_UP, the name of a golden answer (sent with the
-    request's number), or the very message to send.
+    An entry of a script is OBSERVATION, SILENCE, HANG_UP, the name of a golden answer (sent with the
+    request's number), or exactly the message to send.
     """
 
     def __init__(self, *scripts: list[str | bytes]) -> None:
         self._scripts = iter(scripts)
         self.requests: list[list[dict[str, Any]]] = []
-        # An asyncio client does not answer the closing handshake while its loop stands still.
+        # An asyncio client does not answer the closing handshake while its loop is not running.
         self._server = serve(
             self._follow,
             "127.0.0.1",
@@ -60,13 +60,13 @@ class FakeServer:
                     return
                 if entry != SILENCE:
                     connection.send(self._message(entry, request["seq"]))
-            # Until the client leaves. What is not in the script gets no answer, but is noted.
+            # Until the client disconnects. Requests beyond the script are recorded and get no answer.
             requests.extend(json.loads(beyond) for beyond in connection)
         except ConnectionClosed:
             pass
 
     def _message(self, entry: str | bytes, seq: int) -> str | bytes:
-        if entry == SEEN:
+        if entry == OBSERVATION:
             return observation(seq)
         if isinstance(entry, bytes) or entry.startswith(("{", "[")):
             return entry

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import wildcity.aio
 from conftest import frame, vector
-from fake_server import HANG_UP, SEEN, SILENCE, FakeServer, observation
+from fake_server import HANG_UP, OBSERVATION, SILENCE, FakeServer, observation
 from websockets.utils import accept_key
 from wildcity import (
     BadFrame,
@@ -39,8 +39,8 @@ def seqs(requests: list[dict[str, Any]]) -> list[int]:
     return [request["seq"] for request in requests]
 
 
-def test_a_whole_conversation(connect: Connect) -> None:
-    script: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, SEEN, "ok", "closed"]
+def test_a_whole_session(connect: Connect) -> None:
+    script: list[str | bytes] = ["welcome", "opened", OBSERVATION, OBSERVATION, OBSERVATION, "ok", "closed"]
     with FakeServer(script) as server:
         with connect(server.url) as client, client.open("street") as session:
             assert client.welcome.twins[0].name == "street"
@@ -64,7 +64,7 @@ def test_a_session_closed_by_hand_is_not_closed_again(connect: Connect) -> None:
 
 
 def test_a_refused_request_keeps_its_number(connect: Connect) -> None:
-    with FakeServer(["welcome", "opened", "error", SEEN]) as server:
+    with FakeServer(["welcome", "opened", "error", OBSERVATION]) as server:
         session = connect(server.url).open("street")
         with pytest.raises(Refused) as refused:
             session.step(HERE)
@@ -75,8 +75,8 @@ def test_a_refused_request_keeps_its_number(connect: Connect) -> None:
     assert seqs(server.requests[0]) == [0, 1, 2, 2]
 
 
-def test_a_request_that_json_cannot_say_is_not_sent(connect: Connect) -> None:
-    with FakeServer(["welcome", "opened", SEEN]) as server:
+def test_a_request_that_json_cannot_represent_is_not_sent(connect: Connect) -> None:
+    with FakeServer(["welcome", "opened", OBSERVATION]) as server:
         client = connect(server.url)
         with pytest.raises(ValueError, match="Out of range|not JSON compliant"):
             client.open("street", seed=float("nan"))
@@ -85,18 +85,18 @@ def test_a_request_that_json_cannot_say_is_not_sent(connect: Connect) -> None:
 
 
 def test_a_server_that_does_not_read_ends_in_a_time_out(connect: Connect) -> None:
-    with deaf_server() as url:
+    with unresponsive_server() as url:
         client = connect(url, timeout=0.5)
         asked = time.monotonic()
-        # Some 30 MB: more than the buffers of two sockets.
+        # 30 MB are more than the buffers of two sockets hold.
         with pytest.raises(TimedOut):
             client.open("x" * 30_000_000)
         assert time.monotonic() - asked < 10.0
 
 
 @contextlib.contextmanager
-def deaf_server() -> Iterator[str]:
-    """Answers the upgrade and `hello`, and reads nothing after that."""
+def unresponsive_server() -> Iterator[str]:
+    """A server that answers the upgrade and `hello`, and reads nothing after that."""
     listener = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -141,8 +141,8 @@ def test_a_fatal_error_ends_the_connection(connect: Connect) -> None:
 
 def test_a_lost_answer_is_fetched_after_resuming(connect: Connect) -> None:
     """The golden `resumed` says that request 4 was carried out."""
-    first: list[str | bytes] = ["welcome", "opened", SEEN, SEEN, HANG_UP]
-    with FakeServer(first, ["welcome", "resumed", SEEN, SEEN]) as server:
+    first: list[str | bytes] = ["welcome", "opened", OBSERVATION, OBSERVATION, HANG_UP]
+    with FakeServer(first, ["welcome", "resumed", OBSERVATION, OBSERVATION]) as server:
         session = connect(server.url).open("street")
         session.reset()
         session.step(HERE)
@@ -158,8 +158,8 @@ def test_a_lost_answer_is_fetched_after_resuming(connect: Connect) -> None:
 
 def test_a_new_session_can_follow_one_that_is_gone(connect: Connect) -> None:
     gone = '{"type":"error","seq":1,"code":"unknown_session","message":"","fatal":false}'
-    second: list[str | bytes] = ["welcome", gone, "opened", SEEN]
-    with FakeServer(["welcome", "opened", SEEN, HANG_UP], second) as server:
+    second: list[str | bytes] = ["welcome", gone, "opened", OBSERVATION]
+    with FakeServer(["welcome", "opened", OBSERVATION, HANG_UP], second) as server:
         client = connect(server.url)
         session = client.open("street")
         session.step(HERE)
@@ -171,15 +171,15 @@ def test_a_new_session_can_follow_one_that_is_gone(connect: Connect) -> None:
     assert seqs(server.requests[1]) == [0, 1, 1, 2]
 
 
-def test_another_client_can_take_a_session_over(connect: Connect) -> None:
-    with FakeServer(["welcome", "resumed", SEEN]) as server:
+def test_another_client_can_resume_a_session(connect: Connect) -> None:
+    with FakeServer(["welcome", "resumed", OBSERVATION]) as server:
         session = connect(server.url).resume("run-17", 4)
         assert session.step(HERE).metadata.seq == 5
         with pytest.raises(WildCityError, match="another client"):
             _ = session.opened
 
 
-def test_a_session_that_is_elsewhere_is_not_taken_over(connect: Connect) -> None:
+def test_a_session_at_another_request_is_not_resumed(connect: Connect) -> None:
     with FakeServer(["welcome", "resumed"]) as server:
         with pytest.raises(ProtocolError, match="the session is at 4, not at 2"):
             connect(server.url).resume("run-17", 2)
@@ -204,7 +204,7 @@ def test_silence_ends_in_a_time_out(connect: Connect) -> None:
         (frame("damaged/overlap.bin"), BadFrame, "offset"),
     ],
 )
-def test_what_is_no_answer_is_named(
+def test_invalid_answers_are_named(
     connect: Connect, reply: str | bytes, error: type[Exception], says: str
 ) -> None:
     with FakeServer(["welcome", "opened", reply]) as server:
@@ -215,7 +215,7 @@ def test_what_is_no_answer_is_named(
             session.step(HERE)
 
 
-def test_nobody_there_is_no_connection(connect: Connect) -> None:
+def test_connecting_without_a_server_fails(connect: Connect) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     for url in (f"ws://127.0.0.1:{port}/v1/session", "http://127.0.0.1/", "not a url"):
@@ -237,7 +237,7 @@ def test_a_cancelled_call_gives_the_connection_up() -> None:
 
 
 def test_calls_do_not_overlap() -> None:
-    """A second thread is told so, rather than getting the first one's answer."""
+    """A call of a second thread fails, instead of getting the first thread's answer."""
     with FakeServer(["welcome", "opened", SILENCE]) as server:
         client = wildcity.connect(server.url, timeout=0.5)
         session = client.open("street")

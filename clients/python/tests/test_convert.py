@@ -1,4 +1,4 @@
-"""Checkpoints to safetensors: what trainers save, and what nobody should run."""
+"""Conversion of checkpoints to safetensors, and checkpoints that try to run code."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ N = 20
 
 @pytest.fixture(autouse=True)
 def fake_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Just enough of PyTorch to be named in a pickle."""
+    """The names of PyTorch that a pickle refers to."""
     torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
     for module, name in [
         (torch, "FloatStorage"),
@@ -43,7 +43,7 @@ def fake_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Tensor:
-    """To be saved as torch saves one; some numbers can be made wrong."""
+    """A tensor that `save` writes as torch does; `wrong` replaces some of its numbers."""
 
     def __init__(self, values: Any, storage: str = "FloatStorage", **wrong: Any) -> None:
         self.values = np.asarray(values)
@@ -160,7 +160,7 @@ def test_drivestudio_names_its_models(tmp_path: Path) -> None:
         convert.splats(source, "Sky")
 
 
-def test_a_sky_goes_into_the_same_file(tmp_path: Path) -> None:
+def test_a_sky_is_written_to_the_same_file(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     shapes = {"0.weight": (8, 9), "0.bias": (8,), "1.weight": (8, 17), "1.bias": (8,)}
     shapes |= {"2.weight": (3, 8), "2.bias": (3,)}
@@ -227,13 +227,13 @@ def test_nothing_in_a_checkpoint_is_run(
     source = save(tmp_path / "ckpt.pt", saved)
     assert len(convert.splats(source)["means"]) == N
     assert not made.exists()
-    # It would have: the pickle is what it seems.
+    # The pickle is dangerous: Python's own unpickler runs it.
     pickle.loads(pickle.dumps(Evil()))
     assert made.exists()
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"size": (2**60, 3)}, "in 60 numbers"),
         ({"size": (2**40, 3), "stride": (0, 1)}, "in 60 numbers"),
@@ -245,15 +245,15 @@ def test_nothing_in_a_checkpoint_is_run(
         ({"size": ("a", 3)}, "size"),
     ],
 )
-def test_tensors_that_leave_their_bytes(tmp_path: Path, wrong: Any, said: str) -> None:
+def test_tensors_beyond_their_storage_are_refused(tmp_path: Path, wrong: Any, message: str) -> None:
     saved = tensors(gaussians())
     saved["means"] = Tensor(gaussians()["means"], **wrong)
     source = save(tmp_path / "ckpt.pt", {"splats": saved})
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         convert.splats(source)
 
 
-def test_shapes_that_do_not_fit(tmp_path: Path) -> None:
+def test_inconsistent_shapes_are_refused(tmp_path: Path) -> None:
     saved = tensors(gaussians())
     saved["quats"] = Tensor(gaussians(N - 1)["quats"])
     with pytest.raises(CheckpointError, match=r"quats has shape \(19, 4\), not \(20, 4\)"):
@@ -269,14 +269,14 @@ def test_compression_is_refused(tmp_path: Path) -> None:
         convert.splats(source)
 
 
-def test_damage_anywhere_is_one_kind_of_error(tmp_path: Path) -> None:
+def test_any_damage_raises_checkpoint_error(tmp_path: Path) -> None:
     whole = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians(3))}).read_bytes()
     broken = tmp_path / "broken.pt"
     for end in range(0, len(whole), 7):
         broken.write_bytes(whole[:end])
         with pytest.raises(CheckpointError):
             convert.splats(broken)
-    # Beneath the archive's checksums: the pickle itself.
+    # Damage in the pickle itself, with valid checksums of the archive.
     with zipfile.ZipFile(tmp_path / "ckpt.pt") as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     program = files["archive/data.pkl"]
@@ -311,7 +311,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def data() -> Path | None:
-    """The real data, or None, said on standard error, where it is absent."""
+    """Folder of the real data. If it is absent: None, with a message on standard error."""
     beside = Path(__file__).parents[3] / "../shared/data"
     root = Path(os.environ.get("WILDCITY_DATA", beside))
     if root.is_dir():
@@ -321,7 +321,7 @@ def data() -> Path | None:
     return None
 
 
-def test_what_torch_itself_saved() -> None:
+def test_files_that_torch_saved() -> None:
     root = data()
     if root is None:
         return
@@ -340,7 +340,7 @@ def test_what_torch_itself_saved() -> None:
     assert np.isfinite(means).all()
 
 
-def test_what_was_converted_is_imported(tmp_path: Path) -> None:
+def test_converted_files_can_be_imported(tmp_path: Path) -> None:
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the wildcity binary"
     source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())})

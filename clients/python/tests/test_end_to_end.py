@@ -1,4 +1,4 @@
-"""Against the real server, on a twin made here: 40,000 Gaussians on the walls of a corridor."""
+"""Both clients against the real server, on a twin that this test makes: a corridor of 40,000 Gaussians."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
                 check(seen, step)
                 assert seen.ego.velocity == pytest.approx((2.5, 0.0, 0.0))
             assert not np.array_equal(first.images["front"], seen.images["front"])
-            # 0.25 m a step, looking back from where it is now.
+            # 0.25 m per step, relative to the current pose.
             assert seen.history_xyz[:, 0] == pytest.approx(0.25 * np.arange(-15, 1), abs=1e-6)
             assert seen.ego.history_count == 16
             summary = session.close()
@@ -111,7 +111,7 @@ def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
             assert summary.distance_m == pytest.approx(5.0)
 
 
-def test_frames_of_the_log_and_of_the_way(connect: Connect, server: Server) -> None:
+def test_frames_of_the_recorded_and_the_driven_part(connect: Connect, server: Server) -> None:
     outputs = Outputs(encoding="raw", frames=3, trust=True, period_us={"rear": 200_000})
     with connect(server.url) as client:
         with client.open("corridor", rig=PAIR, outputs=outputs, warm_up_us=500_000) as session:
@@ -123,10 +123,11 @@ def test_frames_of_the_log_and_of_the_way(connect: Connect, server: Server) -> N
             seen = session.step(Pose((3.0, 1.0, 0.0)))
     assert np.array_equal(seen.frames("front")[:2], then["front"][1:])
     assert np.array_equal(seen.frames("rear"), then["rear"])
-    on_it, beside = (o.metadata.images[0].trust for o in (first, seen))
-    assert on_it is not None and beside is not None
-    assert on_it.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
-    assert beside.value < on_it.value <= 1.0
+    on_route = first.metadata.images[0].trust
+    beside = seen.metadata.images[0].trust
+    assert on_route is not None and beside is not None
+    assert on_route.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
+    assert beside.value < on_route.value <= 1.0
 
 
 def test_drives_a_car(connect: Connect, server: Server) -> None:
@@ -181,7 +182,7 @@ def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:
         columns = image.shape[1] // 4
         assert image[:, :columns, left].mean() > 3 * image[:, :columns, right].mean()
         assert image[:, -columns:, right].mean() > 3 * image[:, -columns:, left].mean()
-    # Walls are seen from between them: what is left faces right, in the camera's axes x.
+    # The camera is between the walls: the left wall faces right, which is +x of the camera.
     normals = seen.normals["front"]
     assert normals[20:44, 2:10, 0].mean() > 0.95 and normals[20:44, -10:-2, 0].mean() < -0.95
     # The wall is 2 m to the left: z = fx * 2 m / (cx - u) for the pixel centre of column 8.
@@ -190,7 +191,7 @@ def test_pictures_show_the_corridor(connect: Connect, server: Server) -> None:
     assert depth == pytest.approx(60.0 * 2.0 / (48.0 - 8.5), rel=0.1)
 
 
-def test_exposure_and_overlay_are_what_the_rig_says(connect: Connect, server: Server) -> None:
+def test_exposure_and_overlay_are_those_of_the_rig(connect: Connect, server: Server) -> None:
     hood = np.zeros((64, 96, 4), np.uint8)
     hood[48:] = (10, 20, 30, 255)
     file = io.BytesIO()
@@ -208,7 +209,7 @@ def test_exposure_and_overlay_are_what_the_rig_says(connect: Connect, server: Se
                 seen[name] = session.reset()
     plain, image = (seen[name].images["front"].astype(float) for name in ("plain", "looks"))
     wanted = np.clip(plain * (0.5, 1.0, 2.0) + (0.0, 25.5, 0.0), 0, 255)
-    # Each of the two is rounded once, and blue twice as much.
+    # Both images are rounded once, and the gain doubles the rounding error of blue.
     assert np.abs(image - wanted)[:48].max() <= 2.0
     assert (image[48:] == (10, 20, 30)).all()
     assert np.array_equal(seen["plain"].normals["front"], seen["looks"].normals["front"])
@@ -272,7 +273,7 @@ def test_observe_does_not_move(connect: Connect, server: Server) -> None:
         ({"seed": -1}, "invalid_request", "seed"),
     ],
 )
-def test_bad_openings_are_refused_and_cost_nothing(
+def test_invalid_open_requests_are_refused_without_effect(
     connect: Connect, server: Server, options: dict[str, Any], code: str, field: str | None
 ) -> None:
     with connect(server.url) as client:
@@ -308,7 +309,7 @@ def test_a_lost_connection_is_resumed(connect: Connect, server: Server) -> None:
 
 
 def test_a_killed_agents_session_lives_on(connect: Connect, server: Server) -> None:
-    """The last answer comes again, byte for byte, to whoever takes the session over."""
+    """Another client that resumes the session gets the last answer again, byte for byte."""
     with connect(server.url) as client:
         session = client.open("corridor", rig=PAIR, session=f"killed-{time.time_ns()}")
         name = session.opened.session
@@ -367,7 +368,7 @@ def check(seen: Observation, step: int) -> None:
 def listening_url(process: subprocess.Popen[str]) -> str:
     lines: queue.Queue[str] = queue.Queue()
     assert process.stdout is not None
-    # Reads on, so that the server never waits for a full pipe.
+    # Keeps reading, so that the server never blocks on a full pipe.
     stdout = process.stdout
     threading.Thread(target=lambda: [lines.put(line) for line in stdout], daemon=True).start()
     deadline = time.monotonic() + 30

@@ -41,7 +41,7 @@ end_header
 
 
 def write_ply(path: Path, x: float, seed: int, count: int = 2000) -> Path:
-    """Gaussians about a place on the x axis."""
+    """Writes Gaussians around a point on the x axis."""
     numbers = random.Random(seed)
     with path.open("wb") as file:
         file.write(PLY.format(count=count).encode())
@@ -54,7 +54,7 @@ def write_ply(path: Path, x: float, seed: int, count: int = 2000) -> Path:
 
 @contextlib.contextmanager
 def serving(folder: Path, *more: str) -> Iterator[str]:
-    """A server of its own; gives its http address."""
+    """Runs a server, and yields its HTTP address."""
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the built wildcity binary"
     command = [binary, "serve", "--backend", "cpu", "--listen", "127.0.0.1:0", *more]
@@ -101,7 +101,7 @@ def test_a_scene_becomes_a_twin_and_then_another_version(server: str, tmp_path: 
     assert wildcity.rollback("street", 1, server=server) == 3
 
 
-def test_refusals_have_types(server: str, tmp_path: Path) -> None:
+def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:
     wildcity.push(write_ply(tmp_path / "a.ply", 0.0, 1), twin="road", server=server)
     wildcity.push(write_ply(tmp_path / "b.ply", 0.0, 2), twin="road", server=server)
     late = write_ply(tmp_path / "c.ply", 0.0, 3)
@@ -126,19 +126,21 @@ def test_refusals_have_types(server: str, tmp_path: Path) -> None:
         wildcity.rollback("road", 1, server="http://127.0.0.1:1")
 
 
-def test_a_cut_upload_goes_on(server: str, tmp_path: Path) -> None:
+def test_an_interrupted_upload_continues(server: str, tmp_path: Path) -> None:
     path = write_ply(tmp_path / "large.ply", 0.0, 5, count=60_000)
-    with Cutting(server, after_bytes=1_500_000) as address:
+    with CuttingProxy(server, after_bytes=1_500_000) as address:
         pushed = wildcity.push(path, twin="cut", server=address)
     assert pushed.report["gaussians"] == 60_000
 
 
-class Cutting:
-    """A way to a server on which the first connection that carries much is cut."""
+class CuttingProxy:
+    """A proxy that cuts the first connection after some bytes."""
 
     def __init__(self, server: str, after_bytes: int) -> None:
         host, port = server.removeprefix("http://").split(":")
-        self.target, self.after_bytes, self.has_cut = (host, int(port)), after_bytes, False
+        self.target = (host, int(port))
+        self.after_bytes = after_bytes
+        self.has_cut = False
         self.listener = socket.create_server(("127.0.0.1", 0))
 
     def __enter__(self) -> str:
@@ -157,7 +159,7 @@ class Cutting:
                 threading.Thread(target=self.carry, args=(near, far), daemon=True).start()
 
     def carry(self, near: socket.socket, far: socket.socket) -> None:
-        """Both ways, until one side is done or the way is cut."""
+        """Transfers in both directions, until one side closes or the connection is cut."""
         carried = 0
         with near, far, contextlib.suppress(OSError):
             while True:
@@ -176,9 +178,9 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tokens.write_text(f'{{"tokens": [{{"name": "ci", "role": "push", "token": "{TOKEN}"}}]}}')
     path = write_ply(tmp_path / "a.ply", 0.0, 1)
     with serving(tmp_path, "--tokens", str(tokens)) as address:
-        with pytest.raises(Refused) as nobody:
+        with pytest.raises(Refused) as no_token:
             wildcity.push(path, twin="street", server=address)
-        assert nobody.value.code == "unauthorized"
+        assert no_token.value.code == "unauthorized"
         assert wildcity.push(path, twin="street", server=address, token=TOKEN).version == 1
         monkeypatch.setenv("WILDCITY_TOKEN", TOKEN)
         with pytest.raises(Refused) as role:

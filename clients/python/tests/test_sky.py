@@ -1,4 +1,4 @@
-"""The sky of the demo twin, evaluated by numpy from its weights: what the server's tests compare with."""
+"""The sky of the demo twin, evaluated by numpy from its weights. The server's tests compare with these colours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_the_colours_that_the_server_is_held_to_are_those_of_the_weights() -> None:
+def test_the_expected_colours_of_the_server_follow_from_the_weights() -> None:
     spec = importlib.util.spec_from_file_location("sky", ROOT / "scenes" / "sky.py")
     assert spec is not None and spec.loader is not None
     sky = importlib.util.module_from_spec(spec)
@@ -22,6 +22,6 @@ def test_the_colours_that_the_server_is_held_to_are_those_of_the_weights() -> No
     away = rows[:, :3]
     assert np.abs(sky.colours(tensors, away) - rows[:, 3:6]).max() < 1e-12
     assert np.abs(sky.colours(tensors, away, 1) - rows[:, 6:9]).max() < 1e-12
-    # Another weight is another sky.
+    # A changed weight changes the colours.
     tensors["sky_head.layers.1.weight"] = tensors["sky_head.layers.1.weight"] * 1.001
     assert np.abs(sky.colours(tensors, away) - rows[:, 3:6]).max() > 1e-5

@@ -1,4 +1,4 @@
-"""The golden vectors: requests as built here, answers and frames as decoded here."""
+"""The golden vectors: this client builds the same requests and decodes the same answers and frames."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from wildcity import (
     Trajectory,
     png_data_uri,
 )
-from wildcity.core import Conversation
 from wildcity.protocol import ANSWERS, decode_answer, encode
+from wildcity.session_protocol import SessionProtocol
 
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
-WAY = Trajectory(
+PLANNED = Trajectory(
     (TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0))))
 )
 LOG = Station("log", 12.5)
@@ -55,7 +55,7 @@ SEEN = dataclasses.replace(
     FRONT, exposure=Exposure(gain=(1.5, 1.0, 0.75)), overlay=png_data_uri(b"hood")
 )
 
-REQUESTS: dict[str, Callable[[Conversation], Any]] = {
+REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "hello": lambda c: c.hello(),
     "open": lambda c: c.open(
         "street",
@@ -85,7 +85,7 @@ REQUESTS: dict[str, Callable[[Conversation], Any]] = {
     "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
-    "step_trajectory": lambda c: c.step(WAY, False),
+    "step_trajectory": lambda c: c.step(PLANNED, False),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
@@ -107,9 +107,9 @@ def names(folder: str) -> list[str]:
 @pytest.mark.parametrize("name", names("requests"))
 def test_requests_are_the_golden_ones(name: str) -> None:
     golden = vector(f"requests/{name}.json")
-    conversation = Conversation("golden")
-    conversation.next_seq = golden["seq"]
-    assert json.loads(next(REQUESTS[name](conversation))) == golden
+    protocol = SessionProtocol("golden")
+    protocol.next_seq = golden["seq"]
+    assert json.loads(next(REQUESTS[name](protocol))) == golden
 
 
 @pytest.mark.parametrize("name", names("answers"))
@@ -140,7 +140,7 @@ def test_unknown_fields_of_the_metadata_are_ignored() -> None:
 
 
 def with_unknown_fields(value: Any) -> Any:
-    """With one more in every object but a profile and times by camera, whose fields are all known."""
+    """Adds a field to every object, except `profile` and `period_us`: they are maps, so any field is known."""
     if isinstance(value, list):
         return [with_unknown_fields(item) for item in value]
     if not isinstance(value, dict):
@@ -153,7 +153,7 @@ def with_unknown_fields(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses", "bundle"])
-def test_observations_decode_to_what_went_in(name: str) -> None:
+def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
     observation = Observation(frame(f"observations/{name}.bin"))
     assert without_absent(plain(observation.metadata)) == expected["observation"]
@@ -173,7 +173,7 @@ def test_observations_decode_to_what_went_in(name: str) -> None:
 
 
 def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
-    """Without what the wire leaves out: no history, and frames of now."""
+    """Without the fields that the server omits: an empty history, and `back` of current frames."""
     if not metadata["history"]:
         del metadata["history"]
     for image in metadata["images"]:
@@ -206,7 +206,7 @@ def test_frames_of_a_camera_are_in_the_order_they_were_taken() -> None:
     frames = observation.frames("front")
     assert frames.dtype == np.uint8 and frames.shape == (3, 3, 4, 3)
     assert np.array_equal(frames[2], observation.images["front"])
-    # What tells them apart: blue is 3 + 50 k in frame k before now.
+    # Blue differs: it is 3 + 50 k in frame k before the current one.
     assert frames[:, 0, 0, 2].tolist() == [103, 53, 3]
     with pytest.raises(KeyError, match="roof"):
         observation.frames("roof")
@@ -304,7 +304,7 @@ def test_no_prefix_and_no_flipped_byte_raises_anything_else() -> None:
         ('{"type": "error", "seq": 1, "code": "odd", "message": "", "fatal": false}', "error.code"),
     ],
 )
-def test_what_is_no_answer_is_named(text: str, says: str) -> None:
+def test_invalid_answers_are_named(text: str, says: str) -> None:
     with pytest.raises(ProtocolError, match=says):
         decode_answer(text)
 
@@ -323,7 +323,7 @@ def test_codes_are_those_of_the_schema() -> None:
 
 
 def test_vectors_obey_the_schemas() -> None:
-    """And so do schemas: they are not so loose that a damaged message passes."""
+    """The vectors are valid, and a message without a required field is not."""
     for schema_name, folder in (("request", "requests"), ("answer", "answers")):
         schema = json.loads((PROTOCOL / f"schema/{schema_name}.json").read_text())
         for name in names(folder):
@@ -342,5 +342,5 @@ def test_vectors_obey_the_schemas() -> None:
 
 
 def plain(value: Any) -> Any:
-    """A dataclass as JSON would hold it."""
+    """A dataclass as plain JSON values."""
     return json.loads(json.dumps(encode(value)))

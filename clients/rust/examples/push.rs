@@ -25,7 +25,7 @@ async fn main() -> anyhow::Result<()> {
 
     let request = NewPush {
         id: None,
-        // The axes of a scene whose y points down and z forward, as COLMAP has them.
+        // The axes of COLMAP: y points down and z forward.
         files: vec![PushFile { upload: upload.id, axes: "y-down-z-forward".into(), scale: 1.0 }],
         base: None,
         cells: None,

@@ -19,7 +19,7 @@ use crate::options::ConnectOptions;
 
 /// A connection to a server, and the session on it.
 ///
-/// A request that was refused, or whose answer did not arrive, keeps its number. Make the same call again
+/// A request keeps its number if it was refused or its answer did not arrive. Make the same call again
 /// (after [`Client::reconnect`] if the connection was lost): the server carries it out only once. Dropping
 /// the future of a call before it completes closes the connection, because its answer could still come.
 ///
@@ -374,8 +374,8 @@ impl Client {
         }
     }
 
-    /// Takes the connection for the time of a call. A call whose future is dropped does not give it back,
-    /// so the connection is closed.
+    /// Takes the connection for the time of a call. A dropped future does not give it back, which closes the
+    /// connection.
     fn take_connection(&mut self) -> Result<Connection, ClientError> {
         self.connection.take().ok_or_else(|| {
             let reason = mem::take(&mut self.disconnect_reason);

@@ -10,38 +10,40 @@ use std::time::Instant;
 use anyhow::Context;
 
 use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::progress;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_twin::ingest;
 use wildcity_twin::store::{Catalog, Version};
 
-/// Time reading a twin: every section, checked against its hash and decoded, against the bare bytes.
+/// Time reading a twin: every section, checked against its hash and decoded, compared with the bare bytes.
 ///
-/// Bytes are those on disk, or as they come from an object store; then sections are read through the disk
-/// cache, unless --cache-gib is 0. With --cold the system's cache is emptied before each reading, which takes
-/// root; without, all is read once before, and nothing is read from the disk.
+/// The bare bytes are those on the disk or in the object store, read without checks and decoding. Sections of a twin in an object store are
+/// read through the disk cache, unless --cache-gib is 0. With --cold the system's page cache is emptied
+/// before each reading, which needs root. Without --cold everything is read once before, so that the times
+/// do not include the disk.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Load {
-    /// The twin, or NAME@NUMBER for an older version.
+    /// The twin: NAME, or NAME@NUMBER for an older version.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
     #[command(flatten)]
     twins: Twins,
 
-    /// The same Gaussians in a scene file, which is read and checked as by an import.
+    /// A scene file with the same Gaussians, which is read and checked as by `wildcity import`.
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
 
-    /// Threads that read sections [default: as many as the machine has]
+    /// Threads that read sections [default: one per core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
 
-    /// Readings of each kind; the median counts.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    /// Readings of each kind; the median is printed.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
 
-    /// Empty the system's cache before each reading.
+    /// Empty the system's page cache before each reading (needs root).
     #[arg(long)]
     cold: bool,
 }
@@ -51,7 +53,7 @@ Examples:
   wildcity bench load street --file street.ply
   sudo wildcity bench load street --cold --twins ./twins";
 
-/// What was read, and how fast.
+/// One line of the result: what was read, and how fast.
 struct Line {
     what: String,
     bytes: u64,
@@ -72,19 +74,24 @@ impl Load {
         let gaussians = sections.iter().map(|(_, section)| u64::from(section.count)).sum();
         let bytes = version.manifest.chunks.iter().map(|chunk| chunk.bytes).sum();
         let cores = thread::available_parallelism()?.get();
+        let bar = progress::count("reading");
+        let kinds = if self.file.is_some() { 4 } else { 3 };
+        bar.set_length(kinds);
         let mut lines = vec![Line {
             what: "bare bytes".into(),
             bytes,
             gaussians,
-            seconds: self.time(|| bare(&catalog, &version))?,
+            seconds: self.time(|| read_bare(&catalog, &version))?,
         }];
+        bar.inc(1);
         for threads in [1, self.threads.map_or(cores, |threads| threads as usize)] {
             lines.push(Line {
                 what: format!("sections, {threads} threads"),
                 bytes,
                 gaussians,
-                seconds: self.time(|| decoded(&catalog, &version, &sections, threads))?,
+                seconds: self.time(|| read_decoded(&catalog, &version, &sections, threads))?,
             });
+            bar.inc(1);
         }
         if let Some(file) = &self.file {
             let bytes = fs::metadata(file).with_context(|| file.display().to_string())?.len();
@@ -95,7 +102,8 @@ impl Load {
             })?;
             lines.push(Line { what: "scene file".into(), bytes, gaussians, seconds });
         }
-        tell(&mut io::stdout().lock(), &lines)?;
+        bar.finish_and_clear();
+        print(&mut io::stdout().lock(), &lines)?;
         Ok(())
     }
 
@@ -107,7 +115,9 @@ impl Load {
         let mut seconds = Vec::new();
         for _ in 0..self.repeat {
             if self.cold {
-                fs::write("/proc/sys/vm/drop_caches", "3").context("cannot empty the cache")?;
+                fs::write("/proc/sys/vm/drop_caches", "3").context(
+                    "--cold: cannot empty the page cache; run as root, or leave --cold away",
+                )?;
             }
             let start = Instant::now();
             read()?;
@@ -118,16 +128,16 @@ impl Load {
     }
 }
 
-/// Reads all chunks of a version, one after the other, and looks at nothing.
-fn bare(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
+/// Reads the bytes of all chunks of a version, one after the other, without decoding them.
+fn read_bare(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
     for chunk in &version.manifest.chunks {
         catalog.read_and_discard(version, chunk)?;
     }
     Ok(())
 }
 
-/// Reads all sections of a version, so many at once.
-fn decoded(
+/// Reads and decodes all sections of a version on several threads.
+fn read_decoded(
     catalog: &Catalog,
     version: &Version,
     sections: &[(&ChunkEntry, &Section)],
@@ -149,7 +159,7 @@ fn decoded(
     })
 }
 
-fn tell(out: &mut impl Write, lines: &[Line]) -> io::Result<()> {
+fn print(out: &mut impl Write, lines: &[Line]) -> io::Result<()> {
     for line in lines {
         let Line { what, bytes, gaussians, seconds } = line;
         writeln!(

@@ -6,15 +6,20 @@ mod load;
 mod step;
 mod timed;
 
-/// Time the renderer, and reading twins.
+/// Measure the speed of the renderer, of a session, and of reading twins.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity bench step street.ply --cameras cameras.json
+  wildcity bench drive street --csv steps.csv
+  wildcity bench load street")]
 pub(super) struct Bench {
     #[command(subcommand)]
-    what: What,
+    subcommand: Subcommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
+enum Subcommand {
     Step(step::Step),
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
@@ -23,11 +28,11 @@ enum What {
 
 impl Bench {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.what {
-            What::Step(step) => step.run(),
-            What::Gpu(gpu) => gpu.run(),
-            What::Drive(drive) => drive.run(),
-            What::Load(load) => load.run(),
+        match self.subcommand {
+            Subcommand::Step(step) => step.run(),
+            Subcommand::Gpu(gpu) => gpu.run(),
+            Subcommand::Drive(drive) => drive.run(),
+            Subcommand::Load(load) => load.run(),
         }
     }
 }

@@ -10,11 +10,11 @@ use super::timed::{Timed, time};
 use crate::cli::backend_options::RendererOptions;
 use crate::cli::scene_source::SceneSource;
 
-/// Time one step: all cameras of the list in one frame, to 8-bit colour.
+/// Time one step: all cameras of a list in one frame, rendered to 8-bit colour.
 ///
-/// Reports the median and the extremes of the repeats, after one that is not counted; medians per
-/// stage; (Gaussian, view) pairs that are visible, (Gaussian, tile) pairs after binning, and
-/// Gaussian-pixel evaluations.
+/// Prints the median time and the extremes in milliseconds, after one frame that is not counted, and the
+/// median time of each stage. Also counts visible (Gaussian, view) pairs, instances (Gaussian, tile) after
+/// binning, and Gaussian-pixel evaluations.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Step {
@@ -25,7 +25,7 @@ pub(super) struct Step {
     renderer: RendererOptions,
 
     /// Frames to time.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
     /// Print one JSON object on standard output.
@@ -46,15 +46,15 @@ impl Step {
         let profile = ready.shots[0].profile;
         if let Some(other) = ready.shots.iter().find(|shot| shot.profile != profile) {
             anyhow::bail!(
-                "camera {:?} has another near than {:?}; one step has one profile: give \
-                 --set near=...",
+                "cameras {:?} and {:?} have different values of near, but a step has one profile: give \
+                 one for all with --set near=METRES",
                 other.name,
                 ready.shots[0].name
             );
         }
         let scene = ready.scene()?;
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        // The first frame makes room, and is not counted.
+        // The first frame allocates buffers, and is not counted.
         time(&*backend, &frame, 1, "rendering")?;
         let timed = time(&*backend, &frame, self.repeat, "rendering")?;
         self.report(&scene, &views, &*backend, &timed)
@@ -71,7 +71,9 @@ impl Step {
         let step_ms = timed.step_ms();
         let min_ms = steps_ms.iter().copied().fold(step_ms, f64::min);
         let max_ms = steps_ms.iter().copied().fold(step_ms, f64::max);
-        let (name, detail, threads) = (backend.name(), backend.detail(), backend.threads());
+        let name = backend.name();
+        let detail = backend.detail();
+        let threads = backend.threads();
         let pixels: usize = views.iter().map(|view| view.camera.pixels()).sum();
         let mut out = io::stdout().lock();
         if self.json {

@@ -1,21 +1,21 @@
-//! Frames that are drawn again and again, and how long they took.
+//! Frames that are rendered several times, and how long each took.
 
 use std::time::Instant;
 
 use crate::cli::progress;
 use wildcity_render::{Backend, Frame, FrameStats, Target};
 
-/// So many frames.
+/// The times of a frame that was rendered several times.
 pub(super) struct Timed {
-    /// Wall time of each, in milliseconds.
+    /// Wall time of each run, in milliseconds.
     pub(super) steps_ms: Vec<f64>,
-    /// What the first counted, and the median time of each stage.
+    /// Counts of the first run, and the median time of each stage.
     pub(super) stats: FrameStats,
-    /// The images of the last, in 8 bit.
+    /// The 8-bit images of the last run.
     pub(super) images: Vec<Vec<u8>>,
 }
 
-/// Draws a frame `count` times, at least once.
+/// Renders a frame `count` times, but at least once.
 pub(super) fn time(
     backend: &dyn Backend,
     frame: &Frame<'_>,
@@ -49,16 +49,17 @@ pub(super) fn time(
 }
 
 impl Timed {
-    /// The median frame, in milliseconds.
+    /// Median time of a run, in milliseconds.
     pub(super) fn step_ms(&self) -> f64 {
         median(self.steps_ms.iter().copied())
     }
 }
 
-/// The one in the middle, or the mean of the two in the middle.
+/// The middle value, or the mean of the two middle values. NaN without values.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
-    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
-    0.5 * (values.get(low).unwrap_or(&f64::NAN) + values.get(high).unwrap_or(&f64::NAN))
+    let at = |index: usize| values.get(index).copied().unwrap_or(f64::NAN);
+    let last = values.len().saturating_sub(1);
+    0.5 * (at(last / 2) + at(values.len() / 2))
 }

@@ -25,19 +25,19 @@ use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::{output, progress};
 
-/// Drive through the demo twin and look at the pictures.
+/// Build a demo street, drive through it as an agent, and write images of the drive.
 ///
-/// Builds a street on first use, serves it on a free loopback port, drives along its recorded
-/// trajectory through the WebSocket as any agent would, and writes what the six cameras saw: a
-/// mosaic of every tenth step, the recorded episode, and report.json with the time of every step.
+/// Builds the street on first use, serves it on a free loopback port, and drives along its recorded
+/// trajectory through the WebSocket, as any agent would. Writes a mosaic of the six cameras for every tenth
+/// step, the recorded episode, and report.json with the time of every step.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
-    /// Steps to drive, a tenth of a second each.
-    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    /// Steps to drive, of 0.1 s each.
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     steps: u32,
 
-    /// Directory for the pictures and the report; made if it is missing.
+    /// Directory for the images and the report; created if it is missing.
     #[arg(long, value_name = "DIR", default_value = "wildcity-demo")]
     out: PathBuf,
 
@@ -52,24 +52,24 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity demo
   wildcity demo --steps 20 --out /tmp/look
-  wildcity serve            (then the twin \"demo\" can be opened by any agent)";
+  wildcity serve            (then an agent can open the twin \"demo\")";
 
 /// Name of the demo twin.
 pub(super) const TWIN: &str = "demo";
-/// The same, of `wildcity report`.
+/// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
 const EXACT_TWIN: &str = "demo-f32";
-/// How the source of every revision of it begins.
+/// Start of the provenance of the demo street, in every revision of the generator.
 const STREET: &str = "street ";
-/// How fast the agent drives, in m/s; a step takes 0.1 s.
+/// Speed of the agent, in m/s.
 const SPEED_M_PER_S: f64 = 8.0;
-/// Steps between two mosaics.
+/// A mosaic is written for every so many steps.
 const MOSAIC_STEPS: u64 = 10;
 
 impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
         let version = demo_twin(&twins, TWIN, StorageOptions::default())?;
-        output::make_dir(&self.out)?;
+        output::create_dir(&self.out)?;
         let config = wildcity_server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             twins,
@@ -91,7 +91,7 @@ impl Demo {
         self.report(&version, &drive)
     }
 
-    /// The agent: follows the recorded trajectory at a constant speed.
+    /// The agent: follows the recorded trajectory at a constant speed, and checks every frame's hash.
     async fn drive(&self, url: &str, version: &Version) -> anyhow::Result<Drive> {
         let route = &version.manifest.trajectories[0];
         let mut client = Client::connect(url, "wildcity demo").await?;
@@ -99,7 +99,7 @@ impl Demo {
         let dt_s = opened.dt_us as f64 * 1e-6;
         let mut drive = Drive { backend: opened.backend, steps: Vec::new(), mosaics: Vec::new() };
         let first = client.reset(0, None).await?;
-        drive.keep(&first, &self.out)?;
+        drive.write_mosaic(&first, &self.out)?;
         let bar = progress::count("driving");
         bar.set_length(self.steps.into());
         for step in 1..=self.steps {
@@ -108,8 +108,8 @@ impl Demo {
             let seen = client.step(pose).await?;
             let step_ms = start.elapsed().as_secs_f64() * 1e3;
             seen.verify()?;
-            drive.steps.push(report_step(&seen, step_ms));
-            drive.keep(&seen, &self.out)?;
+            drive.steps.push(step_report(&seen, step_ms));
+            drive.write_mosaic(&seen, &self.out)?;
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -119,16 +119,17 @@ impl Demo {
 
     fn report(&self, version: &Version, drive: &Drive) -> anyhow::Result<()> {
         let step_ms = |step: &serde_json::Value| step["step_ms"].as_f64().unwrap_or(f64::NAN);
-        let mut times: Vec<f64> = drive.steps.iter().map(step_ms).collect();
-        times.sort_by(f64::total_cmp);
-        let at = |share: f64| times[((times.len() - 1) as f64 * share).round() as usize];
+        let mut steps_ms: Vec<f64> = drive.steps.iter().map(step_ms).collect();
+        steps_ms.sort_by(f64::total_cmp);
+        let last = (steps_ms.len() - 1) as f64;
+        let quantile_ms = |share: f64| steps_ms[(last * share).round() as usize];
         let report = json!({
             "twin": version.manifest.twin,
             "version": version.number,
             "version_hash": version.hash,
             "gaussians": version.manifest.gaussians(),
             "backend": drive.backend,
-            "step_ms": { "median": at(0.5), "p95": at(0.95), "max": at(1.0) },
+            "step_ms": { "median": quantile_ms(0.5), "p95": quantile_ms(0.95), "max": quantile_ms(1.0) },
             "steps": drive.steps,
             "mosaics": drive.mosaics,
         });
@@ -139,8 +140,8 @@ impl Demo {
             out,
             "drove {} steps of six cameras: median {:.0} ms a step, 95 % within {:.0} ms",
             self.steps,
-            at(0.5),
-            at(0.95)
+            quantile_ms(0.5),
+            quantile_ms(0.95)
         )?;
         if let Some(last) = drive.mosaics.last() {
             writeln!(out, "look at   {}", self.out.join(last).display())?;
@@ -151,16 +152,18 @@ impl Demo {
     }
 }
 
-/// What is kept of a drive.
+/// Records of a drive.
 struct Drive {
     backend: String,
+    /// One JSON object per step.
     steps: Vec<serde_json::Value>,
+    /// File names of the mosaics.
     mosaics: Vec<String>,
 }
 
 impl Drive {
-    /// Writes a mosaic of every tenth step.
-    fn keep(&mut self, seen: &Observation, out: &Path) -> anyhow::Result<()> {
+    /// Writes a mosaic, if the step is one of every tenth.
+    fn write_mosaic(&mut self, seen: &Observation, out: &Path) -> anyhow::Result<()> {
         let step = seen.metadata().step;
         if step.is_multiple_of(MOSAIC_STEPS) {
             let name = format!("step_{step:04}.png");
@@ -171,7 +174,7 @@ impl Drive {
     }
 }
 
-fn report_step(seen: &Observation, step_ms: f64) -> serde_json::Value {
+fn step_report(seen: &Observation, step_ms: f64) -> serde_json::Value {
     let metadata = seen.metadata();
     json!({
         "step": metadata.step,
@@ -188,8 +191,8 @@ fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
     Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
 }
 
-/// The demo street in the record that leaves nothing out, under a name of its own.
-pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
+/// The demo street in the exact record format f32, under its own name.
+pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
     demo_twin(
         twins,
         EXACT_TWIN,
@@ -197,19 +200,19 @@ pub(super) fn exact(twins: &Path) -> anyhow::Result<Version> {
     )
 }
 
-/// The demo twin in the user's store: built on first use, and again after the generator changed or
-/// the disk lost some of it.
+/// The demo twin in the user's directory. It is built on first use, and again if the generator changed or
+/// the files are damaged.
 fn demo_twin(twins: &Path, name: &str, storage: StorageOptions) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = wildcity_generate::REVISION;
     let settings_json = serde_json::to_string(&settings)?;
     let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
-    let why = match built(&catalog, name, &provenance)? {
-        Ok(version) => return Ok(version),
-        Err(why) => why,
+    let reason = match existing(&catalog, name, &provenance)? {
+        Existing::Usable(version) => return Ok(*version),
+        Existing::Rebuild(reason) => reason,
     };
-    writeln!(io::stderr(), "building the demo twin in {} ({why})", twins.display())?;
+    writeln!(io::stderr(), "building the demo twin in {} ({reason})", twins.display())?;
     let street = wildcity_generate::street(&settings)?;
     let sky = sky::read_bytes(wildcity_generate::SKY, None)?;
     let bar = progress::count("writing");
@@ -231,42 +234,54 @@ fn demo_twin(twins: &Path, name: &str, storage: StorageOptions) -> anyhow::Resul
     Ok(version)
 }
 
-/// The demo twin as it was built, or why it must be built.
+/// State of the demo twin in a directory.
+enum Existing {
+    /// It was built before, and can be used.
+    Usable(Box<Version>),
+    /// It must be built, for this reason.
+    Rebuild(&'static str),
+}
+
+/// Looks for the demo twin.
 ///
 /// # Errors
-/// The name belongs to a twin that somebody imported: it is not ours to add a version to.
-fn built(
-    catalog: &Catalog,
-    name: &str,
-    provenance: &Provenance,
-) -> anyhow::Result<Result<Version, &'static str>> {
-    const DAMAGED: &str = "again, since it is damaged";
+/// Another twin has the name: a user imported it, and it must not get a version of the demo street.
+fn existing(catalog: &Catalog, name: &str, provenance: &Provenance) -> anyhow::Result<Existing> {
+    const DAMAGED: &str = "its files are damaged";
     let version = match catalog.version(name, None) {
         Ok(version) => version,
-        Err(StoreError::NoTwin { .. }) => return Ok(Err("once")),
-        Err(StoreError::Damaged { .. }) => return Ok(Err(DAMAGED)),
-        Err(StoreError::Format { .. }) => return Ok(Err("anew, in this build's format")),
+        Err(StoreError::NoTwin { .. }) => {
+            return Ok(Existing::Rebuild("only on the first use"));
+        }
+        Err(StoreError::Damaged { .. }) => return Ok(Existing::Rebuild(DAMAGED)),
+        Err(StoreError::Format { .. }) => {
+            return Ok(Existing::Rebuild("it is stored in the format of another build"));
+        }
         Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
-            return Ok(Err(DAMAGED));
+            return Ok(Existing::Rebuild(DAMAGED));
         }
         Err(error) => return Err(error.into()),
     };
     let found = &version.manifest.provenance;
     anyhow::ensure!(
         found.source.starts_with(STREET),
-        "twin {name:?} in {} is not the demo street (its source is {:?}): give --twins another \
-         directory, or import yours under another name",
+        "twin {name:?} in {} is not the demo street (its source is {:?}): give another directory with \
+         --twins, or import that twin under another name",
         catalog.dir().display(),
         found.source,
     );
     if found != provenance {
-        return Ok(Err("anew, as the generator changed"));
+        return Ok(Existing::Rebuild("the generator changed"));
     }
-    Ok(if is_sound(catalog, name, &version)? { Ok(version) } else { Err(DAMAGED) })
+    Ok(match is_intact(catalog, name, &version)? {
+        true => Existing::Usable(Box::new(version)),
+        false => Existing::Rebuild(DAMAGED),
+    })
 }
 
-/// Whether every chunk of a version is what was committed; older versions may be as they like.
-fn is_sound(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<bool> {
+/// Whether every chunk of a version, and its sky, have the hashes that were committed. Damage in older
+/// versions does not count.
+fn is_intact(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<bool> {
     let bar = progress::bytes("checking");
     let verified = catalog.verify(name, &mut progress::show(&bar))?;
     bar.finish_and_clear();

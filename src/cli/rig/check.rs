@@ -2,16 +2,20 @@
 
 use std::io::{self, Write};
 
-use super::{rig_of, view_of};
+use super::lookup::{rig_of, view_of};
 use crate::cli::backend_options::BackendOptions;
 use wildcity_render::compare::reprojection::ReprojectionErrors;
 
-/// Render points that each camera must show at known pixels, and find them there.
+/// Render points at known pixels, and check that each camera of a rig shows them there.
 ///
-/// A grid of small Gaussians stands before each camera, where its lens says that the middle of a pixel
-/// looks. Their images' centroids are compared with those pixels; fails with exit code 1 if one is off by
-/// more than 0.1 px.
+/// A grid of small Gaussians stands before each camera, on the rays of the middles of pixels. The centroids
+/// of their images are compared with those pixels. Prints the largest distance for each camera; the exit
+/// code is 1 if one is above 0.1 px.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity rig check alpamayo2
+  wildcity rig check car.json --backend reference")]
 pub(super) struct Check {
     /// A preset, or a JSON file.
     #[arg(value_name = "RIG")]
@@ -21,8 +25,8 @@ pub(super) struct Check {
     backend: BackendOptions,
 }
 
-/// Farthest that a point may be from its pixel, in pixels.
-const OFF_PX: f64 = 0.1;
+/// Largest distance of a point from its pixel, in pixels.
+const MAX_DISTANCE_PX: f64 = 0.1;
 
 impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -34,11 +38,15 @@ impl Check {
             let ReprojectionErrors { count, worst_px } =
                 ReprojectionErrors::measure(&*backend, &view_of(camera))?;
             writeln!(out, "{:<24} {count:>3} points, at most {worst_px:.3} px off", camera.name)?;
-            if worst_px > OFF_PX || count == 0 {
+            if worst_px > MAX_DISTANCE_PX || count == 0 {
                 wrong.push(camera.name.clone());
             }
         }
-        anyhow::ensure!(wrong.is_empty(), "not where the lens says: {}", wrong.join(", "));
+        anyhow::ensure!(
+            wrong.is_empty(),
+            "these cameras do not show points where their lens says: {}",
+            wrong.join(", ")
+        );
         Ok(())
     }
 }

@@ -2,29 +2,27 @@
 
 mod check;
 mod draw;
+mod lookup;
 mod show;
 
-use std::path::Path;
+pub(super) use lookup::rig_of;
 
-use glam::DVec2;
-
-use wildcity_render::View;
-use wildcity_scene::Rig;
-use wildcity_scene::rig::RigCamera;
-
-use super::import::read_rig;
-
-/// Look at a vehicle's cameras, and prove that images show what they should.
+/// Show the cameras of a rig, draw them, and check that their images show points where they should.
 ///
-/// RIG is a preset (see `wildcity rig show`) or a JSON file as `wildcity import --rig` reads it.
+/// RIG is a preset (see `wildcity rig show`), or a JSON file as `wildcity import --rig` reads it.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity rig show
+  wildcity rig check alpamayo2
+  wildcity rig draw vehicle6 --out vehicle6.svg")]
 pub(super) struct RigCommand {
     #[command(subcommand)]
-    what: What,
+    subcommand: Subcommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
+enum Subcommand {
     Show(show::Show),
     Check(check::Check),
     Draw(draw::Draw),
@@ -32,35 +30,10 @@ enum What {
 
 impl RigCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.what {
-            What::Show(show) => show.run(),
-            What::Check(check) => check.run(),
-            What::Draw(draw) => draw.run(),
+        match self.subcommand {
+            Subcommand::Show(show) => show.run(),
+            Subcommand::Check(check) => check.run(),
+            Subcommand::Draw(draw) => draw.run(),
         }
     }
-}
-
-/// A preset, or else a file.
-pub(super) fn rig_of(name: &str) -> anyhow::Result<Rig> {
-    if let Some(rig) = Rig::preset(name) {
-        return Ok(rig);
-    }
-    let presets: Vec<&str> = Rig::preset_names().collect();
-    anyhow::ensure!(
-        Path::new(name).exists(),
-        "{name:?} is neither a file nor a preset; there is {}",
-        presets.join(", ")
-    );
-    read_rig(Path::new(name))
-}
-
-/// The view of a camera while the rig stands at the world's origin.
-fn view_of(camera: &RigCamera) -> View {
-    View::new(camera.camera, camera.rig_from_camera)
-}
-
-/// Angle between what two points of an image look at, in degrees; `None` where one shows nothing.
-fn between_deg(view: &View, a_px: DVec2, b_px: DVec2) -> Option<f64> {
-    let (a, b) = (view.ray_world(a_px)?, view.ray_world(b_px)?);
-    Some(a.angle_between(b).to_degrees())
 }

@@ -4,14 +4,17 @@ use std::io::{self, Write};
 
 use glam::{DVec2, DVec3};
 
-use super::{between_deg, rig_of, view_of};
+use super::lookup::{rig_of, view_of};
+use wildcity_render::View;
 use wildcity_scene::Rig;
 
-/// Print what a rig's cameras see; without RIG, the presets' names.
+/// Print the cameras of a rig; without RIG, the names of the presets.
 ///
-/// yaw is to the left of straight ahead and pitch above the horizon, in degrees. Fields of view are
-/// between the middles of opposite edges, `-` where the lens shows nothing there.
+/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is to the left of straight
+/// ahead and pitch is above the horizon, in degrees. Fields of view, in degrees, lie between the middles of
+/// opposite edges; `-` where the lens shows nothing there.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "Examples:\n  wildcity rig show\n  wildcity rig show vehicle6")]
 pub(super) struct Show {
     /// A preset, or a JSON file.
     #[arg(value_name = "RIG")]
@@ -29,31 +32,51 @@ impl Show {
         };
         let rig = rig_of(&name)?;
         writeln!(out, "{}: {} cameras", rig.name, rig.cameras.len())?;
-        let head = ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw", "pitch"];
-        let [index, camera, size, field, x, y, z, yaw, pitch] = head;
+        let headings =
+            ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw deg", "pitch deg"];
+        let [index, camera, size, field, x, y, z, yaw, pitch] = headings;
         writeln!(
             out,
-            "{index:>2} {camera:<24} {size:>9} {field:>11} {x:>6} {y:>6} {z:>6} {yaw:>7} {pitch:>6}"
+            "{index:>2} {camera:<24} {size:>9} {field:>11} {x:>6} {y:>6} {z:>6} {yaw:>7} {pitch:>9}"
         )?;
         for (index, camera) in rig.cameras.iter().enumerate() {
             let view = view_of(camera);
-            let (width, height) = (camera.camera.width_px, camera.camera.height_px);
-            let (w, h) = (f64::from(width), f64::from(height));
-            let across = between_deg(&view, DVec2::new(0.0, h / 2.0), DVec2::new(w, h / 2.0));
-            let down = between_deg(&view, DVec2::new(w / 2.0, 0.0), DVec2::new(w / 2.0, h));
-            let text = |deg: Option<f64>| deg.map_or("-".to_owned(), |deg| format!("{deg:.1}"));
+            let width_px = camera.camera.width_px;
+            let height_px = camera.camera.height_px;
             let [x, y, z] = camera.rig_from_camera.position_m.to_array();
             let forward = camera.rig_from_camera.rotation * DVec3::Z;
             let yaw = forward.y.atan2(forward.x).to_degrees();
             let pitch = forward.z.clamp(-1.0, 1.0).asin().to_degrees();
             writeln!(
                 out,
-                "{index:>2} {:<24} {:>9} {:>11} {x:>6.2} {y:>6.2} {z:>6.2} {yaw:>7.1} {pitch:>6.1}",
+                "{index:>2} {:<24} {:>9} {:>11} {x:>6.2} {y:>6.2} {z:>6.2} {yaw:>7.1} {pitch:>9.1}",
                 camera.name,
-                format!("{width}x{height}"),
-                format!("{}x{}", text(across), text(down)),
+                format!("{width_px}x{height_px}"),
+                fields_of_view(&view),
             )?;
         }
         Ok(())
     }
+}
+
+/// Horizontal and vertical field of view in degrees, as text.
+fn fields_of_view(view: &View) -> String {
+    let width = f64::from(view.camera.width_px);
+    let height = f64::from(view.camera.height_px);
+    let left = DVec2::new(0.0, height / 2.0);
+    let right = DVec2::new(width, height / 2.0);
+    let top = DVec2::new(width / 2.0, 0.0);
+    let bottom = DVec2::new(width / 2.0, height);
+    let text = |angle: Option<f64>| angle.map_or("-".to_owned(), |deg| format!("{deg:.1}"));
+    let horizontal = text(angle_between_deg(view, left, right));
+    let vertical = text(angle_between_deg(view, top, bottom));
+    format!("{horizontal}x{vertical}")
+}
+
+/// Angle between the rays of two points of an image, in degrees. None if the lens shows nothing at one of
+/// them.
+fn angle_between_deg(view: &View, a_px: DVec2, b_px: DVec2) -> Option<f64> {
+    let a = view.ray_world(a_px)?;
+    let b = view.ray_world(b_px)?;
+    Some(a.angle_between(b).to_degrees())
 }

@@ -5,26 +5,29 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::read_times_us;
-use crate::cli::import::read_trajectory;
+use super::files::read_times_us;
+use crate::cli::input_files::read_trajectory;
 use wildcity_scene::route;
 
-/// Find which keyframe belongs to each time of another clock, as to the images of a camera.
+/// Match the keyframes of a drive with the times of another clock, for example those of a camera's images.
 ///
-/// A time and a keyframe belong together if each is the other's nearest and they are at most
-/// --tolerance-us apart. Prints one JSON object: pairs with their residuals (keyframe minus time), the
-/// times that found nothing, and the median and largest residual.
+/// A time and a keyframe match if each is the other's nearest, and they are at most --tolerance-us apart.
+/// Prints one JSON object: the pairs with their residuals (keyframe time minus time), the times without a
+/// keyframe, and the median and the largest residual, all in microseconds.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Example:
+  wildcity route associate log.json --times images.json --tolerance-us 20000 | jq .residual_us_median")]
 pub(in crate::cli) struct Associate {
-    /// The drive.
-    #[arg(value_name = "FILE")]
+    /// The drive: a JSON file as `wildcity import --trajectory` reads it.
+    #[arg(value_name = "DRIVE")]
     drive: PathBuf,
 
     /// JSON list of times, in whole microseconds, rising.
     #[arg(long, value_name = "FILE")]
     times: PathBuf,
 
-    /// Farthest that two times may be apart, in microseconds.
+    /// Largest difference of two matching times, in microseconds.
     #[arg(long, value_name = "US", default_value_t = 50_000)]
     tolerance_us: i64,
 }

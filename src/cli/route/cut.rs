@@ -6,31 +6,36 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::to_json;
-use crate::cli::import::read_trajectory;
+use super::files::to_json;
+use crate::cli::input_files::read_trajectory;
 use crate::cli::output;
 use wildcity_scene::route::{self, Route};
 
-/// Cut a drive into sub-trajectories of given lengths, all in the drive's own world.
+/// Cut a drive into shorter drives of given lengths, in the same world.
 ///
-/// Writes DIR/<name>-<length>-<number>.json for each, whose clock begins at 0, and DIR/index.json:
-/// their names, stations on the drive and beginnings on its clock.
+/// Writes DIR/<name>-<length>-<number>.json for each cut, with a clock that begins at 0, and
+/// DIR/index.json with the name of each cut, its stations on the drive in metres, and its start on the
+/// drive's clock in microseconds.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity route cut log.json --out cuts
+  wildcity route cut log.json --length-m 50,200 --stride-m 25 --out cuts")]
 pub(in crate::cli) struct Cut {
-    /// The drive.
-    #[arg(value_name = "FILE")]
+    /// The drive: a JSON file as `wildcity import --trajectory` reads it.
+    #[arg(value_name = "DRIVE")]
     drive: PathBuf,
 
-    /// Lengths, in metres.
+    /// Lengths of the cuts, in metres.
     #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::SUB_TRAJECTORY_LENGTHS_M)]
     length_m: Vec<f64>,
 
-    /// From the start of one to the start of the next, in metres [default: the length, so that they
-    /// do not overlap]
+    /// Distance from the start of one cut to the start of the next, in metres [default: the length, so that
+    /// cuts do not overlap]
     #[arg(long, value_name = "M")]
     stride_m: Option<f64>,
 
-    /// Directory for the files; made if it is missing.
+    /// Directory for the files; created if it is missing.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -39,18 +44,10 @@ impl Cut {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let trajectory = read_trajectory(&self.drive)?;
         let route = Route::new(&trajectory)?;
-        let mut labels = BTreeSet::new();
-        for &length_m in &self.length_m {
-            let label = route::length_label(length_m);
-            let once = labels.insert(label.clone());
-            anyhow::ensure!(
-                once,
-                "--length-m: two lengths would both be written to files called {label}; give each once"
-            );
-        }
-        output::make_dir(&self.out)?;
+        self.check_labels()?;
+        output::create_dir(&self.out)?;
         let mut index = Vec::new();
-        for length_m in self.length_m {
+        for &length_m in &self.length_m {
             let before = index.len();
             for cut in route::sub_trajectories(&route, length_m, self.stride_m.unwrap_or(length_m))?
             {
@@ -67,5 +64,19 @@ impl Cut {
         }
         let index = json!({ "drive": trajectory.name, "cuts": index });
         output::write(&self.out.join("index.json"), format!("{index:#}\n").as_bytes())
+    }
+
+    /// Checks that the cuts of two lengths do not have the same file names.
+    fn check_labels(&self) -> anyhow::Result<()> {
+        let mut labels = BTreeSet::new();
+        for &length_m in &self.length_m {
+            let label = route::length_label(length_m);
+            let is_new = labels.insert(label.clone());
+            anyhow::ensure!(
+                is_new,
+                "--length-m: two lengths would both be written to files called {label}; give each once"
+            );
+        }
+        Ok(())
     }
 }

@@ -5,17 +5,22 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use crate::cli::import::read_trajectory;
-use wildcity_scene::route::Route;
+use crate::cli::input_files::read_trajectory;
+use wildcity_scene::Trajectory;
+use wildcity_scene::route::{Route, RouteChunk};
 
-/// Show how long a drive is, and its chunks of 5 km.
+/// Show the length of a drive, and its chunks of 5 km.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity route measure log.json
+  wildcity route measure log.json --json | jq .length_m")]
 pub(in crate::cli) struct Measure {
-    /// The drive.
-    #[arg(value_name = "FILE")]
+    /// The drive: a JSON file as `wildcity import --trajectory` reads it.
+    #[arg(value_name = "DRIVE")]
     drive: PathBuf,
 
-    /// Print one JSON object, with the station of every keyframe.
+    /// Print one JSON object, with the station of every keyframe in metres.
     #[arg(long)]
     json: bool,
 }
@@ -24,36 +29,22 @@ impl Measure {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let trajectory = read_trajectory(&self.drive)?;
         let route = Route::new(&trajectory)?;
-        let (keyframes, length_m) = (&trajectory.keyframes, route.length_m());
-        let [from_us, to_us] = [keyframes[0], keyframes[keyframes.len() - 1]].map(|k| k.time_us);
-        let seconds = to_us.abs_diff(from_us) as f64 * 1e-6;
-        let chunks = route.chunks();
+        let first = &trajectory.keyframes[0];
+        let last = &trajectory.keyframes[trajectory.keyframes.len() - 1];
+        let seconds = last.time_us.abs_diff(first.time_us) as f64 * 1e-6;
         let mut out = io::stdout().lock();
         if self.json {
-            let chunk = |chunk: &wildcity_scene::route::RouteChunk| {
-                json!({
-                    "number": chunk.number,
-                    "keyframes": [chunk.keyframes.start, chunk.keyframes.end],
-                    "stations_m": chunk.stations_m,
-                })
-            };
-            let report = json!({
-                "name": trajectory.name,
-                "length_m": length_m,
-                "seconds": seconds,
-                "stations_m": route.stations_m(),
-                "chunks": chunks.iter().map(chunk).collect::<Vec<_>>(),
-            });
-            writeln!(out, "{report}")?;
+            writeln!(out, "{}", json_report(&trajectory, &route, seconds))?;
             return Ok(());
         }
         writeln!(
             out,
-            "{}: {} keyframes, {length_m:.1} m in {seconds:.1} s",
+            "{}: {} keyframes, {:.1} m in {seconds:.1} s",
             trajectory.name,
-            keyframes.len()
+            trajectory.keyframes.len(),
+            route.length_m()
         )?;
-        for chunk in chunks {
+        for chunk in route.chunks() {
             let [from_m, to_m] = chunk.stations_m;
             let count = chunk.keyframes.len();
             writeln!(
@@ -64,4 +55,21 @@ impl Measure {
         }
         Ok(())
     }
+}
+
+fn json_report(trajectory: &Trajectory, route: &Route<'_>, seconds: f64) -> serde_json::Value {
+    let chunk = |chunk: &RouteChunk| {
+        json!({
+            "number": chunk.number,
+            "keyframes": [chunk.keyframes.start, chunk.keyframes.end],
+            "stations_m": chunk.stations_m,
+        })
+    };
+    json!({
+        "name": trajectory.name,
+        "length_m": route.length_m(),
+        "seconds": seconds,
+        "stations_m": route.stations_m(),
+        "chunks": route.chunks().iter().map(chunk).collect::<Vec<_>>(),
+    })
 }

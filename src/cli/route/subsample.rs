@@ -3,23 +3,26 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use super::to_json;
-use crate::cli::import::read_trajectory;
+use super::files::to_json;
+use crate::cli::input_files::read_trajectory;
 use crate::cli::output;
 use wildcity_scene::route::{self, Route};
 
-/// Keep the recorded poses of a drive that are so far apart, and drop those between.
+/// Drop keyframes of a drive that are closer together than a given distance.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Example:
+  wildcity route subsample log.json --step-m 0.5 --out sparse.json")]
 pub(in crate::cli) struct Subsample {
-    /// The drive.
-    #[arg(value_name = "FILE")]
+    /// The drive: a JSON file as `wildcity import --trajectory` reads it.
+    #[arg(value_name = "DRIVE")]
     drive: PathBuf,
 
-    /// Least distance between two poses, in metres, as the crow flies.
+    /// Least straight-line distance between two kept poses, in metres.
     #[arg(long, value_name = "M", default_value_t = route::KEYFRAME_SPACING_M)]
     step_m: f64,
 
-    /// What to write.
+    /// JSON file to write.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
 }
@@ -29,8 +32,9 @@ impl Subsample {
         let trajectory = read_trajectory(&self.drive)?;
         let kept = Route::new(&trajectory)?.subsample(self.step_m)?;
         output::write(&self.out, &to_json(&kept)?)?;
-        let (kept, all) = (kept.keyframes.len(), trajectory.keyframes.len());
-        writeln!(io::stdout(), "{kept} of {all} keyframes")?;
+        let kept_count = kept.keyframes.len();
+        let all_count = trajectory.keyframes.len();
+        writeln!(io::stdout(), "{kept_count} of {all_count} keyframes")?;
         Ok(())
     }
 }

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use crate::cli::directories::Twins;
 use wildcity_twin::store::{CellDiff, CellSize, Diff as Differences};
 
-/// Show which cells differ between two versions of a twin: Gaussians and bytes, before and after.
+/// Show which cells differ between two versions of a twin, with their Gaussians and bytes in each.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Example:\n  wildcity twin diff street 3 4")]
 pub(super) struct Diff {
@@ -13,11 +13,11 @@ pub(super) struct Diff {
     #[arg(value_name = "TWIN")]
     twin: String,
 
-    /// Number of the version before.
+    /// Number of the first version.
     #[arg(value_name = "BEFORE")]
     before: u64,
 
-    /// Number of the version after.
+    /// Number of the second version.
     #[arg(value_name = "AFTER")]
     after: u64,
 
@@ -31,7 +31,9 @@ impl Diff {
         let Differences { cells, kept, settings } =
             catalog.diff(&self.twin, self.before, self.after)?;
         let mut out = io::stdout().lock();
-        let (mut added, mut removed, mut changed) = (0, 0, 0);
+        let mut added = 0;
+        let mut removed = 0;
+        let mut changed = 0;
         for CellDiff { cell: [x, y], before, after } in &cells {
             let (sign, count) = match (before, after) {
                 (None, _) => ("+", &mut added),

@@ -6,11 +6,11 @@ use crate::cli::directories::Twins;
 use crate::cli::progress;
 use wildcity_twin::store::FsckReport;
 
-/// Read every object of every version of a twin again and compare it with its hash; and look for what
-/// the log lost, and what no version names.
+/// Check a twin: read every object of every version and compare it with its hash, and check the log.
 ///
-/// Exit code 0 if all is what was committed; otherwise 1, and what is not is named. Importing the same
-/// source again with the same options heals objects. What no version names is no loss: `gc` removes it.
+/// Prints damaged objects, lost versions, and objects that no version refers to. The exit code is 0 if
+/// everything is as it was committed, and 1 otherwise. To repair objects, import the same source again with
+/// the same options. Objects without a version are not damage: `wildcity twin gc` removes them.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Example:\n  wildcity twin fsck street && wildcity serve")]
 pub(super) struct Fsck {
@@ -21,7 +21,7 @@ pub(super) struct Fsck {
     #[command(flatten)]
     twins: Twins,
 
-    /// Print what was found as one JSON object.
+    /// Print the result as one JSON object.
     #[arg(long)]
     json: bool,
 }
@@ -36,15 +36,16 @@ impl Fsck {
         if self.json {
             writeln!(out, "{}", json(&checked))?;
         } else {
-            self.tell(&mut out, &checked)?;
+            self.print(&mut out, &checked)?;
         }
-        let (damaged, objects) = (checked.verified.damaged.len(), checked.verified.objects);
+        let damaged = checked.verified.damaged.len();
+        let objects = checked.verified.objects;
         anyhow::ensure!(damaged == 0, "{damaged} of {objects} objects are damaged");
         anyhow::ensure!(checked.is_sound(), "the log of twin {} is damaged", self.twin);
         Ok(())
     }
 
-    fn tell(&self, out: &mut impl Write, checked: &FsckReport) -> io::Result<()> {
+    fn print(&self, out: &mut impl Write, checked: &FsckReport) -> io::Result<()> {
         for damage in &checked.verified.damaged {
             writeln!(out, "damaged {}: {}", damage.object, damage.error)?;
         }
@@ -59,14 +60,16 @@ impl Fsck {
         }
         let garbage = checked.unreferenced;
         if garbage.objects > 0 {
-            let (objects, bytes) = (garbage.objects, garbage.bytes);
+            let objects = garbage.objects;
+            let bytes = garbage.bytes;
             writeln!(out, "{objects} objects of {bytes} bytes belong to no version")?;
         }
         if checked.staging {
             writeln!(out, "a commit is being made, or was killed: the next start cleans up")?;
         }
         if checked.is_sound() {
-            let (objects, bytes) = (checked.verified.objects, checked.verified.bytes);
+            let objects = checked.verified.objects;
+            let bytes = checked.verified.bytes;
             writeln!(
                 out,
                 "twin {}: {objects} objects, {bytes} bytes of chunks, all sound",

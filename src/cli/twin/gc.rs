@@ -7,10 +7,10 @@ use crate::cli::directories::Twins;
 use crate::cli::limits;
 use wildcity_twin::store::Retention;
 
-/// Remove objects of a twin that no version to be kept names.
+/// Remove objects of a twin that none of the kept versions refers to.
 ///
-/// In two steps: the first run notes what is garbage, and one after the grace period removes it. So run
-/// it every day. Versions that running servers use are kept, however old.
+/// This takes two runs: the first one notes the garbage, and a run after the grace period removes it. So run
+/// the command every day. Versions that running servers use are kept, however old they are.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -21,16 +21,16 @@ pub(super) struct Gc {
     #[arg(value_name = "TWIN")]
     twin: String,
 
-    /// How many of the latest versions are kept.
+    /// Number of latest versions to keep.
     #[arg(long, value_name = "N", default_value_t = limits::GC_KEEP,
           value_parser = clap::value_parser!(u32).range(1..))]
     keep: u32,
 
-    /// How long an object stays after it was found to be garbage, as 90s, 30m, 24h or 7d.
+    /// How long an object stays after it was noted as garbage, for example 90s, 30m, 24h or 7d.
     #[arg(long, value_name = "TIME", default_value = limits::GC_GRACE, value_parser = duration)]
     grace: Duration,
 
-    /// Only says what would be done.
+    /// Only print what would be done.
     #[arg(long)]
     dry_run: bool,
 
@@ -59,7 +59,7 @@ impl Gc {
 }
 
 fn duration(text: &str) -> Result<Duration, String> {
-    let wrong = || "expected a whole number and s, m, h or d, as 24h".to_owned();
+    let wrong = || "expected a whole number and s, m, h or d, for example 24h".to_owned();
     let unit = text.chars().last().ok_or_else(wrong)?;
     let seconds = match unit {
         's' => 1,
@@ -83,7 +83,7 @@ mod tests {
         }
         assert_eq!(duration("7d").unwrap().as_secs(), 7 * 86_400);
         for text in ["", "24", "h", "-1h", "1.5h", "99999999999999999999d", "1 h", "1µ"] {
-            assert!(duration(text).unwrap_err().contains("as 24h"), "{text}");
+            assert!(duration(text).unwrap_err().contains("for example 24h"), "{text}");
         }
     }
 }

@@ -13,29 +13,28 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig};
 use wildcity_twin::store::{CommitKind, StorageOptions, VersionSettings};
 
-/// Make a twin of a procedural city: a route of any length between houses, cars and trees.
+/// Generate a twin of a procedural city: a route between houses, cars and trees.
 ///
-/// The route runs east, bending, through streets that each have a crossing and things of their own;
-/// its trajectory `log` has a keyframe every 0.5 m. The same options give the same bytes. Cells are
-/// written as soon as nothing further can touch them, so a long route needs no more memory than a
-/// short one.
+/// The route bends and runs east, through streets that each have a crossing and different objects. Its
+/// trajectory `log` has a keyframe every 0.5 m. The same options give the same bytes. Each cell is written
+/// as soon as it is complete, so a long route needs no more memory than a short one.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Generate {
-    /// Name of the twin, of a-z 0-9 . _ -; an existing one gets a new version.
+    /// Name of the twin, made of a-z 0-9 . _ -; an existing twin gets a new version.
     #[arg(long, value_name = "NAME")]
     twin: String,
 
-    /// Length of the route, in km: 0.1 to 100, to the metre.
+    /// Length of the route, in km: 0.1 to 100, rounded to the metre.
     #[arg(long, value_name = "KM")]
     length_km: f64,
 
-    /// Millions of Gaussians per km, about: 1 to 15. A captured street has 12.
+    /// Approximate density, in millions of Gaussians per km: 1 to 15. A captured street has 12.
     #[arg(long, value_name = "MILLIONS", default_value_t = 5.0)]
     density: f64,
 
-    /// Seed of everything that is random.
-    #[arg(long, default_value_t = 1)]
+    /// Seed of the random numbers.
+    #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u32,
 
     /// Speed of the recorded drive, in m/s.
@@ -47,23 +46,22 @@ pub(in crate::cli) struct Generate {
 }
 
 const EXAMPLES: &str = "\
-A twin has about LENGTH x DENSITY million Gaussians, which take 48 (at 2) to 36 (at 12) bytes of disk
-each, levels of detail included:
-   1 km at  5    5 million Gaussians    0.2 GiB
-  20 km at  5  100 million Gaussians    3.9 GiB
-  20 km at 12  240 million Gaussians    8.0 GiB
+A twin has about LENGTH x DENSITY million Gaussians. Each takes 48 (density 2) to 36 (density 12) bytes
+on disk, including levels of detail:
+   1 km at density  5    5 million Gaussians    0.2 GiB
+  20 km at density  5  100 million Gaussians    3.9 GiB
+  20 km at density 12  240 million Gaussians    8.0 GiB
 
 Examples:
   wildcity twin generate --twin town --length-km 1
   wildcity twin generate --twin city --length-km 20 --density 5
-  wildcity render --twin town --out pictures --cameras views.json";
+  wildcity render town --cameras views.json --out images";
 
-/// Bytes on disk per Gaussian, levels of detail included, of a thin city; of a dense one they are
-/// fewer.
+/// Bytes on disk per Gaussian of a city of low density, including levels of detail. Dense cities take fewer.
 const STORED_BYTES: u64 = 48;
 
-/// Farthest block that is drawn, in metres: the street's bends hide what is farther. At four places of
-/// a kilometre the picture is, to the bit, the one without a limit; 300 m are 1/255 off in one.
+/// Draw distance, in metres: the bends of the street hide what is farther. At four places of a kilometre the
+/// image is bit-identical to the one without a limit; with 300 m, one of the four is off by 1/255.
 const REACH_M: f64 = 600.0;
 
 impl Generate {
@@ -77,9 +75,9 @@ impl Generate {
         let city = wildcity_generate::city(&settings)?;
         let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
-        let in_directory = catalog.traffic().is_none();
-        if in_directory {
-            check_room(catalog.dir(), gaussians)?;
+        let is_on_disk = catalog.traffic().is_none();
+        if is_on_disk {
+            check_free_space(catalog.dir(), gaussians)?;
         }
 
         let begun = Instant::now();
@@ -105,8 +103,10 @@ impl Generate {
         let version = commit.replace(None, parts)?;
         bar.finish_and_clear();
 
-        let (manifest, seconds) = (&version.manifest, begun.elapsed().as_secs_f64());
-        let (count, stored_bytes) = (manifest.gaussians(), manifest.stored_bytes());
+        let seconds = begun.elapsed().as_secs_f64();
+        let manifest = &version.manifest;
+        let count = manifest.gaussians();
+        let stored_bytes = manifest.stored_bytes();
         writeln!(
             std::io::stdout().lock(),
             "twin {} version {}: {count} Gaussians in {} chunks, {:.2} GiB, {:.1} bytes each; \
@@ -123,12 +123,12 @@ impl Generate {
     }
 }
 
-/// Whether the disk has room for so many Gaussians.
-fn check_room(dir: &Path, gaussians: u64) -> anyhow::Result<()> {
-    // The directory is made with the first twin.
-    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
-    let disk = rustix::fs::statvfs(there);
-    let disk = disk.with_context(|| format!("cannot ask how much room is in {}", dir.display()))?;
+/// Checks that the disk has space for so many Gaussians.
+fn check_free_space(dir: &Path, gaussians: u64) -> anyhow::Result<()> {
+    // The directory may not exist yet; then its nearest parent is on the same disk.
+    let existing = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
+    let disk = rustix::fs::statvfs(existing);
+    let disk = disk.with_context(|| format!("cannot read the free space of {}", dir.display()))?;
     let free_bytes = disk.f_bavail.saturating_mul(disk.f_frsize);
     let needed_bytes = gaussians.saturating_mul(STORED_BYTES);
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);

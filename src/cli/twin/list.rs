@@ -4,13 +4,16 @@ use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 
-/// List all twins with their latest versions.
+/// List all twins with the number and hash of their latest versions.
 #[derive(Debug, clap::Args)]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin list\n  wildcity twin list --twins s3://fleet/twins --json"
+)]
 pub(super) struct List {
     #[command(flatten)]
     twins: Twins,
 
-    /// Print one JSON object a line: name, number, hash.
+    /// Print one JSON object per line: name, number, hash.
     #[arg(long)]
     json: bool,
 }
@@ -19,12 +22,13 @@ impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
         for twin in self.twins.catalog()?.twins()? {
-            let (name, number, hash) = (&twin.name, twin.number, &twin.hash);
             if self.json {
-                let line = serde_json::json!({ "name": name, "number": number, "hash": hash });
+                let line = serde_json::json!({
+                    "name": twin.name, "number": twin.number, "hash": twin.hash,
+                });
                 writeln!(out, "{line}")?;
             } else {
-                writeln!(out, "{name:<24} version {number:<6} {hash}")?;
+                writeln!(out, "{:<24} version {:<6} {}", twin.name, twin.number, twin.hash)?;
             }
         }
         Ok(())

@@ -6,8 +6,11 @@ use crate::cli::directories::Twins;
 use crate::cli::time::utc;
 use wildcity_twin::store::LogEntry;
 
-/// Show all versions of a twin, from the first on: when, how, and made from which.
+/// Show all versions of a twin, oldest first: when and how each was made, and from which version.
 #[derive(Debug, clap::Args)]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin log street\n  wildcity twin log street --json | jq .created_us"
+)]
 pub(super) struct Log {
     /// The twin's name.
     #[arg(value_name = "TWIN")]
@@ -16,7 +19,7 @@ pub(super) struct Log {
     #[command(flatten)]
     twins: Twins,
 
-    /// Print one JSON object a line: number, hash, created_us, kind, parent, commit.
+    /// Print one JSON object per line: number, hash, created_us, kind, parent, commit.
     #[arg(long)]
     json: bool,
 }
@@ -34,7 +37,8 @@ impl Log {
                 writeln!(out, "{line}")?;
             } else {
                 let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
-                let (how, when) = (format!("{kind}{from}"), utc(created_us));
+                let how = format!("{kind}{from}");
+                let when = utc(created_us);
                 writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}")?;
             }
         }

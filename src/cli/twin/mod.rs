@@ -9,15 +9,20 @@ mod log;
 mod rollback;
 mod sky;
 
-/// Keep twins: their versions, and what they take.
+/// List, generate, check and clean up twins, and manage their versions.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity twin list
+  wildcity twin log street
+  wildcity twin fsck street")]
 pub(super) struct Twin {
     #[command(subcommand)]
-    what: What,
+    subcommand: Subcommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
+enum Subcommand {
     List(list::List),
     Generate(generate::Generate),
     Log(log::Log),
@@ -30,15 +35,15 @@ enum What {
 
 impl Twin {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.what {
-            What::List(list) => list.run(),
-            What::Generate(generate) => generate.run(),
-            What::Log(log) => log.run(),
-            What::Diff(diff) => diff.run(),
-            What::Rollback(rollback) => rollback.run(),
-            What::Gc(gc) => gc.run(),
-            What::Fsck(fsck) => fsck.run(),
-            What::Sky(sky) => sky.run(),
+        match self.subcommand {
+            Subcommand::List(list) => list.run(),
+            Subcommand::Generate(generate) => generate.run(),
+            Subcommand::Log(log) => log.run(),
+            Subcommand::Diff(diff) => diff.run(),
+            Subcommand::Rollback(rollback) => rollback.run(),
+            Subcommand::Gc(gc) => gc.run(),
+            Subcommand::Fsck(fsck) => fsck.run(),
+            Subcommand::Sky(sky) => sky.run(),
         }
     }
 }

@@ -6,22 +6,21 @@ use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::sky_source::SkySource;
 use wildcity_twin::store::{CommitKind, NewSky, StorageOptions, VersionChange};
 
-/// Put a sky behind a twin, another in its place, or take it away: a new version with the same
-/// Gaussians.
+/// Add, replace or remove the sky of a twin: makes a new version with the same Gaussians.
 ///
-/// Agents that drive keep the version that they opened.
+/// Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
-#[command(group = clap::ArgGroup::new("what").args(["sky", "remove"]).required(true))]
+#[command(group = clap::ArgGroup::new("action").args(["sky", "remove"]).required(true))]
 pub(in crate::cli) struct Sky {
-    /// The twin's name.
+    /// The twin: NAME, or NAME@NUMBER to start from an older version.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
     #[command(flatten)]
     source: SkySource,
 
-    /// Takes the sky away.
+    /// Remove the sky.
     #[arg(long)]
     remove: bool,
 
@@ -40,7 +39,7 @@ impl Sky {
         let sky = self.source.read("identity")?.map(NewSky::Put);
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.twin.name, self.twin.number)?;
-        // That of the version: what it says of its Gaussians stays true.
+        // The Gaussians stay, and so does what the version says of their origin.
         let provenance = base.manifest.provenance.clone();
         let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
         let commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;

@@ -1,31 +1,32 @@
-//! How far off images are: PSNR, SSIM, the largest error and the 99.9th percentile, and depth in metres.
+//! Errors of images against reference images: PSNR, SSIM, the largest error and its 99.9th percentile, and
+//! the mean error of depth in metres.
 
 use serde::Serialize;
 
 use super::json_numbers::serialize_number;
 use crate::compare::psnr::psnr_db;
 
-/// How far off a set of images is. Values are those of colour, clamped to [0, 1] as they are shown.
+/// Errors of a set of images. Values are those of colour, clamped to [0, 1] as displayed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ImageErrors {
-    /// Peak signal-to-noise ratio of all values together, in dB; infinite where none differs.
+    /// Peak signal-to-noise ratio of all values together, in dB; infinite if none differs.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// Mean structural similarity of the images' luma; 1 where nothing differs.
+    /// Mean structural similarity (SSIM) of the images' luma; 1 if nothing differs.
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
     /// Largest error of a value.
     #[serde(serialize_with = "serialize_number")]
     pub max: f64,
-    /// The error that all but one of a thousand values keep below.
+    /// 99.9th percentile of the errors of values.
     #[serde(serialize_with = "serialize_number")]
     pub p99_9: f64,
-    /// Mean error of the depth, in metres, where both images cover at least half of the pixel.
+    /// Mean error of depth, in metres, over pixels where both images have an opacity of at least 1/2.
     #[serde(serialize_with = "serialize_number")]
     pub depth_l1_m: f64,
 }
 
-/// One image that is compared with another one.
+/// An image to compare with another one.
 #[derive(Clone, Debug)]
 pub struct Image {
     /// Width and height, in pixels.
@@ -39,8 +40,8 @@ pub struct Image {
 }
 
 impl Image {
-    /// The same at another size: colour and opacity bilinearly, depth from the nearest pixel, since between
-    /// two depths there is nothing.
+    /// The image at another size: colour and opacity are interpolated bilinearly; depth is that of the
+    /// nearest pixel, since there is no surface between two depths.
     pub fn resized(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px.map(|px| px as usize);
         let mut new = Self {
@@ -49,7 +50,8 @@ impl Image {
             depth_m: Vec::with_capacity((width * height) as usize),
             opacity: Vec::with_capacity((width * height) as usize),
         };
-        // The place of a pixel's centre among the centres of the own pixels, and its two neighbours.
+        // Of a new pixel's centre, the two neighbouring centres of the old image, and the position between
+        // them.
         let neighbours = |i: u32, count: u32, own: usize| {
             let at = (f64::from(i) + 0.5) * own as f64 / f64::from(count) - 0.5;
             let at = at.clamp(0.0, (own - 1) as f64);
@@ -62,7 +64,8 @@ impl Image {
                 let (left, right, across) = neighbours(x, width, own_width);
                 let mixed = |value: &dyn Fn(usize) -> f32| {
                     let row = |y: usize| {
-                        let (l, r) = (value(y * own_width + left), value(y * own_width + right));
+                        let l = value(y * own_width + left);
+                        let r = value(y * own_width + right);
                         l + across * (r - l)
                     };
                     row(top) + down * (row(bottom) - row(top))
@@ -78,7 +81,7 @@ impl Image {
     }
 }
 
-/// What is gathered of pairs of images.
+/// Accumulates the errors of pairs of images.
 #[derive(Clone, Debug, Default)]
 pub struct ErrorAccumulator {
     errors: Vec<f32>,
@@ -88,7 +91,7 @@ pub struct ErrorAccumulator {
 }
 
 impl ErrorAccumulator {
-    /// Adds an image and what it should be, of the same size. Gives the pair's own PSNR in dB.
+    /// Adds an image and its reference, of the same size. Returns the PSNR of the pair in dB.
     pub fn add(&mut self, image: &Image, truth: &Image) -> f64 {
         let before = self.errors.len();
         let pairs = image.rgb.iter().zip(&truth.rgb);
@@ -103,7 +106,7 @@ impl ErrorAccumulator {
         psnr_db(self.errors[before..].iter().map(|&off| f64::from(off)))
     }
 
-    /// Adds what was gathered elsewhere.
+    /// Adds the pairs of another accumulator.
     pub fn merge(&mut self, other: &Self) {
         self.errors.extend_from_slice(&other.errors);
         self.ssims.extend_from_slice(&other.ssims);
@@ -111,7 +114,7 @@ impl ErrorAccumulator {
         self.depths += other.depths;
     }
 
-    /// The errors of all that was added; `None` of nothing.
+    /// The errors of all pairs; `None` if there are none.
     pub fn errors(&self) -> Option<ImageErrors> {
         let mut sorted = self.errors.clone();
         sorted.sort_unstable_by(f32::total_cmp);
@@ -127,43 +130,51 @@ impl ErrorAccumulator {
     }
 }
 
-/// Edge of the window of SSIM, in pixels, and its standard deviation (Wang et al. 2004).
+/// Edge of SSIM's window, in pixels (Wang et al. 2004).
 const WINDOW: usize = 11;
+/// Standard deviation of SSIM's window.
 const SIGMA_PX: f64 = 1.5;
-/// Wang et al. 2004: `(0.01 L)²` and `(0.03 L)²`, of values from 0 to L = 1.
+/// Wang et al. 2004: C1 is `(0.01 L)²` and C2 `(0.03 L)²`, for values from 0 to L = 1.
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// Mean structural similarity of luma over all windows within the image; of an image smaller than a
-/// window, over the image as one window.
+/// Mean structural similarity (Wang et al. 2004) of luma over all windows within the image. An image smaller
+/// than a window is one window.
 pub fn ssim(image: &Image, truth: &Image) -> f64 {
     let [width, height] = image.size_px.map(|px| px as usize);
-    let (a, b) = (luma(&image.rgb), luma(&truth.rgb));
+    let a = luma(&image.rgb);
+    let b = luma(&truth.rgb);
     let products = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(x, y)| x * y).collect::<Vec<_>>();
     let mean = |values: &[f64]| smooth(values, width, height);
-    let (mean_a, mean_b) = (mean(&a), mean(&b));
-    let (square_a, square_b, mixed) =
-        (mean(&products(&a, &a)), mean(&products(&b, &b)), mean(&products(&a, &b)));
+    let mean_a = mean(&a);
+    let mean_b = mean(&b);
+    let square_a = mean(&products(&a, &a));
+    let square_b = mean(&products(&b, &b));
+    let mixed = mean(&products(&a, &b));
     let at = |i: usize| {
-        let (ma, mb) = (mean_a[i], mean_b[i]);
-        let (va, vb) = (square_a[i] - ma * ma, square_b[i] - mb * mb);
+        let ma = mean_a[i];
+        let mb = mean_b[i];
+        let va = square_a[i] - ma * ma;
+        let vb = square_b[i] - mb * mb;
         let covariance = mixed[i] - ma * mb;
         (2.0 * ma * mb + C1) * (2.0 * covariance + C2) / ((ma * ma + mb * mb + C1) * (va + vb + C2))
     };
     (0..mean_a.len()).map(at).sum::<f64>() / mean_a.len() as f64
 }
 
-/// ITU-R BT.601.
+/// Luma by the weights of ITU-R BT.601.
 fn luma(rgb: &[f32]) -> Vec<f64> {
     let weights = [0.299, 0.587, 0.114];
     let pixel = |rgb: &[f32]| rgb.iter().zip(weights).map(|(&v, w)| w * f64::from(v)).sum();
     rgb.chunks_exact(3).map(pixel).collect()
 }
 
-/// Weighted means over all windows within the image: columns, then rows.
+/// Weighted means over all windows within the image: along rows first, then along columns.
 fn smooth(values: &[f64], width: usize, height: usize) -> Vec<f64> {
-    let (across, down) = (weights(WINDOW.min(width)), weights(WINDOW.min(height)));
-    let (columns, rows) = (width + 1 - across.len(), height + 1 - down.len());
+    let across = weights(WINDOW.min(width));
+    let down = weights(WINDOW.min(height));
+    let columns = width + 1 - across.len();
+    let rows = height + 1 - down.len();
     let sum = |weights: &[f64], at: &dyn Fn(usize) -> f64| {
         weights.iter().enumerate().map(|(k, weight)| weight * at(k)).sum::<f64>()
     };
@@ -175,7 +186,7 @@ fn smooth(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     (0..columns * rows).map(cell).collect()
 }
 
-/// A Gaussian of `count` pixels whose sum is 1.
+/// Weights of a 1D Gaussian window of `count` pixels, with sum 1.
 fn weights(count: usize) -> Vec<f64> {
     let at = |k: usize| {
         let off = k as f64 - 0.5 * (count - 1) as f64;
@@ -190,9 +201,10 @@ fn weights(count: usize) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// Stripes of a width, and some noise.
+    /// An image of vertical stripes of a width, with noise of an amplitude.
     fn striped(stripe: usize, noise: f32) -> Image {
-        let (width, height) = (40, 30);
+        let width = 40;
+        let height = 30;
         let value = |i: usize| {
             let x = i % width / stripe % 2;
             0.2 + 0.5 * x as f32 + noise * ((i * 7919 % 13) as f32 / 6.0 - 1.0)
@@ -207,19 +219,20 @@ mod tests {
 
     #[test]
     fn known_errors() {
-        let (truth, mut image) = (striped(4, 0.0), striped(4, 0.0));
-        let mut gathered = ErrorAccumulator::default();
-        assert_eq!(gathered.add(&image, &truth), f64::INFINITY);
-        assert_eq!(gathered.errors().unwrap().ssim, 1.0);
+        let truth = striped(4, 0.0);
+        let mut image = striped(4, 0.0);
+        let mut accumulator = ErrorAccumulator::default();
+        assert_eq!(accumulator.add(&image, &truth), f64::INFINITY);
+        assert_eq!(accumulator.errors().unwrap().ssim, 1.0);
         // A tenth everywhere is 20 dB; one value of 3,600 is beyond the 99.9th percentile.
         image.rgb.iter_mut().for_each(|value| *value += 0.1);
         image.rgb[7] += 0.3;
         image.depth_m[..600].fill(5.5);
         image.opacity[1199] = 0.4;
         image.depth_m[1199] = 1e6;
-        let mut gathered = ErrorAccumulator::default();
-        gathered.add(&image, &truth);
-        let errors = gathered.errors().unwrap();
+        let mut accumulator = ErrorAccumulator::default();
+        accumulator.add(&image, &truth);
+        let errors = accumulator.errors().unwrap();
         assert!((errors.psnr_db - 20.0).abs() < 0.1, "{errors:?}");
         assert!((errors.max - 0.4).abs() < 1e-6 && (errors.p99_9 - 0.1).abs() < 1e-6, "{errors:?}");
         assert!((errors.depth_l1_m - 300.0 / 1199.0).abs() < 1e-6, "{errors:?}");
@@ -243,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn similarity_is_of_structure() {
+    fn ssim_depends_on_structure_more_than_on_brightness() {
         let truth = striped(4, 0.0);
         let mut brighter = truth.clone();
         brighter.rgb.iter_mut().for_each(|value| *value += 0.05);
@@ -256,7 +269,7 @@ mod tests {
     /// One window of two values each, by hand: means 0.5 and 0.25, variances 0.25 and 0.0625, covariance
     /// 0.125, so (0.25 + C1)(0.25 + C2) / ((0.3125 + C1)(0.3125 + C2)).
     #[test]
-    fn similarity_of_a_single_window() {
+    fn ssim_of_a_single_window() {
         let image = |high: f32| Image {
             size_px: [2, 1],
             rgb: vec![0.0, 0.0, 0.0, high, high, high],

@@ -1,4 +1,5 @@
-//! A few Gaussians, written by what they are and not by what is stored.
+//! Small scenes for tests: Gaussians written with standard deviations, opacities and colours, which
+//! [`Gaussians`] stores as logarithms, logits and SH coefficients.
 
 use glam::{DQuat, DVec3};
 
@@ -6,12 +7,12 @@ use crate::View;
 use crate::compare::images::view_along;
 use wildcity_scene::{Gaussians, Scene, sh};
 
-/// One Gaussian, by default an orange ball of 10 cm, 5 m ahead of [`ahead`].
+/// One Gaussian; by default an orange ball with a standard deviation of 10 cm, 5 m ahead of [`forward_view`].
 #[derive(Clone, Copy, Debug)]
 pub struct GaussianSpec {
     /// Centre, in metres.
     pub mean_m: DVec3,
-    /// Rotation of its own axes.
+    /// Rotation from its own axes to the world's.
     pub rotation: DQuat,
     /// Standard deviation along each own axis, in metres.
     pub sigma_m: DVec3,
@@ -33,15 +34,15 @@ impl Default for GaussianSpec {
     }
 }
 
-/// The scene that they make.
-pub fn scene_of(blobs: &[GaussianSpec]) -> Scene {
-    Scene::from_gaussians(&gaussians_of(blobs))
+/// A scene of some Gaussians.
+pub fn scene_of(specs: &[GaussianSpec]) -> Scene {
+    Scene::from_gaussians(&gaussians_of(specs))
 }
 
-/// Raw columns of SH degree 0.
-pub fn gaussians_of(blobs: &[GaussianSpec]) -> Gaussians {
-    let mut g = Gaussians::with_capacity(0, blobs.len());
-    for GaussianSpec { mean_m, rotation: q, sigma_m, opacity, rgb } in blobs {
+/// The columns of some Gaussians, with SH degree 0.
+pub fn gaussians_of(specs: &[GaussianSpec]) -> Gaussians {
+    let mut g = Gaussians::with_capacity(0, specs.len());
+    for GaussianSpec { mean_m, rotation: q, sigma_m, opacity, rgb } in specs {
         g.means_m.push(mean_m.to_array());
         g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
         g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
@@ -51,7 +52,7 @@ pub fn gaussians_of(blobs: &[GaussianSpec]) -> Gaussians {
     g
 }
 
-/// A camera at the origin that looks along +z, y down.
+/// A pinhole camera at the origin that looks along +z, with +y down.
 pub fn forward_view(size_px: [u32; 2], focal_px: f64) -> View {
     view_along(size_px, focal_px, DVec3::ZERO, DVec3::Z, DVec3::Y)
 }

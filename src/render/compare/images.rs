@@ -1,4 +1,4 @@
-//! What a backend draws of a view, every value of it, and whether two drawings are of one thing.
+//! All images of a view by a backend, parts of them, and whether two backends drew the same.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -8,20 +8,20 @@ use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{RenderProfile, Scene};
 
-/// What a backend says of one view, row by row from the top; the shapes are those of [`Target`].
+/// All images of one view, row by row from the top. Their shapes are those of [`Target`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedImage {
-    /// `[height, width, 4]`: linear premultiplied colour on black, and opacity.
+    /// `[height, width, 4]`: linear colour, and opacity.
     pub rgba: Vec<f32>,
-    /// `[height, width, 3]`: the colour in 8 bit.
+    /// `[height, width, 3]`: the colour in 8 bits.
     pub rgb8: Vec<u8>,
-    /// `[height, width]`: expected camera z in metres, 0 where opacity is 0.
+    /// `[height, width]`: expected depth in metres, 0 where opacity is 0.
     pub depth_m: Vec<f32>,
-    /// `[height, width]`.
+    /// `[height, width]`: accumulated opacity.
     pub opacity: Vec<f32>,
 }
 
-/// Draws all views in one frame, with every output.
+/// Renders all views in one frame, with every image but normals.
 ///
 /// # Errors
 /// As [`Backend::render`].
@@ -31,7 +31,7 @@ pub fn render_images(
     profile: &RenderProfile,
     views: &[View],
 ) -> Result<Vec<RenderedImage>, RenderError> {
-    // Garbage, so that a pixel that nobody wrote is seen.
+    // The buffers are filled with other values first, so that a pixel that is not written shows up.
     let empty = |view: &View| {
         let pixels = view.camera.pixels();
         RenderedImage {
@@ -41,22 +41,21 @@ pub fn render_images(
             opacity: vec![f32::NAN; pixels],
         }
     };
-    let mut drawings: Vec<RenderedImage> = views.iter().map(empty).collect();
-    let targets =
-        drawings.iter_mut().map(|RenderedImage { rgba, rgb8, depth_m, opacity }| Target {
-            rgba: Some(rgba),
-            rgb8: Some(rgb8),
-            depth_m: Some(depth_m),
-            opacity: Some(opacity),
-            ..Target::default()
-        });
+    let mut images: Vec<RenderedImage> = views.iter().map(empty).collect();
+    let targets = images.iter_mut().map(|RenderedImage { rgba, rgb8, depth_m, opacity }| Target {
+        rgba: Some(rgba),
+        rgb8: Some(rgb8),
+        depth_m: Some(depth_m),
+        opacity: Some(opacity),
+        ..Target::default()
+    });
     let mut targets: Vec<Target<'_>> = targets.collect();
     backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {})?;
-    Ok(drawings)
+    Ok(images)
 }
 
-/// A camera with a centred principal point and square pixels, at `position_m`, that looks along
-/// `forward` with `down` on the image's lower side.
+/// A pinhole camera with a centred principal point and square pixels, at `position_m`, that looks along
+/// `forward`; `down` points to the image's lower edge.
 pub fn view_along(
     size_px: [u32; 2],
     focal_px: f64,
@@ -78,7 +77,7 @@ pub fn view_along(
     View::new(Camera::from_pinhole(width_px, height_px, pinhole), world_from_camera)
 }
 
-/// A part of a view's image, as a view of its own. It may begin before the image, and reach beyond.
+/// A view with an image that is a part of another view's image. The part may reach beyond the image's edges.
 pub fn crop_view(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32; 2]) -> View {
     let mut camera = Camera { width_px, height_px, ..whole.camera };
     camera.pinhole.cx -= f64::from(left);
@@ -86,12 +85,12 @@ pub fn crop_view(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32
     View { camera, ..whole }
 }
 
-/// The colours and opacities of a part of a drawing that is `width_px` wide, row by row.
+/// The colours and opacities (`rgba`) of a part of an image that is `width_px` wide, row by row.
 ///
 /// # Panics
-/// If the part is not within the drawing.
+/// If the part does not lie within the image.
 pub fn crop_rgba(
-    drawing: &RenderedImage,
+    image: &RenderedImage,
     width_px: u32,
     [left, top]: [u32; 2],
     [columns, rows]: [u32; 2],
@@ -99,12 +98,12 @@ pub fn crop_rgba(
     assert!(left + columns <= width_px, "{left} and {columns} columns of {width_px}");
     let row = |y: u32| {
         let start = 4 * (y as usize * width_px as usize + left as usize);
-        &drawing.rgba[start..start + 4 * columns as usize]
+        &image.rgba[start..start + 4 * columns as usize]
     };
     (top..top + rows).flat_map(row).copied().collect()
 }
 
-/// Largest difference; NaN anywhere, or another length, gives infinity.
+/// The largest difference of two values; infinity if one is a NaN, or if the lengths differ.
 pub fn max_difference(a: &[f32], b: &[f32]) -> f32 {
     if a.len() != b.len() {
         return f32::INFINITY;
@@ -121,32 +120,32 @@ pub fn max_difference(a: &[f32], b: &[f32]) -> f32 {
     })
 }
 
-/// Least PSNR at which two drawings agree, in dB.
+/// Least PSNR at which two images agree, in dB.
 pub const AGREEMENT_DB: f64 = 70.0;
 
-/// Whether two backends drew the same thing: at least [`AGREEMENT_DB`], no value off by more than 2/255,
-/// and depths within a hundredth, on average 1e-4, where at least half the pixel is covered. Gives the
-/// PSNR in dB.
+/// Whether two backends drew the same: a PSNR of at least [`AGREEMENT_DB`], no value off by more than 2/255,
+/// and depths within a hundredth, on average 1e-4, where opacity is at least 1/2. Returns the PSNR in dB.
 ///
 /// # Errors
-/// Says what is off, and by how much.
-pub fn agree(drawing: &RenderedImage, truth: &RenderedImage) -> Result<f64, String> {
-    let pairs = drawing.rgba.iter().zip(&truth.rgba);
+/// Says what differs, and by how much.
+pub fn agree(image: &RenderedImage, truth: &RenderedImage) -> Result<f64, String> {
+    let pairs = image.rgba.iter().zip(&truth.rgba);
     let db = psnr_db(pairs.map(|(a, b)| f64::from(a - b)));
-    let off = max_difference(&drawing.rgba, &truth.rgba);
+    let off = max_difference(&image.rgba, &truth.rgba);
     let close = db >= AGREEMENT_DB && off <= 2.0 / 255.0;
     if !close {
         return Err(format!("{db:.1} dB, off by {off:.5}"));
     }
-    let bytes = drawing.rgb8.iter().zip(&truth.rgb8).map(|(a, b)| a.abs_diff(*b)).max();
+    let bytes = image.rgb8.iter().zip(&truth.rgb8).map(|(a, b)| a.abs_diff(*b)).max();
     if bytes > Some(2) {
         return Err(format!("8-bit colour off by {bytes:?}"));
     }
-    // Where one backend blends what the other finds just below alpha_cut, 1/255 of the weight comes
-    // from another depth: a hundredth of the depth, if that lies 2.5 times as deep. On average the
+    // Where one backend blends a splat that the other finds just below alpha_cut, 1/255 of the weight comes
+    // from another depth: a hundredth of the depth, if the splat lies 2.5 times as deep. On average the
     // backends must be far closer.
-    let (mut off, mut covered) = (0.0, 0.0);
-    for (pixel, (&depth, &truth_m)) in drawing.depth_m.iter().zip(&truth.depth_m).enumerate() {
+    let mut off = 0.0;
+    let mut covered = 0.0;
+    for (pixel, (&depth, &truth_m)) in image.depth_m.iter().zip(&truth.depth_m).enumerate() {
         if truth.opacity[pixel] < 0.5 {
             if !depth.is_finite() {
                 return Err(format!("pixel {pixel}: depth {depth}"));

@@ -1,13 +1,14 @@
-//! Numbers of which JSON has none: `"inf"`, `"-inf"` and `"NaN"`, as the CSV spells them.
+//! Serialization of numbers that JSON lacks: infinity and NaN become the strings `"inf"`, `"-inf"` and
+//! `"NaN"`, as in the CSV.
 
 use serde::{Serialize, Serializer};
 
-/// One number.
+/// For `#[serde(serialize_with)]`: one number.
 pub fn serialize_number<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
     Number(*value).serialize(serializer)
 }
 
-/// Several.
+/// For `#[serde(serialize_with)]`: several numbers.
 pub fn serialize_numbers<S: Serializer>(values: &[f64], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(values.iter().copied().map(Number))
 }

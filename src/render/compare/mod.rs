@@ -1,4 +1,13 @@
-//! What a backend draws of a view, and how two drawings differ.
+//! Test scenes, images of them, and measures of how images differ.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`gaussians`] | small scenes, written as lists of [`GaussianSpec`](gaussians::GaussianSpec) |
+//! | [`images`] | all images of a view by a backend, parts of images, and [`agree`](images::agree): whether two backends drew the same |
+//! | [`psnr`] | peak signal-to-noise ratio |
+//! | [`errors`] | PSNR, SSIM, largest errors and depth errors over many images |
+//! | [`reprojection`] | how far known points are from their pixels |
+//! | [`json_numbers`] | numbers that JSON lacks (infinity, NaN) |
 
 pub mod errors;
 pub mod gaussians;

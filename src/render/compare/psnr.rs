@@ -1,17 +1,17 @@
-//! How close two drawings of one thing are.
+//! Peak signal-to-noise ratio.
 
-/// Least PSNR at which a drawing counts as right, in dB: what backends promise each other.
+/// Least PSNR at which an image of one backend counts as that of another, in dB.
 pub const MIN_PSNR_DB: f64 = 60.0;
 
-/// Peak signal-to-noise ratio in dB, of differences of values whose peak is 1: infinite where none
-/// differs, NaN where one is NaN or there is none.
+/// Peak signal-to-noise ratio in dB, of differences of values with peak 1: `-10 log10(mean of squares)`.
+/// Infinite if all differences are 0; NaN if one is a NaN, or if there are none.
 pub fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) =
         differences.fold((0.0, 0_u64), |(sum, count), off| (sum + off * off, count + 1));
     -10.0 * (sum / count as f64).log10()
 }
 
-/// The same of two drawings in 8 bit.
+/// The same of two images in 8 bits.
 pub fn psnr_db_u8<'a>(pairs: impl Iterator<Item = (&'a u8, &'a u8)>) -> f64 {
     psnr_db(pairs.map(|(a, b)| f64::from(a.abs_diff(*b)) / 255.0))
 }

@@ -1,29 +1,29 @@
-//! Whether a camera shows points where its lens says.
+//! Reprojection error: how far a camera's images of known points are from where its model puts them.
 
 use glam::DVec2;
 
 use crate::{Backend, Frame, RenderError, Target, View};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
-/// Points across an image and down.
+/// Number of points across the image and down.
 const GRID: [u32; 2] = [7, 5];
-/// How far the points are, in metres.
-const AWAY_M: f64 = 10.0;
-/// Size of a point in the image, one standard deviation, in pixels; it is looked for within four.
+/// Distance of the points from the camera, in metres.
+const DISTANCE_M: f64 = 10.0;
+/// Standard deviation of a point's image, in pixels. Its centroid is taken within four of them.
 const POINT_PX: f64 = 2.0;
 
 /// Points that a camera should show.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReprojectionErrors {
-    /// How many there were.
+    /// Number of points.
     pub count: usize,
-    /// How far the worst was from its pixel; infinite if one was not seen.
+    /// Largest distance of a point's image from its pixel; infinite if a point is not visible.
     pub worst_px: f64,
 }
 
 impl ReprojectionErrors {
-    /// Draws a grid of small Gaussians before a camera, where its lens says that known places of the image
-    /// look, and finds them by their centroids.
+    /// Renders a grid of small Gaussians, each on the ray of a known pixel, and measures the distances of
+    /// their images' centroids from these pixels.
     ///
     /// # Errors
     /// The backend cannot draw them.
@@ -32,15 +32,17 @@ impl ReprojectionErrors {
         let mut gaussians = Gaussians::with_capacity(0, 0);
         let mut wanted = Vec::new();
         for (row, column) in (0..GRID[1]).flat_map(|row| (0..GRID[0]).map(move |k| (row, k))) {
-            // Middles of equal fields, off the middle of the pixel.
+            // The middle of one of GRID equal cells of the image, 0.37 px into a pixel, off its centre.
             let share =
                 (DVec2::new(column.into(), row.into()) + 0.5) / DVec2::from(GRID.map(f64::from));
             let at_px = (share * size_px).floor() + 0.37;
             let rays = view.ray_world(at_px).zip(view.ray_world(at_px + DVec2::X));
-            let Some((ray, beside)) = rays else { continue };
+            let Some((ray, next_ray)) = rays else { continue };
             wanted.push(at_px);
-            let sigma_m = POINT_PX * AWAY_M * ray.angle_between(beside);
-            gaussians.means_m.push((view.world_from_camera.position_m + AWAY_M * ray).to_array());
+            let sigma_m = POINT_PX * DISTANCE_M * ray.angle_between(next_ray);
+            gaussians
+                .means_m
+                .push((view.world_from_camera.position_m + DISTANCE_M * ray).to_array());
             gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
             gaussians.ln_scales.push([sigma_m.ln() as f32; 3]);
             gaussians.logit_opacities.push(2.0);
@@ -48,20 +50,21 @@ impl ReprojectionErrors {
         }
         let mut opacity = vec![0.0; view.camera.pixels()];
         let scene = Scene::from_gaussians(&gaussians);
-        let (profile, views) = (RenderProfile::default(), [*view]);
+        let profile = RenderProfile::default();
+        let views = [*view];
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         let target = Target { opacity: Some(&mut opacity), ..Target::default() };
         backend.render(&frame, &mut [target], &|_, _| {})?;
-        let (width, height) = (view.camera.width_px, view.camera.height_px);
+        let size_px = [view.camera.width_px, view.camera.height_px];
         let off_px = wanted.iter().map(|&at_px| {
-            let found = centroid(&opacity, [width, height], at_px, 4.0 * POINT_PX);
+            let found = centroid(&opacity, size_px, at_px, 4.0 * POINT_PX);
             found.map_or(f64::INFINITY, |found_px| found_px.distance(at_px))
         });
         Ok(Self { count: wanted.len(), worst_px: off_px.fold(0.0, f64::max) })
     }
 }
 
-/// The middle of what is within reach of a place, in pixels; `None` if nothing is.
+/// The centroid of opacity within a square around a place, in pixels; `None` if opacity is 0 there.
 pub fn centroid(
     opacity: &[f32],
     [width, height]: [u32; 2],
@@ -72,7 +75,8 @@ pub fn centroid(
         let from = (middle - reach_px).floor().max(0.0) as u32;
         from..((middle + reach_px).ceil() as u32).min(side)
     };
-    let (mut sum_px, mut weight) = (DVec2::ZERO, 0.0);
+    let mut sum_px = DVec2::ZERO;
+    let mut weight = 0.0;
     for row in range(around_px.y, height) {
         for column in range(around_px.x, width) {
             let seen = f64::from(opacity[(row * width + column) as usize]);

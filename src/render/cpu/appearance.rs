@@ -1,17 +1,14 @@
-//! Exposure and overlay of one camera: a part of stage resolve, for cameras that have them.
+//! Exposure and overlay of one camera: the second part of stage resolve, for cameras that have them.
 
 use fearless_simd::{f32x16, prelude::*};
 
 use super::lanes::Vec3x16;
-use super::resolve::TileSums;
+use super::resolve::{BLOCKS, TileSums, block_corner};
 use crate::constants::BLOCK_PX;
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::chunk::LANES;
 
-/// Blocks of a tile.
-const BLOCKS: usize = 16;
-
-/// Turns a tile's colours into those that the camera records; its corner is `at_px`.
+/// Applies exposure, then the overlay, to the colours of a tile with its top left pixel at `at_px`.
 #[inline(always)]
 pub(super) fn apply<S: Simd>(
     simd: S,
@@ -26,9 +23,8 @@ pub(super) fn apply<S: Simd>(
             rgb = expose(simd, exposure, rgb);
         }
         if let Some(overlay) = &appearance.overlay {
-            let edge = BLOCK_PX;
-            let (left, top) = (block as u32 % edge * edge, block as u32 / edge * edge);
-            rgb = cover(simd, overlay, [at_px[0] + left, at_px[1] + top], rgb);
+            let [left, top] = block_corner(block);
+            rgb = blend_overlay(simd, overlay, [at_px[0] + left, at_px[1] + top], rgb);
         }
         rgb.x.store_array(&mut sums.rgb[0][block]);
         rgb.y.store_array(&mut sums.rgb[1][block]);
@@ -36,6 +32,7 @@ pub(super) fn apply<S: Simd>(
     }
 }
 
+/// `matrix rgb + offset`.
 #[inline(always)]
 fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> {
     let row = |c: usize| {
@@ -46,14 +43,20 @@ fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> 
     Vec3x16 { x: row(0), y: row(1), z: row(2) }
 }
 
-/// Lays the overlay over the block whose corner is `at_px`.
+/// Blends the overlay over the block with its top left pixel at `at_px`: `(1 - alpha) rgb + alpha color`.
 #[inline(always)]
-fn cover<S: Simd>(simd: S, overlay: &Overlay, at_px: [u32; 2], rgb: Vec3x16<S>) -> Vec3x16<S> {
+fn blend_overlay<S: Simd>(
+    simd: S,
+    overlay: &Overlay,
+    at_px: [u32; 2],
+    rgb: Vec3x16<S>,
+) -> Vec3x16<S> {
     let [width, height] = overlay.size_px();
     let mut over = [[0.0; LANES]; 4];
     for lane in 0..LANES as u32 {
-        let (x, y) = (at_px[0] + lane % BLOCK_PX, at_px[1] + lane / BLOCK_PX);
-        // Tiles reach beyond the image.
+        let x = at_px[0] + lane % BLOCK_PX;
+        let y = at_px[1] + lane / BLOCK_PX;
+        // The last tiles of a row or column reach beyond the image.
         if x < width && y < height {
             let first = 4 * (y as usize * width as usize + x as usize);
             let pixel = &overlay.rgba8()[first..first + 4];
@@ -64,6 +67,7 @@ fn cover<S: Simd>(simd: S, overlay: &Overlay, at_px: [u32; 2], rgb: Vec3x16<S>) 
     }
     let splat = |value: f32| f32x16::splat(simd, value);
     let load = |c: usize| f32x16::load_array_ref(simd, &over[c]) * splat(1.0 / 255.0);
-    let (alpha, color) = (load(3), Vec3x16 { x: load(0), y: load(1), z: load(2) });
+    let alpha = load(3);
+    let color = Vec3x16 { x: load(0), y: load(1), z: load(2) };
     rgb.mul_add(splat(1.0) - alpha, color.scale(alpha))
 }

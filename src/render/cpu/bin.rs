@@ -1,8 +1,12 @@
-//! Stage bin: for every tile, the splats that can touch it, from the nearest.
+//! Stage bin: for every tile, the list of splats that can touch it, from the nearest.
 //!
-//! Blocks of sorted splats are walked twice. The first walk finds each splat's spans of tiles, keeps
-//! them, and counts; the second only unpacks them, so the two cannot disagree. A prefix sum over
-//! (tile, block) gives every block its own places, so the lists do not depend on the schedule.
+//! **Two passes over the sorted splats, but one test.** The first pass finds each splat's spans of tiles (4
+//! bytes a span), keeps them, and counts the splats of each tile. The second pass only unpacks the spans into
+//! lists, so that the passes cannot disagree about a splat that ends on a tile's edge.
+//!
+//! **The lists do not depend on the schedule.** Sorted splats are cut into segments that run in parallel. A
+//! prefix sum over (tile, segment) gives each segment its own places in every list. Segments write their
+//! places through relaxed atomics, which compile to plain stores, so that no `unsafe` is needed.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -15,38 +19,39 @@ use crate::constants::{EXTENT_SLACK_PX, MAX_INSTANCES, TILE_PX};
 use crate::layout::{Cutoffs, Splat};
 use crate::{RenderError, View};
 
-/// Splats of a parallel block: enough to outweigh its histogram of a view's tiles.
-const BLOCK: usize = 1 << 14;
+/// Splats of a segment: enough to outweigh its histogram of a view's tiles.
+const SEGMENT: usize = 1 << 14;
 
-/// Splats read at a time.
-const GATHER: usize = 64;
+/// Splats read at a time, so that their cache misses overlap.
+const READ_BATCH: usize = 64;
 
 /// The splats of a frame by tile.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
-    /// Places of splats in the projection, tile after tile. Atomic so that blocks can fill their
-    /// places side by side without unsafe code; a relaxed store is an ordinary store.
+    /// Places of splats in the projection, tile after tile. Atomic so that segments can write to disjoint
+    /// elements in parallel without `unsafe`; a relaxed store is an ordinary store.
     instances: Vec<AtomicU32>,
-    /// How many of `instances` are of this frame.
+    /// Number of `instances` that belong to this frame; the rest is spare room.
     used: usize,
-    /// Where each tile's list starts, and the end of the last.
+    /// Start of each tile's list in `instances`, view after view, and the end of the last list.
     starts: Vec<u32>,
     /// First tile of each view.
     first_tile: Vec<usize>,
-    blocks: Vec<Block>,
+    segments: Vec<Segment>,
 }
 
-/// What a block of sorted splats keeps from the first walk for the second.
+/// What the first pass over a segment of sorted splats keeps for the second.
 #[derive(Debug, Default)]
-struct Block {
+struct Segment {
     spans: Vec<Span>,
-    /// Per tile of the block's view: how many instances, then where the next one goes.
+    /// For each tile of the view: first the number of instances, then the place of the next one.
     cursors: Vec<u32>,
 }
 
-/// A row of tiles that a splat touches: first tile (20 bits), tiles (11 bits), last of its splat.
+/// Consecutive tiles of one row that a splat touches: first tile (bits 0 to 19), number of tiles (bits 20 to
+/// 30), whether it is the last span of its splat (bit 31).
 ///
-/// An image of 16,384 x 16,384 px has 2^20 tiles, 1,024 in a row.
+/// The largest image, 16,384 x 16,384 px, has 2^20 tiles, 1,024 in a row.
 #[derive(Clone, Copy, Debug)]
 struct Span(u32);
 
@@ -70,6 +75,12 @@ impl Span {
     }
 }
 
+/// Sorted splats of one view that one thread bins.
+struct Job<'a> {
+    view: usize,
+    keys: &'a [u64],
+}
+
 /// A view's grid of tiles.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Grid {
@@ -82,7 +93,7 @@ pub(super) struct Grid {
 }
 
 impl Grid {
-    /// The tiles of a view; the last ones of a row and of a column may be cut.
+    /// The tiles of a view; the last tile of a row or column may reach beyond the image.
     pub(super) fn new(view: &View) -> Self {
         let size_px = [view.camera.width_px, view.camera.height_px];
         let [columns, rows] = size_px.map(|size| size.div_ceil(TILE_PX));
@@ -107,31 +118,33 @@ impl Bins {
         views: &[View],
         cutoffs: &Cutoffs,
     ) -> Result<(), RenderError> {
+        // One job per segment, in order of views.
         let grids: Vec<Grid> = views.iter().map(Grid::new).collect();
-        let jobs: Vec<(usize, &[u64])> = (0..views.len())
-            .flat_map(|view| sorted.view(view).chunks(BLOCK).map(move |keys| (view, keys)))
-            .collect();
-        if self.blocks.len() < jobs.len() {
-            self.blocks.resize_with(jobs.len(), Block::default);
+        let segments_of =
+            |view| sorted.view(view).chunks(SEGMENT).map(move |keys| Job { view, keys });
+        let jobs: Vec<Job<'_>> = (0..views.len()).flat_map(segments_of).collect();
+        if self.segments.len() < jobs.len() {
+            self.segments.resize_with(jobs.len(), Segment::default);
         }
 
+        // First pass: find spans and count.
         let total = AtomicU64::new(0);
-        let blocks = self.blocks.par_iter_mut().zip(&jobs);
-        blocks.for_each_init(Vec::new, |spans, (block, (view, keys))| {
-            // Beyond the limit the frame fails whatever the rest holds: gather no more of it.
+        let segments = self.segments.par_iter_mut().zip(&jobs);
+        segments.for_each_init(Vec::new, |spans, (segment, Job { view, keys })| {
+            // Beyond the limit the frame fails whatever the rest holds, so the rest is skipped.
             if total.load(Relaxed) > MAX_INSTANCES {
                 return;
             }
             let grid = &grids[*view];
-            block.cursors.clear();
-            block.cursors.resize(grid.tiles(), 0);
+            segment.cursors.clear();
+            segment.cursors.resize(grid.tiles(), 0);
             spans.clear();
             let cut = cutoffs.log2_alpha_cut;
-            dispatch!(level, _ => count(projected, keys, grid, cut, spans, &mut block.cursors));
-            block.spans.clear();
-            block.spans.reserve_exact(spans.len());
-            block.spans.extend_from_slice(spans);
-            let count: u64 = block.cursors.iter().map(|&count| u64::from(count)).sum();
+            dispatch!(level, _ => count(projected, keys, grid, cut, spans, &mut segment.cursors));
+            segment.spans.clear();
+            segment.spans.reserve_exact(spans.len());
+            segment.spans.extend_from_slice(spans);
+            let count: u64 = segment.cursors.iter().map(|&count| u64::from(count)).sum();
             total.fetch_add(count, Relaxed);
         });
         if total.into_inner() > MAX_INSTANCES {
@@ -139,30 +152,32 @@ impl Bins {
             return Err(RenderError::TooMany { what, limit: MAX_INSTANCES });
         }
 
-        self.place(&jobs, &grids);
+        self.allocate_lists(&jobs, &grids);
 
-        self.blocks.par_iter_mut().zip(&jobs).for_each(|(block, (_, keys))| {
-            emit(keys, &block.spans, &mut block.cursors, &self.instances);
+        // Second pass: write the lists.
+        self.segments.par_iter_mut().zip(&jobs).for_each(|(segment, Job { keys, .. })| {
+            write_lists(keys, &segment.spans, &mut segment.cursors, &self.instances);
         });
         Ok(())
     }
 
-    /// Turns counts into places, tile by tile and within a tile block by block.
-    fn place(&mut self, jobs: &[(usize, &[u64])], grids: &[Grid]) {
+    /// Turns counts into places by an exclusive prefix sum, tile by tile, and within a tile segment by
+    /// segment: a tile's list keeps the order of the sort.
+    fn allocate_lists(&mut self, jobs: &[Job<'_>], grids: &[Grid]) {
         self.starts.clear();
         self.first_tile.clear();
         let mut total = 0;
-        let mut rest = &mut self.blocks[..jobs.len()];
+        let mut rest = &mut self.segments[..jobs.len()];
         for (view, grid) in grids.iter().enumerate() {
-            let count = jobs.iter().filter(|(of, _)| *of == view).count();
-            let (blocks, after) = rest.split_at_mut(count);
+            let count = jobs.iter().filter(|job| job.view == view).count();
+            let (segments, after) = rest.split_at_mut(count);
             rest = after;
             self.first_tile.push(self.starts.len());
             for tile in 0..grid.tiles() {
                 self.starts.push(total);
-                for block in &mut *blocks {
-                    let count = block.cursors[tile];
-                    block.cursors[tile] = total;
+                for segment in &mut *segments {
+                    let count = segment.cursors[tile];
+                    segment.cursors[tile] = total;
                     total += count;
                 }
             }
@@ -170,19 +185,19 @@ impl Bins {
         self.starts.push(total);
         self.used = total as usize;
         if self.instances.len() < self.used {
-            // An eighth to spare, not as much again: a drive's frames differ by little.
+            // An eighth of spare room: consecutive frames of a drive differ by little.
             let wanted = self.used + self.used / 8;
             self.instances.reserve_exact(wanted - self.instances.len());
             self.instances.resize_with(wanted, AtomicU32::default);
         }
     }
 
-    /// (Gaussian, tile) pairs of the frame.
+    /// Number of (Gaussian, tile) pairs of the frame.
     pub(super) fn instances(&self) -> usize {
         self.used
     }
 
-    /// Where each tile's list starts, all views one after the other, and the end of the last.
+    /// Start of each tile's list, view after view, and the end of the last list.
     pub(super) fn starts(&self) -> &[u32] {
         &self.starts
     }
@@ -199,7 +214,7 @@ impl Bins {
     }
 }
 
-/// Finds a block's spans, and counts its instances per tile.
+/// First pass: finds the spans of a segment, and counts its instances per tile.
 #[inline(always)]
 fn count(
     projected: &Projected,
@@ -209,9 +224,10 @@ fn count(
     spans: &mut Vec<Span>,
     counts: &mut [u32],
 ) {
-    // Read a few, then walk them: side by side, their cache misses cost little more than one.
-    let mut splats = [Splat::default(); GATHER];
-    for keys in keys.chunks(GATHER) {
+    // Splats lie in order of ids and are read in order of depth. A batch is read first, so that its cache
+    // misses overlap and cost little more than one.
+    let mut splats = [Splat::default(); READ_BATCH];
+    for keys in keys.chunks(READ_BATCH) {
         for (splat, &key) in splats.iter_mut().zip(keys) {
             *splat = *projected.splat(key as u32);
         }
@@ -227,7 +243,8 @@ fn count(
                     counts[span.tiles()].iter_mut().for_each(|count| *count += 1);
                 },
             );
-            // Slack may choose a splat that touches no pixel's centre: its one span is empty.
+            // A splat kept by EXTENT_SLACK_PX alone may touch no pixel's centre. It gets one empty span, since
+            // the second pass expects at least one span per splat.
             if spans.len() == before {
                 spans.push(Span::new(0, 0));
             }
@@ -238,8 +255,8 @@ fn count(
     }
 }
 
-/// Writes a block's instances where its cursors say.
-fn emit(keys: &[u64], spans: &[Span], cursors: &mut [u32], instances: &[AtomicU32]) {
+/// Second pass: writes the instances of a segment to the places that its cursors give.
+fn write_lists(keys: &[u64], spans: &[Span], cursors: &mut [u32], instances: &[AtomicU32]) {
     let mut spans = spans.iter();
     for &key in keys {
         for span in spans.by_ref() {
@@ -254,15 +271,19 @@ fn emit(keys: &[u64], spans: &[Span], cursors: &mut [u32], instances: &[AtomicU3
     }
 }
 
-/// Calls `visit` for every row of tiles that the ellipse `u² + v² <= power` touches.
+/// Calls `visit` with the span of every row of tiles that the ellipse `u² + v² <= power` touches, where
+/// `u = l0 dx + l1 dy` and `v = l2 dy` (see [`Splat`]) and power is `log2(opacity) - log2(alpha_cut)`.
 ///
-/// Within a band of rows the ellipse's right edge `x(dy) = s dy + √(power - (l2 dy)²)/l0`, with
-/// `s = -l1/l0`, is concave: its maximum lies at `dy* = s (power/l2²)/extent_x` or at the end of
-/// the band nearest to it. The left edge mirrors it. (Speedy-Splat, Hanson et al. 2025, finds the
-/// same set by walking the ellipse's bounds.)
+/// At the height dy the ellipse reaches to the right as far as `x(dy) = s dy + √(power - (l2 dy)²)/l0`, with
+/// `s = -l1/l0`. This is concave in dy, and its maximum over the whole ellipse lies at
+/// `dy* = s (power/l2²)/extent_x`. So its maximum over a band of rows lies at dy*, or at the end of the band
+/// that is nearest to dy*. The left edge is the mirror image. (Speedy-Splat, Hanson et al. 2025, finds the same
+/// set of tiles by following the ellipse's bounds.)
 #[inline(always)]
 fn for_each_span(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMut(Span)) {
-    let ([x, y], [extent_x, extent_y]) = (splat.mean_px, splat.extent_px);
+    // Pixels of the bounding box.
+    let [x, y] = splat.mean_px;
+    let [extent_x, extent_y] = splat.extent_px;
     let last = grid.size_px.map(|size| size as i32 - 1);
     let (left, right) = pixels(x, -extent_x, extent_x, last[0]);
     let (top, bottom) = pixels(y, -extent_y, extent_y, last[1]);
@@ -271,10 +292,13 @@ fn for_each_span(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
     }
     let tile = TILE_PX as i32;
     let span = |row: i32, left: i32, right: i32| {
-        let (first, last) = ((left / tile) as u32, (right / tile) as u32);
+        let first = (left / tile) as u32;
+        let last = (right / tile) as u32;
         Span::new(row as u32 * grid.columns + first, last - first + 1)
     };
-    let (first_row, last_row) = (top / tile, bottom / tile);
+    let first_row = top / tile;
+    let last_row = bottom / tile;
+    // In one row or one column of tiles the ellipse touches all tiles of its box.
     if left / tile == right / tile || first_row == last_row {
         for row in first_row..=last_row {
             visit(span(row, left, right));
@@ -282,6 +306,7 @@ fn for_each_span(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
         return;
     }
 
+    // Otherwise row by row, between the extremes of the left and right edge.
     let [l0, l1, l2] = splat.factor;
     let power = splat.log2_opacity - log2_cut;
     let inverse_l0 = 1.0 / l0;
@@ -302,9 +327,10 @@ fn for_each_span(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
     }
 }
 
-/// First and last pixel with its centre, at +0.5, between `center + low` and `center + high`.
+/// First and last pixel of a row or column with its centre, at +0.5, between `center + low` and
+/// `center + high`, within 0 to `last`.
 ///
-/// Float to int saturates, so the largest splat is no exception.
+/// Conversion of float to int saturates, so a splat of any size is handled.
 #[inline(always)]
 fn pixels(center: f32, low: f32, high: f32, last: i32) -> (i32, i32) {
     let first = ((center + low - 0.5).ceil() as i32).max(0);

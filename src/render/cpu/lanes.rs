@@ -1,13 +1,13 @@
-//! Three-vectors of 16 lanes.
+//! Sixteen 3D vectors, one per SIMD lane.
 //!
-//! Everything here is forced inline: a closure or an iterator adapter that stays a call of its own
-//! is compiled without the instruction set that its caller was dispatched to.
+//! Every function is `#[inline(always)]`: a function that remains a call of its own is compiled without the
+//! instruction set that its caller was dispatched to.
 
 use fearless_simd::{f32x16, prelude::*};
 
 use wildcity_scene::chunk::Lanes;
 
-/// Sixteen three-vectors.
+/// Sixteen 3D vectors, component by component.
 #[derive(Clone, Copy)]
 pub(super) struct Vec3x16<S: Simd> {
     pub(super) x: f32x16<S>,
@@ -23,7 +23,7 @@ impl<S: Simd> Vec3x16<S> {
         Self { x: f32x16::splat(simd, x), y: f32x16::splat(simd, y), z: f32x16::splat(simd, z) }
     }
 
-    /// Three columns of a block, from the first.
+    /// Three consecutive columns of a block.
     #[inline(always)]
     pub(super) fn load(simd: S, columns: &[Lanes], first: usize) -> Self {
         Self {
@@ -47,13 +47,13 @@ impl<S: Simd> Vec3x16<S> {
         }
     }
 
-    /// Each component times one factor.
+    /// Each vector times a factor of its own.
     #[inline(always)]
     pub(super) fn scale(self, by: f32x16<S>) -> Self {
         Self { x: self.x * by, y: self.y * by, z: self.z * by }
     }
 
-    /// Component times component.
+    /// The product component by component.
     #[inline(always)]
     pub(super) fn times(self, other: Self) -> Self {
         Self { x: self.x * other.x, y: self.y * other.y, z: self.z * other.z }
@@ -79,13 +79,13 @@ impl<S: Simd> Vec3x16<S> {
         Self { x: self.x - other.x, y: self.y - other.y, z: self.z - other.z }
     }
 
-    /// The larger of each component and one number.
+    /// The larger of each component and a number of its lane.
     #[inline(always)]
     pub(super) fn max(self, least: f32x16<S>) -> Self {
         Self { x: self.x.max(least), y: self.y.max(least), z: self.z.max(least) }
     }
 
-    /// The largest magnitude of a component.
+    /// The largest magnitude of the three components.
     #[inline(always)]
     pub(super) fn max_abs(self) -> f32x16<S> {
         self.x.abs().max(self.y.abs()).max(self.z.abs())

@@ -1,29 +1,30 @@
-//! The embedded default: f32, SIMD chosen at run time, all cores.
+//! The cpu backend, the default: f32, SIMD chosen at run time, all cores.
 //!
-//! Deterministic: what runs in parallel writes to places that do not depend on the schedule, and
-//! every pixel adds its splats in one order. Scratch buffers live from frame to frame.
+//! Each file is a stage: `project`, `sort`, `bin`, `rasterize`, `resolve`. The images are
+//! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
+//! splats in one order. Scratch buffers are kept from frame to frame.
 
 mod appearance;
-mod behind;
-mod bent;
+mod background;
 mod bin;
-mod handover;
+mod export;
 mod lanes;
-mod optics;
+mod lens;
+mod math;
 mod project;
 mod rasterize;
 mod resolve;
 mod sort;
 
-use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use fearless_simd::Level;
+use parking_lot::Mutex;
 use rayon::ThreadPool;
 
 use crate::limits;
 
-use self::behind::Behind;
+use self::background::Background;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -36,10 +37,10 @@ pub struct Cpu {
     scratch: Mutex<Scratch>,
 }
 
-/// Instruction sets that can be asked for; the best one that the machine has is the default.
+/// Instruction sets that can be requested; the default is the best one of the machine.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Simd {
-    /// The best of the machine.
+    /// The best one of the machine.
     #[default]
     Best,
     /// Sixteen lanes.
@@ -50,16 +51,16 @@ pub enum Simd {
     Sse42,
 }
 
-/// Why the backend could not be made.
+/// Why the backend could not be created.
 #[derive(Debug, thiserror::Error)]
 pub enum CpuError {
-    /// The machine lacks the instruction set asked for.
+    /// The machine lacks the requested instruction set.
     #[error("this machine has no {0:?}")]
     NoSuchSimd(Simd),
-    /// More threads than any machine has cores.
+    /// More threads than [`limits::RENDER_THREADS`].
     #[error("{threads} render threads; 0 to {} are accepted", limits::RENDER_THREADS)]
     TooManyThreads {
-        /// How many were asked for.
+        /// The requested number.
         threads: usize,
     },
     /// The threads could not be started.
@@ -67,7 +68,7 @@ pub enum CpuError {
     Threads(rayon::ThreadPoolBuildError),
 }
 
-/// What a frame leaves behind for the next one to fill again.
+/// Buffers that each frame fills anew.
 #[derive(Debug, Default)]
 struct Scratch {
     projected: project::Projected,
@@ -76,10 +77,10 @@ struct Scratch {
 }
 
 impl Cpu {
-    /// A backend with threads of its own: `threads`, or one per core if 0.
+    /// A backend with its own thread pool of `threads` threads, or one per core if 0.
     ///
     /// # Errors
-    /// The machine lacks the instruction set, or the threads; or there are too many of them.
+    /// The machine lacks the instruction set, the threads cannot be started, or there are too many of them.
     pub fn new(threads: usize, simd: Simd) -> Result<Self, CpuError> {
         if threads > limits::RENDER_THREADS {
             return Err(CpuError::TooManyThreads { threads });
@@ -103,10 +104,11 @@ impl Cpu {
         Ok(Self { pool, level, scratch: Mutex::default() })
     }
 
-    /// Runs the stages up to and including `last`, for another backend to go on or to compare with.
+    /// Runs the stages up to and including `last`, and returns their outputs, for another backend to continue
+    /// from or to compare with.
     ///
     /// # Errors
-    /// The views are none or too many, or there are too many instances.
+    /// No view, too many views, a profile with exact rays, or too many (Gaussian, tile) pairs.
     pub fn run_through(
         &self,
         frame: &Frame<'_>,
@@ -114,23 +116,23 @@ impl Cpu {
     ) -> Result<(StageOutputs, FrameStats), RenderError> {
         frame.check_views()?;
         frame.check_splats(self.name())?;
-        let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut scratch = self.scratch.lock();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
-            let mut clock = Clock::start();
-            let between = handover::between(scratch, last, &cutoffs);
-            clock.stage("hand over", &mut stats);
-            Ok((between, stats))
+            let mut timer = StageTimer::start();
+            let outputs = export::stage_outputs(scratch, last, &cutoffs);
+            timer.finish("hand over", &mut stats);
+            Ok((outputs, stats))
         })
     }
 }
 
 impl Scratch {
-    /// Runs the stages up to `last`. Each fills its part from the start, so what a frame before left
-    /// there, or a panic, does no harm.
+    /// Runs the stages up to and including `last`. Each stage overwrites its part, so what an earlier frame
+    /// left there, even one that panicked, does not matter.
     fn run(
         &mut self,
         level: Level,
@@ -140,17 +142,17 @@ impl Scratch {
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
         let Self { projected, sorted, bins } = self;
-        let mut clock = Clock::start();
+        let mut timer = StageTimer::start();
         projected.project(level, frame, cutoffs);
-        clock.stage("project", stats);
+        timer.finish("project", stats);
         stats.visible_pairs = projected.len() as u64;
         if last >= Stage::Sort {
             sorted.sort(projected, cutoffs);
-            clock.stage("sort", stats);
+            timer.finish("sort", stats);
         }
         if last >= Stage::Bin {
             bins.bin(level, projected, sorted, frame.views, cutoffs)?;
-            clock.stage("bin", stats);
+            timer.finish("bin", stats);
             stats.instances = bins.instances() as u64;
         }
         Ok(())
@@ -163,7 +165,7 @@ impl Backend for Cpu {
     }
 
     fn detail(&self) -> String {
-        // Four lanes have no fused multiply-add, so instruction sets differ in the last bit.
+        // SSE4.2 has no fused multiply-add, so instruction sets differ in the last bit.
         let token = format!("{:?}", self.level);
         token.split('(').next().unwrap_or_default().to_owned()
     }
@@ -180,37 +182,43 @@ impl Backend for Cpu {
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
-        // Outside of the pool: baking waits for threads, and one that waits for its own pool may take up
-        // other work there.
-        let behind = Behind::of(frame)?;
-        let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
+        // Outside of the pool: baking a sky waits for other threads, and a thread that waits within its own
+        // rayon pool may start unrelated work of the pool.
+        let backgrounds = Background::of(frame)?;
+        let mut scratch = self.scratch.lock();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
-            let mut clock = Clock::start();
+            let mut timer = StageTimer::start();
             let Scratch { projected, bins, .. } = scratch;
-            let (views, behind) = (frame.views, &*behind);
-            let input = rasterize::Input { projected, bins, views, behind, cutoffs: &cutoffs };
+            let input = rasterize::Input {
+                projected,
+                bins,
+                views: frame.views,
+                backgrounds: &backgrounds,
+                cutoffs: &cutoffs,
+            };
             stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
-            clock.stage("rasterize", &mut stats);
+            timer.finish("rasterize", &mut stats);
             Ok(stats)
         })
     }
 }
 
-struct Clock {
+/// Wall time of consecutive stages.
+struct StageTimer {
     start: Instant,
 }
 
-impl Clock {
+impl StageTimer {
     fn start() -> Self {
         Self { start: Instant::now() }
     }
 
-    /// What has passed since the last stage is this one's.
-    fn stage(&mut self, name: &'static str, stats: &mut FrameStats) {
+    /// Records the time since the end of the previous stage.
+    fn finish(&mut self, name: &'static str, stats: &mut FrameStats) {
         let now = Instant::now();
         stats.stages_ms.push((name, (now - self.start).as_secs_f64() * 1e3));
         self.start = now;

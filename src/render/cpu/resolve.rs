@@ -1,4 +1,4 @@
-//! Stage resolve: a tile's sums become the pixels that were asked for.
+//! Stage resolve: the sums of a tile become the pixels of the requested images.
 
 use fearless_simd::{f32x16, prelude::*, u32x16};
 
@@ -7,30 +7,39 @@ use crate::{Target, View};
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::chunk::LANES;
 
-const BLOCKS: usize = 16;
+/// Blocks of a tile, row by row.
+pub(super) const BLOCKS: usize = (TILE_PX / BLOCK_PX * (TILE_PX / BLOCK_PX)) as usize;
 
-/// What the 256 pixels of a tile have gathered, block by block.
+/// Column and row of a block's top left pixel, from that of its tile.
+#[inline(always)]
+pub(super) fn block_corner(block: usize) -> [u32; 2] {
+    let per_row = TILE_PX / BLOCK_PX;
+    [block as u32 % per_row * BLOCK_PX, block as u32 / per_row * BLOCK_PX]
+}
+
+/// Accumulated values of the 256 pixels of a tile, block by block.
 #[derive(Debug)]
 #[repr(C, align(64))]
 pub(super) struct TileSums {
     /// Linear premultiplied red, green, blue.
     pub(super) rgb: [[[f32; LANES]; BLOCKS]; 3],
-    /// Depth weighted by contribution, in metres; zero unless wanted.
+    /// Depth weighted by contribution, in metres; 0 unless depth is requested.
     pub(super) depth_m: [[f32; LANES]; BLOCKS],
-    /// Share of the background that is seen.
+    /// Share of the background that shows.
     pub(super) transmittance: [[f32; LANES]; BLOCKS],
-    /// Transmittance that runs on where a pixel has stopped.
+    /// Transmittance that continues to fall after a pixel has stopped (see `rasterize::blend`).
     pub(super) running: [[f32; LANES]; BLOCKS],
 }
 
 impl Default for TileSums {
     fn default() -> Self {
-        let (zero, one) = ([[0.0; LANES]; BLOCKS], [[1.0; LANES]; BLOCKS]);
+        let zero = [[0.0; LANES]; BLOCKS];
+        let one = [[1.0; LANES]; BLOCKS];
         Self { rgb: [zero; 3], depth_m: zero, transmittance: one, running: one }
     }
 }
 
-/// The rows of a target under one row of tiles.
+/// The part of a target that one row of tiles covers.
 #[derive(Debug, Default)]
 pub(super) struct Band<'a> {
     width: usize,
@@ -39,20 +48,21 @@ pub(super) struct Band<'a> {
     rgb8: Option<&'a mut [u8]>,
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
-    /// What the camera makes of the colours.
+    /// Exposure and overlay of the camera; `None` if they change nothing.
     pub(super) appearance: Option<&'a Appearance>,
 }
 
 impl Band<'_> {
-    /// Whether depth has to be gathered.
+    /// Whether depth must be accumulated.
     pub(super) fn wants_depth(&self) -> bool {
         self.depth_m.is_some()
     }
 }
 
-/// Cuts a target into the bands of its view's rows of tiles.
+/// Splits a target into bands, one per row of tiles of its view.
 pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>> {
-    let (width, height) = (view.camera.width_px as usize, view.camera.height_px as usize);
+    let width = view.camera.width_px as usize;
+    let height = view.camera.height_px as usize;
     let pixels = width * TILE_PX as usize;
     let appearance = target.appearance.filter(|appearance| !appearance.is_identity());
     let mut rgba = target.rgba.as_mut().map(|b| b.chunks_mut(4 * pixels));
@@ -73,7 +83,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
         .collect()
 }
 
-/// Writes one tile whose left edge is at column `left`.
+/// Writes one tile with its left edge at column `left`.
 #[inline(always)]
 pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, left: u32, band: &mut Band<'_>) {
     for block in 0..BLOCKS {
@@ -84,8 +94,9 @@ pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, left: u32, band: &mut B
 #[inline(always)]
 fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, band: &mut Band<'_>) {
     let edge = BLOCK_PX as usize;
-    let (column, row) = (left as usize + block % edge * edge, block / edge * edge);
-    // Images need not be multiples of 16 px: nothing is written beyond their edges.
+    let [block_left, row] = block_corner(block).map(|px| px as usize);
+    let column = left as usize + block_left;
+    // An image's size need not be a multiple of 16 px: pixels beyond its edges are not written.
     let columns = edge.min(band.width.saturating_sub(column));
     let rows = edge.min(band.rows.saturating_sub(row));
     let each = |write: &mut dyn FnMut(usize, usize)| {

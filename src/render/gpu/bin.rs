@@ -1,68 +1,95 @@
-//! Stage bin: the splats of every tile, from the nearest.
+//! Stage bin: lists the splats of every tile in order of depth.
 //!
-//! In two levels: each splat is listed with the macro tiles of 8 x 4 tiles that it touches, a bit per
-//! tile; the radix sort brings these touches, a quarter as many as instances, in order of macro tiles;
-//! and then each macro tile hands its splats to its tiles.
+//! Binning has two levels. Each splat is listed with the macro tiles of 8 x 4 tiles that it touches, and
+//! with one bit for each touched tile, by the same exact test per row of tiles as on the cpu. Such a
+//! (splat, macro tile) pair is a touch. The radix sort orders the touches by macro tile: there are a
+//! quarter as many of them as (splat, tile) pairs, which are called instances. Then one workgroup per
+//! macro tile distributes its splats to its tiles, 1,024 at a time, by transposing a bit matrix.
 //!
-//! Twin of `render/cpu/bin.rs`; WGSL: `bin`, `sort`, `ranges` and `expand` in `shaders`.
+//! Binning and its sort take half the time and half the bytes of sorting all instances, and produce the
+//! same lists. The last part is necessary: when each tile of `rasterize` instead picked its splats from
+//! its macro tile's list, the step took longer than with one level, since 32 tiles read every mask.
+//! `BENCHMARKS.md` has the numbers.
+//!
+//! Twin of `render/cpu/bin.rs`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
 
 use wgpu::{Buffer, ComputePass};
 
 use super::device::Device;
-use super::growing::{Growing, HANDED_OVER};
-use super::kernel::{Groups, Kernel, module, slot};
-use super::layout::Job;
+use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
+use super::kernel::{Groups, Kernel, module};
 use super::plan::{Plan, job};
-use super::project::Splats;
+use super::project::SplatBuffers;
 use super::scan::Scan;
-use super::shaders::Shaders;
 use super::sort::Columns;
 use crate::constants::MAX_INSTANCES;
 
-/// The stage on the device, and the lists that it leaves.
+/// The kernels of the stage, and the lists that it writes.
 #[derive(Debug)]
 pub(super) struct Bin {
     count_touches: Kernel,
     emit_touches: Kernel,
-    ranges_of: Kernel,
+    find_ranges: Kernel,
     count_instances: Kernel,
     list_instances: Kernel,
-    /// Per splat, where its touches go.
-    splat_offsets: Growing,
-    /// Of each touch, before and after each pass of the sort: the macro tile, ...
-    macros: [Growing; 2],
-    /// ... the splat, ...
-    places: [Growing; 2],
-    /// ... and a bit for each of the macro tile's tiles that it touches.
-    masks: [Growing; 2],
-    /// First and end of each macro tile's touches.
-    macro_ranges: Growing,
-    /// Per tile, where its instances go.
-    tile_offsets: Growing,
-    /// First and end of each tile's instances.
-    pub(super) ranges: Growing,
+    /// For each splat, the index of its first touch.
+    splat_offsets: GrowableBuffer,
+    /// The macro tile of each touch. Of this and the next two, the sort needs two buffers each.
+    touch_macro_tiles: [GrowableBuffer; 2],
+    /// The splat of each touch.
+    touch_splats: [GrowableBuffer; 2],
+    /// For each touch, one bit for each touched tile of the macro tile.
+    touch_masks: [GrowableBuffer; 2],
+    /// Range of each macro tile's touches.
+    macro_ranges: GrowableBuffer,
+    /// For each tile, the index of its first instance.
+    tile_offsets: GrowableBuffer,
+    /// Range of each tile's instances.
+    pub(super) ranges: GrowableBuffer,
     /// The splat of each instance, tile after tile.
-    pub(super) instances: Growing,
+    pub(super) instances: GrowableBuffer,
+}
+
+/// What the stage needs room for.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct BinSizes {
+    /// Splats of a region.
+    pub(super) splats: u64,
+    /// Macro tiles of the frame.
+    pub(super) macro_tiles: u32,
+    /// Tiles of the frame.
+    pub(super) tiles: u32,
+    /// Touches of a region.
+    pub(super) touches: u64,
+    /// Instances of a region.
+    pub(super) instances: u64,
+}
+
+/// How many touches and instances the buffers can hold.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct BinCapacity {
+    pub(super) touches: u32,
+    pub(super) instances: u32,
 }
 
 impl Bin {
-    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
-        let kernel = |name, entry| Kernel::new(device, &module(device, shaders, name), entry, &[]);
-        let growing = |label| Growing::new(device, label, HANDED_OVER);
+    pub(super) fn new(device: &Device) -> Self {
+        let kernel = |name, entry| Kernel::new(device, &module(device, name), entry, &[]);
+        let buffer = |label| GrowableBuffer::new(device, label, INTERMEDIATE);
         Self {
             count_touches: kernel("bin", "count"),
             emit_touches: kernel("bin", "emit"),
-            ranges_of: kernel("ranges", "main"),
+            find_ranges: kernel("ranges", "main"),
             count_instances: kernel("expand", "count"),
             list_instances: kernel("expand", "list"),
-            splat_offsets: growing("splat offsets"),
-            macros: [growing("touch macros"), growing("touch macros")],
-            places: [growing("touch places"), growing("touch places")],
-            masks: [growing("touch masks"), growing("touch masks")],
-            macro_ranges: growing("macro ranges"),
-            tile_offsets: growing("tile offsets"),
-            ranges: growing("ranges"),
-            instances: growing("instances"),
+            splat_offsets: buffer("splat offsets"),
+            touch_macro_tiles: [buffer("touch macro tiles"), buffer("touch macro tiles")],
+            touch_splats: [buffer("touch splats"), buffer("touch splats")],
+            touch_masks: [buffer("touch masks"), buffer("touch masks")],
+            macro_ranges: buffer("macro tile ranges"),
+            tile_offsets: buffer("tile offsets"),
+            ranges: buffer("ranges"),
+            instances: buffer("instances"),
         }
     }
 
@@ -71,108 +98,114 @@ impl Bin {
         MAX_INSTANCES.min(device.binding_bytes() / 4)
     }
 
-    /// Makes room for the offsets and ranges of a frame, for touches and for instances, and tells how
-    /// many of the latter two fit then.
-    pub(super) fn reserve(
-        &mut self,
-        device: &Device,
-        splats: u64,
-        (macros, tiles): (u32, u32),
-        (touches, instances): (u64, u64),
-    ) -> (u32, u32) {
-        self.splat_offsets.reserve(device, 4 * splats);
-        self.macro_ranges.reserve(device, 8 * u64::from(macros));
-        self.tile_offsets.reserve(device, 4 * u64::from(tiles));
-        self.ranges.reserve(device, 8 * u64::from(tiles));
-        self.instances.reserve(device, 4 * instances);
-        for words in [&mut self.macros, &mut self.places, &mut self.masks].into_iter().flatten() {
-            words.reserve(device, 4 * touches);
+    /// Makes room. Returns what the buffers can hold then.
+    pub(super) fn reserve(&mut self, device: &Device, sizes: BinSizes) -> BinCapacity {
+        self.splat_offsets.reserve(device, 4 * sizes.splats);
+        self.macro_ranges.reserve(device, 8 * u64::from(sizes.macro_tiles));
+        self.tile_offsets.reserve(device, 4 * u64::from(sizes.tiles));
+        self.ranges.reserve(device, 8 * u64::from(sizes.tiles));
+        self.instances.reserve(device, 4 * sizes.instances);
+        let touches = [&mut self.touch_macro_tiles, &mut self.touch_splats, &mut self.touch_masks];
+        for buffer in touches.into_iter().flatten() {
+            buffer.reserve(device, 4 * sizes.touches);
         }
-        let held = |words: &Growing| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
-        (held(&self.macros[0]), held(&self.instances))
+        let capacity =
+            |words: &GrowableBuffer| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
+        BinCapacity {
+            touches: capacity(&self.touch_macro_tiles[0]),
+            instances: capacity(&self.instances),
+        }
     }
 
     /// Lists the touches of all splats; `sorted` tells which of their buffers are in order.
-    pub(super) fn touch(
+    pub(super) fn list_touches(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
-        (plan, scan): (&Plan, &Scan),
-        (splats, sorted): (&Splats, usize),
+        plan: &Plan,
+        scan: &Scan,
+        splats: &SplatBuffers,
+        sorted: usize,
     ) {
-        let jobs = plan.jobs();
+        let job = plan.job(job::SPLATS);
+        let groups = Groups::Job(job);
         let common = [
             (0, plan.frame().as_entire_binding()),
-            (1, slot(jobs, job::SPLATS, size_of::<Job>())),
+            (1, job.bind()),
             (3, splats.keys[sorted].bind()),
-            (4, splats.places[sorted].bind()),
+            (4, splats.indices[sorted].bind()),
             (5, splats.shapes.bind()),
             (6, self.splat_offsets.bind()),
         ];
-        let groups = Groups::Job(jobs, job::SPLATS);
         self.count_touches.run(device, pass, groups, &common);
-        scan.run(device, pass, (jobs, job::SPLATS_SCAN), self.splat_offsets.buffer());
-        plan.touches(device, pass, scan.block_sums());
-        let emitted = [
-            (2, slot(jobs, job::TOUCHES, size_of::<Job>())),
-            (7, self.macros[0].bind()),
-            (8, self.places[0].bind()),
-            (9, self.masks[0].bind()),
+        scan.run(device, pass, plan.job(job::SPLATS_SCAN), self.splat_offsets.buffer());
+        plan.set_touches(device, pass, scan.block_sums());
+        let outputs = [
+            (2, plan.job(job::TOUCHES).bind()),
+            (7, self.touch_macro_tiles[0].bind()),
+            (8, self.touch_splats[0].bind()),
+            (9, self.touch_masks[0].bind()),
         ];
-        let all: Vec<_> = common.into_iter().chain(emitted).collect();
+        let all: Vec<_> = common.into_iter().chain(outputs).collect();
         self.emit_touches.run(device, pass, groups, &all);
     }
 
-    /// What is to be sorted between [`Bin::touch`] and [`Bin::expand`].
+    /// The touches, which must be sorted between [`Bin::list_touches`] and [`Bin::list_instances`].
     pub(super) fn touches(&self) -> Columns<'_> {
-        Columns { keys: &self.macros, values: &self.places, masks: Some(&self.masks) }
+        Columns {
+            keys: &self.touch_macro_tiles,
+            values: &self.touch_splats,
+            masks: Some(&self.touch_masks),
+        }
     }
 
-    /// Lists the splats of all tiles; `sorted` tells which touches are in order.
-    pub(super) fn expand(
+    /// Lists the splats of all tiles; `sorted` tells which buffers of the touches are in order.
+    pub(super) fn list_instances(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
-        (plan, scan): (&Plan, &Scan),
-        (macros, sorted): (u32, usize),
+        plan: &Plan,
+        scan: &Scan,
+        macro_tiles: u32,
+        sorted: usize,
     ) {
-        let jobs = plan.jobs();
+        // The range of touches of each macro tile.
+        let touches = plan.job(job::TOUCHES);
         let frame = (0, plan.frame().as_entire_binding());
         let found = [
             frame.clone(),
-            (1, slot(jobs, job::TOUCHES, size_of::<Job>())),
-            (2, self.macros[sorted].bind()),
+            (1, touches.bind()),
+            (2, self.touch_macro_tiles[sorted].bind()),
             (3, self.macro_ranges.bind()),
         ];
-        self.ranges_of.run(device, pass, Groups::Job(jobs, job::TOUCHES), &found);
+        self.find_ranges.run(device, pass, Groups::Job(touches), &found);
 
-        let groups = Groups::Count(macros);
-        let counted = [
+        // The number of splats of each tile.
+        let groups = Groups::Count(macro_tiles);
+        let common = [
             frame,
             (1, self.macro_ranges.bind()),
-            (2, self.masks[sorted].bind()),
+            (2, self.touch_masks[sorted].bind()),
             (4, self.tile_offsets.bind()),
         ];
-        let crowd = (8, plan.counters().as_entire_binding());
-        self.count_instances.run(
-            device,
-            pass,
-            groups,
-            &counted.iter().cloned().chain([crowd]).collect::<Vec<_>>(),
-        );
-        scan.run(device, pass, (jobs, job::TILES), self.tile_offsets.buffer());
-        plan.instances(device, pass, scan.block_sums());
-        let listed = [
-            (3, self.places[sorted].bind()),
-            (5, slot(jobs, job::INSTANCES, size_of::<Job>())),
+        let counters = [(8, plan.counters().as_entire_binding())];
+        let counted: Vec<_> = common.iter().cloned().chain(counters).collect();
+        self.count_instances.run(device, pass, groups, &counted);
+
+        // The list of each tile.
+        scan.run(device, pass, plan.job(job::TILES), self.tile_offsets.buffer());
+        plan.set_instances(device, pass, scan.block_sums());
+        let outputs = [
+            (3, self.touch_splats[sorted].bind()),
+            (5, plan.job(job::INSTANCES).bind()),
             (6, self.ranges.bind()),
             (7, self.instances.bind()),
         ];
-        let all: Vec<_> = counted.into_iter().chain(listed).collect();
+        let all: Vec<_> = common.into_iter().chain(outputs).collect();
         self.list_instances.run(device, pass, groups, &all);
     }
 
-    /// The buffer that must be zero before [`Bin::expand`].
+    /// The buffer that must be cleared before [`Bin::list_instances`].
     pub(super) fn macro_ranges(&self) -> &Buffer {
         self.macro_ranges.buffer()
     }

@@ -1,19 +1,29 @@
-//! Which device, and what went wrong on it. Nothing here panics: a machine without a driver, a name
-//! that no adapter has and a device that dies are ordinary errors.
+//! Choosing and opening a device, its limits, and its errors. Nothing here panics: a machine without a
+//! driver, a name that no adapter has, and a device that is lost are ordinary errors.
+//!
+//! # Software devices
+//!
+//! The backend is tested on Mesa's software device, lavapipe. Such devices leave a shader's loops,
+//! without an error, after 65,535 iterations of all of its loops together. The limits
+//! [`Device::max_tile_splats`], [`Device::max_macro_tile_touches`], and [`Device::max_view_tiles`] keep
+//! each shader below that number: frames are split into more regions, or refused. Other devices have no
+//! such limit.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
-use std::sync::{Arc, Mutex, PoisonError};
 
 use futures_util::FutureExt;
+use parking_lot::Mutex;
 use wgpu::{
     Adapter, AdapterInfo, Backends, Buffer, BufferDescriptor, BufferUsages, DeviceDescriptor,
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, PollType, Queue,
 };
 
 use super::layout::{EXPAND_BATCH, MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
+use super::shaders::Shaders;
 use crate::RenderError;
 
 /// Why there is no GPU to render on.
@@ -21,16 +31,16 @@ use crate::RenderError;
 pub enum GpuError {
     /// The machine has no Vulkan driver, or the driver has no device.
     #[error(
-        "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a device in \
-         software; `wildcity devices` lists what is found"
+        "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software device; \
+         `wildcity devices` lists the devices that are found"
     )]
     NoAdapter,
-    /// Nothing goes by this name or number.
-    #[error("no device is called {choice:?}; there are {}", found.join(", "))]
+    /// No device has this name or number.
+    #[error("no device is called {choice:?}; the devices are {}", found.join(", "))]
     NoSuchAdapter {
-        /// What was asked for.
+        /// The requested name or number.
         choice: String,
-        /// What was found, numbered.
+        /// The devices that were found, numbered.
         found: Vec<String>,
     },
     /// The driver refuses to open the device.
@@ -38,16 +48,16 @@ pub enum GpuError {
     Device {
         /// The adapter's name.
         name: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
-    /// The device opened, but a stage could not be compiled for it.
+    /// The device opened, but a shader could not be compiled for it.
     #[error(transparent)]
     Stages(#[from] RenderError),
     /// The threads that copy images could not be started.
     #[error("cannot start the render threads: {reason}")]
     Threads {
-        /// The system's words.
+        /// The system's message.
         reason: String,
     },
 }
@@ -55,16 +65,17 @@ pub enum GpuError {
 /// Which adapter to use.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum AdapterChoice {
-    /// The fastest kind: a card of its own, before one that shares memory, before software.
+    /// The fastest kind: discrete before integrated before virtual before software.
     #[default]
     Best,
     /// The fastest kind that is not software.
     Hardware,
-    /// Its number in [`devices`], or else a part of its name in any case; of several the first.
+    /// The device with this number in [`devices`], or else the first one whose name contains this text,
+    /// in upper or lower case.
     Named(String),
 }
 
-/// What a device is and can do, as its driver says.
+/// Properties and limits of a device, as its driver reports them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DeviceInfo {
     /// The driver's name for it.
@@ -73,7 +84,7 @@ pub struct DeviceInfo {
     pub kind: &'static str,
     /// The driver and its version.
     pub driver: String,
-    /// Most bytes that a shader sees of one buffer.
+    /// Most bytes of one storage buffer binding.
     pub binding_bytes: u64,
     /// Most bytes of one buffer.
     pub buffer_bytes: u64,
@@ -85,18 +96,19 @@ pub struct DeviceInfo {
     pub groups_per_dimension: u32,
     /// Fewest and most threads of a subgroup.
     pub subgroup_threads: RangeInclusive<u32>,
-    /// Whether the device times its stages itself.
+    /// Whether the device can time its stages (timestamp queries).
     pub has_clock: bool,
 }
 
-/// The devices of this machine, the fastest kind first, and in the driver's order within a kind.
+/// The devices of this machine, the fastest kind first, in the driver's order within a kind.
 pub fn devices() -> Vec<DeviceInfo> {
     adapters().iter().map(DeviceInfo::new).collect()
 }
 
 impl DeviceInfo {
     fn new(adapter: &Adapter) -> Self {
-        let (info, limits) = (adapter.get_info(), adapter.limits());
+        let info = adapter.get_info();
+        let limits = adapter.limits();
         Self {
             kind: match info.device_type {
                 DeviceType::DiscreteGpu => "discrete",
@@ -121,13 +133,13 @@ impl DeviceInfo {
 fn adapters() -> Vec<Adapter> {
     let instance = Instance::new(InstanceDescriptor {
         backends: Backends::VULKAN,
-        // Every group count is computed by `plan.wgsl` within the limits that the validation would
-        // check, at the price of one more dispatch per indirect one.
-        // WGPU_VALIDATION=1 in the environment asks for the Vulkan validation layer.
+        // wgpu's validation of indirect dispatches costs one more dispatch each. It is not needed:
+        // `plan.wgsl` computes all workgroup counts within the limits that it would check.
+        // WGPU_VALIDATION=1 in the environment enables the Vulkan validation layer.
         flags: InstanceFlags::default().with_env() - InstanceFlags::VALIDATION_INDIRECT_CALL,
         ..InstanceDescriptor::new_without_display_handle()
     });
-    // Outside of browsers the answer is there at once.
+    // Outside of browsers this future is ready at once.
     let found = instance.enumerate_adapters(Backends::VULKAN).now_or_never();
     let mut found = found.unwrap_or_default();
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
@@ -171,56 +183,61 @@ impl AdapterChoice {
     }
 }
 
-/// Whether it is worth asking for devices in hardware. Linux gives each a node, those of NVIDIA and of
-/// Windows beneath names of their own; where there is none, no Vulkan library is loaded.
+/// Whether the machine may have a hardware device. Linux has device nodes for them, under separate names
+/// for NVIDIA's driver and for WSL; without any of them, the Vulkan library need not be loaded.
 fn may_have_hardware() -> bool {
     let nodes = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg"];
     cfg!(not(target_os = "linux")) || nodes.iter().any(|node| Path::new(node).exists())
 }
 
-/// An open device.
+/// An open device, and the shaders that run on it.
 #[derive(Debug)]
 pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: Queue,
     pub(super) info: AdapterInfo,
+    shaders: Shaders,
     limits: Limits,
-    /// Most bytes of a binding, however many the adapter's own limits allow.
+    /// Most bytes of a binding, even if the adapter allows more.
     binding_limit: u64,
-    /// The first thing that went wrong since the last look.
+    /// The first error since the last [`Device::check`].
     fault: Arc<Mutex<Option<String>>>,
-    /// What was made and run, so that who pays for what can be shown.
-    totals: Counted,
+    /// What was created and run, so that the cost of each feature can be reported.
+    totals: AtomicTotals,
 }
 
-/// [`DeviceTotals`] in the making.
+/// The counters behind [`DeviceTotals`].
 #[derive(Debug, Default)]
-struct Counted {
+struct AtomicTotals {
     pipelines: AtomicU64,
     buffers: AtomicU64,
     dispatches: AtomicU64,
 }
 
-/// What was made and run on a device since it was opened.
+/// What was created and run on a device since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DeviceTotals {
     /// Kernels that were compiled.
     pub pipelines: u64,
-    /// Buffers, those that grew anew.
+    /// Buffers that were created; a buffer that grows counts again.
     pub buffers: u64,
     /// Kernels that were started.
     pub dispatches: u64,
 }
 
 impl Device {
-    /// Opens a device with all that its adapter can do, but for bindings of at most `binding_limit`
-    /// bytes.
+    /// Opens a device with its adapter's limits, except that bindings hold at most `binding_limit` bytes.
     ///
     /// # Errors
-    /// There is none, or it does not open.
-    pub(super) fn open(choice: &AdapterChoice, binding_limit: u64) -> Result<Self, GpuError> {
+    /// There is no such device, or the driver does not open it.
+    pub(super) fn open(
+        choice: &AdapterChoice,
+        shaders: &Shaders,
+        binding_limit: u64,
+    ) -> Result<Self, GpuError> {
         let adapter = choice.find()?;
-        let (info, limits) = (adapter.get_info(), adapter.limits());
+        let info = adapter.get_info();
+        let limits = adapter.limits();
         let descriptor = DeviceDescriptor {
             required_features: adapter.features() & Features::TIMESTAMP_QUERY,
             required_limits: limits.clone(),
@@ -228,30 +245,43 @@ impl Device {
         };
         let failed = |reason: String| GpuError::Device { name: info.name.clone(), reason };
         let opened = adapter.request_device(&descriptor).now_or_never();
-        let opened = opened.ok_or_else(|| failed("the driver does not answer".into()))?;
+        let opened = opened.ok_or_else(|| failed("the driver does not respond".into()))?;
         let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
 
-        // At once: an error that nobody listens to would end the process.
+        // The handlers are set first of all: without one, an error ends the process.
         let fault = Arc::new(Mutex::new(None));
-        let note = |fault: &Mutex<Option<String>>, reason: String| {
-            let mut fault = fault.lock().unwrap_or_else(PoisonError::into_inner);
-            fault.get_or_insert(reason);
+        let keep_first = |fault: &Mutex<Option<String>>, reason: String| {
+            fault.lock().get_or_insert(reason);
         };
-        let (refused, lost) = (Arc::clone(&fault), Arc::clone(&fault));
+        let on_error = Arc::clone(&fault);
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            note(&refused, error.to_string());
+            keep_first(&on_error, error.to_string());
         }));
-        device.set_device_lost_callback(move |_, message| note(&lost, message));
-        Ok(Self { device, queue, info, limits, binding_limit, fault, totals: Counted::default() })
+        let on_lost = Arc::clone(&fault);
+        device.set_device_lost_callback(move |_, message| keep_first(&on_lost, message));
+        Ok(Self {
+            device,
+            queue,
+            info,
+            shaders: shaders.clone(),
+            limits,
+            binding_limit,
+            fault,
+            totals: AtomicTotals::default(),
+        })
     }
 
-    /// Tells of what went wrong since the last call.
+    /// The shaders that run on this device.
+    pub(super) fn shaders(&self) -> &Shaders {
+        &self.shaders
+    }
+
+    /// Reports the first error since the last call.
     ///
     /// # Errors
-    /// A command was refused, memory ran out, or the device is lost.
+    /// A command was invalid, memory ran out, or the device is lost.
     pub(super) fn check(&self) -> Result<(), RenderError> {
-        let mut fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner);
-        match fault.take() {
+        match self.fault.lock().take() {
             None => Ok(()),
             Some(reason) => Err(self.failed(reason)),
         }
@@ -262,74 +292,80 @@ impl Device {
         RenderError::Device { device: self.info.name.clone(), reason }
     }
 
-    /// Most bytes that a shader sees at once: 128 MiB on lavapipe, 2 GiB on cards.
+    /// Most bytes of a binding, a multiple of 256: 128 MiB on lavapipe, 2 GiB on graphics cards.
     pub(super) fn binding_bytes(&self) -> u64 {
         let own = self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size);
         own.min(self.binding_limit) / 256 * 256
     }
 
-    /// Bytes of the device's memory that its buffers take, as the allocator counts them.
+    /// Bytes of device memory that the buffers take, as the allocator counts them.
     pub(super) fn allocated_bytes(&self) -> Option<u64> {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most splats of a tile that are blended, where what is behind them takes so many iterations. A batch
-    /// of `rasterize` takes one iteration, one for each of its splats, and two that load them.
-    pub(super) fn tile_splats(&self, behind: u64) -> u64 {
+    /// Most splats that a tile can blend, if the background takes `background_iterations` loop iterations
+    /// of a thread. A batch of `rasterize` takes one iteration, one for each of its splats, and two to
+    /// load them.
+    pub(super) fn max_tile_splats(&self, background_iterations: u64) -> u64 {
         let batch = u64::from(RASTER_BATCH);
-        let blended = |most: u64| most.saturating_sub(behind) / (batch + 3) * batch;
+        let blended = |most: u64| most.saturating_sub(background_iterations) / (batch + 3) * batch;
         self.loop_iterations().map_or(u64::MAX, blended)
     }
 
-    /// Most touches of a macro tile that `expand` hands on. Half of the iterations are for batches of
-    /// 1,024, 45 each; the other half for tiles that are touched: with at most 64,000 splats a tile
-    /// ([`Device::tile_splats`]), 2 million of a macro tile, twice over 256 threads, 16,000 each.
-    pub(super) fn macro_touches(&self) -> u64 {
+    /// Most touches of a macro tile that `expand` can distribute.
+    ///
+    /// Half of the iterations are for batches of 1,024 touches, 45 iterations each. The other half is for
+    /// the touched tiles: with at most 64,000 splats per tile ([`Device::max_tile_splats`]), a macro tile
+    /// has 2 million (splat, tile) pairs, which are visited twice by 256 threads: 16,000 iterations of a
+    /// thread.
+    pub(super) fn max_macro_tile_touches(&self) -> u64 {
         let batch = u64::from(EXPAND_BATCH);
         self.loop_iterations().map_or(u32::MAX.into(), |most| most / 2 / 45 * batch)
     }
 
-    /// Most tiles of a view that are binned at once, should 256 splats of one workgroup of `emit`
-    /// cover all of them: each takes 20 iterations, and 13 for every 256 macro tiles. Those at the
-    /// edges of an image may be of a few tiles: half of a macro tile is counted on.
-    pub(super) fn view_tiles(&self) -> u64 {
+    /// Most tiles of a view that can be binned at once, even if all 256 splats of a workgroup of `emit`
+    /// cover all of them.
+    ///
+    /// Each splat takes 20 iterations, and 13 for every 256 macro tiles. Macro tiles at the edges of an
+    /// image have fewer tiles; on average at least half of a macro tile's tiles are assumed.
+    pub(super) fn max_view_tiles(&self) -> u64 {
         let splats = u64::from(WORKGROUP);
-        let macros = |most: u64| (most / splats - 20) / 13 * 256;
+        let macro_tiles = |most: u64| (most / splats - 20) / 13 * 256;
         let tiles = u64::from(MACRO_COLUMNS * MACRO_ROWS / 2);
-        self.loop_iterations().map_or(u64::MAX, |most| macros(most) * tiles)
+        self.loop_iterations().map_or(u64::MAX, |most| macro_tiles(most) * tiles)
     }
 
-    /// Mesa's software devices leave every loop of a shader, without a word, after so many iterations
-    /// in all of its loops together (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+    /// Loop iterations of a shader, in all of its loops together, after which Mesa's software devices
+    /// leave every loop without an error (`LP_MAX_TGSI_LOOP_ITERATIONS`). `None` for other devices.
     fn loop_iterations(&self) -> Option<u64> {
         (self.info.device_type == DeviceType::Cpu).then_some(65_535)
     }
 
-    /// Nanoseconds per tick of the clock, where the device has one.
+    /// Nanoseconds per tick of the device's clock; `None` if it has none.
     pub(super) fn tick_ns(&self) -> Option<f32> {
         let has_clock = self.device.features().contains(Features::TIMESTAMP_QUERY);
         has_clock.then(|| self.queue.get_timestamp_period())
     }
 
-    /// What was made and run since the device was opened.
+    /// What was created and run since the device was opened.
     pub(super) fn totals(&self) -> DeviceTotals {
-        let Counted { pipelines, buffers, dispatches } = &self.totals;
+        let AtomicTotals { pipelines, buffers, dispatches } = &self.totals;
         let [pipelines, buffers, dispatches] =
             [pipelines, buffers, dispatches].map(|count| count.load(Relaxed));
         DeviceTotals { pipelines, buffers, dispatches }
     }
 
-    /// A kernel was compiled.
+    /// Counts a kernel that is compiled.
     pub(super) fn count_pipeline(&self) {
         self.totals.pipelines.fetch_add(1, Relaxed);
     }
 
-    /// A kernel is started.
+    /// Counts a kernel that is started.
     pub(super) fn count_dispatch(&self) {
         self.totals.dispatches.fetch_add(1, Relaxed);
     }
 
-    /// A buffer of its own, at least 256 bytes.
+    /// Creates a buffer of at least 256 bytes.
     pub(super) fn buffer(&self, label: &str, bytes: u64, usage: BufferUsages) -> Buffer {
         self.totals.buffers.fetch_add(1, Relaxed);
         self.device.create_buffer(&BufferDescriptor {
@@ -340,8 +376,8 @@ impl Device {
         })
     }
 
-    /// Copies bytes to a buffer, and lets go of the staging memory of copies that are done, so that it
-    /// does not pile up. What goes wrong is told by [`Device::check`].
+    /// Copies bytes to a buffer at once, and frees the staging memory of finished copies, so that it does
+    /// not accumulate. [`Device::check`] reports errors.
     pub(super) fn write_now(&self, buffer: &Buffer, offset: u64, bytes: &[u8]) {
         self.queue.write_buffer(buffer, offset, bytes);
         self.queue.submit([]);

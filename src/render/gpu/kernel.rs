@@ -1,4 +1,4 @@
-//! A compiled entry point of a shader, and the passes that run it.
+//! Compute kernels (compiled entry points of shaders), and the passes that run them.
 
 use wgpu::{
     BindGroupDescriptor, BindGroupEntry, BindGroupLayout, BindingResource, Buffer, BufferBinding,
@@ -9,10 +9,9 @@ use wgpu::{
 };
 
 use super::device::Device;
-use super::layout::{JobSlot, MAX_GROUPS};
-use super::shaders::Shaders;
+use super::layout::{Job, JobSlot, MAX_GROUPS, Span};
 
-/// One entry point, specialised.
+/// One entry point of a shader, with its override constants set.
 #[derive(Debug)]
 pub(super) struct Kernel {
     label: &'static str,
@@ -20,17 +19,33 @@ pub(super) struct Kernel {
     layout: BindGroupLayout,
 }
 
-/// How many groups of a kernel run.
+/// How many workgroups of a kernel run.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Groups<'a> {
-    /// As many as the host knows.
+    /// A number that the host knows.
     Count(u32),
-    /// As many as `plan.wgsl` wrote into this slot.
-    Job(&'a Buffer, u64),
+    /// The number in a job: `plan.wgsl` computes it on the device.
+    Job(JobRef<'a>),
+}
+
+/// A job in the buffer of jobs.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct JobRef<'a> {
+    /// The buffer of [`JobSlot`]s.
+    pub(super) jobs: &'a Buffer,
+    /// Index of the slot.
+    pub(super) slot: u64,
+}
+
+impl<'a> JobRef<'a> {
+    /// The job as a shader's resource.
+    pub(super) fn bind(self) -> BindingResource<'a> {
+        slot_binding(self.jobs, self.slot, size_of::<Job>())
+    }
 }
 
 impl Kernel {
-    /// Compiles an entry point; what the shader has wrong is told by [`Device::check`].
+    /// Compiles an entry point. [`Device::check`] reports errors of the shader.
     pub(super) fn new(
         device: &Device,
         module: &ShaderModule,
@@ -79,23 +94,29 @@ impl Kernel {
         pass.set_bind_group(0, &bind_group, &[]);
         match groups {
             Groups::Count(count) => {
-                // As `plan.wgsl` folds: rows of at most 65,535, of about equal length.
-                let rows = count.div_ceil(MAX_GROUPS).max(1);
-                pass.dispatch_workgroups(count.div_ceil(rows), rows, 1);
+                let [columns, rows, layers] = fold_groups(count);
+                pass.dispatch_workgroups(columns, rows, layers);
             }
-            Groups::Job(jobs, slot) => {
-                // The groups lie behind the length.
+            Groups::Job(JobRef { jobs, slot }) => {
+                // The numbers of workgroups follow the job's length.
                 pass.dispatch_workgroups_indirect(jobs, slot * SLOT_BYTES + 4);
             }
         }
     }
 }
 
-/// Distance of slots that are bound one at a time.
+/// Folds workgroups into rows of at most [`MAX_GROUPS`], of about equal length, as `job` in `plan.wgsl`
+/// does. The last row may have surplus workgroups, which do nothing.
+pub(super) fn fold_groups(count: u32) -> [u32; 3] {
+    let rows = count.div_ceil(MAX_GROUPS).max(1);
+    [count.div_ceil(rows), rows, 1]
+}
+
+/// Distance of slots that are bound one at a time, in bytes.
 pub(super) const SLOT_BYTES: u64 = size_of::<JobSlot>() as u64;
 
-/// One slot of a buffer of slots.
-pub(super) fn slot(buffer: &Buffer, slot: u64, bytes: usize) -> BindingResource<'_> {
+/// The first `bytes` of one slot of a buffer of slots, as a shader's resource.
+pub(super) fn slot_binding(buffer: &Buffer, slot: u64, bytes: usize) -> BindingResource<'_> {
     BindingResource::Buffer(BufferBinding {
         buffer,
         offset: slot * SLOT_BYTES,
@@ -103,30 +124,73 @@ pub(super) fn slot(buffer: &Buffer, slot: u64, bytes: usize) -> BindingResource<
     })
 }
 
-/// Compiles a stage's shader; what is wrong with it is told by [`Device::check`].
-pub(super) fn module(device: &Device, shaders: &Shaders, name: &str) -> ShaderModule {
+/// The content of a buffer with one span per slot.
+pub(super) fn span_slots(spans: impl Iterator<Item = Span>) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for span in spans {
+        let end = bytes.len() + SLOT_BYTES as usize;
+        bytes.extend_from_slice(bytemuck::bytes_of(&span));
+        bytes.resize(end, 0);
+    }
+    bytes
+}
+
+/// Compiles a shader. [`Device::check`] reports its errors.
+pub(super) fn module(device: &Device, shader: &str) -> ShaderModule {
     device.device.create_shader_module(ShaderModuleDescriptor {
-        label: Some(name),
-        source: ShaderSource::Wgsl(shaders.get(name).into()),
+        label: Some(shader),
+        source: ShaderSource::Wgsl(device.shaders().get(shader).into()),
     })
 }
 
-/// The stages of a frame on their way to the device, and the clock beside them.
+/// A shader whose kernels exist in up to `N` variants, each compiled when it is first needed.
+#[derive(Debug)]
+pub(super) struct LazyShader<K, const N: usize> {
+    shader: &'static str,
+    module: Option<ShaderModule>,
+    variants: [Option<K>; N],
+}
+
+impl<K, const N: usize> LazyShader<K, N> {
+    /// Nothing is compiled yet.
+    pub(super) fn new(shader: &'static str) -> Self {
+        Self { shader, module: None, variants: [const { None }; N] }
+    }
+
+    /// Compiles the module now, so that [`Device::check`] reports its errors before the first frame.
+    pub(super) fn with_module(mut self, device: &Device) -> Self {
+        self.module = Some(module(device, self.shader));
+        self
+    }
+
+    /// The kernels of a variant, a number below `N`; `compile` makes them from the module.
+    pub(super) fn variant(
+        &mut self,
+        device: &Device,
+        variant: usize,
+        compile: impl FnOnce(&ShaderModule) -> K,
+    ) -> &K {
+        let module = self.module.get_or_insert_with(|| module(device, self.shader));
+        self.variants[variant].get_or_insert_with(|| compile(module))
+    }
+}
+
+/// Records the stages of a frame and times them.
 #[derive(Debug)]
 pub(super) struct Recorder {
     pub(super) encoder: CommandEncoder,
-    clock: Option<QuerySet>,
+    timestamps: Option<QuerySet>,
     stages: Vec<&'static str>,
 }
 
 /// Most stages of a frame.
 pub(super) const MAX_STAGES: u32 = 8;
 
-/// Bytes of all ticks: before and after each stage.
-pub(super) const TICKS_BYTES: u64 = 2 * 8 * MAX_STAGES as u64;
+/// Bytes of all timestamps: one before and one after each stage.
+pub(super) const TIMESTAMP_BYTES: u64 = 2 * 8 * MAX_STAGES as u64;
 
-/// A clock for all stages of a frame, where the device has one.
-pub(super) fn clock(device: &Device) -> Option<QuerySet> {
+/// Timestamp queries for all stages of a frame; `None` if the device has no clock.
+pub(super) fn timestamps(device: &Device) -> Option<QuerySet> {
     device.tick_ns().map(|_| {
         device.device.create_query_set(&QuerySetDescriptor {
             label: Some("stages"),
@@ -137,20 +201,20 @@ pub(super) fn clock(device: &Device) -> Option<QuerySet> {
 }
 
 impl Recorder {
-    /// An empty frame, timed by `clock` where the device has one.
-    pub(super) fn new(device: &Device, clock: Option<QuerySet>) -> Self {
+    /// An empty frame, timed if there are `timestamps`.
+    pub(super) fn new(device: &Device, timestamps: Option<QuerySet>) -> Self {
         let encoder = device
             .device
             .create_command_encoder(&CommandEncoderDescriptor { label: Some("frame") });
-        Self { encoder, clock, stages: Vec::new() }
+        Self { encoder, timestamps, stages: Vec::new() }
     }
 
-    /// Starts a stage: what runs in the pass is on its account.
+    /// Starts a stage: the time of everything in the pass is the stage's.
     pub(super) fn stage(&mut self, name: &'static str) -> ComputePass<'_> {
         let first = 2 * self.stages.len() as u32;
         self.stages.push(name);
-        let clock = self.clock.as_ref().filter(|_| first < 2 * MAX_STAGES);
-        let timestamp_writes = clock.map(|query_set| ComputePassTimestampWrites {
+        let timestamps = self.timestamps.as_ref().filter(|_| first < 2 * MAX_STAGES);
+        let timestamp_writes = timestamps.map(|query_set| ComputePassTimestampWrites {
             query_set,
             beginning_of_pass_write_index: Some(first),
             end_of_pass_write_index: Some(first + 1),
@@ -159,10 +223,11 @@ impl Recorder {
         self.encoder.begin_compute_pass(&descriptor)
     }
 
-    /// Copies the ticks to `ticks`, and tells the stages' names in order.
-    pub(super) fn finish_stages(&mut self, ticks: &Buffer) -> Vec<&'static str> {
-        if let Some(clock) = &self.clock {
-            self.encoder.resolve_query_set(clock, 0..2 * self.stages.len() as u32, ticks, 0);
+    /// Copies the timestamps to a buffer. Returns the names of the stages in order.
+    pub(super) fn finish_stages(&mut self, timestamps: &Buffer) -> Vec<&'static str> {
+        if let Some(queries) = &self.timestamps {
+            let count = 2 * self.stages.len() as u32;
+            self.encoder.resolve_query_set(queries, 0..count, timestamps, 0);
         }
         std::mem::take(&mut self.stages)
     }

@@ -1,44 +1,46 @@
-//! What lies in GPU buffers. WGSL copy: `shaders/shared/{constants,layout}.wgsl`, held equal by
-//! `tests/gpu/twins.rs`.
+//! Layouts of GPU buffers, and the constants that Rust and the shaders share. WGSL copy:
+//! `shaders/shared/{constants,layout}.wgsl`; `tests/gpu/twins.rs` checks that both are equal.
 
 use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
-use super::parts::{Part, Rows};
+use super::partition::{Region, TileRows};
 use crate::layout::{ChunkView as CpuChunkView, Cutoffs};
 use crate::{MAX_VIEWS, View, constants};
 
-/// Threads of a workgroup: what wgpu by default asks of every device. Vulkan alone promises 128.
+/// Threads of a workgroup. wgpu's default limits guarantee 256 on every device; Vulkan itself guarantees
+/// only 128.
 pub const WORKGROUP: u32 = 256;
-/// Elements that one workgroup of the prefix sum adds up.
+/// Elements per workgroup of the prefix sum.
 pub const SCAN_BLOCK: u32 = 2048;
-/// Keys that one workgroup of the radix sort places: its 256 counters are 1 KiB beside 32 KiB
-/// of keys and values, or 48 KiB with masks.
+/// Keys per workgroup of the radix sort. The 256 counters of a workgroup take 1 KiB of memory, next to
+/// 32 KiB of keys and values, or 48 KiB with masks.
 pub const SORT_BLOCK: u32 = 4096;
-/// Values of a digit of the radix sort.
+/// Number of values of a digit of the radix sort.
 pub const DIGITS: u32 = 256;
-/// Most groups of one dimension of a dispatch, on any device.
+/// Most workgroups in one dimension of a dispatch that every device supports.
 pub const MAX_GROUPS: u32 = 65_535;
-/// Tiles side by side in a macro tile, ...
+/// Columns of tiles of a macro tile.
 pub const MACRO_COLUMNS: u32 = 8;
-/// ... and one above the other: a word has a bit for each.
+/// Rows of tiles of a macro tile: 8 x 4 tiles are one bit each of a 32-bit word.
 pub const MACRO_ROWS: u32 = 4;
-/// Splats over more macro tiles are emitted by a whole workgroup: a thread alone writes at most 16 macro
-/// tiles of 4 rows of tiles each, 64 masks of a row, while 255 others wait; beyond, all 256 share.
-pub const BIG_SPLAT_MACROS: u32 = 16;
-/// Splats of a macro tile that are handed to its tiles at a time: 8 KiB of workgroup memory.
+/// A splat that touches more macro tiles than this is emitted by a whole workgroup. One thread alone
+/// writes at most 16 macro tiles of 4 rows of tiles, 64 row masks, while the 255 other threads wait;
+/// beyond that, all 256 threads share the work.
+pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
+/// Splats of a macro tile that are distributed to its tiles at a time: 8 KiB of workgroup memory.
 pub const EXPAND_BATCH: u32 = 1024;
-/// Splats that a tile blends at a time.
+/// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Gaussians side by side in the mirror, and words of one of its lines: 128 B, what a warp reads at
-/// once. A cluster's header is a line, of which three words are used.
-pub const STRIP: u32 = 32;
-/// Words of a Gaussian without its colour: mean, scale, opacity, and a quaternion in two.
+/// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
+/// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
+pub const SOA_BLOCK: u32 = 32;
+/// Words of a Gaussian without its colour: mean (3), scale (3), opacity (1), and quaternion (2).
 pub const GEOMETRY_WORDS: u32 = 9;
 
-/// The grid of tiles of one view, and what is drawn of it (32 bytes).
+/// The grid of tiles of one view, and the rows of it that are drawn (32 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct FrameView {
@@ -51,40 +53,40 @@ pub struct FrameView {
     /// Macro tiles per row.
     pub macro_columns: u32,
     /// Index of the first macro tile among those of all views.
-    pub first_macro: u32,
-    /// The first row of tiles that is drawn, and the one after the last.
+    pub first_macro_tile: u32,
+    /// Rows of tiles that are drawn: first, and end (exclusive).
     pub rows: [u32; 2],
 }
 
-/// What all stages know of a frame (576 bytes).
+/// Parameters of a frame that all stages read (576 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Frame {
-    /// Splats that the buffers hold.
+    /// Splats that the buffers can hold.
     pub splat_capacity: u32,
-    /// (Splat, macro tile) pairs that the buffers hold.
+    /// (Splat, macro tile) pairs that the buffers can hold.
     pub touch_capacity: u32,
-    /// Instances that the buffers hold.
+    /// Instances, which are (splat, tile) pairs, that the buffers can hold.
     pub instance_capacity: u32,
-    /// How many of `view` are used.
+    /// Number of elements of `view` that are used.
     pub views: u32,
     /// Tiles of all views.
     pub tiles: u32,
     /// Macro tiles of all views.
-    pub macros: u32,
-    /// As in [`Cutoffs`], likewise the fields that follow.
+    pub macro_tiles: u32,
+    /// Nearest depth, in metres. This and the fields up to `stop` are those of [`Cutoffs`].
     pub near_m: f32,
-    /// In metres.
+    /// Farthest depth, in metres.
     pub far_m: f32,
-    /// In px².
+    /// Variance of the blur, in px².
     pub blur_px2: f32,
-    /// 1 or 0.
+    /// 1 if opacity is compensated for the blur, else 0.
     pub antialiased: u32,
     /// Largest alpha.
     pub alpha_cap: f32,
     /// Base-2 logarithm of the smallest alpha.
     pub log2_alpha_cut: f32,
-    /// Transmittance that ends a pixel.
+    /// Transmittance at which a pixel stops.
     pub stop: f32,
     /// Zero.
     pub pad0: u32,
@@ -97,7 +99,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A frame of these views; the capacities are the caller's to fill in.
+    /// A frame of these views, drawn completely. The caller fills in the capacities.
     pub(super) fn new(views: &[View], cutoffs: &Cutoffs) -> Self {
         let mut frame = Self {
             views: views.len() as u32,
@@ -119,78 +121,81 @@ impl Frame {
                 columns,
                 first_tile: frame.tiles,
                 macro_columns,
-                first_macro: frame.macros,
+                first_macro_tile: frame.macro_tiles,
                 rows: [0, rows],
             };
-            // At most 16 views of 1024 x 1024 tiles: 2^24.
+            // At most 16 views of 1024 x 1024 tiles, 2^24: this cannot overflow.
             frame.tiles += columns * rows;
-            frame.macros += macro_columns * rows.div_ceil(MACRO_ROWS);
+            frame.macro_tiles += macro_columns * rows.div_ceil(MACRO_ROWS);
         }
         frame
     }
 
-    /// Draws these rows alone. Returns the tiles that they are.
-    pub(super) fn restrict(&mut self, rows: &Rows, part: &Part) -> Range<u32> {
-        let views = rows.views(part);
+    /// Restricts the frame to a region. Returns the region's range of tiles.
+    pub(super) fn restrict(&mut self, rows: &TileRows, region: &Region) -> Range<u32> {
+        let views = rows.views(region);
         for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
-            let Range { start, end } = rows.of_view(index, part);
+            let Range { start, end } = rows.of_view(index, region);
             view.rows = [start, end];
         }
-        let (first, last) = (&self.view[views.start], &self.view[views.end - 1]);
+        let first = &self.view[views.start];
+        let last = &self.view[views.end - 1];
         let start = first.first_tile + first.rows[0] * first.columns;
-        start..last.first_tile + last.rows[1] * last.columns
+        let end = last.first_tile + last.rows[1] * last.columns;
+        start..end
     }
 }
 
-/// What is behind the Gaussians of all views (800 bytes).
+/// The background of all views (800 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Behind {
-    /// A face's width in values, ...
+pub struct Background {
+    /// Of a cube map: width of a face, in texels, ...
     pub scale: f32,
-    /// ... where its first one lies, ...
+    /// ... position of the first texel, in texels, ...
     pub offset: f32,
-    /// ... and values along an edge; of a map.
+    /// ... and texels along an edge.
     pub edge: u32,
-    /// Outputs of a hidden layer, ...
+    /// Of a network: outputs of a hidden layer, ...
     pub width: u32,
-    /// ... octaves of sines and cosines, ...
+    /// ... octaves of the frequency encoding, ...
     pub octaves: u32,
-    /// ... values of a direction and its octaves, ...
+    /// ... values of an encoded direction, ...
     pub encoded: u32,
-    /// ... and whether the direction itself is one, 1 or 0, ...
+    /// ... 1 if the direction itself is among them, else 0, ...
     pub identity: u32,
-    /// ... and the second layer reads them again; of a network.
+    /// ... and 1 if the second layer also reads them (a skip connection), else 0.
     pub skip: u32,
-    /// By view, rows that take `(x, y, 1)` in pixels to a direction of any length; of a lens or a rolling
-    /// shutter, directions in the camera's frame at the exposure's end.
+    /// For each view, the rows of a matrix to a direction (of any length) in the sky's axes. It
+    /// transforms `(x, y, 1)` in pixels or, for a lens or a rolling shutter, a direction in the camera's
+    /// frame at the end of the exposure.
     pub sky_from_pixel: [[[f32; 4]; 3]; MAX_VIEWS],
 }
 
-/// What one camera makes of colours (64 bytes).
+/// Exposure and overlay of one camera (64 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Seen {
-    /// Rows of the exposure's matrix, each with its offset.
+pub struct CameraAppearance {
+    /// Rows of the exposure's colour matrix, each followed by its offset.
     pub exposure: [[f32; 4]; 3],
-    /// Size of the overlay; 0 if there is none.
+    /// Size of the overlay in pixels; 0 if there is none.
     pub overlay_px: [u32; 2],
-    /// Its first pixel among those of all views.
+    /// Index of the overlay's first pixel among those of all views.
     pub first_overlay: u32,
     /// 1 if there is an exposure.
-    pub exposed: u32,
+    pub has_exposure: u32,
 }
 
-/// A view relative to one chunk (128 bytes): what `render::layout::ChunkView` holds.
+/// A view relative to one chunk (128 bytes): the content of [`crate::layout::ChunkView`].
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct ChunkView {
-    /// Rows of the rigid transform, translation last, in metres.
+    /// Rows of the rigid transform from the chunk to the camera, translation last, in metres.
     pub camera_from_chunk: [[f32; 4]; 3],
-    /// What depth is computed from, rounded to f32: the camera's forward axis in the chunk and the chunk's
-    /// origin along it, or, where depth is distance, the camera's centre in the chunk, ...
+    /// Terms of the depth, rounded to f32: the camera's forward axis in the chunk's frame and the chunk's
+    /// origin along it. Where depth is distance: the camera's centre in the chunk's frame.
     pub depth_high: [f32; 4],
-    /// ... and what the rounding left over.
+    /// The rounding errors of `depth_high`.
     pub depth_low: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
@@ -207,7 +212,7 @@ pub struct ChunkView {
 }
 
 impl ChunkView {
-    /// The same numbers in rows of four.
+    /// The view with index `view` relative to a chunk.
     pub(super) fn new(view: u32, from: &CpuChunkView) -> Self {
         let row = |i: usize| {
             let [x, y, z] = from.rotation[i];
@@ -226,95 +231,102 @@ impl ChunkView {
         }
     }
 
-    /// The same, with depth as the distance from a centre in the chunk, in metres.
-    pub(super) fn by_distance(self, center_m: DVec3) -> Self {
+    /// The same with depth as distance from a centre in the chunk's frame, in metres.
+    pub(super) fn with_distance_from(self, center_m: DVec3) -> Self {
         let exact = center_m.extend(0.0).to_array();
         Self { depth_high: exact.map(|high| high as f32), depth_low: exact.map(low), ..self }
     }
 }
 
-/// What is left of a number that is rounded to f32.
+/// Rounding error of a number that is rounded to f32.
 fn low(exact: f64) -> f32 {
     (exact - f64::from(exact as f32)) as f32
 }
 
-/// What a view has that a pinhole at rest has not (352 bytes). WGSL: `shaders/lens.wgsl`.
+/// Lens, windshield, and rolling shutter of a view that is no static pinhole (352 bytes). Read by
+/// `shaders/lens.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Lens {
-    /// Where the axis lands, in pixels.
+    /// Where the optical axis lands, in pixels.
     pub center_px: [f32; 2],
-    /// 0 a pinhole, 1 OpenCV's model, 2 a distance from the axis by the angle off it, 3 the other way.
+    /// Lens model. 0: pinhole; 1: OpenCV; 2: a polynomial from the angle off the axis to the radius on
+    /// the image; 3: a polynomial from the radius to the angle.
     pub model: u32,
-    /// Which way the windshield's polynomials go: 0 none, 1 inwards, 2 outwards.
+    /// Windshield. 0: none; 1: polynomials from outside directions to inside ones; 2: the inverse.
     pub windshield: u32,
-    /// Columns that take the lens' plane to pixels.
+    /// Columns of the matrix from the lens' plane to pixels.
     pub linear: [f32; 4],
-    /// Where the model begins to go on straight: a slope, an angle or a distance, ...
+    /// Where the linear extrapolation of the model starts: a slope, an angle in radians, or a radius in
+    /// pixels.
     pub end: f32,
-    /// ... what its polynomial is there, ...
+    /// Value of the model's polynomial at `end`.
     pub end_value: f32,
-    /// ... and its slope; and ...
+    /// Derivative of the polynomial at `end`.
     pub end_slope: f32,
-    /// ... of a slope, its angle off the axis, in radians.
+    /// Where `end` is a slope, its angle off the axis, in radians.
     pub end_rad: f32,
-    /// How far off the axis a centre may be, in radians.
+    /// Largest angle off the axis of a Gaussian's centre that is drawn, in radians.
     pub widest_rad: f32,
     /// 1 if depth is distance, 0 if it is z.
     pub by_distance: u32,
-    /// 0 for a pinhole at rest, 1 for all else.
-    pub bent: u32,
+    /// 0 for a static pinhole, else 1.
+    pub non_pinhole: u32,
     /// Zero.
     pub pad0: u32,
-    /// k1 to k6, p1 and p2, s1 to s4; or a polynomial from its first power on, in shares of the end.
-    pub c: [[f32; 4]; 3],
-    /// By how much the windshield changes the angles: 21 coefficients, horizontal and vertical.
-    pub bend: [[f32; 2]; 22],
-    /// The share of the exposure that is still to come, as a sum of this times x, y and 1.
-    pub rolls: [f32; 4],
-    /// From the camera's first centre to its last, in the frame of the last, in metres.
+    /// OpenCV: k1 to k6, p1 and p2, s1 to s4. Otherwise the polynomial's coefficients from the first power
+    /// on, for a variable that is a fraction of `end`.
+    pub coefficients: [[f32; 4]; 3],
+    /// Polynomials of the change of the angles by the windshield: 21 coefficients, horizontal and
+    /// vertical.
+    pub windshield_shift: [[f32; 2]; 22],
+    /// The fraction of the exposure that remains when pixel (x, y) is exposed: the dot product of the first
+    /// three values with (x, y, 1).
+    pub remaining_exposure: [f32; 4],
+    /// From the camera's first centre to its last, in the camera's last frame, in metres.
     pub moved_m: [f32; 3],
     /// Zero.
     pub pad1: u32,
-    /// The same along the world's axes.
+    /// The same in world axes.
     pub moved_world_m: [f32; 3],
     /// Zero.
     pub pad2: u32,
-    /// The axis about which the camera turns meanwhile, and the angle in radians.
-    pub turned: [f32; 4],
+    /// The camera's rotation during the exposure: unit axis, and angle in radians.
+    pub axis_angle: [f32; 4],
 }
 
-/// One cluster in one view (8 bytes): the unit of projection.
+/// One cluster in one view (8 bytes): the unit of work of stage project.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Item {
+pub struct ClusterView {
     /// First line of the cluster on its page of the mirror.
     pub line: u32,
-    /// Which [`ChunkView`].
+    /// Index of its [`ChunkView`].
     pub chunk_view: u32,
 }
 
-/// A range (8 bytes): items of a page for `project`, tiles of a page for `rasterize`.
+/// A range (8 bytes): cluster views of a page for `project`, tiles of a page for `rasterize`, or touches
+/// of a splat.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Span {
-    /// The first one.
+    /// Index of the first element.
     pub first: u32,
-    /// How many.
+    /// Number of elements.
     pub count: u32,
 }
 
-/// How many elements a stage treats, and the groups of its indirect dispatch (16 bytes).
+/// Number of elements that a stage processes, and the workgroups of its indirect dispatch (16 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Job {
     /// Elements.
     pub length: u32,
-    /// Groups in x, y, z.
+    /// Workgroups in x, y, z.
     pub groups: [u32; 3],
 }
 
-/// A job where a binding may start (256 bytes).
+/// A job, padded to the alignment at which a binding may start (256 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct JobSlot {
@@ -324,44 +336,44 @@ pub struct JobSlot {
     pub pad: [[u32; 4]; 15],
 }
 
-/// What the host reads after a frame (24 bytes).
+/// Counters that the host reads after a frame (24 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Counters {
-    /// (Gaussian, view) pairs that survived culling, whether or not they fit.
+    /// (Gaussian, view) pairs that survived culling, whether or not the buffers can hold them.
     pub splats: u32,
-    /// (Splat, macro tile) pairs, whether or not they fit; 2^32 - 1 stands for more.
+    /// (Splat, macro tile) pairs, likewise. 2^32 - 1 means that or more.
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
     /// Batches of [`RASTER_BATCH`] splats that tiles blended.
     pub batches: u32,
-    /// Those of the tile that blended the most.
+    /// Most batches of one tile.
     pub most_batches: u32,
-    /// Splats that touch the macro tile that most do.
+    /// Most splats that touch one macro tile.
     pub most_touches: u32,
 }
 
-/// Where a Gaussian lies on the screen (32 bytes): `render::layout::Splat` without its colour.
+/// Shape of a splat (32 bytes): [`crate::layout::Splat`] without its colour.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct SplatShape {
     /// Centre, in pixels from the image's top-left corner.
     pub mean_px: [f32; 2],
-    /// Half-size of the box that alpha_cut reaches, in pixels.
+    /// Half-size of the box in which alpha reaches alpha_cut, in pixels.
     pub extent_px: [f32; 2],
-    /// Factor `(l0, l1, l2)`, in 1/px.
+    /// Cholesky factor `(l0, l1, l2)` of the exponent, in 1/px.
     pub factor: [f32; 3],
     /// Base-2 logarithm of the peak opacity.
     pub log2_opacity: f32,
 }
 
-/// What a splat adds where it is seen (16 bytes).
+/// Colour and depth of a splat (16 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct SplatColor {
-    /// Linear colour towards its view, at least 0.
+    /// Linear colour in the direction of its view, at least 0.
     pub rgb: [f32; 3],
-    /// Camera-space z of the centre, in metres.
+    /// Depth of the centre in metres: camera-space z, or distance for wide lenses.
     pub depth_m: f32,
 }

@@ -1,13 +1,21 @@
-//! What a device is told of lenses and rolling shutters: with the first frame that has either.
+//! Parameters of lenses, windshields, and rolling shutters on the device, uploaded from the first frame
+//! on that has one of them. Frames with static pinhole cameras only have no such buffer or binding, and
+//! their shaders have no test for them.
 //!
-//! WGSL: `shaders/lens.wgsl`. The models are in `geometry/camera`, the search for rows in `render/view.rs`.
+//! f32 suffices, since no large numbers cancel: polynomials take fractions of the lens' field, those of a
+//! windshield give only the change of the angles, and a rolling camera is described by its pose at the end
+//! of the exposure and the small motion back from there. WGSL's `atan2` and `sin` may be off by 2^-11, so
+//! `shaders/shared/angle.wgsl` has fits of its own.
+//!
+//! WGSL: `shaders/lens.wgsl`. The lens models are in the scene package (`geometry::camera`), the search for
+//! the row that sees a point in `render/view.rs`.
 
 use bytemuck::Zeroable;
 use glam::{DMat2, DVec2};
 use wgpu::{BindingResource, BufferUsages};
 
 use super::device::Device;
-use super::growing::Growing;
+use super::growable_buffer::GrowableBuffer;
 use super::layout::Lens;
 use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
@@ -17,36 +25,38 @@ use wildcity_scene::geometry::camera::{
     WindshieldReference,
 };
 
-/// The views' lenses on the device.
+/// The lenses of a frame's views on the device.
 #[derive(Debug, Default)]
 pub(super) struct Lenses {
-    buffer: Option<Growing>,
+    buffer: Option<GrowableBuffer>,
 }
 
 impl Lenses {
-    /// Sends what a frame's views have; nothing, where all are pinholes at rest.
-    pub(super) fn hold(&mut self, device: &Device, frame: &Frame<'_>) {
+    /// Uploads the lenses of a frame's views; nothing if all are static pinholes.
+    pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>) {
         if frame.views.iter().all(View::is_static_pinhole) {
             return;
         }
         let mut lenses = [Lens::zeroed(); MAX_VIEWS];
-        for (lens, view) in
-            lenses.iter_mut().zip(frame.views).filter(|(_, v)| !v.is_static_pinhole())
-        {
-            *lens = Lens::of(view);
+        for (lens, view) in lenses.iter_mut().zip(frame.views) {
+            if !view.is_static_pinhole() {
+                *lens = Lens::of(view);
+            }
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
-        let buffer = self.buffer.get_or_insert_with(|| Growing::new(device, "lenses", usage));
+        let buffer =
+            self.buffer.get_or_insert_with(|| GrowableBuffer::new(device, "lenses", usage));
         buffer.fill(device, bytemuck::cast_slice(&lenses));
     }
 
-    /// Where shaders find them; `None` until there were any.
+    /// The lenses as a shader's resource; `None` if no frame has had any.
     pub(super) fn bind(&self) -> Option<(u32, BindingResource<'_>)> {
         self.buffer.as_ref().map(|buffer| (12, buffer.bind()))
     }
 }
 
 impl Lens {
+    /// The parameters of a view that is no static pinhole.
     fn of(view: &View) -> Self {
         let camera = &view.camera;
         let pinhole = &camera.pinhole;
@@ -55,7 +65,7 @@ impl Lens {
             linear: columns(DMat2::from_diagonal(DVec2::new(pinhole.fx, pinhole.fy))),
             widest_rad: max_center_angle_rad(camera) as f32,
             by_distance: camera.depth_is_distance().into(),
-            bent: 1,
+            non_pinhole: 1,
             ..Self::zeroed()
         };
         match &camera.lens {
@@ -70,25 +80,29 @@ impl Lens {
         if let Some(windshield) = &camera.windshield {
             lens.set_windshield(windshield);
         }
-        if let Some(still) = view.shutter_motion() {
-            lens.set_rolling(&still);
+        if let Some(motion) = view.shutter_motion() {
+            lens.set_shutter_motion(&motion);
         }
         lens
     }
 
+    /// Where the extrapolation starts, as a slope.
     fn set_end(&mut self, slope: f64) {
-        (self.end, self.end_rad) = (slope as f32, slope.atan() as f32);
+        self.end = slope as f32;
+        self.end_rad = slope.atan() as f32;
     }
 
     fn set_opencv(&mut self, lens: &OpenCv) {
-        let ([k1, k2, k3, k4, k5, k6], [p1, p2], s) = (lens.k(), lens.p(), lens.s());
+        let [k1, k2, k3, k4, k5, k6] = lens.k();
+        let [p1, p2] = lens.p();
+        let rows = [[k1, k2, k3, k4], [k5, k6, p1, p2], lens.s()];
         self.model = 1;
-        self.c = [[k1, k2, k3, k4], [k5, k6, p1, p2], s].map(|row| row.map(|value| value as f32));
+        self.coefficients = rows.map(|row| row.map(|value| value as f32));
     }
 
     fn set_fisheye(&mut self, lens: &Fisheye) {
         self.model = 2;
-        self.set_rising(lens.radius());
+        self.set_polynomial(lens.radius());
     }
 
     fn set_ftheta(&mut self, lens: &FTheta) {
@@ -97,22 +111,23 @@ impl Lens {
             FThetaReference::PixelToAngle => 3,
         };
         self.linear = columns(lens.linear());
-        self.set_rising(lens.rising());
+        self.set_polynomial(lens.rising());
     }
 
-    /// In shares of the end no power of a distance in pixels leaves f32.
-    fn set_rising(&mut self, rising: &MonotonePolynomial) {
-        let end = rising.end();
+    /// The polynomial takes a fraction of its end, so that no power of a radius in pixels overflows f32.
+    fn set_polynomial(&mut self, polynomial: &MonotonePolynomial) {
+        let end = polynomial.end();
         self.end = end as f32;
-        self.end_value = rising.at(end) as f32;
-        self.end_slope = rising.slope(end) as f32;
-        let scaled = rising.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
-        for (to, c) in self.c.as_flattened_mut().iter_mut().zip(scaled.skip(1)) {
+        self.end_value = polynomial.at(end) as f32;
+        self.end_slope = polynomial.slope(end) as f32;
+        let scaled =
+            polynomial.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
+        for (to, c) in self.coefficients.as_flattened_mut().iter_mut().zip(scaled.skip(1)) {
             *to = c as f32;
         }
     }
 
-    /// Its polynomials less the angles themselves, padded to order 5.
+    /// The windshield's polynomials minus the angles themselves, padded to order 5.
     fn set_windshield(&mut self, windshield: &Windshield) {
         self.windshield = match windshield.reference() {
             WindshieldReference::Forward => 1,
@@ -121,26 +136,28 @@ impl Lens {
         for (axis, polynomial) in
             [windshield.horizontal(), windshield.vertical()].iter().enumerate()
         {
-            let mut place = 0;
+            let mut index = 0;
             for j in 0..=5 {
                 for i in 0..=5 - j {
-                    let own = if [i, j] == [1 - axis, axis] { 1.0 } else { 0.0 };
-                    self.bend[place][axis] = (polynomial.coefficient(i, j) - own) as f32;
-                    place += 1;
+                    let identity = if [i, j] == [1 - axis, axis] { 1.0 } else { 0.0 };
+                    let shift = polynomial.coefficient(i, j) - identity;
+                    self.windshield_shift[index][axis] = shift as f32;
+                    index += 1;
                 }
             }
         }
     }
 
-    fn set_rolling(&mut self, still: &ShutterMotion) {
-        let [a, b, c] = still.share.map(|value| value as f32);
-        self.rolls = [a, b, c, 0.0];
-        self.moved_world_m = still.moved_world_m.as_vec3().to_array();
-        self.moved_m = still.moved_m.as_vec3().to_array();
-        self.turned = still.axis.extend(still.turned_rad).as_vec4().to_array();
+    fn set_shutter_motion(&mut self, motion: &ShutterMotion) {
+        let [a, b, c] = motion.remaining.map(|value| value as f32);
+        self.remaining_exposure = [a, b, c, 0.0];
+        self.moved_world_m = motion.translation_world_m.as_vec3().to_array();
+        self.moved_m = motion.translation_m.as_vec3().to_array();
+        self.axis_angle = motion.axis.extend(motion.rotation_rad).as_vec4().to_array();
     }
 }
 
+/// The columns of a matrix, one after the other.
 fn columns(m: DMat2) -> [f32; 4] {
     m.to_cols_array().map(|value| value as f32)
 }

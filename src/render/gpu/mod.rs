@@ -1,19 +1,30 @@
-//! The wgpu backend: one WGSL file per stage in `shaders/`, twin of the cpu backend.
+//! The gpu backend: WGSL compute shaders in `shaders/`, one per stage, run by wgpu on Vulkan. Each stage
+//! is the twin of the cpu backend's stage of the same name.
 //!
-//! Deterministic: sorts are stable, sums of floats keep one order per pixel, and what threads do in
-//! any order commutes. Nothing is read back in mid-frame: a frame that does not fit its buffers is
-//! drawn again in larger ones, and one that does not fit the device is drawn part by part.
+//! The backend is deterministic: sorts are stable, the floating-point sums of a pixel are always added in
+//! the same order, and operations that threads execute in any order commute. Nothing is read back in the
+//! middle of a frame: a frame that does not fit its buffers is drawn again in larger ones, and one that
+//! does not fit the device is drawn region by region (`gpu/partition.rs`).
+//!
+//! # Frames in flight
+//!
+//! A GPU has three frames in flight ([`Backend::frames_in_flight`]): one is drawn, in the order of the
+//! calls (`gpu/tickets.rs`), while others are copied out, hashed, and encoded. The engine runs a render thread
+//! for each. Drawing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
+//! that waits takes up other work of its pool; if that were the next frame, it would wait for this one,
+//! which waits for it.
 
-mod behind;
+mod background;
+mod bandwidth;
 mod bin;
 mod chain;
 mod device;
-mod growing;
+mod growable_buffer;
 mod kernel;
 pub mod layout;
 mod lens;
 mod mirror;
-mod parts;
+mod partition;
 mod plan;
 mod project;
 mod rasterize;
@@ -23,26 +34,25 @@ mod roofline;
 mod scan;
 pub mod shaders;
 mod sort;
-mod traffic;
-mod turns;
+mod tickets;
 
-use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
+use parking_lot::Mutex;
 use rayon::ThreadPool;
 use rayon::prelude::*;
 use wgpu::AdapterInfo;
 
+pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
-pub use traffic::FrameCounts;
 
 use self::chain::Chain;
 use self::device::Device;
-use self::read_back::Drawn;
-use self::resolve::{Pixels, Wanted};
+use self::read_back::MappedFrame;
+use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
-use self::turns::Turns;
+use self::tickets::TicketQueue;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::limits;
@@ -51,66 +61,67 @@ use crate::limits;
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
-    /// The device and its driver, the same for as long as the backend lives.
+    /// The device and its driver. A backend never changes to another device.
     info: AdapterInfo,
     shaders: Shaders,
     limits: MemoryLimits,
-    /// Delivers images, and runs what `finished` does with them.
+    /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
-    /// Culls clusters: threads of its own, so that a frame that is drawn does not wait for one that
-    /// is encoded.
+    /// Culls clusters. A pool of its own, so that a frame that is drawn does not wait for one that is
+    /// encoded.
     cull: ThreadPool,
-    turns: Turns,
-    /// Gone after the device failed, and made again by the next frame.
+    queue: TicketQueue,
+    /// Empty after the device has failed; the next frame opens it again.
     chain: Mutex<Option<Chain>>,
 }
 
-/// How much of a device is used, where that is less than what it has.
+/// How much of a device's memory is used, if that is less than all of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemoryLimits {
-    /// Bytes of resident Gaussians: what was not drawn for longest goes when there would be more.
+    /// Most bytes of resident Gaussians; the least recently drawn chunks are evicted beyond it.
     pub mirror_bytes: u64,
-    /// Bytes that a binding may hold; below `limits::BINDING_BYTES_MIN` it is that. Frames that need
-    /// more are drawn part by part.
+    /// Most bytes of a binding, at least `limits::BINDING_BYTES_MIN`. Frames that need more are drawn
+    /// region by region.
     pub binding_bytes: u64,
 }
 
 impl Default for MemoryLimits {
-    /// What the device has.
+    /// No limits but the device's own.
     fn default() -> Self {
         Self { mirror_bytes: u64::MAX, binding_bytes: u64::MAX }
     }
 }
 
-/// What a device holds and has done since it was opened.
+/// What a device holds, and what it has done since it was opened.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GpuUsage {
     /// The adapter's name.
     pub name: String,
     /// Bytes of resident Gaussians.
     pub mirror_bytes: u64,
-    /// Bytes of all buffers, if the driver's memory is counted.
+    /// Bytes of all buffers, if the allocator counts them.
     pub allocated_bytes: Option<u64>,
-    /// Attempts at drawing that drew nothing, since buffers were too small.
+    /// Attempts that drew nothing since buffers were too small.
     pub retries: u64,
-    /// Parts that frames were drawn in: one for each that fits.
+    /// Regions that were drawn: one for each frame that fits at once.
     pub regions: u64,
-    /// What the last frame counted.
+    /// Counts of the last frame.
     pub last_frame: FrameCounts,
-    /// Pipelines, buffers and dispatches so far.
+    /// Numbers of pipelines, buffers, and dispatches.
     pub totals: DeviceTotals,
 }
 
 impl Gpu {
-    /// Opens a device. `threads` copy images out of its memory; 0 for one per core.
+    /// Opens a device. `threads` is the number of threads that copy images out of its memory; 0 means one
+    /// per core.
     ///
     /// # Errors
-    /// There is no such device, or it cannot do what the stages need.
+    /// There is no such device, or a shader cannot be compiled for it.
     pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
         Self::open(choice, threads, Shaders::default(), MemoryLimits::default())
     }
 
-    /// The same with other shaders: for tests that break one and see that it is noticed.
+    /// As [`Gpu::new`] with other shaders: for tests that break a shader and check that it is detected.
     ///
     /// # Errors
     /// As [`Gpu::new`].
@@ -122,7 +133,7 @@ impl Gpu {
         Self::open(choice, threads, shaders, MemoryLimits::default())
     }
 
-    /// The same with less of the device than it has.
+    /// As [`Gpu::new`] with limits on the device's memory.
     ///
     /// # Errors
     /// As [`Gpu::new`].
@@ -142,36 +153,34 @@ impl Gpu {
     ) -> Result<Self, GpuError> {
         if threads > limits::RENDER_THREADS {
             let limit = limits::RENDER_THREADS;
-            let reason = format!("{threads} are too many; 0 to {limit} are accepted");
+            let reason = format!("{threads} are too many; 0 to {limit} are allowed");
             return Err(GpuError::Threads { reason });
         }
         let limits = MemoryLimits {
             binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
             ..limits
         };
-        let device = Device::open(choice, limits.binding_bytes)?;
+        let device = Device::open(choice, &shaders, limits.binding_bytes)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
             pool.map_err(|error| GpuError::Threads { reason: error.to_string() })
         };
-        let (deliver, cull) = (pool("deliver")?, pool("cull")?);
         Ok(Self {
             choice: choice.clone(),
             info: device.info.clone(),
             limits,
-            deliver,
-            cull,
-            turns: Turns::default(),
-            chain: Mutex::new(Some(Chain::new(device, &shaders, limits.mirror_bytes)?)),
+            deliver: pool("deliver")?,
+            cull: pool("cull")?,
+            queue: TicketQueue::default(),
+            chain: Mutex::new(Some(Chain::new(device, limits.mirror_bytes)?)),
             shaders,
         })
     }
 
     /// What the device holds; `None` while it is lost.
     pub fn usage(&self) -> Option<GpuUsage> {
-        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
-        chain.as_ref().map(|chain| GpuUsage {
+        self.chain.lock().as_ref().map(|chain| GpuUsage {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
             allocated_bytes: chain.device.allocated_bytes(),
@@ -182,37 +191,37 @@ impl Gpu {
         })
     }
 
-    /// Measures what the device can do at most, in about a second.
+    /// Measures the device's peak rates, in about a second.
     ///
     /// # Errors
     /// The device fails, or is lost.
     pub fn roofline(&self) -> Result<Roofline, RenderError> {
-        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let lost = || RenderError::Device {
             device: "the GPU".to_owned(),
-            reason: "it was lost by the frame before".to_owned(),
+            reason: "it was lost in the previous frame".to_owned(),
         };
-        Roofline::measure(&chain.as_ref().ok_or_else(lost)?.device, &self.shaders)
+        let chain = self.chain.lock();
+        Roofline::measure(&chain.as_ref().ok_or_else(lost)?.device)
     }
 
-    /// Renders the rest of a frame after the stages that another backend did.
+    /// Renders the rest of a frame after the stages that another backend has run.
     ///
     /// # Errors
-    /// As [`Backend::render`]; and what is handed over must fit the device at once.
+    /// As [`Backend::render`]; also if the frame does not fit the device at once.
     pub fn resume(
         &self,
-        between: &StageOutputs,
+        done: &StageOutputs,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, wanted| {
-            chain.resume(between, frame, wanted)
+        self.render_with(frame, targets, finished, |chain, outputs| {
+            chain.resume(done, frame, outputs)
         })
     }
 
-    /// Runs the stages up to and including `last`, from the beginning or after what is `done`, and
-    /// reads what they leave: for tests that compare stages. Normal frames read nothing in mid-frame.
+    /// Runs the stages up to and including `last`, from the beginning or after those whose outputs are
+    /// `done`, and reads their outputs: for tests that compare stages.
     ///
     /// # Errors
     /// As [`Gpu::resume`].
@@ -226,63 +235,64 @@ impl Gpu {
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
 
-    /// Does something on the device, which is opened again if it was lost. The device is free for
-    /// the next one when this returns.
+    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The
+    /// device is free for the next caller when this returns.
     fn in_turn<T>(
         &self,
         work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
     ) -> Result<T, RenderError> {
-        let _turn = self.turns.wait();
-        let mut slot = self.chain.lock().unwrap_or_else(|poisoned| {
-            // Someone panicked in mid-frame: memory may be half-written, so begin anew.
-            self.chain.clear_poison();
-            let mut slot = poisoned.into_inner();
-            discard(slot.take());
-            slot
-        });
-        let chain = match &mut *slot {
+        let _ticket = self.queue.wait();
+        let mut slot = self.chain.lock();
+        // If `work` panics, the slot stays empty: memory may be half-written then, and the next caller
+        // opens the device again.
+        let mut chain = match slot.take() {
             Some(chain) => chain,
-            None => {
-                let failed =
-                    |reason| RenderError::Device { device: self.info.name.clone(), reason };
-                let device = Device::open(&self.choice, self.limits.binding_bytes);
-                let device = device.map_err(|error| failed(error.to_string()))?;
-                // Another one would draw other bytes, and nobody has asked for it.
-                if device.info != self.info {
-                    let reason = format!("it was lost, and in its place is {}", device.info.name);
-                    return Err(failed(reason));
-                }
-                tracing::info!(device = device.info.name, "the GPU is opened again");
-                slot.insert(Chain::new(device, &self.shaders, self.limits.mirror_bytes)?)
-            }
+            None => self.reopen()?,
         };
-        let done = work(chain);
-        // Whatever else it was, memory may be half-written: begin anew.
-        if let Err(RenderError::Device { .. }) = done {
-            discard(slot.take());
+        let done = work(&mut chain);
+        match done {
+            // Memory may be half-written here, too.
+            Err(RenderError::Device { .. }) => discard(chain),
+            _ => *slot = Some(chain),
         }
         done
     }
 
-    /// Draws a frame, and delivers its pixels.
+    /// Opens the device again after it was lost.
+    fn reopen(&self) -> Result<Chain, RenderError> {
+        let failed = |reason| RenderError::Device { device: self.info.name.clone(), reason };
+        let device = Device::open(&self.choice, &self.shaders, self.limits.binding_bytes);
+        let device = device.map_err(|error| failed(error.to_string()))?;
+        // Another device would draw other bytes, and was not requested.
+        if device.info != self.info {
+            let reason = format!("it was lost, and in its place is {}", device.info.name);
+            return Err(failed(reason));
+        }
+        tracing::info!(device = device.info.name, "the GPU was opened again");
+        Chain::new(device, self.limits.mirror_bytes)
+    }
+
+    /// Draws a frame, and copies its pixels to the targets.
     fn render_with(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
-        draw: impl FnOnce(&mut Chain, &Wanted) -> Result<Drawn, RenderError>,
+        draw: impl FnOnce(&mut Chain, &Outputs) -> Result<MappedFrame, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
-        let wanted = Wanted::of(targets);
-        let planes = wanted.planes;
+        let outputs = Outputs::of(targets);
         let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
-        let asked = Instant::now();
-        // Not in a pool: a thread that waits for its own pool may take up another frame there.
+
+        // Draw on this thread: a thread of a pool that waits may take up another frame of that pool.
+        let called = Instant::now();
         let (drawn, wait_ms) = self.in_turn(|chain| {
-            let wait_ms = ms(asked);
-            Ok((draw(chain, &wanted)?, wait_ms))
+            let wait_ms = ms(called);
+            Ok((draw(chain, &outputs)?, wait_ms))
         })?;
+
+        // Copy the pixels. Other frames can be drawn meanwhile.
         let start = Instant::now();
         let words: Result<Vec<&[u32]>, _> =
             drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
@@ -290,11 +300,15 @@ impl Gpu {
             device: "the GPU".to_owned(),
             reason: format!("its memory cannot be read: {error}"),
         })?;
-        let pixels = Pixels { pages: &words, tiles_per_page: drawn.tiles_per_page(), planes };
+        let pixels = Pixels {
+            pages: &words,
+            tiles_per_page: drawn.tiles_per_page(),
+            planes: outputs.planes,
+        };
         self.deliver.install(|| {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
-                pixels.deliver(view, target);
+                pixels.copy_to(view, target);
                 target.finish(&frame.views[index]);
                 finished(index, target);
             });
@@ -307,11 +321,9 @@ impl Gpu {
     }
 }
 
-/// Lets go of a device that failed, without waiting for it: a driver that hangs would hold up everyone.
-fn discard(chain: Option<Chain>) {
-    if chain.is_some() {
-        std::thread::spawn(move || drop(chain));
-    }
+/// Drops a device that has failed, in a thread of its own: a driver that hangs would block all callers.
+fn discard(chain: Chain) {
+    std::thread::spawn(move || drop(chain));
 }
 
 impl Backend for Gpu {
@@ -338,8 +350,8 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, wanted| {
-            chain.draw(frame, wanted, &self.cull)
+        self.render_with(frame, targets, finished, |chain, outputs| {
+            chain.draw(frame, outputs, &self.cull)
         })
     }
 }
@@ -358,7 +370,8 @@ mod tests {
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 8.0, cy: 8.0 };
         let views = [View::new(Camera::from_pinhole(16, 16, pinhole), Pose::IDENTITY)];
-        let (scene, profile) = (Scene::default(), RenderProfile::default());
+        let scene = Scene::default();
+        let profile = RenderProfile::default();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         let render = |gpu: &Gpu| {
             let mut image = vec![77; 3 * 256];
@@ -366,7 +379,7 @@ mod tests {
             gpu.render(&frame, &mut [target], &|_, _| {}).map(|_| image[0])
         };
         let lose = |gpu: &Gpu| {
-            gpu.chain.lock().unwrap().as_ref().unwrap().device.device.destroy();
+            gpu.chain.lock().as_ref().unwrap().device.device.destroy();
         };
         assert_eq!(render(&gpu), Ok(0));
         lose(&gpu);
@@ -374,8 +387,8 @@ mod tests {
         assert!(matches!(lost, Err(RenderError::Device { .. })), "{lost:?}");
         assert_eq!(gpu.usage(), None);
         assert_eq!(render(&gpu), Ok(0));
-        // Lost again, and now another device is in its place.
-        gpu.info.name = "the card that was there before".to_owned();
+        // It is lost again, and now another device takes its place.
+        gpu.info.name = "the previous device".to_owned();
         lose(&gpu);
         assert!(render(&gpu).is_err());
         let error = render(&gpu).unwrap_err().to_string();

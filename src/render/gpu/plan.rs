@@ -1,18 +1,16 @@
-//! What the device decides for itself in mid-frame: how much the next stages have to do.
+//! The amount of work of each stage, which the device computes itself, so that nothing is read back in
+//! the middle of a frame. WGSL: `shaders/plan.wgsl`.
 
 use wgpu::{Buffer, BufferUsages, ComputePass};
 
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::{Groups, Kernel, module};
-use super::layout::{
-    Counters, DIGITS, Frame, Job, JobSlot, MAX_GROUPS, SCAN_BLOCK, SORT_BLOCK, WORKGROUP,
-};
-use super::shaders::Shaders;
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::{Groups, JobRef, Kernel, fold_groups, module};
+use super::layout::{Counters, DIGITS, Frame, Job, JobSlot, SCAN_BLOCK, SORT_BLOCK, WORKGROUP};
 
-/// Slots of the jobs, as `plan.wgsl` names them.
+/// Slots of the jobs; `plan.wgsl` has the same numbers.
 pub(super) mod job {
-    pub(crate) const ITEMS: u64 = 0;
+    pub(crate) const CLUSTER_VIEWS: u64 = 0;
     pub(crate) const SPLATS: u64 = 1;
     pub(crate) const SPLATS_SCAN: u64 = 2;
     pub(crate) const SPLATS_SORT: u64 = 3;
@@ -25,52 +23,56 @@ pub(super) mod job {
     pub(crate) const COUNT: usize = 10;
 }
 
-/// What there is before the first stage of a frame runs; what the device finds for itself is zero.
+/// Counts that are known before the first stage of a frame runs; those that the device computes are zero.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Counts {
-    /// Clusters in views.
-    pub(super) items: u32,
+    /// (Cluster, view) pairs to project.
+    pub(super) cluster_views: u32,
     /// Splats that another backend projected.
     pub(super) splats: u32,
     /// Instances that another backend binned.
     pub(super) instances: u32,
 }
 
-/// What a frame is, what it counts, and what is to do.
+/// The parameters of a frame, its counters, and the jobs of its stages.
 #[derive(Debug)]
 pub(super) struct Plan {
     splats: Kernel,
     touches: Kernel,
     instances: Kernel,
-    frame: Growing,
-    jobs: Growing,
-    counters: Growing,
+    frame: GrowableBuffer,
+    jobs: GrowableBuffer,
+    counters: GrowableBuffer,
 }
 
 impl Plan {
-    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
-        let module = module(device, shaders, "plan");
+    pub(super) fn new(device: &Device) -> Self {
+        let module = module(device, "plan");
         let kernel = |entry| Kernel::new(device, &module, entry, &[]);
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let mut plan = Self {
             splats: kernel("splats"),
             touches: kernel("touches"),
             instances: kernel("instances"),
-            frame: Growing::new(device, "frame", BufferUsages::UNIFORM | BufferUsages::COPY_DST),
-            jobs: Growing::new(device, "jobs", storage | BufferUsages::INDIRECT),
-            counters: Growing::new(device, "counters", storage | BufferUsages::COPY_SRC),
+            frame: GrowableBuffer::new(
+                device,
+                "frame",
+                BufferUsages::UNIFORM | BufferUsages::COPY_DST,
+            ),
+            jobs: GrowableBuffer::new(device, "jobs", storage | BufferUsages::INDIRECT),
+            counters: GrowableBuffer::new(device, "counters", storage | BufferUsages::COPY_SRC),
         };
         plan.frame.reserve(device, size_of::<Frame>() as u64);
         plan.jobs.reserve(device, (job::COUNT * size_of::<JobSlot>()) as u64);
         plan
     }
 
-    /// Starts a frame.
+    /// Writes the parameters of a frame, and resets counters and jobs.
     pub(super) fn start(&self, device: &Device, frame: &Frame, counts: &Counts) {
-        let Counts { items, splats, instances } = *counts;
+        let Counts { cluster_views, splats, instances } = *counts;
         let mut jobs: [JobSlot; job::COUNT] = bytemuck::Zeroable::zeroed();
         for (slot, length, per_group) in [
-            (job::ITEMS, items, SCAN_BLOCK),
+            (job::CLUSTER_VIEWS, cluster_views, SCAN_BLOCK),
             (job::SPLATS, splats, WORKGROUP),
             (job::SPLATS_SCAN, splats, SCAN_BLOCK),
             (job::SPLATS_SORT, splats, SORT_BLOCK),
@@ -80,7 +82,7 @@ impl Plan {
             jobs[slot as usize].job = job(length, per_group);
         }
         let counters = Counters { splats, instances, ..bytemuck::Zeroable::zeroed() };
-        let write = |to: &Growing, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);
+        let write = |to: &GrowableBuffer, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);
         write(&self.frame, bytemuck::bytes_of(frame));
         write(&self.jobs, bytemuck::bytes_of(&jobs));
         write(&self.counters, bytemuck::bytes_of(&counters));
@@ -90,41 +92,41 @@ impl Plan {
         self.frame.buffer()
     }
 
-    pub(super) fn jobs(&self) -> &Buffer {
-        self.jobs.buffer()
+    /// The job in one of the slots of [`job`].
+    pub(super) fn job(&self, slot: u64) -> JobRef<'_> {
+        JobRef { jobs: self.jobs.buffer(), slot }
     }
 
     pub(super) fn counters(&self) -> &Buffer {
         self.counters.buffer()
     }
 
-    /// After the items' visible splats were summed up.
-    pub(super) fn splats(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+    /// Sets the jobs that depend on the number of splats, after the prefix sum over the visible splats of
+    /// the cluster views.
+    pub(super) fn set_splats(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.splats, device, pass, sums);
     }
 
-    /// After the splats' macro tiles were summed up.
-    pub(super) fn touches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+    /// Sets the jobs that depend on the number of touches, after the prefix sum over the splats' touches.
+    pub(super) fn set_touches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.touches, device, pass, sums);
     }
 
-    /// After the tiles' splats were summed up.
-    pub(super) fn instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+    /// Sets the jobs that depend on the number of instances, after the prefix sum over the tiles' splats.
+    pub(super) fn set_instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.instances, device, pass, sums);
     }
 
     fn run(&self, kernel: &Kernel, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
-        let buffers = [self.frame(), self.jobs(), sums, self.counters()];
+        let buffers = [self.frame(), self.jobs.buffer(), sums, self.counters()];
         let all = [0, 1, 2, 3].map(|k| (k, buffers[k as usize].as_entire_binding()));
         kernel.run(device, pass, Groups::Count(1), &all);
     }
 }
 
-/// As `plan.wgsl` folds groups into two dimensions.
+/// A job of `length` elements, `per_group` per workgroup, as `job` in `plan.wgsl` computes it.
 fn job(length: u32, per_group: u32) -> Job {
-    let groups = length.div_ceil(per_group);
-    let rows = groups.div_ceil(MAX_GROUPS).max(1);
-    Job { length, groups: [groups.div_ceil(rows), rows, 1] }
+    Job { length, groups: fold_groups(length.div_ceil(per_group)) }
 }
 
 #[cfg(test)]
@@ -136,9 +138,9 @@ mod tests {
     use super::job;
 
     #[test]
-    fn slots_are_the_shaders() {
+    fn slots_have_the_same_numbers_in_the_shader() {
         let rust = BTreeMap::from([
-            ("ITEMS", job::ITEMS),
+            ("CLUSTER_VIEWS", job::CLUSTER_VIEWS),
             ("SPLATS", job::SPLATS),
             ("SPLATS_SCAN", job::SPLATS_SCAN),
             ("SPLATS_SORT", job::SPLATS_SORT),
@@ -150,7 +152,7 @@ mod tests {
             ("INSTANCES", job::INSTANCES),
             ("JOB_COUNT", job::COUNT as u64),
         ]);
-        // The shader's own, without those that it imports.
+        // The constants that the file itself declares, without those of the files that it imports.
         let shader = include_str!("../../../shaders/plan.wgsl");
         let own = shader.lines().filter(|line| line.starts_with("const "));
         let module = naga::front::wgsl::parse_str(&own.collect::<String>()).unwrap();

@@ -1,4 +1,4 @@
-//! Stage rasterize: blends each tile's splats, and writes the pixels that were asked for.
+//! Stage rasterize: blends the splats of each tile front to back, and writes the requested pixels.
 //!
 //! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`.
 
@@ -6,145 +6,172 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wgpu::{
-    BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass,
-    ShaderModule,
-};
+use wgpu::{BindingResource, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass};
 
-use super::behind::Behind;
+use super::background::{Background, BackgroundShader};
 use super::bin::Bin;
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::{Groups, Kernel, SLOT_BYTES, module, slot};
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
 use super::layout::Span;
 use super::lens::Lenses;
 use super::plan::Plan;
-use super::project::Splats;
+use super::project::SplatBuffers;
 use super::resolve::Planes;
-use super::shaders::Shaders;
 use crate::{Frame, RenderError};
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::sky::{CubeMap, DrawableSky};
 
-/// The stage on the device, and its output.
+/// The stage with one kind of background; one kernel for each combination of planes.
+type Shader = LazyShader<Kernel, { Planes::VARIANTS }>;
+
+/// The kernels of the stage, and its output.
 #[derive(Debug)]
 pub(super) struct Rasterize {
-    module: ShaderModule,
-    /// By the planes that are wanted, compiled when first asked for.
-    kernels: [Option<Kernel>; Planes::VARIANTS],
-    /// For frames with something behind the Gaussians, or cameras that change colours; made with the
-    /// first of them.
-    behind: Option<Behind>,
-    /// What is behind the Gaussians of the latter alone.
+    no_background: Shader,
+    map: Shader,
+    network: Shader,
+    map_lens: Shader,
+    network_lens: Shader,
+    /// For frames with a background or with appearances; created with the first of them.
+    background: Option<Background>,
+    /// The background of frames that have appearances only.
     black: Option<Arc<CubeMap>>,
-    /// Whether the frame at hand is one.
-    has_behind: bool,
-    shaders: Shaders,
-    spans: Growing,
+    /// Whether the current frame uses `background`.
+    has_background: bool,
+    spans: GrowableBuffer,
     /// Pixels, tile after tile, page after page.
-    pages: Vec<Growing>,
+    pages: Vec<GrowableBuffer>,
+}
+
+/// The part of the output that a region writes.
+#[derive(Clone, Debug)]
+pub(super) struct TileOutput {
+    /// The values of each pixel.
+    pub(super) planes: Planes,
+    /// The tiles of the region.
+    pub(super) tiles: Range<u32>,
+    /// Tiles of a page.
+    pub(super) tiles_per_page: u32,
+}
+
+/// What [`Rasterize::run`] reads.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RasterizeInputs<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) splats: &'a SplatBuffers,
+    pub(super) bin: &'a Bin,
+    pub(super) lenses: &'a Lenses,
 }
 
 impl Rasterize {
-    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
+    pub(super) fn new(device: &Device) -> Self {
         let uniform = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
         Self {
-            module: module(device, shaders, "rasterize"),
-            kernels: [const { None }; Planes::VARIANTS],
-            behind: None,
+            no_background: Shader::new("rasterize").with_module(device),
+            map: Shader::new("rasterize_map"),
+            network: Shader::new("rasterize_network"),
+            map_lens: Shader::new("rasterize_map_lens"),
+            network_lens: Shader::new("rasterize_network_lens"),
+            background: None,
             black: None,
-            has_behind: false,
-            shaders: shaders.clone(),
-            spans: Growing::new(device, "tile spans", uniform),
+            has_background: false,
+            spans: GrowableBuffer::new(device, "tile spans", uniform),
             pages: Vec::new(),
         }
     }
 
-    /// Sends what is behind a frame's Gaussians to the device, and what its cameras make of colours, if
-    /// there is either; `appearances` is empty if they all record what is there.
+    /// Uploads the background of a frame and the appearances of its cameras, if there is either.
+    /// `appearances` is empty if no camera changes colours.
     ///
     /// # Errors
-    /// The sky cannot be drawn as the profile asks, or is larger than a binding.
-    pub(super) fn hold_behind(
+    /// The sky cannot be drawn as the profile demands, or is larger than a binding.
+    pub(super) fn upload_background(
         &mut self,
         device: &Device,
         frame: &Frame<'_>,
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
-        let behind = match frame.background()? {
+        let background = match frame.background()? {
             None if !appearances.is_empty() => {
                 let black =
                     self.black.get_or_insert_with(|| Arc::new(CubeMap::uniform(DVec3::ZERO)));
                 Some((DrawableSky::CubeMap(black.clone()), DMat3::IDENTITY))
             }
-            behind => behind,
+            background => background,
         };
-        self.has_behind = behind.is_some();
-        let Some(drawn) = behind else { return Ok(()) };
-        let held = self.behind.get_or_insert_with(|| Behind::new(device));
-        held.hold(device, frame, drawn, appearances)
+        self.has_background = background.is_some();
+        let Some((sky, sky_from_world)) = background else { return Ok(()) };
+        let held = self.background.get_or_insert_with(|| Background::new(device));
+        held.upload(device, frame, sky, sky_from_world, appearances)
     }
 
-    /// Iterations of loops that what is behind the Gaussians takes of a thread, at most.
-    pub(super) fn iterations_behind(&self) -> u64 {
-        let behind = self.behind.as_ref().filter(|_| self.has_behind);
-        behind.map_or(0, Behind::iterations)
+    /// Most loop iterations that the background takes of a thread.
+    pub(super) fn background_iterations(&self) -> u64 {
+        let background = self.background.as_ref().filter(|_| self.has_background);
+        background.map_or(0, Background::iterations)
     }
 
-    /// Makes room for the pixels of all tiles. Returns how many tiles a page holds.
+    /// Makes room for the pixels of all tiles. Returns the number of tiles of a page.
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32) -> u32 {
         let tile_bytes = planes.tile_bytes();
         let per_page = (device.binding_bytes() / tile_bytes).min(u64::from(u32::MAX)) as u32;
         for (page, tiles) in pages(&(0..tiles), per_page) {
             if page == self.pages.len() {
                 let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
-                self.pages.push(Growing::new(device, "pixels", usage));
+                self.pages.push(GrowableBuffer::new(device, "pixels", usage));
             }
             self.pages[page].reserve(device, tile_bytes * tiles.len() as u64);
         }
         per_page
     }
 
-    /// Blends some tiles.
+    /// Blends the tiles of a region.
     pub(super) fn run(
         &mut self,
         device: &Device,
         pass: &mut ComputePass<'_>,
-        plan: &Plan,
-        (splats, bin, lenses): (&Splats, &Bin, &Lenses),
-        (planes, tiles, per_page): (Planes, &Range<u32>, u32),
+        inputs: RasterizeInputs<'_>,
+        output: &TileOutput,
     ) {
-        let (kernel, of_behind) = match self.behind.as_mut().filter(|_| self.has_behind) {
-            Some(behind) => {
-                let lenses = if behind.is_bent() { lenses.bind() } else { None };
-                let (kernel, resources) = behind.kernel(device, &self.shaders, planes);
-                (kernel, resources.into_iter().chain(lenses).collect())
-            }
-            None => {
-                let module = &self.module;
-                let kernel = self.kernels[planes.variant()].get_or_insert_with(|| {
-                    Kernel::new(device, module, "main", &planes.constants())
-                });
-                (&*kernel, Vec::new())
-            }
+        let RasterizeInputs { plan, splats, bin, lenses } = inputs;
+        let TileOutput { planes, tiles, tiles_per_page } = output;
+
+        // The kernel for this kind of background and these planes.
+        let background = self.background.as_ref().filter(|_| self.has_background);
+        let shader = match background.map(Background::shader) {
+            None => &mut self.no_background,
+            Some(BackgroundShader::Map) => &mut self.map,
+            Some(BackgroundShader::Network) => &mut self.network,
+            Some(BackgroundShader::MapLens) => &mut self.map_lens,
+            Some(BackgroundShader::NetworkLens) => &mut self.network_lens,
         };
-        let spans = pages(tiles, per_page).map(|(_, tiles)| {
-            let mut slot = [0; SLOT_BYTES as usize / 4];
-            slot[..2].copy_from_slice(&[tiles.start, tiles.len() as u32]);
-            slot
+        let kernel = shader.variant(device, planes.variant(), |module| {
+            Kernel::new(device, module, "main", &planes.constants())
         });
-        self.spans.fill(device, bytemuck::cast_slice(&spans.collect::<Vec<_>>()));
-        for (index, (page, tiles)) in pages(tiles, per_page).enumerate() {
-            let [first, bytes] = place(planes, &tiles, per_page);
+        let mut background_resources = Vec::new();
+        if let Some(background) = background {
+            background_resources.extend(background.bind());
+            if background.has_lenses() {
+                background_resources.extend(lenses.bind());
+            }
+        }
+
+        // One dispatch per page of pixels.
+        let spans = pages(tiles, *tiles_per_page)
+            .map(|(_, tiles)| Span { first: tiles.start, count: tiles.len() as u32 });
+        self.spans.fill(device, &span_slots(spans));
+        for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
+            let bytes = page_bytes(*planes, &tiles, *tiles_per_page);
             let pixels = BufferBinding {
                 buffer: self.pages[page].buffer(),
-                // Of 1 KiB or more each, so that a binding may start at any tile.
-                offset: first,
-                size: BufferSize::new(bytes),
+                // A tile takes 1 KiB or a multiple of it, so any tile's offset is aligned.
+                offset: bytes.start,
+                size: BufferSize::new(bytes.end - bytes.start),
             };
-            let mut all = vec![
+            let mut resources = vec![
                 (0, plan.frame().as_entire_binding()),
-                (1, slot(self.spans.buffer(), index as u64, size_of::<Span>())),
+                (1, slot_binding(self.spans.buffer(), index as u64, size_of::<Span>())),
                 (2, bin.ranges.bind()),
                 (3, bin.instances.bind()),
                 (4, splats.shapes.bind()),
@@ -152,27 +179,28 @@ impl Rasterize {
                 (6, plan.counters().as_entire_binding()),
                 (7, BindingResource::Buffer(pixels)),
             ];
-            all.extend(of_behind.iter().cloned());
-            kernel.run(device, pass, Groups::Count(tiles.len() as u32), &all);
+            resources.extend(background_resources.iter().cloned());
+            kernel.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
         }
     }
 
-    /// Copies the pixels of some tiles to where the host can read them, page by page.
+    /// Copies the pixels of a region's tiles to buffers that the host can read, page by page.
     pub(super) fn copy(
         &self,
         encoder: &mut CommandEncoder,
-        to: &[Growing],
-        (planes, tiles, per_page): (Planes, &Range<u32>, u32),
+        to: &[GrowableBuffer],
+        output: &TileOutput,
     ) {
-        for (page, tiles) in pages(tiles, per_page) {
-            let [first, bytes] = place(planes, &tiles, per_page);
-            let (from, to): (&Buffer, &Buffer) = (self.pages[page].buffer(), to[page].buffer());
-            encoder.copy_buffer_to_buffer(from, first, to, first, bytes);
+        let TileOutput { planes, tiles, tiles_per_page } = output;
+        for (page, tiles) in pages(tiles, *tiles_per_page) {
+            let Range { start, end } = page_bytes(*planes, &tiles, *tiles_per_page);
+            let from = self.pages[page].buffer();
+            encoder.copy_buffer_to_buffer(from, start, to[page].buffer(), start, end - start);
         }
     }
 }
 
-/// The pages that hold some tiles, and which of the tiles each holds.
+/// The pages that hold some tiles, and the tiles that each of them holds.
 pub(super) fn pages(
     tiles: &Range<u32>,
     per_page: u32,
@@ -184,7 +212,8 @@ pub(super) fn pages(
     })
 }
 
-/// Where the pixels of some tiles start on their page, and how many bytes they are.
-fn place(planes: Planes, tiles: &Range<u32>, per_page: u32) -> [u64; 2] {
-    [tiles.start % per_page, tiles.len() as u32].map(|tiles| planes.tile_bytes() * u64::from(tiles))
+/// The bytes of some tiles of one page, counted from the start of the page.
+fn page_bytes(planes: Planes, tiles: &Range<u32>, per_page: u32) -> Range<u64> {
+    let start = planes.tile_bytes() * u64::from(tiles.start % per_page);
+    start..start + planes.tile_bytes() * tiles.len() as u64
 }

@@ -1,98 +1,95 @@
-//! The way of a frame back to the host: buffers in memory that it sees, which frames hand on to each
-//! other.
+//! Reading a frame back: buffers in memory that the host can read, reused by later frames.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use parking_lot::Mutex;
 use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
 
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::TICKS_BYTES;
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::TIMESTAMP_BYTES;
 use super::layout::{Counters, FrameView};
 use super::rasterize::pages;
 use super::resolve::Planes;
-use crate::limits;
-use crate::{FrameStats, RenderError};
+use crate::{FrameStats, RenderError, limits};
 
 /// How long a frame may take on the device before it counts as lost.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Where the ticks lie behind the counters.
-pub(super) const TICKS_OFFSET: u64 = 256;
+/// Offset of the timestamps after the counters, in bytes.
+pub(super) const TIMESTAMP_OFFSET: u64 = 256;
 
-/// Where a frame reaches the host. A step's images are copied out of one while the next step fills
-/// another.
+/// The read-back buffers of one frame. The images of a step are copied out of one while the device fills
+/// another one with the next step.
 #[derive(Debug)]
 pub(super) struct ReadBack {
-    /// Counters, then ticks.
-    pub(super) head: Growing,
-    pub(super) pages: Vec<Growing>,
+    /// Counters, then timestamps.
+    pub(super) head: GrowableBuffer,
+    /// Pixels.
+    pub(super) pages: Vec<GrowableBuffer>,
+    /// Tiles of a page; the last page may have fewer.
     pub(super) tiles_per_page: u32,
 }
 
-/// Read-back buffers of one device that nobody reads.
+/// The unused read-back buffers of one device.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Ring(Arc<Mutex<Vec<ReadBack>>>);
+pub(super) struct ReadBackPool(Arc<Mutex<Vec<ReadBack>>>);
 
-/// A frame that is done, in mapped memory.
+/// A frame that the device has finished, in mapped memory.
 #[derive(Debug)]
-pub(super) struct Drawn {
+pub(super) struct MappedFrame {
     pub(super) read_back: ReadBack,
-    pub(super) ring: Ring,
+    pub(super) pool: ReadBackPool,
     /// Pixels, page by page.
     pub(super) pages: Vec<BufferView>,
     pub(super) views: Vec<FrameView>,
     pub(super) stats: FrameStats,
 }
 
-impl Drawn {
-    /// Tiles of a page, of the last one perhaps fewer.
+impl MappedFrame {
+    /// Tiles of a page; the last page may have fewer.
     pub(super) fn tiles_per_page(&self) -> u32 {
         self.read_back.tiles_per_page
     }
 
-    /// Gives the memory back for another frame, which may be drawn by now.
+    /// Unmaps the memory and returns it for use by another frame.
     pub(super) fn recycle(self) {
-        let Self { read_back, ring, pages, .. } = self;
-        // A buffer stays mapped for as long as a view of it lives.
+        let Self { read_back, pool, pages, .. } = self;
+        // A buffer cannot be unmapped while a view of it exists.
         drop(pages);
         read_back.unmap();
-        let mut unused = ring.lock();
+        let mut unused = pool.0.lock();
         if unused.len() < limits::GPU_FRAMES {
             unused.push(read_back);
         }
     }
 }
 
-impl Ring {
-    /// One that a frame has handed on.
+impl ReadBackPool {
+    /// Takes the buffers of an earlier frame, if some are unused.
     pub(super) fn take(&self) -> Option<ReadBack> {
-        self.lock().pop()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Vec<ReadBack>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock().pop()
     }
 }
 
 impl ReadBack {
-    /// The smallest.
+    /// Buffers of the smallest size.
     pub(super) fn new(device: &Device) -> Self {
         let head = Self::buffer(device, "counters read back");
         Self { head, pages: Vec::new(), tiles_per_page: 1 }
     }
 
-    /// A buffer that the device copies to and the host reads.
-    pub(super) fn buffer(device: &Device, label: &'static str) -> Growing {
-        Growing::new(device, label, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
+    /// A buffer to which the device copies and from which the host reads.
+    pub(super) fn buffer(device: &Device, label: &'static str) -> GrowableBuffer {
+        GrowableBuffer::new(device, label, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
     }
 
     /// Makes room for the pixels of all tiles.
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32, per_page: u32) {
         self.tiles_per_page = per_page;
-        self.head.reserve(device, TICKS_OFFSET + TICKS_BYTES);
+        self.reserve_head(device);
         let count = tiles.div_ceil(per_page) as usize;
         self.pages.resize_with(count, || Self::buffer(device, "pixels read back"));
         for (page, tiles) in pages(&(0..tiles), per_page) {
@@ -100,16 +97,24 @@ impl ReadBack {
         }
     }
 
-    /// Waits for a submission, and maps everything.
+    /// Makes room for the counters and the timestamps.
+    pub(super) fn reserve_head(&mut self, device: &Device) {
+        self.head.reserve(device, TIMESTAMP_OFFSET + TIMESTAMP_BYTES);
+    }
+
+    /// Waits for a submission, and maps all buffers.
+    ///
+    /// # Errors
+    /// The device fails, or does not finish within [`FRAME_TIMEOUT`].
     pub(super) fn map(
         &self,
         device: &Device,
         submission: SubmissionIndex,
     ) -> Result<(), RenderError> {
         let failed = Arc::new(AtomicBool::new(false));
-        for growing in self.all() {
+        for buffer in self.all() {
             let failed = Arc::clone(&failed);
-            growing.buffer().slice(..).map_async(MapMode::Read, move |result| {
+            buffer.buffer().slice(..).map_async(MapMode::Read, move |result| {
                 failed.fetch_or(result.is_err(), Relaxed);
             });
         }
@@ -124,12 +129,13 @@ impl ReadBack {
         }
     }
 
-    /// What was counted, and the ticks.
+    /// The counters and the timestamps.
     pub(super) fn head(&self, device: &Device) -> Result<(Counters, Vec<u64>), RenderError> {
         let view = view(device, &self.head)?;
         let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
-        let ticks = &view[TICKS_OFFSET as usize..(TICKS_OFFSET + TICKS_BYTES) as usize];
-        Ok((counters, ticks.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect()))
+        let start = TIMESTAMP_OFFSET as usize;
+        let timestamps = view[start..start + TIMESTAMP_BYTES as usize].chunks_exact(8);
+        Ok((counters, timestamps.map(bytemuck::pod_read_unaligned).collect()))
     }
 
     /// The pixels.
@@ -137,17 +143,18 @@ impl ReadBack {
         self.pages.iter().map(|page| view(device, page)).collect()
     }
 
-    /// Hands everything back to the device.
+    /// Unmaps all buffers, so that the device can use them again.
     pub(super) fn unmap(&self) {
-        self.all().for_each(|growing| growing.buffer().unmap());
+        self.all().for_each(|buffer| buffer.buffer().unmap());
     }
 
-    fn all(&self) -> impl Iterator<Item = &Growing> {
+    fn all(&self) -> impl Iterator<Item = &GrowableBuffer> {
         std::iter::once(&self.head).chain(&self.pages)
     }
 }
 
-fn view(device: &Device, growing: &Growing) -> Result<BufferView, RenderError> {
-    let mapped = growing.buffer().slice(..).get_mapped_range();
+/// The mapped content of a buffer.
+fn view(device: &Device, buffer: &GrowableBuffer) -> Result<BufferView, RenderError> {
+    let mapped = buffer.buffer().slice(..).get_mapped_range();
     mapped.map_err(|error| device.failed(error.to_string()))
 }

@@ -1,6 +1,7 @@
-//! Stage resolve: what the device leaves, tile after tile, becomes the rows of the targets.
+//! Stage resolve, the host's part: copies the device's output, which is tile after tile, to the rows of
+//! the targets.
 //!
-//! The arithmetic is in `shaders/resolve.wgsl`; twin of `render/cpu/resolve.rs`.
+//! The arithmetic is in `shaders/resolve.wgsl`. Twin of `render/cpu/resolve.rs`.
 
 use std::ops::Range;
 
@@ -14,7 +15,7 @@ use wildcity_scene::appearance::Appearance;
 /// Pixels of a tile.
 const PLANE: usize = (TILE_PX * TILE_PX) as usize;
 
-/// Which values of a pixel the device computes and the host reads: what any target wants.
+/// Which values of a pixel the device computes and the host reads: those that any target requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Planes {
     rgb8: bool,
@@ -23,21 +24,21 @@ pub(super) struct Planes {
     depth: bool,
 }
 
-/// What the targets of a frame ask of the device.
+/// The outputs that the targets of a frame request.
 #[derive(Clone, Debug)]
-pub(super) struct Wanted {
+pub(super) struct Outputs {
     pub(super) planes: Planes,
-    /// What each camera makes of colours; empty if they all record what is there.
+    /// Exposure and overlay of each camera; empty if no camera has either.
     pub(super) appearances: Vec<Appearance>,
 }
 
-impl Wanted {
-    /// What these targets ask for.
+impl Outputs {
+    /// The outputs that these targets request.
     pub(super) fn of(targets: &[Target<'_>]) -> Self {
         let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
         let appearances: Vec<Appearance> = appearances.collect();
-        let all_plain = appearances.iter().all(Appearance::is_identity);
-        let appearances = if all_plain { Vec::new() } else { appearances };
+        let all_identity = appearances.iter().all(Appearance::is_identity);
+        let appearances = if all_identity { Vec::new() } else { appearances };
         Self { planes: Planes::of(targets), appearances }
     }
 }
@@ -46,9 +47,9 @@ impl Planes {
     /// Number of combinations.
     pub(super) const VARIANTS: usize = 16;
 
-    /// What these targets ask for.
+    /// The values that these targets request.
     pub(super) fn of(targets: &[Target<'_>]) -> Self {
-        let any = |wants: fn(&Target<'_>) -> bool| targets.iter().any(wants);
+        let any = |requests: fn(&Target<'_>) -> bool| targets.iter().any(requests);
         Self {
             rgb8: any(|t| t.rgb8.is_some()),
             rgb: any(|t| t.rgba.is_some()),
@@ -63,7 +64,7 @@ impl Planes {
         bits.into_iter().fold(0, |number, bit| 2 * number + usize::from(bit))
     }
 
-    /// The switches of `shaders/resolve.wgsl`.
+    /// The override constants of `shaders/resolve.wgsl`.
     pub(super) fn constants(self) -> [(&'static str, f64); 4] {
         let switch = |name, on| (name, f64::from(u8::from(on)));
         [
@@ -74,11 +75,12 @@ impl Planes {
         ]
     }
 
-    /// Bytes of the pixels of one tile; one plane at least, so that buffers are not empty.
+    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty.
     pub(super) fn tile_bytes(self) -> u64 {
         4 * (self.count().max(1) * PLANE) as u64
     }
 
+    /// Number of planes.
     fn count(self) -> usize {
         let [rgb8, rgb, opacity, depth] = self.starts();
         [rgb8.map(|s| s + 1), rgb.map(|s| s + 3), opacity.map(|s| s + 1), depth.map(|s| s + 1)]
@@ -88,12 +90,12 @@ impl Planes {
             .unwrap_or(0)
     }
 
-    /// First plane of rgb8, rgb, opacity and depth, where they are wanted.
+    /// First plane of rgb8, rgb, opacity, and depth; `None` if it is not requested.
     fn starts(self) -> [Option<usize>; 4] {
         let mut next = 0;
         [(self.rgb8, 1), (self.rgb, 3), (self.opacity, 1), (self.depth, 1)].map(
-            |(wanted, planes)| {
-                wanted.then(|| {
+            |(requested, planes)| {
+                requested.then(|| {
                     next += planes;
                     next - planes
                 })
@@ -102,31 +104,31 @@ impl Planes {
     }
 }
 
-/// All pixels of a frame as the device wrote them.
+/// All pixels of a frame in the device's order.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pixels<'a> {
-    /// Pages of as many tiles each, the last one perhaps fewer.
+    /// Pages of `tiles_per_page` tiles each; the last one may have fewer.
     pub(super) pages: &'a [&'a [u32]],
     /// Tiles of a page.
     pub(super) tiles_per_page: u32,
-    /// What each tile has.
+    /// The planes of each tile.
     pub(super) planes: Planes,
 }
 
 impl Pixels<'_> {
-    /// Fills one view's target.
-    pub(super) fn deliver(&self, view: &FrameView, target: &mut Target<'_>) {
+    /// Copies the pixels of one view to its target.
+    pub(super) fn copy_to(&self, view: &FrameView, target: &mut Target<'_>) {
         let row_pixels = (view.size_px[0] * TILE_PX) as usize;
         let [rgb8, rgb, opacity, depth] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
-            self.rows(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
+            self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
                 for (to, word) in to[3 * at..].chunks_exact_mut(3).zip(row(tile, plane, &from)) {
                     to.copy_from_slice(&word.to_le_bytes()[..3]);
                 }
             });
         }
         if let (Some(to), Some(rgb), Some(opacity)) = (&mut target.rgba, rgb, opacity) {
-            self.rows(view, to.par_chunks_mut(4 * row_pixels), |to, at, tile, from| {
+            self.for_each_row(view, to.par_chunks_mut(4 * row_pixels), |to, at, tile, from| {
                 for (channel, plane) in [rgb, rgb + 1, rgb + 2, opacity].into_iter().enumerate() {
                     let to = to[4 * at..].chunks_exact_mut(4);
                     for (to, word) in to.zip(row(tile, plane, &from)) {
@@ -137,7 +139,7 @@ impl Pixels<'_> {
         }
         for (to, plane) in [(&mut target.opacity, opacity), (&mut target.depth_m, depth)] {
             if let (Some(to), Some(plane)) = (to, plane) {
-                self.rows(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
+                self.for_each_row(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
                     for (to, word) in to[at..].iter_mut().zip(row(tile, plane, &from)) {
                         *to = f32::from_bits(*word);
                     }
@@ -146,9 +148,9 @@ impl Pixels<'_> {
         }
     }
 
-    /// For every row of every tile: `copy` gets the band of the target under the tile's row of
-    /// tiles, the pixel in it, the tile's words, and the row's range of a plane.
-    fn rows<'t, T: Send + 't>(
+    /// Calls `copy` for every row of every tile, with the band of the target that the tile's row of tiles
+    /// covers, the index of the first pixel in it, the tile's words, and the row's range of a plane.
+    fn for_each_row<'t, T: Send + 't>(
         &self,
         view: &FrameView,
         bands: impl IndexedParallelIterator<Item = &'t mut [T]>,
@@ -169,6 +171,7 @@ impl Pixels<'_> {
         });
     }
 
+    /// The words of one tile.
     fn tile(&self, tile: u32) -> &[u32] {
         let page = self.pages[(tile / self.tiles_per_page) as usize];
         let words = self.planes.count() * PLANE;

@@ -1,4 +1,4 @@
-//! What a device can do at most, measured: copying memory, and multiplying and adding. WGSL:
+//! Roofline of a device: its peak rates of copying memory and of multiply-adds, measured. WGSL:
 //! `shaders/roofline.wgsl`.
 
 use std::time::Instant;
@@ -6,28 +6,27 @@ use std::time::Instant;
 use wgpu::{BindingResource, BufferUsages, MapMode, PollType, QuerySet};
 
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::{Groups, Kernel, Recorder, TICKS_BYTES, clock, module};
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::{Groups, Kernel, Recorder, TIMESTAMP_BYTES, module, timestamps};
 use super::layout::{Span, WORKGROUP};
-use super::shaders::Shaders;
 use crate::RenderError;
 
-/// Bytes that are copied: five times the cache of a large card, if a binding holds as many.
+/// Bytes that are copied, or fewer if a binding holds less: five times the cache of a large graphics card.
 const COPY_BYTES: u64 = 256 << 20;
-/// Workgroups that multiply: 62 for each of the 132 multiprocessors of a large card, which holds 8 of 256
-/// threads at a time.
+/// Workgroups of the multiply-add kernel: 62 for each of the 132 multiprocessors of a large graphics card,
+/// each of which holds 8 workgroups of 256 threads at a time.
 const GROUPS: u32 = 1 << 13;
-/// Multiply-adds of a round of a thread.
+/// Multiply-adds of a thread per round.
 const ROUND: u64 = 64;
-/// A run of at least as many seconds is long enough to be timed.
+/// Shortest run, in seconds, that is timed accurately enough.
 const LONG_S: f64 = 5e-3;
-/// The best of as many runs counts.
+/// Number of runs, of which the fastest counts.
 const RUNS: usize = 5;
 
-/// What a device can do.
+/// Peak rates of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Roofline {
-    /// Bytes read and written per second by a copy that no cache holds.
+    /// Bytes read plus bytes written per second, by a copy that does not fit the cache.
     pub bytes_per_s: f64,
     /// f32 multiply-adds per second.
     pub multiply_adds_per_s: f64,
@@ -38,8 +37,8 @@ impl Roofline {
     ///
     /// # Errors
     /// The device fails.
-    pub(super) fn measure(device: &Device, shaders: &Shaders) -> Result<Self, RenderError> {
-        let module = module(device, shaders, "roofline");
+    pub(super) fn measure(device: &Device) -> Result<Self, RenderError> {
+        let module = module(device, "roofline");
         let kernel = |entry| Kernel::new(device, &module, entry, &[]);
         let bytes = COPY_BYTES.min(device.binding_bytes());
         let storage = BufferUsages::STORAGE;
@@ -51,8 +50,9 @@ impl Roofline {
         let groups = Groups::Count(((bytes / 16) as u32).div_ceil(WORKGROUP));
         let copy_s = stopwatch.best(device, &kernel("copy"), groups, &buffers)?;
 
+        // More rounds until a run is long enough.
         let usage = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
-        let mut rounds = Growing::new(device, "rounds", usage);
+        let mut rounds = GrowableBuffer::new(device, "rounds", usage);
         let multiply_add = kernel("multiply_add");
         let mut count = 1;
         let multiply_adds_per_s = loop {
@@ -70,25 +70,25 @@ impl Roofline {
     }
 }
 
-/// Times kernels by the device's own clock, or by the host's where it has none.
+/// Times kernels by the device's clock, or by the host's if the device has none.
 struct Stopwatch {
-    clock: Option<QuerySet>,
-    ticks: Growing,
-    read_back: Growing,
+    queries: Option<QuerySet>,
+    timestamps: GrowableBuffer,
+    read_back: GrowableBuffer,
 }
 
 impl Stopwatch {
     fn new(device: &Device) -> Self {
         let resolved = BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC;
         let mapped = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
-        let mut ticks = Growing::new(device, "ticks", resolved);
-        let mut read_back = Growing::new(device, "ticks read back", mapped);
-        ticks.reserve(device, TICKS_BYTES);
-        read_back.reserve(device, TICKS_BYTES);
-        Self { clock: clock(device), ticks, read_back }
+        let mut timestamps_buffer = GrowableBuffer::new(device, "timestamps", resolved);
+        let mut read_back = GrowableBuffer::new(device, "timestamps read back", mapped);
+        timestamps_buffer.reserve(device, TIMESTAMP_BYTES);
+        read_back.reserve(device, TIMESTAMP_BYTES);
+        Self { queries: timestamps(device), timestamps: timestamps_buffer, read_back }
     }
 
-    /// Seconds of the fastest of several runs.
+    /// Seconds of the fastest of [`RUNS`] runs.
     fn best(
         &self,
         device: &Device,
@@ -98,14 +98,15 @@ impl Stopwatch {
     ) -> Result<f64, RenderError> {
         let mut best_s = f64::INFINITY;
         for _ in 0..RUNS {
-            let mut recorder = Recorder::new(device, self.clock.clone());
+            let mut recorder = Recorder::new(device, self.queries.clone());
             kernel.run(device, &mut recorder.stage("roofline"), groups, resources);
-            recorder.finish_stages(self.ticks.buffer());
-            let (ticks, read_back) = (self.ticks.buffer(), self.read_back.buffer());
-            recorder.encoder.copy_buffer_to_buffer(ticks, 0, read_back, 0, TICKS_BYTES);
+            let timestamps = self.timestamps.buffer();
+            let read_back = self.read_back.buffer();
+            recorder.finish_stages(timestamps);
+            recorder.encoder.copy_buffer_to_buffer(timestamps, 0, read_back, 0, TIMESTAMP_BYTES);
             let start = Instant::now();
             device.queue.submit([recorder.encoder.finish()]);
-            // Whether it worked is told by `get_mapped_range`.
+            // `get_mapped_range` reports whether mapping succeeded.
             read_back.slice(..).map_async(MapMode::Read, |_| {});
             let polled = device.device.poll(PollType::wait_indefinitely());
             let host_s = start.elapsed().as_secs_f64();

@@ -1,31 +1,30 @@
-//! The prefix sum that project, sort and bin share.
+//! The prefix sum that the stages project, sort, and bin share. WGSL: `shaders/scan.wgsl`.
 
 use wgpu::{Buffer, BufferUsages, ComputePass};
 
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::{Groups, Kernel, module, slot};
-use super::layout::{Job, SCAN_BLOCK};
-use super::shaders::Shaders;
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::{Groups, JobRef, Kernel, module};
+use super::layout::SCAN_BLOCK;
 
-/// The three kernels, and the sums between them.
+/// The three kernels, and the block sums that they exchange.
 #[derive(Debug)]
 pub(super) struct Scan {
     reduce: Kernel,
     sums: Kernel,
     apply: Kernel,
-    block_sums: Growing,
+    block_sums: GrowableBuffer,
 }
 
 impl Scan {
-    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
-        let module = module(device, shaders, "scan");
+    pub(super) fn new(device: &Device) -> Self {
+        let module = module(device, "scan");
         let kernel = |entry| Kernel::new(device, &module, entry, &[]);
         Self {
             reduce: kernel("reduce"),
             sums: kernel("sums"),
             apply: kernel("apply"),
-            block_sums: Growing::new(device, "block sums", BufferUsages::STORAGE),
+            block_sums: GrowableBuffer::new(device, "block sums", BufferUsages::STORAGE),
         }
     }
 
@@ -35,25 +34,25 @@ impl Scan {
         self.block_sums.reserve(device, 4 * blocks);
     }
 
-    /// The sums of blocks after a run, the total behind them.
+    /// After a run: the exclusive prefix sums of the blocks, then the total.
     pub(super) fn block_sums(&self) -> &Buffer {
         self.block_sums.buffer()
     }
 
-    /// Replaces the values of a job by what precedes each.
+    /// Replaces the first `job.length` values by their exclusive prefix sums.
     pub(super) fn run(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
-        (jobs, job): (&Buffer, u64),
+        job: JobRef<'_>,
         values: &Buffer,
     ) {
-        let groups = Groups::Job(jobs, job);
-        let job = slot(jobs, job, size_of::<Job>());
-        let sums = self.block_sums.bind();
-        let all = [(0, job), (1, values.as_entire_binding()), (2, sums)];
+        let groups = Groups::Job(job);
+        let length = (0, job.bind());
+        let sums = (2, self.block_sums.bind());
+        let all = [length.clone(), (1, values.as_entire_binding()), sums.clone()];
         self.reduce.run(device, pass, groups, &all);
-        self.sums.run(device, pass, Groups::Count(1), &[all[0].clone(), all[2].clone()]);
+        self.sums.run(device, pass, Groups::Count(1), &[length, sums]);
         self.apply.run(device, pass, groups, &all);
     }
 }

@@ -1,126 +1,162 @@
-//! The WGSL of each stage, with its `#import NAME` lines replaced by the file of that name. That one
-//! directive is the whole preprocessor; a NAME in capitals stands for one of several files, and each choice
-//! is a variant of the stage.
+//! The WGSL source of each shader. `#import NAME` lines are replaced by the file of that name; this one
+//! directive is the whole preprocessor. A NAME in capitals is a placeholder for one of several files, and
+//! each choice makes a variant of the shader.
 
 use std::sync::Arc;
 
-/// The linked sources of all stages. A copy shares them.
+/// The linked sources of all shaders. Clones share them.
 #[derive(Clone, Debug)]
 pub struct Shaders {
-    stages: Arc<Vec<(&'static str, String)>>,
+    linked: Arc<Vec<Linked>>,
 }
 
-/// Name of a variant, its stage, and what its capitals stand for.
-type Variant = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+/// A shader with all its imports.
+#[derive(Clone, Debug)]
+struct Linked {
+    name: &'static str,
+    source: String,
+}
 
-/// A stage without a choice is its own variant.
+/// A shader before it is linked.
+#[derive(Clone, Copy, Debug)]
+struct Variant {
+    name: &'static str,
+    /// The file to start with.
+    file: &'static str,
+    /// The file for each placeholder.
+    choices: &'static [Choice],
+}
+
+/// The file that replaces a placeholder.
+#[derive(Clone, Copy, Debug)]
+struct Choice {
+    placeholder: &'static str,
+    file: &'static str,
+}
+
+const fn choice(placeholder: &'static str, file: &'static str) -> Choice {
+    Choice { placeholder, file }
+}
+
+const fn variant(name: &'static str, file: &'static str, choices: &'static [Choice]) -> Variant {
+    Variant { name, file, choices }
+}
+
+/// A shader without placeholders.
+const fn plain(name: &'static str) -> Variant {
+    Variant { name, file: name, choices: &[] }
+}
+
+const BACKGROUND: Choice = choice("BACKGROUND", "background");
+const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
+const MAP: Choice = choice("SKY", "sky_map");
+const NETWORK: Choice = choice("SKY", "sky_network");
+const RAY_PINHOLE: Choice = choice("RAYS", "ray_pinhole");
+const RAY_LENS: Choice = choice("RAYS", "ray_lens");
+
 const VARIANTS: &[Variant] = &[
-    ("project", "project", &[("SIGHT", "straight")]),
-    ("project_bent", "project", &[("SIGHT", "bent")]),
-    ("scan", "scan", &[]),
-    ("plan", "plan", &[]),
-    ("sort", "sort", &[]),
-    ("bin", "bin", &[]),
-    ("ranges", "ranges", &[]),
-    ("expand", "expand", &[]),
-    ("rasterize", "rasterize", &[("BEHIND", "plain")]),
-    ("rasterize_map", "rasterize", &[BEHIND, MAP, STRAIGHT]),
-    ("rasterize_map_bent", "rasterize", &[BEHIND, MAP, BENT]),
-    ("rasterize_network", "rasterize", &[BEHIND, NETWORK, STRAIGHT]),
-    ("rasterize_network_bent", "rasterize", &[BEHIND, NETWORK, BENT]),
-    ("roofline", "roofline", &[]),
+    variant("project", "project", &[choice("PROJECTION", "pinhole")]),
+    variant("project_unscented", "project", &[choice("PROJECTION", "unscented")]),
+    plain("scan"),
+    plain("plan"),
+    plain("sort"),
+    plain("bin"),
+    plain("ranges"),
+    plain("expand"),
+    variant("rasterize", "rasterize", &[NO_BACKGROUND]),
+    variant("rasterize_map", "rasterize", &[BACKGROUND, MAP, RAY_PINHOLE]),
+    variant("rasterize_map_lens", "rasterize", &[BACKGROUND, MAP, RAY_LENS]),
+    variant("rasterize_network", "rasterize", &[BACKGROUND, NETWORK, RAY_PINHOLE]),
+    variant("rasterize_network_lens", "rasterize", &[BACKGROUND, NETWORK, RAY_LENS]),
+    plain("roofline"),
 ];
 
-const BEHIND: (&str, &str) = ("BEHIND", "behind");
-const MAP: (&str, &str) = ("SKY", "sky_map");
-const NETWORK: (&str, &str) = ("SKY", "sky_network");
-const STRAIGHT: (&str, &str) = ("LOOK", "look_straight");
-const BENT: (&str, &str) = ("LOOK", "look_bent");
-
-/// The files in `shaders` and `shaders/shared`.
+/// Name and content of the files in `shaders` and `shaders/shared`.
 const FILES: &[(&str, &str)] = &[
     ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
     ("appearance", include_str!("../../../shaders/appearance.wgsl")),
-    ("behind", include_str!("../../../shaders/behind.wgsl")),
-    ("bent", include_str!("../../../shaders/bent.wgsl")),
+    ("background", include_str!("../../../shaders/background.wgsl")),
     ("bin", include_str!("../../../shaders/bin.wgsl")),
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
-    ("look_bent", include_str!("../../../shaders/look_bent.wgsl")),
-    ("look_straight", include_str!("../../../shaders/look_straight.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
-    ("plain", include_str!("../../../shaders/shared/plain.wgsl")),
+    ("no_background", include_str!("../../../shaders/shared/no_background.wgsl")),
+    ("pinhole", include_str!("../../../shaders/pinhole.wgsl")),
     ("plan", include_str!("../../../shaders/plan.wgsl")),
     ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
     ("project", include_str!("../../../shaders/project.wgsl")),
     ("ranges", include_str!("../../../shaders/ranges.wgsl")),
     ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+    ("ray_lens", include_str!("../../../shaders/ray_lens.wgsl")),
+    ("ray_pinhole", include_str!("../../../shaders/ray_pinhole.wgsl")),
     ("resolve", include_str!("../../../shaders/resolve.wgsl")),
     ("roofline", include_str!("../../../shaders/roofline.wgsl")),
     ("scan", include_str!("../../../shaders/scan.wgsl")),
     ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
     ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
     ("sort", include_str!("../../../shaders/sort.wgsl")),
-    ("straight", include_str!("../../../shaders/straight.wgsl")),
+    ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];
 
 impl Default for Shaders {
     fn default() -> Self {
-        let linked = VARIANTS.iter().map(|(name, stage, choices)| {
+        let linked = VARIANTS.iter().map(|variant| {
             let mut source = String::new();
-            import(stage, choices, &mut Vec::new(), &mut source);
-            (*name, source)
+            append(variant.file, variant.choices, &mut Vec::new(), &mut source);
+            Linked { name: variant.name, source }
         });
-        Self { stages: Arc::new(linked.collect()) }
+        Self { linked: Arc::new(linked.collect()) }
     }
 }
 
 impl Shaders {
-    /// Name and linked source of every variant of a stage.
+    /// Name and linked source of every variant of a shader.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, &str)> {
-        self.stages.iter().map(|(name, source)| (*name, source.as_str()))
+        self.linked.iter().map(|linked| (linked.name, linked.source.as_str()))
     }
 
-    /// The same with the first `part` of a variant replaced, or `None` if it does not have it: how tests
-    /// break a shader to see that it is noticed.
-    pub fn with_mutation(mut self, stage: &str, part: &str, slip: &str) -> Option<Self> {
-        let stages = Arc::make_mut(&mut self.stages);
-        let (_, source) = stages.iter_mut().find(|(name, _)| *name == stage)?;
-        if !source.contains(part) {
+    /// The same shaders with the first `original` text of a variant replaced, or `None` if the variant
+    /// does not contain it. Tests break a shader with it and check that the fault is detected.
+    pub fn with_mutation(
+        mut self,
+        shader: &str,
+        original: &str,
+        replacement: &str,
+    ) -> Option<Self> {
+        let linked = Arc::make_mut(&mut self.linked);
+        let Linked { source, .. } = linked.iter_mut().find(|linked| linked.name == shader)?;
+        if !source.contains(original) {
             return None;
         }
-        *source = source.replacen(part, slip, 1);
+        *source = source.replacen(original, replacement, 1);
         Some(self)
     }
 
-    pub(super) fn get(&self, stage: &str) -> &str {
-        self.stages().find(|(name, _)| *name == stage).map_or("", |(_, source)| source)
+    /// The linked source of a variant; empty if there is no such variant.
+    pub(super) fn get(&self, shader: &str) -> &str {
+        self.stages().find(|(name, _)| *name == shader).map_or("", |(_, source)| source)
     }
 }
 
-/// Appends a file and, where it asks for them, those that are not there yet. What no file is called
-/// stays, and the shader's compiler says where.
-fn import(
-    name: &str,
-    choices: &[(&'static str, &'static str)],
-    there: &mut Vec<&'static str>,
-    source: &mut String,
-) {
+/// Appends a file with its imports, each file once. An import without a file is kept as it is, so that
+/// the shader compiler reports it.
+fn append(name: &str, choices: &[Choice], appended: &mut Vec<&'static str>, source: &mut String) {
     let Some((name, text)) = FILES.iter().find(|(file, _)| *file == name) else {
         source.push_str(&format!("#import {name}\n"));
         return;
     };
-    if there.contains(name) {
+    if appended.contains(name) {
         return;
     }
-    there.push(name);
+    appended.push(name);
     for line in text.lines() {
         match line.strip_prefix("#import ") {
-            Some(asked) => {
-                let chosen = choices.iter().find(|(capitals, _)| *capitals == asked);
-                import(chosen.map_or(asked, |(_, file)| file), choices, there, source);
+            Some(import) => {
+                let choice = choices.iter().find(|choice| choice.placeholder == import);
+                let file = choice.map_or(import, |choice| choice.file);
+                append(file, choices, appended, source);
             }
             None => {
                 source.push_str(line);

@@ -1,14 +1,13 @@
-//! Stage sort, of splats by (view, depth) and of touches by macro tile: a stable radix sort, 8 bits a
-//! pass. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`.
+//! Stage sort: a stable LSD radix sort with 8 bits per pass, of splats by (view, depth) and of touches by
+//! macro tile. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`.
 
-use wgpu::{Buffer, BufferUsages, ComputePass};
+use wgpu::{BufferUsages, ComputePass};
 
 use super::device::Device;
-use super::growing::Growing;
-use super::kernel::{Groups, Kernel, module, slot};
-use super::layout::{DIGITS, Job, SORT_BLOCK};
+use super::growable_buffer::GrowableBuffer;
+use super::kernel::{Groups, JobRef, Kernel, module};
+use super::layout::{DIGITS, SORT_BLOCK};
 use super::scan::Scan;
-use super::shaders::Shaders;
 
 /// Bits of a digit.
 pub(super) const DIGIT_BITS: u32 = DIGITS.ilog2();
@@ -16,9 +15,9 @@ pub(super) const DIGIT_BITS: u32 = DIGITS.ilog2();
 /// The kernels of each pass, and the counters between them.
 #[derive(Debug)]
 pub(super) struct Sort {
-    /// By the digit's number.
+    /// One for each digit of 32-bit keys, from the least significant.
     passes: Vec<Pass>,
-    offsets: Growing,
+    offsets: GrowableBuffer,
 }
 
 #[derive(Debug)]
@@ -28,20 +27,29 @@ struct Pass {
     scatter_masked: Kernel,
 }
 
-/// What is sorted, to and fro between two buffers each.
+/// The buffers of a sort. Each pass moves the data from one buffer of a pair to the other.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns<'a> {
-    /// What it is sorted by.
-    pub(super) keys: &'a [Growing; 2],
-    /// What goes with each key.
-    pub(super) values: &'a [Growing; 2],
-    /// What goes with it beside, perhaps.
-    pub(super) masks: Option<&'a [Growing; 2]>,
+    /// The keys.
+    pub(super) keys: &'a [GrowableBuffer; 2],
+    /// A value for each key.
+    pub(super) values: &'a [GrowableBuffer; 2],
+    /// A second value for each key, if there is one.
+    pub(super) masks: Option<&'a [GrowableBuffer; 2]>,
+}
+
+/// The jobs of a sort.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SortJobs<'a> {
+    /// All keys, in blocks of [`SORT_BLOCK`].
+    pub(super) keys: JobRef<'a>,
+    /// The counters of all digits of all blocks.
+    pub(super) counters: JobRef<'a>,
 }
 
 impl Sort {
-    pub(super) fn new(device: &Device, shaders: &Shaders) -> Self {
-        let module = module(device, shaders, "sort");
+    pub(super) fn new(device: &Device) -> Self {
+        let module = module(device, "sort");
         let pass = |digit: u32| {
             let constants = [("SHIFT", f64::from(DIGIT_BITS * digit))];
             let kernel = |entry| Kernel::new(device, &module, entry, &constants);
@@ -53,7 +61,7 @@ impl Sort {
         };
         Self {
             passes: (0..u32::BITS / DIGIT_BITS).map(pass).collect(),
-            offsets: Growing::new(device, "digit offsets", BufferUsages::STORAGE),
+            offsets: GrowableBuffer::new(device, "digit offsets", BufferUsages::STORAGE),
         }
     }
 
@@ -64,13 +72,13 @@ impl Sort {
         scan.reserve(device, counters);
     }
 
-    /// Sorts by the lowest `bits` of the keys. Returns which of the two buffers has the result.
+    /// Sorts by the lowest `bits` of the keys. Returns which buffer of each pair has the result.
     pub(super) fn run(
         &self,
         device: &Device,
         pass: &mut ComputePass<'_>,
         scan: &Scan,
-        (jobs, sort, digits): (&Buffer, u64, u64),
+        jobs: SortJobs<'_>,
         columns: Columns<'_>,
         bits: u32,
     ) -> usize {
@@ -80,13 +88,9 @@ impl Sort {
             &self.passes[..bits.div_ceil(DIGIT_BITS) as usize]
         {
             let to = 1 - from;
-            let counts = [
-                (0, slot(jobs, sort, size_of::<Job>())),
-                (1, self.offsets.bind()),
-                (2, keys[from].bind()),
-            ];
-            histogram.run(device, pass, Groups::Job(jobs, sort), &counts);
-            scan.run(device, pass, (jobs, digits), self.offsets.buffer());
+            let counts = [(0, jobs.keys.bind()), (1, self.offsets.bind()), (2, keys[from].bind())];
+            histogram.run(device, pass, Groups::Job(jobs.keys), &counts);
+            scan.run(device, pass, jobs.counters, self.offsets.buffer());
             let moved = [(3, values[from].bind()), (4, keys[to].bind()), (5, values[to].bind())];
             let mut all: Vec<_> = counts.into_iter().chain(moved).collect();
             let kernel = match masks {
@@ -96,7 +100,7 @@ impl Sort {
                 }
                 None => scatter,
             };
-            kernel.run(device, pass, Groups::Job(jobs, sort), &all);
+            kernel.run(device, pass, Groups::Job(jobs.keys), &all);
             from = to;
         }
         from
@@ -109,8 +113,9 @@ mod tests {
 
     use super::*;
     use crate::gpu::AdapterChoice;
-    use crate::gpu::kernel::Recorder;
-    use crate::gpu::layout::{JobSlot, MAX_GROUPS, SCAN_BLOCK};
+    use crate::gpu::kernel::{Recorder, fold_groups};
+    use crate::gpu::layout::{Job, JobSlot, SCAN_BLOCK};
+    use crate::gpu::shaders::Shaders;
 
     /// Bits of the keys.
     const BITS: u32 = 31;
@@ -118,51 +123,56 @@ mod tests {
     /// Stress case T21: as many keys as a binding holds, 2^25 on lavapipe, and 70 million at most.
     #[test]
     fn t21_as_many_keys_as_a_binding_holds() {
-        let device = Device::open(&AdapterChoice::Best, u64::MAX)
+        let device = Device::open(&AdapterChoice::Best, &Shaders::default(), u64::MAX)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let count = (device.binding_bytes() / 4).min(70_000_000) as u32;
-        // Half a million values in all four digits, so that 64 keys and more are equal.
+        // Half a million distinct keys that differ in all four digits, so that 64 keys and more are equal.
         let key = |i: u32| (i.wrapping_mul(0x9E37_79B9) ^ i >> 7) & 0x700F_F0FF;
         let keys: Vec<u32> = (0..count).map(key).collect();
         let (sorted_keys, sorted_values) = sort_on(&device, &keys);
         let mut truth: Vec<u32> = (0..count).collect();
         truth.sort_by_key(|&i| key(i));
-        assert!(sorted_values == truth, "the order is another, or not stable");
+        assert!(sorted_values == truth, "the order is wrong or not stable");
         assert!(truth.iter().zip(&sorted_keys).all(|(&i, &sorted)| sorted == key(i)));
     }
 
-    /// Keys and their indices, sorted by the device.
+    /// Keys and their indices, as the device sorts them.
     fn sort_on(device: &Device, unsorted: &[u32]) -> (Vec<u32>, Vec<u32>) {
-        let shaders = Shaders::default();
-        let (mut scan, mut sort) = (Scan::new(device, &shaders), Sort::new(device, &shaders));
+        let mut scan = Scan::new(device);
+        let mut sort = Sort::new(device);
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
         let bytes = 4 * unsorted.len() as u64;
         let pair = || {
-            let mut pair = [Growing::new(device, "to", usage), Growing::new(device, "fro", usage)];
+            let mut pair = ["even passes", "odd passes"]
+                .map(|label| GrowableBuffer::new(device, label, usage));
             pair.iter_mut().for_each(|words| words.reserve(device, bytes));
             pair
         };
-        let (keys, values) = (pair(), pair());
+        let keys = pair();
+        let values = pair();
         for (number, block) in unsorted.chunks(1 << 22).enumerate() {
             let first = (number << 22) as u32;
-            let places: Vec<u32> = (first..first + block.len() as u32).collect();
+            let indices: Vec<u32> = (first..first + block.len() as u32).collect();
             device.write_now(keys[0].buffer(), 4 * u64::from(first), bytemuck::cast_slice(block));
             device.write_now(
                 values[0].buffer(),
                 4 * u64::from(first),
-                bytemuck::cast_slice(&places),
+                bytemuck::cast_slice(&indices),
             );
         }
         let count = unsorted.len() as u32;
         sort.reserve(device, &mut scan, bytes / 4);
-        let slots = [job(count, SORT_BLOCK), job(DIGITS * count.div_ceil(SORT_BLOCK), SCAN_BLOCK)];
+        let counters = DIGITS * count.div_ceil(SORT_BLOCK);
+        let slots = [job(count, SORT_BLOCK), job(counters, SCAN_BLOCK)];
         let jobs = device.buffer("jobs", 512, usage | BufferUsages::INDIRECT);
         device.write_now(&jobs, 0, bytemuck::cast_slice(&slots));
 
         let mut recorder = Recorder::new(device, None);
         let mut pass = recorder.stage("sort");
         let data = Columns { keys: &keys, values: &values, masks: None };
-        let sorted = sort.run(device, &mut pass, &scan, (&jobs, 0, 1), data, BITS);
+        let job = |slot| JobRef { jobs: &jobs, slot };
+        let sort_jobs = SortJobs { keys: job(0), counters: job(1) };
+        let sorted = sort.run(device, &mut pass, &scan, sort_jobs, data, BITS);
         drop(pass);
         let read = [keys[sorted].buffer(), values[sorted].buffer()].map(|from| {
             let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
@@ -176,11 +186,9 @@ mod tests {
         (keys, values)
     }
 
-    /// As `plan.wgsl` writes it.
+    /// A slot as `plan.wgsl` writes it.
     fn job(length: u32, per_group: u32) -> JobSlot {
-        let groups = length.div_ceil(per_group);
-        let rows = groups.div_ceil(MAX_GROUPS).max(1);
-        let job = Job { length, groups: [groups.div_ceil(rows), rows, 1] };
+        let job = Job { length, groups: fold_groups(length.div_ceil(per_group)) };
         JobSlot { job, pad: [[0; 4]; 15] }
     }
 

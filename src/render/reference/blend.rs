@@ -1,16 +1,16 @@
-//! Stage rasterize by definition: every pixel against every Gaussian, in order of depth.
+//! Stage rasterize by definition: every pixel against every splat, from front to back.
 
 use glam::{DVec2, DVec3};
 
 use super::project::Splat;
 use wildcity_scene::RenderProfile;
 
-/// What a pixel has gathered.
+/// Accumulated values of a pixel.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pixel {
     /// Linear premultiplied colour on black.
     pub(super) rgb: DVec3,
-    /// Share of the background that is still seen.
+    /// Share of the background that still shows.
     pub(super) transmittance: f64,
     /// Depth weighted by contribution, in metres.
     pub(super) depth_m: f64,
@@ -18,8 +18,8 @@ pub(super) struct Pixel {
 
 /// One row of pixels, from the left.
 ///
-/// Splats that cannot reach alpha_cut anywhere in the row are set aside first: the same image,
-/// twenty times sooner.
+/// Splats that reach alpha_cut nowhere in the row are left out first: the image is the same, and takes a
+/// twentieth of the time.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
     let near_row = |splat: &&Splat| (splat.mean_px.y - y_px).abs() <= splat.reach_px.y + 1e-6;
@@ -27,7 +27,7 @@ pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProf
     (0..width).map(|column| pixel(&here, DVec2::new(column as f64 + 0.5, y_px), profile)).collect()
 }
 
-/// Kerbl et al. 2023, eq. 3, with the cap, the cut and the stop of the profile.
+/// One pixel: Kerbl et al. 2023, eq. 3, with the cap, the cut and the stop of the profile.
 fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
     let mut pixel = Pixel::EMPTY;
     for splat in splats {
@@ -42,10 +42,10 @@ fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
 }
 
 impl Pixel {
-    /// Nothing is in the way.
+    /// Before any splat is blended.
     pub(super) const EMPTY: Self = Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0 };
 
-    /// Blends the next splat, of so much alpha before the cap. False if the pixel has stopped.
+    /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops before it.
     pub(super) fn add(&mut self, alpha: f64, splat: &Splat, profile: &RenderProfile) -> bool {
         let alpha = alpha.min(profile.alpha_cap);
         let touches = alpha >= profile.alpha_cut;

@@ -1,9 +1,10 @@
-//! The f64 oracle: the image by definition. No tiles, no SIMD, no clever bounds: slow and obvious.
+//! The reference backend: the image by definition, in f64, without tiles, SIMD or bounds. It is slow and
+//! simple.
 //!
-//! It differentiates the camera numerically and inverts the covariance plainly, so that a slip in
-//! the other backends' hand-derived formulas has nowhere to hide.
+//! It differentiates the camera numerically and inverts the covariance directly, so that an error in a
+//! formula that the other backends derive by hand shows up as a difference.
 
-mod behind;
+mod background;
 mod blend;
 mod project;
 mod rays;
@@ -33,22 +34,25 @@ impl Backend for Reference {
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
-        finished: OnViewDone<'_>,
+        on_view_done: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
-        let (mut project_ms, mut blend_ms) = (0.0, 0.0);
+        let mut project_ms = 0.0;
+        let mut blend_ms = 0.0;
         let mut stats = FrameStats::default();
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
+            // Project and sort.
             let start = Instant::now();
             let mut splats = project(frame.scene, frame.profile, view);
             project::sort(&mut splats);
-            let solids = match frame.profile.rays {
+            let gaussians = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
-                Rays::Exact => rays::solids(frame.scene, &splats),
+                Rays::Exact => rays::world_gaussians(frame.scene, &splats),
             };
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
 
+            // Blend row by row, then add the background and what the camera does to colours.
             let start = Instant::now();
             let width = view.camera.width_px as usize;
             let appearance = target.appearance;
@@ -57,11 +61,11 @@ impl Backend for Reference {
                 .flat_map_iter(|row| {
                     let mut pixels = match frame.profile.rays {
                         Rays::Splats => blend::row(&splats, row, width, frame.profile),
-                        Rays::Exact => rays::row(&splats, &solids, row, view, frame.profile),
+                        Rays::Exact => rays::row(&splats, &gaussians, row, view, frame.profile),
                     };
-                    behind::add(frame, view, row, &mut pixels);
+                    background::add(frame, view, row, &mut pixels);
                     if let Some(appearance) = appearance {
-                        appear(appearance, row, &mut pixels);
+                        apply_appearance(appearance, row, &mut pixels);
                     }
                     pixels
                 })
@@ -70,15 +74,15 @@ impl Backend for Reference {
             stats.evaluations += pixels.len() as u64 * splats.len() as u64;
             write(&pixels, target);
             target.finish(view);
-            finished(index, target);
+            on_view_done(index, target);
         }
         stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];
         Ok(stats)
     }
 }
 
-/// What a camera makes of one row of pixels.
-fn appear(appearance: &Appearance, row: u32, pixels: &mut [blend::Pixel]) {
+/// Applies the camera's exposure, then its overlay, to one row of pixels.
+fn apply_appearance(appearance: &Appearance, row: u32, pixels: &mut [blend::Pixel]) {
     let Appearance { exposure, overlay } = appearance;
     for (column, pixel) in pixels.iter_mut().enumerate() {
         if let Some(Exposure { matrix, offset }) = exposure {
@@ -94,7 +98,7 @@ fn appear(appearance: &Appearance, row: u32, pixels: &mut [blend::Pixel]) {
     }
 }
 
-/// Stage resolve: f64 pixels to what was asked for.
+/// Stage resolve: pixels in f64 become the requested images.
 fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
     for (i, pixel) in pixels.iter().enumerate() {
         let opacity = 1.0 - pixel.transmittance;

@@ -1,7 +1,7 @@
 //! Stage project by definition.
 //!
-//! The covariance's determinant is the sum of the squared minors of its root: `xx yy - xy²` has
-//! nothing left of a needle of 3e8 px, even in f64.
+//! The determinant of a covariance is computed as the sum of the squared minors of its root. `xx yy - xy²`
+//! would lose all digits for a needle of 3e8 px, even in f64.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -12,12 +12,12 @@ use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 
-/// A Gaussian on screen.
+/// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
-    /// Which it is: its chunk, and its place there.
-    pub of: [usize; 2],
-    /// Camera-space z of the centre, in metres: what is sorted.
+    /// The Gaussian: index of its chunk, and index within the chunk.
+    pub gaussian: [usize; 2],
+    /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
     /// Centre, in pixels.
     pub mean_px: DVec2,
@@ -25,50 +25,53 @@ pub struct Splat {
     pub conic: DVec3,
     /// Peak opacity.
     pub opacity: f64,
-    /// Colour seen from the camera, linear.
+    /// Linear colour towards the camera.
     pub rgb: DVec3,
-    /// How far from the centre's column and row anything can reach alpha_cut, in pixels.
+    /// Half-size of the box outside of which alpha is below alpha_cut, in pixels.
     pub reach_px: DVec2,
 }
 
-/// Every Gaussian between near and far that can be seen at all, on the image or beside it, in order
-/// of global ids.
+/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or beside
+/// it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
     let chunks = scene.chunks.par_iter().enumerate();
     chunks
         .flat_map_iter(|(number, chunk)| {
-            let splat =
-                move |i| Some(Splat { of: [number, i], ..project_one(chunk, i, profile, view)? });
+            let splat = move |i| {
+                Some(Splat { gaussian: [number, i], ..project_one(chunk, i, profile, view)? })
+            };
             (0..chunk.len()).filter_map(splat)
         })
         .collect()
 }
 
-/// By depth rounded to f32; ties keep the order of global ids. The rounding is part of the
-/// definition: backends sort 32 bits.
+/// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition,
+/// since backends sort 32 bits.
 pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }
 
+/// Projects one Gaussian; `None` if it cannot be seen.
 fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View) -> Option<Splat> {
-    let (mean_world, axes_m) = placed(chunk, index);
-    let seen = if view.is_static_pinhole() {
-        straight(mean_world, axes_m, profile, view)
+    let (mean_world, axes_m) = mean_and_axes(chunk, index);
+    let footprint = if view.is_static_pinhole() {
+        project_pinhole(mean_world, axes_m, profile, view)
     } else {
-        bent(mean_world, axes_m, profile, view)
+        project_unscented(mean_world, axes_m, profile, view)
     }?;
-    let Seen { depth_m, mean_px, xx, xy, yy, det_before, camera_m } = seen;
+    let Footprint { depth_m, mean_px, xx, xy, yy, det_before, camera_m } = footprint;
     let det = det_before + profile.blur * (xx + yy + profile.blur);
-    let (xx, yy) = (xx + profile.blur, yy + profile.blur);
+    let xx = xx + profile.blur;
+    let yy = yy + profile.blur;
 
     let mut opacity = f64::from(chunk.value(index, column::LOG2_OPACITY)).exp2();
     if profile.antialiased {
         // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
         opacity *= (det_before / det).max(0.005 * 0.005).sqrt();
     }
-    let can_be_seen = opacity >= profile.alpha_cut;
-    can_be_seen.then(|| Splat {
-        of: [0, index],
+    let visible = opacity >= profile.alpha_cut;
+    visible.then(|| Splat {
+        gaussian: [0, index],
         depth_m,
         mean_px,
         conic: DVec3::new(yy, -xy, xx) / det,
@@ -78,18 +81,18 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
     })
 }
 
-/// A Gaussian's centre in the world, and its axes times their standard deviations, in metres.
-pub(super) fn placed(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
+/// A Gaussian's centre in the world, and its axes times their standard deviations as columns, in metres.
+pub(super) fn mean_and_axes(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
     let value = |column| f64::from(chunk.value(index, column));
-    let three = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
+    let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
     let q = column::QUAT;
     let rotation = DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q)).normalize();
-    let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(three(column::SCALE));
-    (chunk.origin_m() + three(column::MEAN), axes_m)
+    let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(vector(column::SCALE));
+    (chunk.origin_m() + vector(column::MEAN), axes_m)
 }
 
 /// A Gaussian's place and shape on the image, before the blur.
-struct Seen {
+struct Footprint {
     depth_m: f64,
     mean_px: DVec2,
     /// Covariance, in px².
@@ -98,17 +101,17 @@ struct Seen {
     yy: f64,
     /// Its determinant.
     det_before: f64,
-    /// The camera's centre in the world.
+    /// The camera's position in the world.
     camera_m: DVec3,
 }
 
-/// By a pinhole at rest: linearised at the centre.
-fn straight(
+/// Projection by a static pinhole: linearised at the centre.
+fn project_pinhole(
     mean_world: DVec3,
     axes_m: DMat3,
     profile: &RenderProfile,
     view: &View,
-) -> Option<Seen> {
+) -> Option<Footprint> {
     let camera_from_world = view.world_from_camera.inverse();
     let mean = camera_from_world.transform_point(mean_world);
     let in_range = mean.z >= profile.near && mean.z <= profile.far;
@@ -117,7 +120,7 @@ fn straight(
     }
     let m = camera_from_world.rotation_matrix() * axes_m;
     let [row_x, row_y] = jacobian(mean, &view.camera).map(|row| m.transpose() * row);
-    Some(Seen {
+    Some(Footprint {
         depth_m: mean.z,
         mean_px: view.camera.pinhole.project(mean),
         xx: row_x.dot(row_x),
@@ -128,8 +131,14 @@ fn straight(
     })
 }
 
-/// By a lens or a rolling shutter: the mean and the scatter of six points, each with weight 1/6.
-fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) -> Option<Seen> {
+/// Projection by any other camera: the mean and the scatter of six points, each with weight 1/6 (see
+/// [`crate::unscented`]).
+fn project_unscented(
+    mean_world: DVec3,
+    axes_m: DMat3,
+    profile: &RenderProfile,
+    view: &View,
+) -> Option<Footprint> {
     let center = view.project_extrapolated(mean_world, 1.0);
     let depth_m = view.camera.depth_m(center.point_m);
     let off_axis_rad = center.point_m.angle_between(DVec3::Z);
@@ -148,7 +157,7 @@ fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) 
     let mean_px = points_px.iter().sum::<DVec2>() / 6.0;
     let off_px = points_px.map(|point_px| (point_px - mean_px) / 6.0_f64.sqrt());
     let pairs = (0..6).flat_map(|i| (0..i).map(move |k| (i, k)));
-    Some(Seen {
+    Some(Footprint {
         depth_m,
         mean_px,
         xx: off_px.iter().map(|off| off.x * off.x).sum(),
@@ -159,12 +168,14 @@ fn bent(mean_world: DVec3, axes_m: DMat3, profile: &RenderProfile, view: &View) 
     })
 }
 
-/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes
-/// clamped to 0.3 half-widths beyond the image (gsplat's `persp_proj`).
+/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes clamped to 0.3
+/// half-widths beyond the image (gsplat's `persp_proj`).
 fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
     let p = &camera.pinhole;
-    let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
-    let (slack_x, slack_y) = (0.3 * 0.5 * width / p.fx, 0.3 * 0.5 * height / p.fy);
+    let width = f64::from(camera.width_px);
+    let height = f64::from(camera.height_px);
+    let slack_x = 0.3 * 0.5 * width / p.fx;
+    let slack_y = 0.3 * 0.5 * height / p.fy;
     let slope = (mean.truncate() / mean.z).clamp(
         DVec2::new(-p.cx / p.fx - slack_x, -p.cy / p.fy - slack_y),
         DVec2::new((width - p.cx) / p.fx + slack_x, (height - p.cy) / p.fy + slack_y),
@@ -176,7 +187,7 @@ fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
     [DVec3::new(dx.x, dy.x, dz.x), DVec3::new(dx.y, dy.y, dz.y)]
 }
 
-/// `max(0, SH(direction) + 0.5)` of a Gaussian seen along `toward` (camera to centre, world axes).
+/// `max(0, SH(direction) + 0.5)` of a Gaussian; `toward` leads from the camera to its centre, in world axes.
 fn color(chunk: &Chunk, index: usize, toward: DVec3) -> DVec3 {
     let basis = sh::basis(toward.normalize());
     let mut rgb = DVec3::splat(0.5);

@@ -1,4 +1,4 @@
-//! Cameras, both ways.
+//! Lenses, windshields, shutters and exposures, both ways.
 
 use wildcity_protocol::camera as wire;
 use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
@@ -7,7 +7,7 @@ use wildcity_scene::geometry::camera::{
     Camera, CameraError, FThetaReference, Shutter, ShutterDirection, WindshieldReference,
 };
 
-/// Wire to lens.
+/// A lens from the wire.
 pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
     match lens {
         wire::Lens::Opencv { k, p, s } => LensFields::Opencv { k, p, s },
@@ -22,7 +22,7 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
     }
 }
 
-/// Wire to windshield.
+/// A windshield from the wire.
 pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     let wire::Windshield { reference, horizontal, vertical } = windshield;
     let reference = match reference {
@@ -32,7 +32,7 @@ pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     WindshieldFields { reference, horizontal, vertical }
 }
 
-/// Wire to what a camera makes of an image of a size.
+/// The exposure and the overlay of a camera from the wire; `size_px` is the width and height of its image.
 pub(super) fn appearance_of(
     exposure: Option<wire::Exposure>,
     overlay: Option<&str>,
@@ -43,12 +43,12 @@ pub(super) fn appearance_of(
     Appearance::new(exposure.transpose()?, overlay, size_px)
 }
 
-/// Exposure to wire.
+/// An exposure to the wire.
 pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposure {
     wire::Exposure { matrix: Some(matrix), gain: None, offset }
 }
 
-/// Wire to shutter.
+/// A shutter from the wire.
 pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
@@ -61,13 +61,15 @@ pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError>
     shutter.check().map(|()| shutter)
 }
 
-/// Camera to wire: what it is beyond a pinhole.
-pub(super) fn beyond(camera: &Camera) -> (Option<wire::Lens>, Option<wire::Windshield>) {
+/// The lens and the windshield of a camera to the wire; a pinhole has neither.
+pub(super) fn lens_and_windshield_to(
+    camera: &Camera,
+) -> (Option<wire::Lens>, Option<wire::Windshield>) {
     let Intrinsics { lens, windshield, .. } = Intrinsics::of(camera);
     (lens.map(lens_to), windshield.map(windshield_to))
 }
 
-/// Shutter to wire.
+/// A shutter to the wire.
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {

@@ -1,142 +1,299 @@
-//! Faults to the closed list of codes.
+//! The table of faults: the wire code of each fault, and the HTTP status of each code.
+//!
+//! Every `match` is exhaustive, so that a new fault or code does not compile before it has its entry.
 
-use crate::fault::{Fault, is_content, is_full};
+use axum::http::StatusCode;
+use serde_json::Value;
+
 use wildcity_protocol::error::Code;
+use wildcity_protocol::http::Refusal;
+use wildcity_protocol::message::Answer;
+use wildcity_push::PushError;
 use wildcity_render::RenderError;
 use wildcity_scene::geometry::PoseError;
 use wildcity_scene::rig::RigError;
 use wildcity_session::SessionError;
 use wildcity_sim::EgoError;
+use wildcity_twin::ingest::IngestError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-/// The code of a fault, and the field at fault where one is.
-pub(super) fn code_and_field(fault: &Fault) -> (Code, Option<String>) {
-    let field = |text: &str| Some(text.to_owned());
+use crate::fault::{Fault, is_full};
+
+/// A fault on the wire.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct WireFault {
+    pub(super) code: Code,
+    /// The field at fault, if one is.
+    pub(super) field: Option<String>,
+}
+
+/// The text of a code, as the wire has it.
+#[derive(Clone, Debug)]
+pub(crate) struct WireCode(pub(crate) String);
+
+/// The HTTP status of a fault.
+pub(crate) fn http_status(fault: &Fault) -> StatusCode {
+    status_of(wire_fault(fault).code)
+}
+
+/// The text of a fault's code.
+pub(crate) fn code(fault: &Fault) -> WireCode {
+    let code = serde_json::to_value(wire_fault(fault).code);
+    WireCode(code.ok().and_then(|code| code.as_str().map(str::to_owned)).unwrap_or_default())
+}
+
+/// The message that refuses a request over WebSocket.
+pub(crate) fn refused(seq: Option<u64>, fault: &Fault) -> String {
+    let WireFault { code, field } = wire_fault(fault);
+    let message = fault.to_string();
+    let answer = Answer::Error { seq, code, message, field, fatal: fault.is_fatal() };
+    // An error of strings and flags always has JSON.
+    serde_json::to_string(&answer).unwrap_or_default()
+}
+
+/// The body of an HTTP answer that refuses.
+pub(crate) fn refusal_body(fault: &Fault) -> Value {
+    let WireFault { code, field } = wire_fault(fault);
+    let offset = match fault {
+        Fault::UploadOffset { held, .. } => Some(*held),
+        _ => None,
+    };
+    let cells = match fault {
+        Fault::Session(error) => cells_of_session(error).to_vec(),
+        Fault::Push(error) => cells_of_push(error).to_vec(),
+        _ => Vec::new(),
+    };
+    serde_json::json!(Refusal { code, message: fault.to_string(), field, cells, offset })
+}
+
+/// The cells at fault in a push, if cells are.
+pub(super) fn cells_of_push(error: &PushError) -> &[[i32; 2]] {
+    match error {
+        PushError::Content { cells, .. } => cells,
+        PushError::Session(error) => cells_of_session(error),
+        _ => &[],
+    }
+}
+
+fn cells_of_session(error: &SessionError) -> &[[i32; 2]] {
+    match error {
+        SessionError::Twin(StoreError::Overlap { cells, .. }) => cells,
+        _ => &[],
+    }
+}
+
+/// The HTTP status of a code. Codes that only occur over WebSocket have one too, so that none can be
+/// forgotten when a route begins to give it.
+fn status_of(code: Code) -> StatusCode {
+    match code {
+        Code::MalformedJson
+        | Code::InvalidRequest
+        | Code::UnexpectedBinary
+        | Code::UnsupportedProtocol
+        | Code::InvalidName
+        | Code::PoseNotFinite
+        | Code::PoseInvalid
+        | Code::CameraInvalid
+        | Code::OutOfRange => StatusCode::BAD_REQUEST,
+        Code::Unauthorized => StatusCode::UNAUTHORIZED,
+        Code::Forbidden => StatusCode::FORBIDDEN,
+        Code::UnknownTwin
+        | Code::UnknownVersion
+        | Code::UnknownRig
+        | Code::UnknownCamera
+        | Code::UnknownTrajectory
+        | Code::UnknownSession
+        | Code::UnknownUpload
+        | Code::UnknownPush => StatusCode::NOT_FOUND,
+        Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
+        Code::SeqOutOfOrder
+        | Code::WrongOrder
+        | Code::SessionState
+        | Code::SessionExists
+        | Code::UploadOffset
+        | Code::Conflict => StatusCode::CONFLICT,
+        Code::MessageTooLarge => StatusCode::PAYLOAD_TOO_LARGE,
+        Code::AnswerTooLarge | Code::UploadDigest | Code::PushRefused => {
+            StatusCode::UNPROCESSABLE_ENTITY
+        }
+        Code::TwinDamaged | Code::Internal => StatusCode::INTERNAL_SERVER_ERROR,
+        Code::Busy | Code::ShuttingDown => StatusCode::SERVICE_UNAVAILABLE,
+        Code::DeadlineExceeded => StatusCode::GATEWAY_TIMEOUT,
+        Code::StorageFull => StatusCode::INSUFFICIENT_STORAGE,
+    }
+}
+
+/// A code without a field.
+fn plain(code: Code) -> WireFault {
+    WireFault { code, field: None }
+}
+
+/// A code with the field at fault.
+fn at(code: Code, field: &str) -> WireFault {
+    WireFault { code, field: Some(field.to_owned()) }
+}
+
+/// The code and the field of a fault.
+pub(super) fn wire_fault(fault: &Fault) -> WireFault {
     match fault {
-        Fault::MalformedJson(_) | Fault::BrokenFrame(_) => (Code::MalformedJson, None),
-        Fault::InvalidRequest { field, .. } => (Code::InvalidRequest, field.clone()),
-        Fault::UnexpectedBinary => (Code::UnexpectedBinary, None),
-        Fault::MessageTooLarge { .. } => (Code::MessageTooLarge, None),
-        Fault::SeqOutOfOrder { .. } => (Code::SeqOutOfOrder, field("seq")),
-        Fault::WrongOrder(_) => (Code::WrongOrder, field("type")),
-        Fault::UnsupportedProtocol { .. } => (Code::UnsupportedProtocol, field("protocols")),
-        Fault::SessionState(_) | Fault::Replaced => (Code::SessionState, None),
-        Fault::UnknownSession { .. } => (Code::UnknownSession, field("session")),
-        Fault::SessionExists { .. } => (Code::SessionExists, field("session")),
-        Fault::InvalidName { field, .. } => (Code::InvalidName, Some(field.clone())),
+        Fault::MalformedJson(_) | Fault::BrokenFrame(_) => plain(Code::MalformedJson),
+        Fault::InvalidRequest { field, .. } => {
+            WireFault { code: Code::InvalidRequest, field: field.clone() }
+        }
+        Fault::UnexpectedBinary => plain(Code::UnexpectedBinary),
+        Fault::MessageTooLarge { .. } => plain(Code::MessageTooLarge),
+        Fault::SeqOutOfOrder { .. } => at(Code::SeqOutOfOrder, "seq"),
+        Fault::WrongOrder(_) => at(Code::WrongOrder, "type"),
+        Fault::UnsupportedProtocol { .. } => at(Code::UnsupportedProtocol, "protocols"),
+        Fault::SessionState(_) | Fault::Replaced => plain(Code::SessionState),
+        Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
+        Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
+        Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
             let code = match cause {
                 PoseError::NotFinite { .. } => Code::PoseNotFinite,
                 PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
             };
-            (code, Some(format!("{field}.{}", cause.field())))
+            at(code, &format!("{field}.{}", cause.field()))
         }
         Fault::NotFinite { field } => {
-            // The list of codes is closed, and an action is no pose.
-            let of_action = field.starts_with("action");
-            (if of_action { Code::OutOfRange } else { Code::PoseNotFinite }, Some(field.clone()))
+            // The list of codes is closed, and has none for a number of an action.
+            let is_action = field.starts_with("action");
+            at(if is_action { Code::OutOfRange } else { Code::PoseNotFinite }, field)
         }
         Fault::Camera { field, cause } => {
-            (Code::CameraInvalid, Some(format!("{field}.{}", cause.field())))
+            at(Code::CameraInvalid, &format!("{field}.{}", cause.field()))
         }
-        Fault::Appearance { field, .. } => (Code::CameraInvalid, Some(field.clone())),
+        Fault::Appearance { field, .. } => at(Code::CameraInvalid, field),
         Fault::Rig { field, cause } => {
             let code = match cause {
                 RigError::Count { .. } | RigError::Overlays { .. } => Code::OutOfRange,
                 RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
                 RigError::Camera { .. } | RigError::Appearance { .. } => Code::CameraInvalid,
             };
-            (code, Some(field.clone()))
+            at(code, field)
         }
-        Fault::Busy { .. } => (Code::Busy, None),
-        Fault::TimedOut(_) => (Code::TimedOut, None),
-        Fault::ShuttingDown => (Code::ShuttingDown, None),
-        Fault::Unauthorized => (Code::Unauthorized, None),
-        Fault::Forbidden { .. } => (Code::Forbidden, None),
-        Fault::UnknownUpload { .. } => (Code::UnknownUpload, None),
-        Fault::UploadOffset { .. } => (Code::UploadOffset, field("upload-offset")),
-        Fault::UploadDigest { .. } => (Code::UploadDigest, None),
-        Fault::StorageFull { .. } => (Code::StorageFull, None),
-        Fault::NoUploads { .. } => (Code::Busy, None),
-        Fault::UnknownPush { .. } => (Code::UnknownPush, None),
-        Fault::Content { .. } => (Code::PushRefused, None),
-        Fault::OutOfRange { field, .. } => (Code::OutOfRange, Some(field.clone())),
-        Fault::Spool { .. } => (Code::Internal, None),
-        Fault::Internal(_) => (Code::Internal, None),
+        Fault::Busy { .. } | Fault::NoUploads { .. } => plain(Code::Busy),
+        Fault::TimedOut(_) => plain(Code::TimedOut),
+        Fault::ShuttingDown => plain(Code::ShuttingDown),
+        Fault::Unauthorized => plain(Code::Unauthorized),
+        Fault::Forbidden { .. } => plain(Code::Forbidden),
+        Fault::UnknownUpload { .. } => plain(Code::UnknownUpload),
+        Fault::UploadOffset { .. } => at(Code::UploadOffset, "upload-offset"),
+        Fault::UploadDigest { .. } => plain(Code::UploadDigest),
+        Fault::StorageFull { .. } => plain(Code::StorageFull),
+        Fault::OutOfRange { field, .. } => at(Code::OutOfRange, field),
+        Fault::Spool { .. } | Fault::Internal(_) => plain(Code::Internal),
         Fault::Session(error) => of_session(error),
+        Fault::Push(error) => of_push(error),
     }
 }
 
-/// The cells at fault, if cells are.
-pub(super) fn cells(fault: &Fault) -> &[[i32; 2]] {
-    match fault {
-        Fault::Content { cells, .. }
-        | Fault::Session(SessionError::Twin(StoreError::Overlap { cells, .. })) => cells,
-        _ => &[],
-    }
-}
-
-fn of_session(error: &SessionError) -> (Code, Option<String>) {
-    let field = |text: &str| Some(text.to_owned());
+/// The code and the field of an error of a push.
+pub(super) fn of_push(error: &PushError) -> WireFault {
     match error {
-        SessionError::Twin(StoreError::Name { .. }) => (Code::InvalidName, field("twin")),
-        SessionError::Twin(StoreError::NoTwin { .. }) => (Code::UnknownTwin, field("twin")),
-        SessionError::Twin(StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. }) => {
-            (Code::UnknownVersion, field("version"))
-        }
-        SessionError::Twin(StoreError::Overlap { .. } | StoreError::Conflict { .. }) => {
-            (Code::Conflict, None)
-        }
-        SessionError::Twin(error) if is_content(error) => (Code::PushRefused, None),
-        SessionError::Twin(StoreError::Io { cause, .. }) if is_full(cause) => {
-            (Code::StorageFull, None)
-        }
-        SessionError::Twin(
-            StoreError::NotSynced { .. }
-            | StoreError::OutcomeUnknown { .. }
-            | StoreError::Url { .. },
-        ) => (Code::Internal, None),
-        SessionError::Residency(error) => match error {
-            ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => {
-                (Code::Busy, field("twin"))
-            }
-            ResidencyError::TimedOut { .. } => (Code::DeadlineExceeded, None),
-            ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
-                (Code::TwinDamaged, field("twin"))
-            }
-            ResidencyError::Thread { .. } => (Code::Internal, None),
-        },
-        SessionError::Twin(_) | SessionError::Route(_) => (Code::TwinDamaged, field("twin")),
-        SessionError::UnknownRig { .. } => (Code::UnknownRig, field("rig")),
-        SessionError::UnknownCamera { field, .. } => (Code::UnknownCamera, Some(field.clone())),
+        PushError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
+        PushError::InvalidField { field, .. } => at(Code::InvalidRequest, field),
+        PushError::InvalidName { field, .. } => at(Code::InvalidName, field),
+        PushError::Content { .. } => plain(Code::PushRefused),
+        PushError::UnknownPush { .. } => plain(Code::UnknownPush),
+        PushError::Busy { .. } => plain(Code::Busy),
+        PushError::ShuttingDown => plain(Code::ShuttingDown),
+        PushError::Session(error) => of_session(error),
+        PushError::Unreadable { .. } | PushError::Crashed => plain(Code::Internal),
+    }
+}
+
+fn of_session(error: &SessionError) -> WireFault {
+    match error {
+        SessionError::Twin(error) => of_store(error),
+        SessionError::Residency(error) => of_residency(error),
+        SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
+        SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
+        SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {
-            (Code::OutOfRange, Some(format!("outputs.cameras[{index}]")))
+            at(Code::OutOfRange, &format!("outputs.cameras[{index}]"))
         }
-        SessionError::UnknownTrajectory { .. } => {
-            (Code::UnknownTrajectory, field("start.trajectory"))
+        SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
+        SessionError::Profile(_) | SessionError::Sky(_) => at(Code::OutOfRange, "profile"),
+        SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
+        SessionError::AnswerTooLarge { .. } => plain(Code::AnswerTooLarge),
+        SessionError::EpisodeOver { .. } => plain(Code::SessionState),
+        SessionError::Ego(error) => {
+            let code = match error {
+                EgoError::Command { .. } => Code::SessionState,
+                EgoError::Range { .. }
+                | EgoError::PathCount { .. }
+                | EgoError::PathTime { .. }
+                | EgoError::PathShort { .. } => Code::OutOfRange,
+            };
+            at(code, &error.field())
         }
-        SessionError::Profile(_) | SessionError::Sky(_) => (Code::OutOfRange, field("profile")),
-        SessionError::OutOfRange { field, .. } => (Code::OutOfRange, Some((*field).to_owned())),
-        SessionError::AnswerTooLarge { .. } | SessionError::Render(RenderError::TooMany { .. }) => {
-            (Code::AnswerTooLarge, None)
-        }
-        SessionError::EpisodeOver { .. } => (Code::SessionState, None),
-        SessionError::Ego(error) => match error {
-            EgoError::Command { .. } => (Code::SessionState, Some(error.field())),
-            EgoError::Range { .. }
-            | EgoError::PathCount { .. }
-            | EgoError::PathTime { .. }
-            | EgoError::PathShort { .. } => (Code::OutOfRange, Some(error.field())),
-        },
-        SessionError::Busy { .. } => (Code::Busy, None),
-        SessionError::Render(RenderError::DeviceMemory { .. }) => (Code::Busy, field("twin")),
-        SessionError::DeadlineExceeded => (Code::DeadlineExceeded, None),
-        SessionError::Render(_)
-        | SessionError::Encode { .. }
+        SessionError::Busy { .. } => plain(Code::Busy),
+        SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
+        SessionError::Render(error) => of_render(error),
+        SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
-        | SessionError::Thread { .. } => (Code::Internal, None),
+        | SessionError::Thread { .. } => plain(Code::Internal),
+    }
+}
+
+fn of_store(error: &StoreError) -> WireFault {
+    match error {
+        StoreError::Name { .. } => at(Code::InvalidName, "twin"),
+        StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
+        StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
+            at(Code::UnknownVersion, "version")
+        }
+        StoreError::Overlap { .. } | StoreError::Conflict { .. } => plain(Code::Conflict),
+        StoreError::Gaussians(IngestError::File(_)) => at(Code::TwinDamaged, "twin"),
+        StoreError::Gaussians(_)
+        | StoreError::Clamped { .. }
+        | StoreError::Profile(_)
+        | StoreError::FieldMismatch { .. }
+        | StoreError::ManifestSize { .. } => plain(Code::PushRefused),
+        StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
+        StoreError::NotSynced { .. }
+        | StoreError::OutcomeUnknown { .. }
+        | StoreError::Url { .. } => plain(Code::Internal),
+        StoreError::Io { .. }
+        | StoreError::Leased { .. }
+        | StoreError::Damaged { .. }
+        | StoreError::Format { .. }
+        | StoreError::DuplicateCell { .. }
+        | StoreError::SideFileSize { .. }
+        | StoreError::Rig(_)
+        | StoreError::Trajectory(_)
+        | StoreError::DuplicateTrajectory { .. } => at(Code::TwinDamaged, "twin"),
+    }
+}
+
+fn of_residency(error: &ResidencyError) -> WireFault {
+    match error {
+        ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => at(Code::Busy, "twin"),
+        ResidencyError::TimedOut { .. } => plain(Code::DeadlineExceeded),
+        ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
+            at(Code::TwinDamaged, "twin")
+        }
+        ResidencyError::Thread { .. } => plain(Code::Internal),
+    }
+}
+
+fn of_render(error: &RenderError) -> WireFault {
+    match error {
+        RenderError::TooMany { .. } => plain(Code::AnswerTooLarge),
+        // The device may have room again when other sessions have ended.
+        RenderError::DeviceMemory { .. } => at(Code::Busy, "twin"),
+        RenderError::Views { .. }
+        | RenderError::ExactRays { .. }
+        | RenderError::TargetSize { .. }
+        | RenderError::Normals { .. }
+        | RenderError::Overlay { .. }
+        | RenderError::Targets { .. }
+        | RenderError::Sky(_)
+        | RenderError::Device { .. } => plain(Code::Internal),
     }
 }
 
@@ -147,66 +304,90 @@ mod tests {
     use super::*;
     use wildcity_scene::RecordFormat;
 
-    /// Only what lies in the push itself is refused for good.
+    /// What a commit can end with, over WebSocket or over HTTP.
     #[test]
-    fn what_a_commit_can_end_with() {
+    fn every_error_of_a_commit_has_its_code() {
         let io = |kind: io::ErrorKind| StoreError::Io {
             action: "write",
             path: "city/chunk".into(),
             cause: kind.into(),
         };
-        let (name, number, cells) = ("city".to_owned(), 2, vec![[0, 0]]);
-        let (base, latest, settings) = (1, 2, Vec::new());
-        let (url, reason) = ("s3://x".to_owned(), "no credentials".to_owned());
-        let (record, field, count, gaussians) = (RecordFormat::default(), "mean", 1, 2);
-        for (error, refused, code) in [
-            (io(io::ErrorKind::StorageFull), false, Code::StorageFull),
-            (io(io::ErrorKind::QuotaExceeded), false, Code::StorageFull),
-            (io(io::ErrorKind::PermissionDenied), false, Code::TwinDamaged),
-            (
-                StoreError::OutcomeUnknown {
-                    name: name.clone(),
-                    number,
-                    cause: io::ErrorKind::TimedOut.into(),
-                },
-                false,
-                Code::Internal,
-            ),
-            (
-                StoreError::NotSynced {
-                    name: name.clone(),
-                    number,
-                    cause: Box::new(io(io::ErrorKind::Other)),
-                },
-                false,
-                Code::Internal,
-            ),
-            (StoreError::Url { url, reason }, false, Code::Internal),
-            (
-                StoreError::GarbageCollected { name: name.clone(), number },
-                false,
-                Code::UnknownVersion,
-            ),
-            (
-                StoreError::Format { path: "city/log/2".into(), found: 9, supported: 1 },
-                false,
-                Code::TwinDamaged,
-            ),
-            (StoreError::Conflict { name: name.clone(), number }, false, Code::Conflict),
-            (StoreError::Overlap { name, base, latest, cells, settings }, true, Code::Conflict),
-            (StoreError::Clamped { record, field, count, gaussians }, true, Code::PushRefused),
+        let name = || "city".to_owned();
+        let unsettled = StoreError::OutcomeUnknown {
+            name: name(),
+            number: 2,
+            cause: io::ErrorKind::TimedOut.into(),
+        };
+        let not_synced = StoreError::NotSynced {
+            name: name(),
+            number: 2,
+            cause: Box::new(io(io::ErrorKind::Other)),
+        };
+        let overlap = StoreError::Overlap {
+            name: name(),
+            base: 1,
+            latest: 2,
+            cells: vec![[0, 0]],
+            settings: Vec::new(),
+        };
+        let clamped = StoreError::Clamped {
+            record: RecordFormat::default(),
+            field: "mean",
+            count: 1,
+            gaussians: 2,
+        };
+        let url = StoreError::Url { url: "s3://x".to_owned(), reason: "no credentials".to_owned() };
+        let format = StoreError::Format { path: "city/log/2".into(), found: 9, supported: 1 };
+        for (error, code, status) in [
+            (io(io::ErrorKind::StorageFull), Code::StorageFull, 507),
+            (io(io::ErrorKind::QuotaExceeded), Code::StorageFull, 507),
+            (io(io::ErrorKind::PermissionDenied), Code::TwinDamaged, 500),
+            (unsettled, Code::Internal, 500),
+            (not_synced, Code::Internal, 500),
+            (url, Code::Internal, 500),
+            (StoreError::GarbageCollected { name: name(), number: 2 }, Code::UnknownVersion, 404),
+            (format, Code::TwinDamaged, 500),
+            (StoreError::Conflict { name: name(), number: 2 }, Code::Conflict, 409),
+            (overlap, Code::Conflict, 409),
+            (clamped, Code::PushRefused, 422),
         ] {
             let fault = Fault::from(error);
-            assert_eq!((fault.is_content(), code_and_field(&fault).0), (refused, code), "{fault}");
+            assert_eq!(wire_fault(&fault).code, code, "{fault}");
+            assert_eq!(http_status(&fault).as_u16(), status, "{fault}");
         }
     }
 
-    /// The device may have room again when others have left.
     #[test]
     fn a_scene_that_a_device_has_no_room_for_may_be_tried_again() {
         let error = RenderError::DeviceMemory { needed_bytes: 2 << 30, limit_bytes: 1 << 30 };
         let fault = Fault::Session(error.into());
-        assert_eq!(code_and_field(&fault), (Code::Busy, Some("twin".to_owned())));
+        assert_eq!(wire_fault(&fault), at(Code::Busy, "twin"));
         assert!(fault.to_string().contains("2147483648"), "{fault}");
+    }
+
+    /// The protocol's page has the same codes with the same status, and no other.
+    #[test]
+    fn the_page_of_the_protocol_has_the_same_table() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../protocol/README.md");
+        let page = std::fs::read_to_string(path).unwrap();
+        let section = page.split("\n## Errors").nth(1).expect("a section on errors");
+        let section = section.split("\n## ").next().expect("split gives at least one part");
+        let mut rows: Vec<(String, u16)> = Vec::new();
+        for line in section.lines().filter(|line| line.starts_with("| `")) {
+            let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+            let status = cells[2].parse().unwrap_or_else(|_| panic!("no status in {line}"));
+            rows.push((cells[1].trim_matches('`').to_owned(), status));
+        }
+        rows.sort();
+        let schema = serde_json::to_value(schemars::schema_for!(Code)).unwrap();
+        let variants = schema["oneOf"].as_array().expect("one variant per code");
+        let mut table: Vec<(String, u16)> = Vec::new();
+        for variant in variants {
+            let code: Code = serde_json::from_value(variant["const"].clone()).unwrap();
+            let name = variant["const"].as_str().expect("a text").to_owned();
+            table.push((name, status_of(code).as_u16()));
+        }
+        table.sort();
+        assert_eq!(rows, table);
     }
 }

@@ -1,24 +1,26 @@
 //! Bodies of HTTP, both ways.
 
-use std::collections::BTreeSet;
+use std::fmt::Display;
+use std::str::FromStr;
 
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::fault::Fault;
 use crate::limits;
-use crate::push::{Ask, AskedCells, AskedFile, Status};
-use crate::report::{CellChange, FileReport, Report, State};
-use crate::sessions::About;
+use crate::sessions::ListedSession;
 use crate::spool::{Announced, Upload};
 use wildcity_protocol::http;
-use wildcity_scene::RenderProfile;
-use wildcity_scene::rig::is_name;
-use wildcity_twin::ingest::{Axes, BadGaussian};
+use wildcity_push::{
+    CellChange, CellSelection, FileReport, PushError, PushReport, PushRequest, PushedVersion,
+    RequestedFile, SourceAxes, State, Status,
+};
+use wildcity_twin::ingest::BadGaussian;
 use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
-use super::request::pose_of;
+use super::fault::{WireFault, cells_of_push, of_push};
+use super::field::poses_of;
 
 /// The body of `POST /v1/uploads`.
 pub(crate) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
@@ -48,90 +50,57 @@ pub(crate) fn upload(upload: &Upload) -> Value {
     })
 }
 
-/// The body of `POST /v1/twins/{twin}/pushes`.
-pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<Ask, Fault> {
-    let asked: http::NewPush = parse(body)?;
-    // What was understood, not what was sent: spaces make no other push.
-    let content = blake3::hash(json!([&twin, &asked]).to_string().as_bytes());
-    let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = asked;
-    let name_of = |field: &str, name: String| match is_name(&name) {
-        true => Ok(name),
-        false => Err(Fault::InvalidName { field: field.to_owned(), name }),
-    };
-    let out_of_range =
-        |field: &str, must: String| Err(Fault::OutOfRange { field: field.to_owned(), must });
-    if !(1..=limits::PUSH_FILES).contains(&files.len()) {
-        let must = format!("{} entries; 1 to {} are accepted", files.len(), limits::PUSH_FILES);
-        return out_of_range("files", must);
-    }
-    let file = |(index, file): (usize, http::PushFile)| {
-        let axes = file.axes.parse::<Axes>().and_then(|axes| axes.scaled(file.scale));
-        let axes = axes.map_err(|error| Fault::InvalidRequest {
-            field: Some(format!("files[{index}]")),
-            reason: format!("files[{index}]: {error}"),
-        })?;
-        let options = [format!("axes={}", file.axes), format!("scale={}", file.scale)];
-        Ok(AskedFile { upload: file.upload, axes, options })
-    };
-    let files = files.into_iter().enumerate().map(file).collect::<Result<_, Fault>>()?;
-    let cells = match cells {
-        None => AskedCells::Touched,
-        Some(http::CellSelection::All(http::AllCells::All)) => AskedCells::All,
-        Some(http::CellSelection::Listed(cells)) if cells.is_empty() => {
-            return out_of_range("cells", "empty; leave it out, or name some".to_owned());
-        }
-        Some(http::CellSelection::Listed(cells)) => {
-            AskedCells::These(cells.into_iter().collect::<BTreeSet<_>>())
-        }
-    };
-    let record = match record {
-        None => None,
-        Some(text) => match text.parse() {
-            Ok(record) => Some(record),
-            Err(error) => {
-                let reason = format!("record: {error}");
-                return Err(Fault::InvalidRequest { field: Some("record".to_owned()), reason });
+/// The body of `POST /v1/twins/{twin}/pushes`, checked as far as it can be without the files.
+pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> {
+    let body: http::NewPush = parse(body)?;
+    // The hash is of what was understood: white space makes no other push.
+    let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
+    let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
+    let files = files.into_iter().enumerate();
+    let preview_poses = preview
+        .poses
+        .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_POSES));
+    let request = PushRequest {
+        id,
+        twin,
+        request_hash,
+        files: files.map(|(index, file)| requested_file(index, file)).collect::<Result<_, _>>()?,
+        base,
+        cells: match cells {
+            None => CellSelection::Touched,
+            Some(http::CellSelection::All(http::AllCells::All)) => CellSelection::All,
+            Some(http::CellSelection::Listed(cells)) => {
+                CellSelection::These(cells.into_iter().collect())
             }
         },
-    };
-    for (index, setting) in profile.iter().enumerate() {
-        RenderProfile::default().set(setting).map_err(|error| Fault::InvalidRequest {
-            field: Some(format!("profile[{index}]")),
-            reason: format!("profile[{index}]: {error}"),
-        })?;
-    }
-    if note.as_ref().is_some_and(|note| note.chars().count() > limits::NOTE_CHARS) {
-        let must = format!("longer than {} characters", limits::NOTE_CHARS);
-        return out_of_range("note", must);
-    }
-    let poses = match preview.poses {
-        Some(poses) if poses.len() > limits::GOLDEN_POSES => {
-            let must = format!("{} poses; at most {}", poses.len(), limits::GOLDEN_POSES);
-            return out_of_range("golden.poses", must);
-        }
-        Some(poses) => {
-            let checked = |(index, pose)| pose_of(&format!("golden.poses[{index}]"), pose);
-            Some(poses.iter().enumerate().map(checked).collect::<Result<_, _>>()?)
-        }
-        None => None,
-    };
-    Ok(Ask {
-        id: id.map(|id| name_of("id", id)).transpose()?,
-        twin: name_of("twin", twin)?,
-        content,
-        files,
-        base,
-        cells,
-        record,
+        record: record.map(|text| parse_field("record", &text)).transpose()?,
         levels,
         profile,
         note,
-        poses,
+        preview_poses: preview_poses.transpose()?,
         min_psnr_db: preview.min_psnr_db,
+    };
+    request.check()?;
+    Ok(request)
+}
+
+fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
+    let axes = SourceAxes::parse(&file.axes, file.scale);
+    let axes = axes.map_err(|error| PushError::InvalidField {
+        field: format!("files[{index}]"),
+        reason: error.to_string(),
+    })?;
+    Ok(RequestedFile { upload: file.upload, axes })
+}
+
+fn parse_field<T: FromStr<Err: Display>>(field: &str, text: &str) -> Result<T, PushError> {
+    text.parse().map_err(|error: T::Err| PushError::InvalidField {
+        field: field.to_owned(),
+        reason: error.to_string(),
     })
 }
 
-/// A push.
+/// The status of a push.
 pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
     let state = match status.state {
         State::Queued => http::PushState::Queued,
@@ -143,25 +112,26 @@ pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
         State::Refused => http::PushState::Refused,
         State::Failed => http::PushState::Failed,
     };
-    let (done, total) = status.progress;
+    let progress = http::Progress { done: status.progress.done, total: status.progress.total };
     let version = status.version.as_ref();
     json!(http::Push {
         id: id.to_owned(),
         twin: twin.to_owned(),
         state,
-        progress: http::Progress { done, total },
-        version: version.map(|(number, _)| *number),
-        version_hash: version.map(|(_, hash)| hash.clone()),
+        progress,
+        version: version.map(|PushedVersion { number, .. }| *number),
+        version_hash: version.map(|PushedVersion { hash, .. }| hash.clone()),
         report: status.report.as_deref().map(report),
-        error: status.error.as_deref().map(|fault| http::PushError {
-            code: super::fault::code_and_field(fault).0,
-            message: fault.to_string(),
-            cells: super::fault::cells(fault).to_vec(),
-        }),
+        error: status.error.as_deref().map(push_error),
     })
 }
 
-fn report(report: &Report) -> http::PushReport {
+fn push_error(error: &PushError) -> http::PushError {
+    let WireFault { code, .. } = of_push(error);
+    http::PushError { code, message: error.to_string(), cells: cells_of_push(error).to_vec() }
+}
+
+fn report(report: &PushReport) -> http::PushReport {
     http::PushReport {
         files: report.files.iter().map(file).collect(),
         gaussians: report.gaussians,
@@ -179,11 +149,12 @@ fn report(report: &Report) -> http::PushReport {
             .map(|&CellChange { cell, before, after }| http::CellReport { cell, before, after })
             .collect(),
         previews: report
-            .golden
+            .preview
             .iter()
-            .map(|golden| http::PsnrPreview {
-                pose: pose(&golden.world_from_rig),
-                psnr_db: Some(golden.psnr_db).filter(|db| db.is_finite()),
+            .map(|preview| http::PsnrPreview {
+                pose: pose(&preview.world_from_rig),
+                // JSON has no infinity: equal images have no PSNR.
+                psnr_db: Some(preview.psnr_db).filter(|db| db.is_finite()),
             })
             .collect(),
     }
@@ -204,12 +175,12 @@ fn file(file: &FileReport) -> http::FileReport {
     }
 }
 
-/// The body of `POST /v1/twins/{twin}/rollback`: the old version.
+/// The body of `POST /v1/twins/{twin}/rollback`: the number of the old version.
 pub(crate) fn rollback(body: &[u8]) -> Result<u64, Fault> {
     parse::<http::Rollback>(body).map(|rollback| rollback.version)
 }
 
-/// The versions of a twin, the latest last. Those after one that is held are not ready.
+/// The versions of a twin, the latest last. Versions after `held` are not ready.
 pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
     let version = |entry: &LogEntry| http::VersionInfo {
         version: entry.number,
@@ -222,27 +193,27 @@ pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
     json!({ "versions": versions.iter().map(version).collect::<Vec<_>>() })
 }
 
-/// One version that was just made.
+/// A version that was just made.
 pub(crate) fn version(version: &Version) -> Value {
     json!({ "version": version.number, "version_hash": version.hash })
 }
 
 /// All sessions.
-pub(crate) fn sessions(sessions: &[(String, About, bool)]) -> Value {
-    let session = |(name, about, connected): &(String, About, bool)| http::SessionInfo {
+pub(crate) fn sessions(sessions: &[ListedSession]) -> Value {
+    let session = |ListedSession { name, view, connected }: &ListedSession| http::SessionInfo {
         session: name.clone(),
-        twin: about.twin.clone(),
-        version: about.version,
-        step: about.step,
-        pose: pose(&about.world_from_rig),
+        twin: view.twin.clone(),
+        version: view.version,
+        step: view.step,
+        pose: pose(&view.world_from_rig),
         connected: *connected,
     };
     json!({ "sessions": sessions.iter().map(session).collect::<Vec<_>>() })
 }
 
-/// Reads a body, and names the field of a mistake.
+/// Reads a body; a fault names the field of a mistake.
 fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Fault> {
-    // serde would take a list for the object's values in order.
+    // serde would read a list as the values of the object's fields, in order.
     if body.trim_ascii_start().first() == Some(&b'[') {
         let reason = "expected one object, not a list".to_owned();
         return Err(Fault::InvalidRequest { field: None, reason });
@@ -250,7 +221,8 @@ fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Fault> {
     let deserializer = &mut serde_json::Deserializer::from_slice(body);
     let parsed = serde_path_to_error::deserialize(&mut *deserializer);
     let parsed = parsed.map_err(|error| {
-        let (path, error) = (error.path().to_string(), error.into_inner());
+        let path = error.path().to_string();
+        let error = error.into_inner();
         match error.classify() {
             serde_json::error::Category::Data if path != "." => {
                 Fault::InvalidRequest { reason: format!("{path}: {error}"), field: Some(path) }

@@ -1,4 +1,4 @@
-//! Scenes in a zip archive: SOG, by itself or streamed, and NuRec's USDZ.
+//! Scenes in a zip archive: SOG (one scene, or streamed) and NuRec's USDZ.
 
 use std::io::{Cursor, Read};
 
@@ -12,7 +12,7 @@ use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
-/// Reads the scene of an archive, by the first file in it that is known.
+/// Reads the scene of an archive, found by the first file in it of a known name.
 pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
     let mut archive = Archive::open(bytes)?;
     if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
@@ -21,8 +21,8 @@ pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
     }
     let Some(name) = archive.find(|name| ["lod-meta.json", "meta.json"].contains(&name)) else {
         let reason = match archive.find(|name| name == "data.pkl") {
-            Some(_) => "it is a checkpoint of PyTorch: python -m wildcity.convert makes \
-                        safetensors of it"
+            Some(_) => "it is a checkpoint of PyTorch: convert it to safetensors with \
+                        python -m wildcity.convert"
                 .into(),
             None => "it holds no meta.json or lod-meta.json, as SOG does, and no .nurec, as USDZ of NuRec \
                      does".into(),
@@ -49,7 +49,8 @@ impl Archive {
         Ok(Self { zip, budget })
     }
 
-    /// The first file of such a name, whatever folder it is in; the fewest folders count first.
+    /// The file with a name that, without folders, satisfies the condition; of several, the one in
+    /// the fewest folders.
     fn find(&self, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
         let names = self.zip.file_names();
         let wanted = names.filter(|name| is_wanted(name.rsplit('/').next().unwrap_or(name)));
@@ -66,7 +67,8 @@ impl SceneFiles for Archive {
         }
         self.budget.unpack("zip", name, size.into())?;
         let mut bytes = Vec::new();
-        // One more, so that the checksum is compared, and a file that is longer than it says fails.
+        // One byte more, so that the checksum is compared, and a file longer than its entry says is
+        // refused.
         let read = file.take(size + 1).read_to_end(&mut bytes);
         read.map_err(|e| error(name, format!("it is damaged: {e}; copy the archive again")))?;
         if bytes.len() as u64 != size {

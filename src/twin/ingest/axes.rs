@@ -1,6 +1,7 @@
-//! From the axes and unit of a file to a twin's: metres, x east, y north, z up.
+//! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
-//! A format never says which axes it means (two PLY files differ), so an import is told.
+//! No format says which axes its coordinates have (two PLY files may differ), so an import has
+//! options for them.
 
 use std::str::FromStr;
 
@@ -10,14 +11,15 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::IngestError;
 
-/// The way from a file to a twin: a rotation, perhaps with a mirror, and then a scale.
+/// The transform from a file to a twin: a rotation, perhaps with a reflection, and then a scale.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axes {
     twin_from_file: DMat3,
     metres_per_unit: f64,
 }
 
-/// Name, what it is, and the twin's x, y, z in the file's: rows of the matrix.
+/// Name, description, and the twin's x, y, z axes in the file's axes, which are the rows of
+/// `twin_from_file`.
 const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
     ("identity", "x, y, z stay; z is up", [[1., 0., 0.], [0., 1., 0.], [0., 0., 1.]]),
     (
@@ -38,21 +40,22 @@ const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
 ];
 
 impl Axes {
-    /// Nothing changes.
+    /// The file has a twin's axes and unit.
     pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
 
-    /// How far `M Mᵀ` may be from the identity: a matrix typed with four digits passes.
+    /// How far an entry of `M Mᵀ` may be from the identity's: a matrix typed with four digits is
+    /// accepted.
     const MAX_ERROR: f64 = 1e-3;
 
-    /// From a matrix whose rows are the twin's axes in the file's.
+    /// From a matrix. Its rows are the twin's axes in the file's axes.
     ///
     /// # Errors
-    /// [`IngestError::InvalidAxes`] if the rows are not of unit length and at right angles.
+    /// [`IngestError::InvalidAxes`] if the rows are not orthonormal.
     pub fn from_rows(rows: [[f64; 3]; 3]) -> Result<Self, IngestError> {
         Self::orthonormal(rows).ok_or_else(|| stretched(format!("{rows:?}")))
     }
 
-    /// `None` if the rows are not of unit length and at right angles.
+    /// `None` if the rows are not orthonormal.
     fn orthonormal(rows: [[f64; 3]; 3]) -> Option<Self> {
         let given = DMat3::from_cols_array_2d(&rows).transpose();
         let error = given * given.transpose() - DMat3::IDENTITY;
@@ -60,7 +63,7 @@ impl Axes {
         if !is_orthonormal {
             return None;
         }
-        // Gram-Schmidt, so that what four digits left over does not stretch the scene.
+        // Gram-Schmidt, so that rounding to four digits does not stretch the scene.
         let [x, y, z] = rows.map(DVec3::from_array);
         let x = x.normalize();
         let y = (y - x * x.dot(y)).normalize();
@@ -69,7 +72,7 @@ impl Axes {
         Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
     }
 
-    /// The same axes with a unit of so many metres.
+    /// The same axes, with a unit of `metres_per_unit`.
     ///
     /// # Errors
     /// [`IngestError::InvalidAxes`] if the scale is not from 1e-6 to 1e6.
@@ -81,18 +84,18 @@ impl Axes {
         Ok(Self { metres_per_unit, ..self })
     }
 
-    /// Takes directions in the twin to the file's axes: orthonormal.
+    /// Rotates directions in the twin to the file's axes; orthonormal.
     pub fn file_from_twin(&self) -> DMat3 {
         self.twin_from_file.transpose()
     }
 
-    /// Turns and then scales Gaussians in place. The identity changes no bit.
+    /// Rotates and then scales Gaussians in place. The identity changes no bit.
     ///
-    /// A mirror turns each ellipsoid as its rotation `-M` does, for an ellipsoid equals its own
-    /// reflection through its centre; the colours follow `M` itself.
+    /// A reflection `M` moves each ellipsoid as the rotation `-M` does, because an ellipsoid equals
+    /// its own point reflection through its centre. The colours follow `M` itself.
     pub fn apply(&self, gaussians: &mut Gaussians) {
         if self.twin_from_file != DMat3::IDENTITY {
-            self.turn(gaussians);
+            self.rotate(gaussians);
         }
         if self.metres_per_unit != 1.0 {
             let ln = self.metres_per_unit.ln();
@@ -105,7 +108,7 @@ impl Axes {
         }
     }
 
-    fn turn(&self, gaussians: &mut Gaussians) {
+    fn rotate(&self, gaussians: &mut Gaussians) {
         let matrix = self.twin_from_file;
         for mean in &mut gaussians.means_m {
             *mean = (matrix * DVec3::from_array(*mean)).to_array();
@@ -126,7 +129,8 @@ impl Axes {
 impl FromStr for Axes {
     type Err = IngestError;
 
-    /// A preset's name, or nine numbers of the matrix, row by row, with commas or spaces between.
+    /// Parses the name of a preset, or the nine numbers of the matrix, row by row, separated by
+    /// commas or spaces.
     fn from_str(text: &str) -> Result<Self, IngestError> {
         if let Some((_, _, rows)) = PRESETS.iter().find(|(name, ..)| *name == text) {
             return Self::from_rows(*rows);
@@ -150,8 +154,8 @@ impl FromStr for Axes {
 }
 
 fn stretched(given: String) -> IngestError {
-    let reason = "the rows of the matrix must be of length 1 and at right angles; lengths belong \
-                  into --scale";
+    let reason = "the rows of the matrix must have length 1 and be at right angles; give the scale \
+                  with --scale";
     frame_error("--axes", given, reason.into())
 }
 

@@ -21,47 +21,47 @@ pub struct ListedCamera {
     pub name: String,
     /// Size and intrinsics.
     pub camera: Camera,
-    /// Where it stands, in the axes and units of the scene.
+    /// Its pose, in the axes and units of the scene.
     pub world_from_camera: Pose,
-    /// Nearest z that it draws, if the list says so, in units of the scene.
+    /// The smallest z that it draws, if the list says one, in units of the scene.
     pub near: Option<f64>,
 }
 
 /// Why a camera list was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CamerasError {
-    /// It cannot be read, is no regular file, or is larger than any list should be.
+    /// It cannot be read, is not a regular file, or is larger than a camera list may be.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Not the JSON that is asked for.
+    /// The JSON is not a camera list.
     #[error(
         "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
          fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
     )]
     Json(serde_json::Error),
-    /// There is no camera in it.
+    /// It has no camera.
     #[error("the camera list is empty")]
     Empty,
-    /// A name that cannot be part of a file name, or comes twice.
+    /// A name cannot be part of a file name, or occurs twice.
     #[error("camera {index}: name {name:?} {must}")]
     Name {
-        /// Which camera, from 0.
+        /// Index of the camera, from 0.
         index: usize,
         /// The refused name.
         name: String,
         /// What must hold instead.
         must: &'static str,
     },
-    /// Neither `position` nor `position_ply`, or both.
+    /// A camera has neither `position` nor `position_ply`, or both.
     #[error("camera {name:?}: give either position or position_ply")]
     Position {
-        /// The camera.
+        /// The camera's name.
         name: String,
     },
-    /// The matrix is a rotation with a mirror.
+    /// The matrix is a rotation with a reflection.
     #[error("camera {name:?}: R_world_to_cam is a mirror; flip one of its axes")]
     Mirror {
-        /// The camera.
+        /// The camera's name.
         name: String,
     },
     /// The matrix is not a rotation.
@@ -70,9 +70,9 @@ pub enum CamerasError {
          determinant {determinant:.3})"
     )]
     Rotation {
-        /// The camera.
+        /// The camera's name.
         name: String,
-        /// Largest entry of R Rᵀ - I.
+        /// Largest absolute entry of R Rᵀ - I.
         error: f64,
         /// Its determinant.
         determinant: f64,
@@ -80,18 +80,18 @@ pub enum CamerasError {
     /// The position cannot be used.
     #[error("camera {name:?}: {cause}")]
     Pose {
-        /// The camera.
+        /// The camera's name.
         name: String,
         /// What is wrong.
         cause: PoseError,
     },
-    /// What only cameras of a rig have.
+    /// A field that only cameras of a rig have.
     #[error(
-        "camera {name:?}: a camera list has no {field}: its cameras are at rest, and drawn as they \
-         are; leave {field} out, or mount the camera on a rig"
+        "camera {name:?}: a camera in a list has no {field}, because it is at rest; leave {field} out, or mount \
+         the camera on a rig"
     )]
     RigCameraField {
-        /// The camera.
+        /// The camera's name.
         name: String,
         /// `shutter`, `exposure` or `overlay`.
         field: &'static str,
@@ -99,7 +99,7 @@ pub enum CamerasError {
     /// The size or an intrinsic cannot be used.
     #[error("camera {name:?}: {cause}")]
     Camera {
-        /// The camera.
+        /// The camera's name.
         name: String,
         /// What is wrong.
         cause: CameraError,
@@ -108,7 +108,7 @@ pub enum CamerasError {
 
 const NAME_RULE: &str = "must be 1 to 64 of A-Z a-z 0-9 . _ -, not starting with .";
 
-/// One entry, as written; fields that are not named here are somebody else's notes.
+/// One entry of the JSON. Fields that are not listed here are ignored.
 #[derive(Deserialize)]
 struct Entry {
     name: String,
@@ -155,7 +155,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
             && !entry.name.starts_with('.');
         let twice = !names.insert(entry.name.clone());
         if !usable || twice {
-            let must = if twice { "comes twice" } else { NAME_RULE };
+            let must = if twice { "occurs twice" } else { NAME_RULE };
             return Err(CamerasError::Name { index, name: entry.name, must });
         }
         cameras.push(check(entry)?);
@@ -177,7 +177,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         (Some(position), None) | (None, Some(position)) => position,
         _ => return Err(CamerasError::Position { name }),
     };
-    // glam's columns are the file's rows, so this is the inverse: world_from_camera.
+    // glam's columns are the file's rows, so this matrix is the inverse: the rotation of
+    // world_from_camera.
     let rotation = DMat3::from_cols_array_2d(&entry.rotation);
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
@@ -195,8 +196,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let world_from_camera =
         pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
     let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
-    let (focal_px, center_px) = ([fx, fy], [cx, cy]);
-    let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
+    let intrinsics =
+        Intrinsics { size_px, focal_px: [fx, fy], center_px: [cx, cy], lens, windshield };
     let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near })

@@ -1,34 +1,34 @@
-//! Opening what somebody named: regular files only, of which no more is read than is allowed.
+//! Opens files that a user named: regular files only, up to a size limit.
 
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// Why a file was refused before its content counted.
+/// Why a file was refused before its content was looked at.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// The operating system refused.
+    /// An I/O operation failed.
     #[error("cannot read: {0}")]
     Io(io::Error),
-    /// A pipe or a device has no size to check and may never end; a directory holds no bytes.
-    #[error("not a regular file but {found}; copy what it holds into a file, and give that")]
+    /// A pipe or a device has no size to check and may never end; a directory has no bytes.
+    #[error("not a regular file but {found}; copy its content into a file, and give that")]
     NotRegular {
-        /// What it is.
+        /// What it is instead.
         found: &'static str,
     },
-    /// Named by another file, and not within its folder.
+    /// Another file names it, and it is not within that file's folder.
     #[error("is not a plain path below the folder of the file that names it; move it there")]
     OutsideFolder,
-    /// One of more files than are read for one scene.
-    #[error("one more than the {limit} files that a scene may have; split the scene")]
+    /// The scene has more files than are read.
+    #[error("the scene has more than {limit} files; split it")]
     TooMany {
-        /// The most that are read.
+        /// The most files that are read.
         limit: usize,
     },
-    /// Larger than any honest one.
+    /// Larger than the limit for such a file.
     #[error("larger than {limit_bytes} bytes")]
     TooLarge {
-        /// The most that is read.
+        /// The most bytes that are read.
         limit_bytes: u64,
     },
 }
@@ -39,9 +39,9 @@ impl From<io::Error> for FileError {
     }
 }
 
-/// Opens a regular file, and tells its size in bytes.
+/// Opens a regular file. Also returns its size in bytes.
 pub(super) fn open(path: &Path) -> Result<(File, u64), FileError> {
-    // Before opening: that alone waits for ever on a pipe that nobody writes to.
+    // Checked before opening, because opening a pipe waits until another process writes to it.
     check_regular(&fs::metadata(path)?)?;
     let file = File::open(path)?;
     let metadata = file.metadata()?;
@@ -49,7 +49,7 @@ pub(super) fn open(path: &Path) -> Result<(File, u64), FileError> {
     Ok((file, metadata.len()))
 }
 
-/// Reads a whole file of at most so many bytes.
+/// Reads a whole file of at most `limit_bytes`.
 ///
 /// # Errors
 /// It cannot be read, is not a regular file, or is larger.
@@ -58,10 +58,10 @@ pub fn read_whole(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
     read_at_most(file, limit_bytes)
 }
 
-/// Reads to the end, which must come within so many bytes.
+/// Reads to the end, which must come within `limit_bytes`.
 pub(super) fn read_at_most(input: impl Read, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
     let mut bytes = Vec::new();
-    // One more, to tell a file of the limit from a larger one.
+    // One byte more, to distinguish a file of exactly the limit from a larger one.
     input.take(limit_bytes + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit_bytes {
         return Err(FileError::TooLarge { limit_bytes });

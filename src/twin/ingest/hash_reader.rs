@@ -1,4 +1,4 @@
-//! What is read, and the hash of it.
+//! Hashes a file while it is read.
 
 use std::io::{self, Read};
 
@@ -9,7 +9,7 @@ pub(super) struct HashReader<R> {
 }
 
 impl<R> HashReader<R> {
-    /// Nothing read yet.
+    /// Nothing has been read yet.
     pub(super) fn new(inner: R) -> Self {
         Self { inner, hasher: blake3::Hasher::new() }
     }

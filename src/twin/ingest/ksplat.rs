@@ -1,11 +1,11 @@
 //! `.ksplat`, the format of mkkellogg's GaussianSplats3D, version 0.1: levels 0 to 2, SH degrees 0
 //! to 2.
 //!
-//! A header of 4096 bytes, one of 1024 per section, then the sections: sizes of the buckets that are
-//! not full, centres of all buckets, records. A record is position, standard deviations, rotation
-//! (w, x, y, z), colour and opacity (4 u8, of 255), and the higher colour coefficients: each
-//! degree's all of red, then green, then blue. Level 0 has f32; levels 1 and 2 have positions of 16
-//! bits around their bucket's centre and f16; level 2 has coefficients of 8 bits.
+//! A header of 4096 bytes, one of 1024 per section, then the sections: sizes of the buckets that
+//! are not full, centres of all buckets, records. A record is position, standard deviations,
+//! rotation (w, x, y, z), colour and opacity (4 u8, of 255), and the higher colour coefficients:
+//! each degree's all of red, then green, then blue. Level 0 has f32; levels 1 and 2 have positions
+//! of 16 bits around their bucket's centre and f16; level 2 has coefficients of 8 bits.
 
 use std::io::{self, Read};
 
@@ -21,9 +21,9 @@ const HEADER_BYTES: usize = 4096;
 const SECTION_HEADER_BYTES: usize = 1024;
 /// Largest SH degree of the format.
 const MAX_DEGREE: u16 = 2;
-/// Half the steps of a position of 16 bits, where a section says nothing else.
+/// Half the number of steps of a 16-bit position, unless the section says otherwise.
 const POSITION_RANGE: u32 = 32767;
-/// Least and most of coefficients of 8 bits, where the file says nothing else.
+/// Range of 8-bit coefficients in both directions, unless the file says otherwise.
 const SH_RANGE: f32 = 1.5;
 
 /// Reads a file of a known size.
@@ -59,10 +59,10 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
 }
 
 struct Header {
-    /// Sections that have a header; those that are not used are empty.
+    /// Number of sections with a header; unused ones are empty.
     sections: u32,
     level: u16,
-    /// Least and most of coefficients of 8 bits.
+    /// Smallest and largest value of 8-bit coefficients.
     sh_range: [f32; 2],
 }
 
@@ -128,7 +128,8 @@ impl Section {
             },
         };
         if section.count > section.max_count {
-            let (count, most) = (section.count, section.max_count);
+            let count = section.count;
+            let most = section.max_count;
             return Err(bad(&place, format!("{count} Gaussians, but room for {most}")));
         }
         if header.level > 0 && section.count > 0 && section.bucket_bytes < 12 {
@@ -138,14 +139,14 @@ impl Section {
         Ok(section)
     }
 
-    /// Bytes of the section behind all headers.
+    /// Bytes of the section, without its header.
     fn bytes(&self) -> u128 {
         u128::from(self.partial_buckets) * 4
             + u128::from(self.buckets) * u128::from(self.bucket_bytes)
             + u128::from(self.max_count) * self.record_bytes as u128
     }
 
-    /// Reads the section; the file is known to hold it.
+    /// Reads the section. The caller has checked that the file is long enough.
     fn decode(&self, input: &mut impl Read, header: &Header) -> Result<Gaussians, IngestError> {
         let mut word = [0; 4];
         let mut partial_sizes = Vec::new();
@@ -178,17 +179,15 @@ impl Section {
             };
             self.push(&record, centre_m, header, &mut gaussians);
         }
-        // Room that nothing was put into.
+        // Unused records.
         let rest = u64::from(self.max_count - self.count) * self.record_bytes as u64;
         io::copy(&mut input.take(rest), &mut io::sink())?;
         Ok(gaussians)
     }
 
     fn push(&self, record: &[u8], centre_m: [f32; 3], header: &Header, g: &mut Gaussians) {
-        let (single, half) = (
-            |at: usize| f32::from_bits(u32_at(record, at)),
-            |at: usize| f16::from_bits(u16_at(record, at)).to_f32(),
-        );
+        let single = |at: usize| f32::from_bits(u32_at(record, at));
+        let half = |at: usize| f16::from_bits(u16_at(record, at)).to_f32();
         let (scales, quat, colour_at): ([f32; 3], [f32; 4], usize) = if header.level == 0 {
             g.means_m.push([0, 4, 8].map(|at| single(at).into()));
             ([12, 16, 20].map(single), [24, 28, 32, 36].map(single), 40)
@@ -214,8 +213,10 @@ impl Section {
             }
         };
         for degree in 1..=usize::from(self.sh_degree) {
-            // Of this degree and of those below it: 3 x (1 + 3 + 5 ..), less the three of degree 0.
-            let (of_this, before) = (2 * degree + 1, 3 * (degree * degree - 1));
+            // Degree l has 2 l + 1 coefficients. The degrees below l have l² in sum, of which the
+            // one of degree 0 is not here; each has three channels.
+            let of_this = 2 * degree + 1;
+            let before = 3 * (degree * degree - 1);
             for k in 0..of_this {
                 g.sh.extend([0, 1, 2].map(|channel| value(before + channel * of_this + k)));
             }

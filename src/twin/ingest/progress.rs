@@ -1,14 +1,15 @@
-//! What is read, told to whoever waits for it.
+//! Reports how much of a file has been read.
 
 use std::io::{self, BufRead, Read};
 
-use super::Progress;
+/// Is called with the bytes read so far and the size of the file.
+pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
 
-/// A reader that reports how far it is each time so many bytes have passed.
+/// A reader that reports its progress after every [`REPORT_EVERY_BYTES`], and at the end.
 pub(super) struct ProgressReader<'a, R> {
     inner: R,
     done: u64,
-    told: u64,
+    reported: u64,
     file_bytes: u64,
     progress: Progress<'a>,
 }
@@ -17,15 +18,15 @@ pub(super) struct ProgressReader<'a, R> {
 const REPORT_EVERY_BYTES: u64 = 1 << 20;
 
 impl<'a, R> ProgressReader<'a, R> {
-    /// Of a file of a known size.
+    /// Reads a file of a known size.
     pub(super) fn new(inner: R, file_bytes: u64, progress: Progress<'a>) -> Self {
-        Self { inner, done: 0, told: 0, file_bytes, progress }
+        Self { inner, done: 0, reported: 0, file_bytes, progress }
     }
 
     fn add(&mut self, bytes: usize) {
         self.done += bytes as u64;
-        if self.done - self.told >= REPORT_EVERY_BYTES || self.done == self.file_bytes {
-            self.told = self.done;
+        if self.done - self.reported >= REPORT_EVERY_BYTES || self.done == self.file_bytes {
+            self.reported = self.done;
             (self.progress)(self.done, self.file_bytes);
         }
     }

@@ -22,7 +22,7 @@ pub(super) fn read(
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
-    let mut plan = Plan::of(&metadata)?;
+    let mut plan = ReadPlan::of(&metadata)?;
     let coefficients = sh::coefficients(plan.sh_degree);
     let mut gaussians = Gaussians::with_capacity(plan.sh_degree, plan.count);
     gaussians.sh.resize(3 * coefficients * plan.count, 0.0);
@@ -79,28 +79,28 @@ fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u6
     Ok((metadata, 8 + length))
 }
 
-/// The tensors to read, of shapes that fit each other.
-struct Plan<'a> {
+/// The tensors to read. Their shapes match.
+struct ReadPlan<'a> {
     count: usize,
     sh_degree: u8,
     tensors: Vec<(Column, &'a TensorInfo)>,
-    /// Whether all colours are in coeffs.
+    /// Whether all colours are in the tensor coeffs.
     one_tensor: bool,
 }
 
-/// Where a tensor goes.
+/// The column of Gaussians that a tensor is read into.
 enum Column {
     Means,
     Quats,
     Scales,
     Opacities,
-    /// From this coefficient on.
+    /// SH coefficients, from `first` on.
     Colours {
         first: usize,
     },
 }
 
-impl<'a> Plan<'a> {
+impl<'a> ReadPlan<'a> {
     fn of(metadata: &'a Metadata) -> Result<Self, IngestError> {
         let find = |name: &str| {
             let missing = || bad(&format!("tensor {name}"), "is missing".into());
@@ -136,7 +136,7 @@ impl<'a> Plan<'a> {
             }
             colours
         };
-        // Saturating: a shape with a zero may have any other length.
+        // Saturating, because a shape with a zero may have any other dimension.
         let coefficients = colours.iter().fold(0, |sum: usize, c| sum.saturating_add(c.shape[1]));
         let sh_degree = (0..=sh::MAX_DEGREE).find(|&d| sh::coefficients(d) == coefficients);
         let sh_degree = sh_degree.ok_or_else(|| {
@@ -162,15 +162,15 @@ impl<'a> Plan<'a> {
 struct Body<'a, R> {
     input: R,
     body_start: u64,
-    /// Bytes of the file that were read.
+    /// Bytes of the file that have been read.
     done: u64,
     file_bytes: u64,
     progress: Progress<'a>,
 }
 
 impl<R: Read> Body<'_, R> {
-    /// Hands a tensor to `take` in rows of `N`. It starts no earlier than the last one ended, since
-    /// tensors do not overlap; what lies between is skipped.
+    /// Calls `take` with each row of `N` numbers of a tensor. Tensors do not overlap, so it starts
+    /// no earlier than the previous one ended; what lies between is skipped.
     fn rows<const N: usize>(
         &mut self,
         tensor: &TensorInfo,
@@ -183,7 +183,8 @@ impl<R: Read> Body<'_, R> {
         let mut row = vec![0; N * if is_f64 { 8 } else { 4 }];
         for index in 0..(end - start) / row.len() {
             self.input.read_exact(&mut row)?;
-            let (doubles, singles) = (row.as_chunks::<8>().0, row.as_chunks::<4>().0);
+            let doubles = row.as_chunks::<8>().0;
+            let singles = row.as_chunks::<4>().0;
             take(std::array::from_fn(|i| match is_f64 {
                 true => f64::from_le_bytes(doubles[i]),
                 false => f32::from_le_bytes(singles[i]).into(),
@@ -201,7 +202,7 @@ impl<R: Read> Body<'_, R> {
 /// Rows between two reports of progress.
 const REPORT_EVERY: usize = 65_536;
 
-/// What a safetensors file calls a field.
+/// The name of a field in a safetensors file.
 fn file_name(field: Field, one_tensor: bool) -> String {
     match field {
         Field::Mean(axis) => format!("means[{axis}]"),

@@ -1,4 +1,4 @@
-//! The files of a scene that has several.
+//! The files of a scene that consists of several.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -9,19 +9,20 @@ use super::hash_reader::HashReader;
 use super::unpack_budget::UnpackBudget;
 use super::{FileError, IngestError, Progress, file};
 
-/// Where the files that a scene names are found.
+/// Reads the files that a scene names.
 pub(super) trait SceneFiles {
-    /// A whole file of at most so many bytes; the name is relative to the file given first, with `/`.
+    /// Reads a whole file of at most `limit_bytes`. The name is relative to the folder of the file
+    /// given first, with `/`.
     fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError>;
 
-    /// What the scene may unpack.
+    /// How much the scene may unpack.
     fn budget(&mut self) -> &mut UnpackBudget;
 }
 
 /// The folder of the file given first.
 pub(super) struct Folder<'a> {
     path: PathBuf,
-    /// Of every file read, in order.
+    /// Hashes of the files that were read, in order.
     hashes: Vec<String>,
     read_bytes: u64,
     progress: Progress<'a>,
@@ -29,7 +30,7 @@ pub(super) struct Folder<'a> {
 }
 
 impl<'a> Folder<'a> {
-    /// Of a file that was read, with its size and hash.
+    /// The folder of a file that was read, given its size and hash.
     pub(super) fn new(first: &Path, bytes: u64, hash: String, progress: Progress<'a>) -> Self {
         let path = first.parent().unwrap_or(Path::new("")).to_owned();
         let mut folder = Self {
@@ -43,7 +44,7 @@ impl<'a> Folder<'a> {
         folder
     }
 
-    /// The hash of one file, or of the hashes of several.
+    /// The hash of one file, or the hash of the hashes of several.
     pub(super) fn finish(self) -> String {
         match &self.hashes[..] {
             [one] => one.clone(),

@@ -3,12 +3,12 @@
 //! safetensors: `sky_head.layers.{0,1,2}.{weight,bias}` and, if there are appearances,
 //! `appearance_embedding.weight` `[images, n]`; F32 or F16; tensors of other names are skipped.
 //!
-//! Images, PNG or JPEG, are told by their shape: 2:1 is an equirectangular panorama, 4:3 and 3:4 are
-//! crosses, 1:6 and 6:1 strips of the faces +x, -x, +y, -y, +z, -z; or a folder has them as px, nx, py,
-//! ny, pz, nz. x is right, y up and z ahead, in the middle of a panorama and of a cross: left-handed, as
-//! cube maps are.
+//! Images, PNG or JPEG, are distinguished by their aspect ratio: 2:1 is an equirectangular
+//! panorama, 4:3 and 3:4 are crosses, 1:6 and 6:1 strips of the faces +x, -x, +y, -y, +z, -z. A
+//! folder has the faces as px, nx, py, ny, pz, nz. x is right, y up and z ahead, in the middle of a
+//! panorama and of a cross: left-handed, like cube maps.
 //!
-//! What a twin keeps is one of two: those tensors in F32 and nothing else, or a PNG of six faces, one
+//! A twin stores one of two: those tensors in F32 and no others, or a PNG of six faces, one
 //! below the other.
 
 use std::f64::consts::{PI, TAU};
@@ -27,23 +27,23 @@ use wildcity_scene::sky::{CubeMap, FACES, Layer, Network, SkyError, SkyModel};
 use super::file::{self, FileError};
 use super::{IngestError, read_whole};
 
-/// A sky that was read.
+/// A sky that was read from a file.
 #[derive(Clone, Debug)]
 pub struct SkyFile {
-    /// It as a twin keeps it: what [`decode`] reads.
+    /// The sky as a twin stores it, which [`decode`] reads.
     pub bytes: Vec<u8>,
-    /// It, ready to be looked at.
+    /// The decoded sky.
     pub model: SkyModel,
 }
 
-/// Reads a sky from a file, or the six images of a folder. `image` is whose appearance a network is seen
-/// with; the mean of all if none.
+/// Reads a sky from a file, or from the six images of a folder. `image` is the index of the
+/// training image with the appearance that a network is evaluated for; the mean of all if `None`.
 ///
 /// # Errors
-/// It is no sky, or one that cannot be used.
+/// It is not a sky, or one that cannot be used.
 pub fn read(path: &Path, image: Option<u32>) -> Result<SkyFile, IngestError> {
     if path.is_dir() {
-        return kept_faces(&folder(path)?, image);
+        return stored_faces(&folder(path)?, image);
     }
     read_bytes(&read_whole(path, limits::SKY_FILE_BYTES)?, image)
 }
@@ -55,13 +55,13 @@ pub fn read(path: &Path, image: Option<u32>) -> Result<SkyFile, IngestError> {
 pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestError> {
     if bytes.get(8) == Some(&b'{') {
         let Weights { layers, appearances } = Weights::read(bytes)?;
-        let bytes = kept_network(&layers, &appearances)?;
+        let bytes = stored_network(&layers, &appearances)?;
         return Ok(SkyFile { model: decode(&bytes, image)?, bytes });
     }
-    kept_faces(&faces(&picture(bytes)?)?, image)
+    stored_faces(&faces(&picture(bytes)?)?, image)
 }
 
-/// A sky as a twin keeps it.
+/// Decodes a sky as a twin stores it.
 ///
 /// # Errors
 /// As [`read`].
@@ -84,7 +84,8 @@ struct Weights {
     appearances: Appearances,
 }
 
-/// A row of numbers for every image of the training set; none if there are no rows.
+/// The appearance embedding: a row of numbers for every image of the training set; empty if the
+/// network has none.
 struct Appearances {
     count: usize,
     length: usize,
@@ -115,7 +116,7 @@ impl Weights {
 const APPEARANCES: &str = "appearance_embedding.weight";
 
 impl Appearances {
-    /// That of an image, or the mean of all.
+    /// The row of an image, or the mean of all rows.
     fn of(&self, image: Option<u32>) -> Result<Vec<f32>, SkyError> {
         let Self { count, length, values } = self;
         let row = |row: usize| &values[row * length..(row + 1) * length];
@@ -154,7 +155,7 @@ fn floats(
     Ok((shape, values))
 }
 
-fn kept_network(layers: &[Layer; 3], appearances: &Appearances) -> Result<Vec<u8>, IngestError> {
+fn stored_network(layers: &[Layer; 3], appearances: &Appearances) -> Result<Vec<u8>, IngestError> {
     let bytes = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let mut tensors: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
     for (number, layer) in layers.iter().enumerate() {
@@ -177,8 +178,8 @@ fn kept_network(layers: &[Layer; 3], appearances: &Appearances) -> Result<Vec<u8
     kept.map_err(|error| bad("tensors", error.to_string()))
 }
 
-/// Six faces as a twin keeps them, from a strip.
-fn kept_faces(strip: &RgbImage, image: Option<u32>) -> Result<SkyFile, IngestError> {
+/// Six faces as a twin stores them, from a strip.
+fn stored_faces(strip: &RgbImage, image: Option<u32>) -> Result<SkyFile, IngestError> {
     let mut bytes = Cursor::new(Vec::new());
     strip
         .write_to(&mut bytes, ImageFormat::Png)
@@ -193,7 +194,7 @@ fn picture(bytes: &[u8]) -> Result<RgbImage, IngestError> {
     reader = reader.with_guessed_format()?;
     let is_read = matches!(reader.format(), Some(ImageFormat::Png | ImageFormat::Jpeg));
     if !is_read {
-        return Err(bad("start", "it is no safetensors file, no PNG and no JPEG".to_owned()));
+        return Err(bad("start", "it is not a safetensors file, a PNG, or a JPEG".to_owned()));
     }
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(limits::SKY_IMAGE_BYTES);
@@ -204,8 +205,8 @@ fn picture(bytes: &[u8]) -> Result<RgbImage, IngestError> {
 /// The faces of an image of any of the shapes, as a strip.
 fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     let (width, height) = picture.dimensions();
-    // Where each face lies, in faces from the left and the top.
-    let (side, lying): (u32, [[u32; 2]; FACES]) = match (width, height) {
+    // The position of each face, in faces from the left and the top.
+    let (side, position): (u32, [[u32; 2]; FACES]) = match (width, height) {
         (w, h) if w == 2 * h => return panorama(picture),
         (w, h) if h == 6 * w => return Ok(picture.clone()),
         (w, h) if w == 6 * h => (h, [[0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0]]),
@@ -217,7 +218,7 @@ fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
         }
         _ => {
             let reason = format!(
-                "{width} x {height} pixels are neither a panorama (2:1) nor a cross (4:3, 3:4) nor a \
+                "{width} x {height} pixels are not a panorama (2:1), a cross (4:3, 3:4), or a \
                  strip of six faces (1:6, 6:1)"
             );
             return Err(bad("image", reason));
@@ -225,17 +226,20 @@ fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     };
     let last = side - 1;
     Ok(RgbImage::from_fn(side, FACES as u32 * side, |column, y| {
-        let (face, row) = ((y / side) as usize, y % side);
-        // Below the bottom of an upright cross, -z stands on its head.
-        let on_head = lying[face] == [1, 3];
-        let (column, row) = if on_head { (last - column, last - row) } else { (column, row) };
-        let [left, top] = lying[face];
+        let face = (y / side) as usize;
+        let row = y % side;
+        // In an upright cross, -z is below the bottom face, and upside down.
+        let is_upside_down = position[face] == [1, 3];
+        let (column, row) =
+            if is_upside_down { (last - column, last - row) } else { (column, row) };
+        let [left, top] = position[face];
         *picture.get_pixel(left * side + column, top * side + row)
     }))
 }
 
-/// The faces of an equirectangular panorama, as fine as it is in the middle of each face: there a face of
-/// `n` has `n / 2` pixels per radian, and the panorama `width / 2π`.
+/// The faces of an equirectangular panorama, at its resolution in the middle of each face. There, a
+/// face of `n` pixels has `n / 2` pixels per radian, and the panorama has `width / 2π`; so `n =
+/// width / π`.
 fn panorama(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     let (width, height) = picture.dimensions();
     let side = (f64::from(width) / PI).ceil() as u32;
@@ -248,7 +252,9 @@ fn panorama(picture: &RgbImage) -> Result<RgbImage, IngestError> {
         let u = azimuth * f64::from(width) - 0.5;
         let v = (away.y.clamp(-1.0, 1.0).acos() / PI * f64::from(height) - 0.5)
             .clamp(0.0, f64::from(height - 1));
-        let (fu, fv) = (u - u.floor(), v - v.floor());
+        // Bilinear interpolation.
+        let fu = u - u.floor();
+        let fv = v - v.floor();
         let at = |column: f64, row: f64| {
             let column = column.rem_euclid(f64::from(width)) as u32;
             let row = (row as u32).min(height - 1);

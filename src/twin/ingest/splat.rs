@@ -1,7 +1,7 @@
-//! `.splat`, the format of antimatter15's web viewer: records of 32 bytes, and nothing else.
+//! `.splat`, the format of antimatter15's web viewer: records of 32 bytes, without a header.
 //!
-//! A record is position (3 f32), standard deviations (3 f32), colour and opacity (4 u8, of 255), and
-//! the rotation (w, x, y, z) as u8 around 128. No colour depends on the direction.
+//! A record is position (3 f32), standard deviations (3 f32), colour and opacity (4 u8, of 255),
+//! and the rotation (w, x, y, z) as u8 around 128. Colours do not depend on the direction.
 
 use std::io::Read;
 
@@ -13,15 +13,16 @@ use super::{IngestError, activation, check_count};
 /// Bytes of a Gaussian.
 const RECORD_BYTES: usize = 32;
 
-/// Whether a file that starts so can be one: there is no magic number, but its first rotation is
-/// a unit quaternion, its position near and its scales positive. Text is none of these.
+/// Whether a file that starts like this is likely to be one. There is no magic number, but the
+/// first rotation must be a unit quaternion, the position near the origin, and the scales not
+/// negative. Text fails these tests.
 pub(super) fn is_likely(start: &[u8]) -> bool {
     start.first_chunk().is_some_and(|record| {
         let [means_m, scales, ..] = numbers(record);
         let length = quat_wxyz(record).iter().map(|q| q * q).sum::<f32>().sqrt();
         means_m.iter().all(|m| m.abs() <= 1e8)
             && scales.iter().all(|s| (0.0..=1e5).contains(s))
-            // Components are off by 1/256 at most, and 1 is stored as 127/128.
+            // Components are rounded by at most 1/256, and 1 is stored as 127/128.
             && (0.95..=1.05).contains(&length)
     })
 }

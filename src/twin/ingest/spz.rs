@@ -4,8 +4,8 @@
 //! attributes, each for all Gaussians, in the order of [`Payload`]: positions (3 x 24-bit fixed
 //! point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations and the
 //! higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green, blue).
-//! Version 4 has a header of 32 bytes that no compression hides, a table of the streams' sizes
-//! behind it, and between the two whatever extensions somebody added; those are skipped.
+//! Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes
+//! after it. Between the two there may be extensions, which are skipped.
 
 use std::io::{self, BufRead, Read};
 
@@ -21,13 +21,14 @@ const FORMAT: &str = "SPZ";
 const MAGIC: [u8; 4] = *b"NGSP";
 /// Bytes of the header of versions 2 and 3.
 const HEADER_BYTES: u64 = 16;
-/// Bytes of version 4's, of which the last 16 begin with the place of the table of streams.
+/// Bytes of version 4's header. Its last 16 begin with the offset of the table of streams.
 const HEADER_4_BYTES: u64 = 32;
 /// Two u64 per stream: compressed and uncompressed bytes.
 const STREAM_ENTRY_BYTES: u64 = 16;
-/// Set if extensions lie before the table of version 4, or behind the payload of the others.
+/// Set if there are extensions: before the table in version 4, after the payload in the others.
 const FLAG_EXTENSIONS: u8 = 2;
-/// What a colour of 0 to 1 was multiplied with, that brighter and darker ones fit a byte.
+/// The factor that colours were multiplied by before quantisation, so that values beyond 0 to 1 fit
+/// into a byte.
 const COLOUR_SCALE: f64 = 0.15;
 
 /// Reads a file that starts with the header, of a known size.
@@ -72,7 +73,7 @@ pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussian
     let attributes = header.attributes();
     let gaussians =
         decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take))?;
-    // To the end, where the checksum is.
+    // Read to the end, so that the checksum is verified.
     let limit = unpack_budget::limit_bytes(file_bytes);
     let more = io::copy(&mut (&mut input).take(limit), &mut io::sink());
     let more = more.map_err(|e| body("the end", format!("the gzip stream is damaged: {e}")))?;
@@ -83,14 +84,14 @@ pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussian
     Ok(gaussians)
 }
 
-/// What all versions say first.
+/// The fields that all versions begin with.
 struct Header {
     version: u32,
     count: u32,
     sh_degree: u8,
     fraction_bits: u8,
     flags: u8,
-    /// Streams of version 4.
+    /// Number of streams, in version 4.
     streams: u8,
 }
 
@@ -113,7 +114,7 @@ impl Header {
         if sh_degree > sh::MAX_DEGREE {
             return Err(bad("byte 12", format!("SH degree {sh_degree}; 0 to 3 are read")));
         }
-        // A sign and 23 bits are all that a coordinate has.
+        // A coordinate has a sign and 23 bits.
         if fraction_bits > 23 {
             return Err(bad("byte 13", format!("{fraction_bits} fractional bits; 0 to 23 fit")));
         }
@@ -158,7 +159,7 @@ impl Attribute {
         self.stride as u128 * u128::from(self.count)
     }
 
-    /// Hands the rows to `take`, one after another.
+    /// Calls `take` with each row.
     fn rows(&self, input: &mut dyn Read, take: &mut dyn FnMut(&[u8])) -> Result<(), IngestError> {
         let mut rows = vec![0; self.stride * ROWS_AT_ONCE];
         let mut left = self.count as usize;
@@ -185,7 +186,7 @@ impl Attribute {
 /// Rows that are read at once.
 const ROWS_AT_ONCE: usize = 4096;
 
-/// Skips to version 4's table of streams and reads it: the compressed bytes of every attribute.
+/// Skips to version 4's table of streams, and reads the compressed size of every attribute from it.
 fn read_table(
     input: &mut impl Read,
     header: &Header,
@@ -193,7 +194,8 @@ fn read_table(
 ) -> Result<Vec<u64>, IngestError> {
     let attributes = header.attributes();
     if usize::from(header.streams) != attributes.len() {
-        let (found, wanted) = (header.streams, attributes.len());
+        let found = header.streams;
+        let wanted = attributes.len();
         let degree = header.sh_degree;
         return Err(bad("byte 15", format!("{found} streams; SH degree {degree} has {wanted}")));
     }
@@ -203,7 +205,7 @@ fn read_table(
     let table_at = u64::from(u32::from_le_bytes([rest[0], rest[1], rest[2], rest[3]]));
     let streams_at = table_at + STREAM_ENTRY_BYTES * attributes.len() as u64;
     if table_at < HEADER_4_BYTES || streams_at > file_bytes {
-        let reason = format!("{table_at} is no place for the table within {file_bytes} bytes");
+        let reason = format!("the table cannot be at {table_at} in a file of {file_bytes} bytes");
         return Err(bad("bytes 16 to 19", reason));
     }
     io::copy(&mut input.take(table_at - HEADER_4_BYTES), &mut io::sink())?;
@@ -212,9 +214,11 @@ fn read_table(
         let mut entry = [0; STREAM_ENTRY_BYTES as usize];
         input.read_exact(&mut entry).map_err(short)?;
         let sizes = entry.as_chunks::<8>().0;
-        let (packed_bytes, bytes) = (u64::from_le_bytes(sizes[0]), u64::from_le_bytes(sizes[1]));
+        let packed_bytes = u64::from_le_bytes(sizes[0]);
+        let bytes = u64::from_le_bytes(sizes[1]);
         if u128::from(bytes) != attribute.bytes() {
-            let (wanted, count) = (attribute.bytes(), attribute.count);
+            let wanted = attribute.bytes();
+            let count = attribute.count;
             let reason = format!("{bytes} bytes; {count} Gaussians have {wanted}");
             return Err(bad(&format!("stream of {}", attribute.name), reason));
         }
@@ -230,7 +234,7 @@ fn read_table(
     Ok(packed)
 }
 
-/// Makes Gaussians of the attributes; `rows` hands all rows of one of them to its argument.
+/// Decodes Gaussians from the attributes; `rows` calls its argument with all rows of one attribute.
 fn decode(
     header: &Header,
     mut rows: impl FnMut(usize, &mut dyn FnMut(&[u8])) -> Result<(), IngestError>,
@@ -242,7 +246,7 @@ fn decode(
     let metres = f64::from(header.fraction_bits).exp2().recip();
     rows(0, &mut |row| {
         let fixed = |i: usize| {
-            // Into the upper three bytes, and back with the sign.
+            // Into the upper three bytes, and shifted back with the sign.
             i32::from_le_bytes([0, row[3 * i], row[3 * i + 1], row[3 * i + 2]]) >> 8
         };
         g.means_m.push(std::array::from_fn(|i| f64::from(fixed(i)) * metres));
@@ -277,14 +281,14 @@ fn decode(
     Ok(gaussians)
 }
 
-/// Version 2: x, y, z around 127.5; w is what is left to length 1, and positive.
+/// Version 2: x, y, z around 127.5; w is positive and makes the length 1.
 fn quat_of_xyz(bytes: [u8; 3]) -> [f32; 4] {
     let xyz = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
     activation::quat_of_smallest_three(0, xyz)
 }
 
-/// Version 3: the place of the largest of (x, y, z, w) in the upper 2 bits, then sign and magnitude
-/// of the others, 1 + 9 bits each, of √½.
+/// Version 3: the index of the largest of (x, y, z, w) in the upper 2 bits, then sign and magnitude
+/// of the others, 1 + 9 bits each, as fractions of √½.
 fn quat_of_word(word: u32) -> [f32; 4] {
     let others = [20, 10, 0].map(|shift| {
         let bits = word >> shift;

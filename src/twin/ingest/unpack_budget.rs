@@ -1,10 +1,10 @@
-//! How much may come of how little: the limit of everything compressed.
+//! Limits how much compressed data may expand to, so that a small file cannot exhaust the memory.
 
 use crate::limits;
 
 use super::IngestError;
 
-/// What a scene has unpacked so far of how much.
+/// Compressed bytes that were read of a scene, and bytes that they unpacked to.
 #[derive(Debug, Default)]
 pub(super) struct UnpackBudget {
     packed: u64,
@@ -12,12 +12,15 @@ pub(super) struct UnpackBudget {
 }
 
 impl UnpackBudget {
-    /// So many more compressed bytes were read.
+    /// Counts compressed bytes that were read.
     pub(super) fn read(&mut self, packed: u64) {
         self.packed = self.packed.saturating_add(packed);
     }
 
-    /// Asks for room for so many more bytes, before there is any.
+    /// Counts bytes that are about to be unpacked, before memory is allocated for them.
+    ///
+    /// # Errors
+    /// [`IngestError::DecompressionBomb`].
     pub(super) fn unpack(
         &mut self,
         format: &'static str,
@@ -29,12 +32,15 @@ impl UnpackBudget {
     }
 }
 
-/// Bytes that so many compressed ones may unpack to.
+/// The most bytes that `packed` compressed bytes may unpack to.
 pub(super) fn limit_bytes(packed: u64) -> u64 {
     packed.saturating_mul(limits::UNPACKED_PER_BYTE).saturating_add(limits::UNPACKED_FREE_BYTES)
 }
 
-/// Refuses what unpacks to more, before memory is asked for.
+/// Checks a size before memory is allocated for it.
+///
+/// # Errors
+/// [`IngestError::DecompressionBomb`].
 pub(super) fn check(
     format: &'static str,
     place: &str,

@@ -67,7 +67,8 @@ impl Budget {
         Ok(())
     }
 
-    /// Reserves memory in place of an earlier claim. If the new claim is refused, the old one stays.
+    /// Reserves memory in place of an earlier claim. If the new claim is refused, the old one
+    /// stays.
     ///
     /// # Errors
     /// As [`Budget::reserve`].
@@ -100,13 +101,13 @@ impl VersionClaims {
     }
 }
 
-/// The default limit: three quarters of the machine's memory.
-pub(super) fn default_bytes() -> u64 {
+/// The memory that twins may take by default, in bytes: three quarters of the machine's memory.
+pub fn default_memory_bytes() -> u64 {
     physical_bytes().map_or(limits::RESIDENT_BYTES, |physical| physical / 4 * 3)
 }
 
-/// Memory of the machine in bytes; `None` where /proc/meminfo does not say. By hand, because it is shorter than the
-/// dependency on a crate for system information.
+/// Memory of the machine in bytes; `None` where /proc/meminfo does not say. By hand, because it is
+/// shorter than the dependency on a crate for system information.
 fn physical_bytes() -> Option<u64> {
     let mut text = String::new();
     File::open("/proc/meminfo").ok()?.take(4096).read_to_string(&mut text).ok()?;

@@ -9,7 +9,7 @@ use crate::store::{Catalog, StoreError, TwinListing, Version};
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{Manifest, Sky};
 
-use super::budget::{Budget, default_bytes};
+use super::budget::{Budget, default_memory_bytes};
 use super::pager::Pager;
 use super::resident::Shared;
 use super::{ResidencyError, Resident, SectionSource, Stats};
@@ -23,12 +23,13 @@ pub struct Cache {
     slots: Mutex<BTreeMap<(String, u64), VersionSlot>>,
     /// The skies of the open versions.
     skies: Mutex<Vec<(SkyKey, Weak<Sky>)>>,
-    /// The version that was opened last stays open for the next session, because its table has megabytes.
+    /// The version that was opened last stays open for the next session, because its table has
+    /// megabytes.
     last: Mutex<Option<Arc<Resident>>>,
 }
 
-/// A version that is open or being opened. The lock is held while opening, so that concurrent callers wait for the
-/// result and do not read the version again.
+/// A version that is open or being opened. The lock is held while opening, so that concurrent
+/// callers wait for the result and do not read the version again.
 type VersionSlot = Arc<Mutex<Weak<Resident>>>;
 
 /// A sky, and the `sky_error` that it is baked for.
@@ -40,7 +41,8 @@ impl Cache {
         Self::limited(catalog, None)
     }
 
-    /// An empty cache that may use `limit_bytes`; by default three quarters of the machine's memory.
+    /// An empty cache that may use `limit_bytes`; by default three quarters of the machine's
+    /// memory.
     pub fn limited(catalog: Catalog, limit_bytes: Option<u64>) -> Self {
         let source = Arc::new(catalog.clone());
         Self::with_source(catalog, source, limit_bytes)
@@ -52,7 +54,7 @@ impl Cache {
         source: Arc<dyn SectionSource>,
         limit_bytes: Option<u64>,
     ) -> Self {
-        let limit_bytes = limit_bytes.unwrap_or_else(default_bytes);
+        let limit_bytes = limit_bytes.unwrap_or_else(default_memory_bytes);
         let pager = Pager::new(source, limit_bytes);
         let budget = Mutex::new(Budget::new(limit_bytes));
         Self {
@@ -77,8 +79,8 @@ impl Cache {
         &self.catalog
     }
 
-    /// Opens one version of a twin, or the latest. Reads its table unless the version is open already; blocks
-    /// meanwhile.
+    /// Opens one version of a twin, or the latest. Reads its table unless the version is open
+    /// already; blocks meanwhile.
     ///
     /// # Errors
     /// As [`Catalog::version`]; [`ResidencyError::Thread`] on the first call.
@@ -104,8 +106,8 @@ impl Cache {
         self.shared.stats()
     }
 
-    /// The sky of a version, baked to its profile's `sky_error`. Versions with the same sky and error share
-    /// it.
+    /// The sky of a version, baked to its profile's `sky_error`. Versions with the same sky and
+    /// error share it.
     fn sky(&self, version: &Version) -> Result<Option<Arc<Sky>>, ResidencyError> {
         let Manifest { sky: Some(named), profile, twin, .. } = &version.manifest else {
             return Ok(None);
@@ -125,8 +127,8 @@ impl Cache {
         Ok(Some(sky))
     }
 
-    /// The slot of a version. Slots of closed versions are removed, so that they do not accumulate as
-    /// versions come and go.
+    /// The slot of a version. Slots of closed versions are removed, so that they do not accumulate
+    /// as versions come and go.
     fn slot(&self, version: &Version) -> VersionSlot {
         let mut slots = self.slots.lock();
         slots.retain(|_, slot| Arc::strong_count(slot) > 1 || slot.lock().strong_count() > 0);

@@ -24,16 +24,16 @@ pub struct SectionRef {
     pub section: usize,
 }
 
-/// The coarsest level of a block whose error is at most `tau_px` pixels from a distance, as an index into the
-/// block's sections in order of level.
+/// The coarsest level of a block with an error of at most `tau_px` pixels at a distance, as an
+/// index into the block's sections in order of level.
 pub(super) fn coarsest_level(
     block: &[Section],
     focal_px: f64,
     distance_m: f64,
     tau_px: f64,
 ) -> usize {
-    // `f e / d <= tau` without the division, so that a distance of 0 needs no special case. Errors rise with
-    // the level, and level 0 has none.
+    // `f e / d <= tau` without the division, so that a distance of 0 needs no special case. Errors
+    // rise with the level, and level 0 has none.
     let small = |error_m: f32| focal_px * f64::from(error_m) <= tau_px * distance_m;
     block.iter().rposition(|section| small(section.error_m)).unwrap_or(0)
 }

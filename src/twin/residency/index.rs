@@ -1,5 +1,5 @@
-//! A spatial index over the blocks of a version, so that a frame looks only at the blocks near it and not at
-//! a whole city; and the sections that a frame draws.
+//! A spatial index over the blocks of a version, so that a frame looks only at the blocks near it
+//! and not at a whole city; and the sections that a frame draws.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,17 +10,17 @@ use wildcity_scene::{Manifest, RenderProfile};
 
 use super::demand::{SectionRef, Viewpoint, coarsest_level, longest_focal_px};
 
-/// Cells along the edge of a group: 1 km. 20 km of road are then about twenty groups, and the 200 cells within
-/// 300 m of a viewpoint lie in at most four of them.
+/// Cells along the edge of a group: 1 km. 20 km of road are then about twenty groups, and the 200
+/// cells within 300 m of a viewpoint lie in at most four of them.
 const GROUP_CELLS: i32 = 16;
 
 /// The sections that a frame draws, in order of (cell y, cell x, block): one for every block within
 /// `reach_m` of a camera. It depends on the cameras, the profile, and the manifest's table alone.
 ///
-/// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal length in
-/// pixels. A block is drawn at the coarsest level for which that is at most `tau_px`, with the longest focal
-/// length of the frame, and the distance of the nearest camera from the bounding box of everything in the block.
-/// The amount of memory has no influence.
+/// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal
+/// length in pixels. A block is drawn at the coarsest level for which that is at most `tau_px`,
+/// with the longest focal length of the frame, and the distance of the nearest camera from the
+/// bounding box of everything in the block. The amount of memory has no influence.
 ///
 /// This looks at every block of the twin; callers that ask often keep a [`BlockIndex`].
 pub fn demand(
@@ -31,7 +31,8 @@ pub fn demand(
     BlockIndex::new(manifest).demand(manifest, viewpoints, profile)
 }
 
-/// The blocks of a version in order, below the bounding boxes of their cells and of groups of cells.
+/// The blocks of a version in order, below the bounding boxes of their cells and of groups of
+/// cells.
 #[derive(Debug)]
 pub struct BlockIndex {
     groups: Vec<Group>,
@@ -111,8 +112,9 @@ impl BlockIndex {
 
     /// Calls `see` with each block within reach and its distance, in order.
     ///
-    /// A box is never farther away than a box within it, in f64 arithmetic as well as on paper: each step of the
-    /// distance rounds monotonically. So no block is lost by skipping groups and cells that are out of reach.
+    /// A box is never farther away than a box within it, in f64 arithmetic as well as on paper:
+    /// each step of the distance rounds monotonically. So no block is lost by skipping groups and
+    /// cells that are out of reach.
     pub(super) fn visit(
         &self,
         reach_m: Option<f64>,

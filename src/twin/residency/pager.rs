@@ -1,8 +1,9 @@
-//! The pager: loads requested sections in order of urgency, and hands a frame all of its sections at once.
+//! The pager: loads requested sections in order of urgency, and hands a frame all of its sections
+//! at once.
 //!
-//! A frame that waits holds no memory, so frames cannot block each other; only older frames may evict the sections
-//! that it waits for ([`super::table::Requester`]). The pager has threads of its own for loading, because reading
-//! blocks. All other threads wait here for the lock at most.
+//! A frame that waits holds no memory, so frames cannot block each other; only older frames may
+//! evict the sections that it waits for ([`super::table::Requester`]). The pager has threads of its
+//! own for loading, because reading blocks. All other threads wait here for the lock at most.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -91,8 +92,8 @@ impl Pager {
         change(&mut self.0.state.lock().requests.table)
     }
 
-    /// Requests the sections of a frame. `callback` is called once all are in memory; before this returns, if they
-    /// are already.
+    /// Requests the sections of a frame. `callback` is called once all are in memory; before this
+    /// returns, if they are already.
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`]; `callback` is dropped then.
@@ -111,8 +112,8 @@ impl Pager {
         Ok(WaitingFrame { shared: self.0.clone(), number })
     }
 
-    /// Loads sections that frames may need later, in order, as far as there is room. This replaces the prefetch of
-    /// the same owner with the number `before`. Returns the new number.
+    /// Loads sections that frames may need later, in order, as far as there is room. This replaces
+    /// the prefetch of the same owner with the number `before`. Returns the new number.
     pub(super) fn prefetch(
         &self,
         before: Option<u64>,
@@ -139,8 +140,8 @@ impl Pager {
         requests.forget_unrequested_failures();
     }
 
-    /// Number of sections of a prefetch that may still be loaded: without those that are in memory, that
-    /// failed, or for which there was no room.
+    /// Number of sections of a prefetch that may still be loaded: without those that are in memory,
+    /// that failed, or for which there was no room.
     pub(super) fn pending(&self, number: u64) -> usize {
         self.0.state.lock().requests.pending(number)
     }
@@ -203,8 +204,8 @@ impl std::ops::Deref for PinnedScene {
 impl Drop for PinnedScene {
     fn drop(&mut self) {
         self.scene.chunks.clear();
-        // The flag is read under the lock: a loader that has just found every section pinned sleeps by then, and
-        // gets the notification.
+        // The flag is read under the lock: a loader that has just found every section pinned sleeps
+        // by then, and gets the notification.
         if self.shared.state.lock().requests.waiting_for_room {
             self.shared.work.notify_all();
         }
@@ -224,8 +225,8 @@ impl Shared {
                     self.notify(notifications);
                     state = self.state.lock();
                 }
-                // The end of a frame notifies. Code that holds a chunk for a moment otherwise does not, so a load
-                // that waits for room also looks again from time to time.
+                // The end of a frame notifies. Code that holds a chunk for a moment otherwise does
+                // not, so a load that waits for room also looks again from time to time.
                 NextLoad::Wait(_) if state.requests.waiting_for_room => {
                     self.work.wait_for(&mut state, limits::ROOM_POLL);
                 }

@@ -1,8 +1,9 @@
-//! Requests for sections: by frames, which wait until all of theirs are in memory, and by prefetches. Decides which
-//! section is loaded next, and which frames are notified once it is loaded or has failed.
+//! Requests for sections: by frames, which wait until all of theirs are in memory, and by
+//! prefetches. Decides which section is loaded next, and which frames are notified once it is
+//! loaded or has failed.
 //!
-//! There is no thread, lock, or file here: those belong to the pager. `C` is a frame's callback, which is
-//! stored and returned here, but never called.
+//! There is no thread, lock, or file here: those belong to the pager. `C` is a frame's callback,
+//! which is stored and returned here, but never called.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -21,13 +22,14 @@ use super::{ResidencyError, Stats};
 /// All requests, and the table of sections that answers them.
 pub(super) struct Requests<C> {
     pub(super) table: SectionTable,
-    /// What is to be loaded, the most urgent first. A section may be queued for several requests; each entry stays
-    /// until the section is loaded.
+    /// What is to be loaded, the most urgent first. A section may be queued for several requests;
+    /// each entry stays until the section is loaded.
     queue: BTreeMap<QueueKey, SectionRef>,
     requests: BTreeMap<u64, Request<C>>,
-    /// Sections whose last load failed.
+    /// Sections with a failed last load.
     failures: BTreeMap<SlotId, RetryState>,
-    /// Number of requests so far. It numbers requests, and is the time of last use of their sections.
+    /// Number of requests so far. It numbers requests, and is the time of last use of their
+    /// sections.
     number: u64,
     /// Whether the most urgent load waits for room.
     pub(super) waiting_for_room: bool,
@@ -80,7 +82,7 @@ struct Frame<C> {
     missing: usize,
 }
 
-/// A section whose load failed and is tried again.
+/// A failed load that is tried again.
 struct RetryState {
     attempts: u32,
     not_before: Instant,
@@ -111,7 +113,8 @@ pub(super) enum LoadFailure {
     Crashed,
 }
 
-/// Callbacks to call once the lock is released: a callback may drop the scene that it gets, which locks.
+/// Callbacks to call once the lock is released: a callback may drop the scene that it gets, which
+/// locks.
 pub(super) type Notifications<C> = Vec<(C, Result<CompleteFrame, ResidencyError>)>;
 
 impl<C> Requests<C> {
@@ -173,7 +176,8 @@ impl<C> Requests<C> {
         Ok(number)
     }
 
-    /// Adds a prefetch, after its owner's previous one with the number `before`. Returns its number.
+    /// Adds a prefetch, after its owner's previous one with the number `before`. Returns its
+    /// number.
     pub(super) fn add_prefetch(
         &mut self,
         before: Option<u64>,
@@ -189,8 +193,8 @@ impl<C> Requests<C> {
                 self.queue.insert(QueueKey { urgency, request, order, id }, section);
             }
         }
-        // It evicts nothing that was used since its owner's previous prefetch. A new owner's evicts nothing that
-        // was used since the oldest prefetch of any other owner.
+        // It evicts nothing that was used since its owner's previous prefetch. A new owner's evicts
+        // nothing that was used since the oldest prefetch of any other owner.
         let since = |request: &Request<C>| match request.requester {
             Requester::Prefetch(since) => Some(since),
             Requester::Frame(_) => None,
@@ -238,8 +242,9 @@ impl<C> Requests<C> {
         });
     }
 
-    /// Forgets the failures of sections that are no longer requested. The next request for one gets all attempts,
-    /// and its slot may be reused for another section. What is requested and not in memory is in the queue.
+    /// Forgets the failures of sections that are no longer requested. The next request for one gets
+    /// all attempts, and its slot may be reused for another section. What is requested and not in
+    /// memory is in the queue.
     pub(super) fn forget_unrequested_failures(&mut self) {
         if !self.failures.is_empty() {
             let queued: BTreeSet<SlotId> = self.queue.keys().map(|key| key.id).collect();
@@ -388,8 +393,8 @@ impl<C> Requests<C> {
         (frame.callback, Ok(complete))
     }
 
-    /// A load failed. It is tried again after a while; after the last attempt, the frames that wait for the section
-    /// are returned with the error.
+    /// A load failed. It is tried again after a while; after the last attempt, the frames that wait
+    /// for the section are returned with the error.
     pub(super) fn load_failed(&mut self, id: SlotId, failure: &LoadFailure) -> Notifications<C> {
         let mut notifications = Notifications::new();
         let cause = self.count_failure(failure);

@@ -12,16 +12,17 @@ use super::demand::{SectionRef, Viewpoint};
 use super::requests::Urgency;
 use super::{ResidencyError, Resident, RigExtent};
 
-/// Memory that is reserved for the frames of one session, and the session's prefetcher. Dropping it releases
-/// both.
+/// Memory that is reserved for the frames of one session, and the session's prefetcher. Dropping it
+/// releases both.
 #[derive(Debug)]
 pub struct Reservation {
     claim: Claim,
     prefetcher: Arc<Prefetcher>,
 }
 
-/// Loads sections of a version ahead of the frames that will need them. It is shared with the task that works out
-/// what those are, which takes a while; it ends with its [`Reservation`] nevertheless.
+/// Loads sections of a version ahead of the frames that will need them. It is shared with the task
+/// that works out what those are, which takes a while; it ends with its [`Reservation`]
+/// nevertheless.
 #[derive(Debug)]
 pub struct Prefetcher {
     resident: Arc<Resident>,
@@ -65,8 +66,8 @@ impl Reservation {
         Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
     }
 
-    /// Reserves `bytes` for another version in place of this one, in one step: there need not be room for
-    /// both. Prefetching of the old version ends.
+    /// Reserves `bytes` for another version in place of this one, in one step: there need not be
+    /// room for both. Prefetching of the old version ends.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.
@@ -134,8 +135,8 @@ impl Prefetcher {
         }
     }
 
-    /// Number of requested sections that may still be loaded: without those for which there was no room, or
-    /// which cannot be read.
+    /// Number of requested sections that may still be loaded: without those for which there was no
+    /// room, or which cannot be read.
     pub fn pending(&self) -> usize {
         match *self.state.lock() {
             PrefetchState::Open(Some(number)) => self.resident.shared.pager.pending(number),

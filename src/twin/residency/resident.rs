@@ -45,8 +45,8 @@ pub struct Resident {
     worst_cases: Mutex<Vec<(WorstCaseKey, u64)>>,
 }
 
-/// What the most that a frame needs depends on: the rig, and of a profile the two values that decide how much
-/// is drawn.
+/// What the most that a frame needs depends on: the rig, and of a profile the two values that
+/// decide how much is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct WorstCaseKey {
     extent: RigExtent,
@@ -57,7 +57,8 @@ struct WorstCaseKey {
 /// A frame that waits for its sections. Dropping it cancels the request.
 #[derive(Debug)]
 pub struct SceneRequest {
-    /// Dropped first: as long as the frame waits, the queue names sections by slots that `resident` keeps.
+    /// Dropped first: as long as the frame waits, the queue names sections by slots that `resident`
+    /// keeps.
     waiting: WaitingFrame,
     resident: Arc<Resident>,
     sections: usize,
@@ -101,15 +102,15 @@ impl Resident {
         }
     }
 
-    /// The sections that a frame of these cameras draws. `profile` is the version's, unless the caller
-    /// overrides it.
+    /// The sections that a frame of these cameras draws. `profile` is the version's, unless the
+    /// caller overrides it.
     pub fn demand(&self, viewpoints: &[Viewpoint], profile: &RenderProfile) -> Vec<SectionRef> {
         self.index.demand(&self.version.manifest, viewpoints, profile)
     }
 
-    /// Requests everything that a frame needs. `callback` is called once everything is in memory: from a loader
-    /// thread, or from this thread before the function returns if everything is in memory already. Until then the
-    /// frame holds no memory.
+    /// Requests everything that a frame needs. `callback` is called once everything is in memory:
+    /// from a loader thread, or from this thread before the function returns if everything is in
+    /// memory already. Until then the frame holds no memory.
     ///
     /// # Errors
     /// [`ResidencyError::TooLarge`] if the frame can never fit into memory.
@@ -149,7 +150,8 @@ impl Resident {
         self.worst_case_bytes_with(extent, &self.version.manifest.profile)
     }
 
-    /// As [`Resident::worst_case_bytes`], for frames that are drawn with another profile than the version's.
+    /// As [`Resident::worst_case_bytes`], for frames that are drawn with another profile than the
+    /// version's.
     pub fn worst_case_bytes_with(&self, extent: RigExtent, profile: &RenderProfile) -> u64 {
         let key = WorstCaseKey { extent, tau_px: profile.tau_px, reach_m: profile.reach_m };
         let find = |cases: &[(WorstCaseKey, u64)]| {
@@ -164,7 +166,8 @@ impl Resident {
             cases.insert(0, (key, bytes));
             bytes
         });
-        // Added last, because the sky grows: each `sky_error` that a session asks for may add a cube map.
+        // Added last, because the sky grows: each `sky_error` that a session asks for may add a
+        // cube map.
         bytes + self.sky.as_ref().map_or(0, |sky| sky.bytes() as u64)
     }
 
@@ -183,8 +186,8 @@ impl Resident {
         self.shared.stats()
     }
 
-    /// Bytes of memory that all twins use now, including sections that are being loaded, and bytes that they
-    /// may use.
+    /// Bytes of memory that all twins use now, including sections that are being loaded, and bytes
+    /// that they may use.
     pub fn memory(&self) -> (u64, u64) {
         self.shared.pager.memory()
     }

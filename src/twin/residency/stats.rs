@@ -27,7 +27,7 @@ pub struct Stats {
     pub waits: u64,
     /// Total time that those frames waited.
     pub wait_time: Duration,
-    /// Frames that were not complete by their deadline, or whose request was dropped.
+    /// Frames that were not complete when their request was dropped, for example at their deadline.
     pub waits_given_up: u64,
     /// Bytes of memory in use, including sections that are being loaded.
     pub held_bytes: u64,

@@ -5,11 +5,13 @@ use std::sync::Arc;
 
 use wildcity_scene::Chunk;
 
-/// A hash of everything that a section's chunk depends on. Versions that share a section share its memory.
+/// A hash of everything that a section's chunk depends on. Versions that share a section share its
+/// memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Key(pub(super) [u8; 16]);
 
-/// Index of a section's slot in the table, valid as long as a version that contains the section is open.
+/// Index of a section's slot in the table, valid as long as a version that contains the section is
+/// open.
 pub(super) type SlotId = u32;
 
 /// No slot: the end of the linked list.
@@ -17,8 +19,8 @@ const NONE: SlotId = SlotId::MAX;
 
 /// Sections by key. Those in memory also form a linked list in the order of their last use.
 ///
-/// A section may be evicted if the table holds its only `Arc` (a frame's scene holds an `Arc` of each chunk that
-/// it draws), and no older frame waits for it.
+/// A section may be evicted if the table holds its only `Arc` (a frame's scene holds an `Arc` of
+/// each chunk that it draws), and no older frame waits for it.
 #[derive(Debug)]
 pub(super) struct SectionTable {
     limit_bytes: u64,
@@ -56,10 +58,12 @@ enum State {
 /// The request that a load is for, which decides what the load may evict.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Requester {
-    /// A frame that waits, by number. It may evict everything except what it waits for itself and what older
-    /// frames wait for. So the oldest frame always makes progress, and no two frames can block each other.
+    /// A frame that waits, by number. It may evict everything except what it waits for itself and
+    /// what older frames wait for. So the oldest frame always makes progress, and no two frames can
+    /// block each other.
     Frame(u64),
-    /// A prefetch: no frame waits yet. It may evict only what was last used before the request of this number.
+    /// A prefetch: no frame waits yet. It may evict only what was last used before the request of
+    /// this number.
     Prefetch(u64),
 }
 
@@ -78,7 +82,8 @@ impl SectionTable {
         }
     }
 
-    /// Returns the slot of a section, made if need be. Called once per open version that contains it.
+    /// Returns the slot of a section, made if need be. Called once per open version that contains
+    /// it.
     pub(super) fn register(&mut self, key: Key, bytes: u64) -> SlotId {
         if let Some(&id) = self.ids.get(&key) {
             self.slots[id as usize].versions += 1;
@@ -107,8 +112,8 @@ impl SectionTable {
         id
     }
 
-    /// A version that contains it was closed. A section in memory stays until its room is needed, because the
-    /// next version may contain it, too.
+    /// A version that contains it was closed. A section in memory stays until its room is needed,
+    /// because the next version may contain it, too.
     pub(super) fn unregister(&mut self, id: SlotId) {
         self.slots[id as usize].versions -= 1;
         self.release_if_unused(id);
@@ -161,8 +166,9 @@ impl SectionTable {
         self.waiters.get(&id).map_or(&[], Vec::as_slice)
     }
 
-    /// Reserves the room of a section that is to be loaded, and returns the sections evicted for it. `None` if
-    /// evicting everything permitted would not make enough room; then nothing changes.
+    /// Reserves the room of a section that is to be loaded, and returns the sections evicted for
+    /// it. `None` if evicting everything permitted would not make enough room; then nothing
+    /// changes.
     pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
         let free_bytes = self.limit_bytes - self.held_bytes;

@@ -1,4 +1,4 @@
-//! The twins of a directory and their versions.
+//! The twins in a directory or an object store, and their versions.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,12 +10,12 @@ use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Chunk, Manifest, sh};
 
-use super::local::Local;
-use super::local::disk_cache::DiskCache;
-use super::log::LogRecord;
-use super::objects::{ObjectBackend, is_hash};
+use super::backend::ObjectBackend;
+use super::layout::is_hash;
+use super::local::{DiskCache, Local};
+use super::log::{LogEntry, LogRecord};
 use super::remote::{Remote, RetryPolicy, Traffic};
-use super::{StoreError, chunk_file, recover};
+use super::{StoreError, chunk_file};
 
 /// Twins in a directory or an object store.
 #[derive(Clone, Debug)]
@@ -24,16 +24,16 @@ pub struct Catalog {
     remote: Option<Remote>,
 }
 
-/// Where parts of remote twins are kept on disk.
+/// Where parts of remote twins are cached on the local disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DiskCacheSettings {
-    /// The directory, made if need be; processes may share it.
+    /// The directory, created if need be. Several processes may share it.
     pub dir: PathBuf,
-    /// How much it may hold, in bytes.
+    /// The most that it may hold, in bytes.
     pub limit_bytes: u64,
 }
 
-/// One line of a listing: a twin and its latest version.
+/// A twin and its latest version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TwinListing {
     /// The twin's name.
@@ -47,51 +47,53 @@ pub struct TwinListing {
 /// One immutable version of a twin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Version {
-    /// Its place in the twin's log, from 1.
+    /// Its number in the twin's log, from 1.
     pub number: u64,
     /// Its identity: the manifest's BLAKE3, 64 lower-case hex digits.
     pub hash: String,
     /// When it was committed, in microseconds since 1970.
     pub created_us: i64,
-    /// What it consists of.
+    /// Its content.
     pub manifest: Manifest,
 }
 
 impl Catalog {
-    /// Opens a directory of twins, which need not exist yet, and cleans up after killed commits; or
-    /// the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
+    /// Opens a directory of twins, which need not exist yet, and removes what killed commits left;
+    /// or opens the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
     /// credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed, or the rest of a killed commit cannot be removed;
+    /// The directory cannot be listed, or what a killed commit left cannot be removed;
     /// [`StoreError::Url`].
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         Self::open_cached(dir, None)
     }
 
-    /// As [`Catalog::open`], and keeps parts of remote twins on disk; local ones need none of that.
+    /// As [`Catalog::open`], and caches parts of remote twins on the local disk. Local twins need
+    /// no cache.
     ///
     /// # Errors
-    /// As [`Catalog::open`]; the cache's directory cannot be made.
+    /// As [`Catalog::open`]; the cache's directory cannot be created.
     pub fn open_cached(
         place: &Path,
         cache: Option<&DiskCacheSettings>,
     ) -> Result<Self, StoreError> {
         let url = place.to_str().filter(|place| place.contains("://"));
-        let catalog = match (url, url.and_then(|url| url.strip_prefix("file://"))) {
+        let dir = url.and_then(|url| url.strip_prefix("file://"));
+        let catalog = match (url, dir) {
             (_, Some(dir)) => Self { objects: Arc::new(Local::new(Path::new(dir))), remote: None },
             (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
             (None, None) => Self { objects: Arc::new(Local::new(place)), remote: None },
         };
-        recover::clean(&catalog)?;
+        catalog.remove_abandoned_commits()?;
         Ok(catalog)
     }
 
-    /// Twins within an object store that is open already, all keys beginning with `prefix`; `url` is
-    /// what messages call it.
+    /// Opens the twins within an object store that is open already. All keys begin with `prefix`;
+    /// messages name the store by `url`.
     ///
     /// # Errors
-    /// The prefix is none, or the cache's directory cannot be made.
+    /// The prefix is invalid, or the cache's directory cannot be created.
     pub fn over(
         store: Arc<dyn object_store::ObjectStore>,
         url: &str,
@@ -106,12 +108,12 @@ impl Catalog {
         Self { objects: Arc::new(remote.clone()), remote: Some(remote) }
     }
 
-    /// The same twins, read from where they are and not from the disk cache.
+    /// The same twins, read without the disk cache.
     pub(super) fn uncached(&self) -> Self {
         self.remote.as_ref().map_or_else(|| self.clone(), |remote| Self::remote(remote.uncached()))
     }
 
-    /// What was asked of the object store since it was opened; none for a directory.
+    /// Counts of requests to the object store since it was opened; `None` for a directory.
     pub fn traffic(&self) -> Option<Traffic> {
         self.remote.as_ref().map(Remote::traffic)
     }
@@ -121,14 +123,14 @@ impl Catalog {
         self.objects.root()
     }
 
-    /// All twins with their latest versions, in order of name.
+    /// All twins with their latest versions, sorted by name.
     ///
     /// # Errors
     /// A log cannot be read.
     pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
         let mut twins = Vec::new();
-        for name in self.objects.names()? {
-            if let Some(&number) = self.objects.numbers(&name)?.last() {
+        for name in self.objects.twin_names()? {
+            if let Some(&number) = self.objects.version_numbers(&name)?.last() {
                 let hash = self.record(&name, number)?.manifest;
                 twins.push(TwinListing { name, number, hash });
             }
@@ -136,8 +138,8 @@ impl Catalog {
         Ok(twins)
     }
 
-    /// Number of a twin's latest version, from the names of the log's records alone: none of them is
-    /// read, and one that is damaged is in nobody's way.
+    /// Number of a twin's latest version, from the names of the log's records alone. The records
+    /// are not read, so a damaged one causes no error.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed.
@@ -146,12 +148,12 @@ impl Catalog {
         Ok(numbers[numbers.len() - 1])
     }
 
-    /// Reads one version of a twin, or the latest, and checks it against its hash.
+    /// Reads one version of a twin, or the latest, and compares it with its hash.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`], [`StoreError::NoVersion`] or
-    /// [`StoreError::GarbageCollected`] for what was asked;
-    /// [`StoreError::Damaged`] or [`StoreError::Format`] for what was found.
+    /// [`StoreError::GarbageCollected`] if there is no such version;
+    /// [`StoreError::Damaged`] or [`StoreError::Format`] if it cannot be used.
     pub fn version(&self, name: &str, number: Option<u64>) -> Result<Version, StoreError> {
         let numbers = self.numbers(name)?;
         let latest = numbers[numbers.len() - 1];
@@ -166,11 +168,25 @@ impl Catalog {
         Ok(Version { number, hash, created_us, manifest })
     }
 
-    /// Reads one section of a chunk, activated, and checks it against its hash; nothing else of the
+    /// All versions of a twin in order of their numbers, from the log alone.
+    ///
+    /// # Errors
+    /// [`StoreError::Name`] or [`StoreError::NoTwin`]; [`StoreError::Damaged`] for a record that
+    /// cannot be parsed.
+    pub fn versions(&self, name: &str) -> Result<Vec<LogEntry>, StoreError> {
+        let entry = |number| {
+            let LogRecord { manifest: hash, created_us, commit, parent, kind } =
+                self.record(name, number)?;
+            Ok(LogEntry { number, hash, created_us, commit, parent, kind })
+        };
+        self.numbers(name)?.into_iter().map(entry).collect()
+    }
+
+    /// Reads one section of a chunk, compares it with its hash, and decodes it. Nothing else of the
     /// chunk is read.
     ///
     /// # Errors
-    /// [`StoreError::Damaged`] if it is not what was committed.
+    /// [`StoreError::Damaged`] if it differs from what was committed.
     pub fn section(
         &self,
         version: &Version,
@@ -191,11 +207,11 @@ impl Catalog {
                 error => error,
             })?;
         chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record)
-            .map_err(|reason| of_section(self.objects.path(twin, &chunk.object), reason))
+            .map_err(|reason| of_section(self.objects.object_path(twin, &chunk.object), reason))
     }
 
-    /// Reads a chunk's object to its end, looks at none of it, and keeps nothing: how fast bytes come.
-    /// Returns how many there are.
+    /// Reads a chunk's object to its end without checking or keeping it, to measure the speed of
+    /// reading. Returns its size in bytes.
     ///
     /// # Errors
     /// It cannot be read.
@@ -207,32 +223,37 @@ impl Catalog {
         self.objects.read_and_discard(&version.manifest.twin, &chunk.object)
     }
 
-    /// Whether a chunk's object and what it says of itself are what was committed. Reads all of it.
+    /// Checks that a chunk's object, and the table of contents in it, are what was committed. Reads
+    /// all of it.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
-        // The hash says more than what its first wrong byte led to, and is compared first.
+        // The hash is compared first: its error says more than what a damaged table of contents
+        // leads to.
         let start = self.objects.read_start(name, &chunk.object, most)?;
-        let path = self.objects.path(name, &chunk.object);
+        let path = self.objects.object_path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)
             .map_err(|reason| StoreError::Damaged { path, reason })
     }
 
-    /// Numbers of a twin's versions, rising; at least one.
+    /// Numbers of a twin's versions, ascending; at least one.
     pub(super) fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
         check_name(name)?;
-        let numbers = self.objects.numbers(name)?;
+        let numbers = self.objects.version_numbers(name)?;
         if numbers.is_empty() {
-            let (dir, known) = (self.dir().to_owned(), self.objects.names()?);
-            return Err(StoreError::NoTwin { name: name.to_owned(), dir, known });
+            return Err(StoreError::NoTwin {
+                name: name.to_owned(),
+                dir: self.dir().to_owned(),
+                known: self.objects.twin_names()?,
+            });
         }
         Ok(numbers)
     }
 
     pub(super) fn record(&self, name: &str, number: u64) -> Result<LogRecord, StoreError> {
-        let bytes = self.objects.record(name, number)?;
+        let bytes = self.objects.read_record(name, number)?;
         let damaged = |reason| {
             let path = self.objects.record_path(name, number);
             StoreError::Damaged { path, reason }
@@ -245,15 +266,17 @@ impl Catalog {
         Ok(record)
     }
 
-    /// JSON with the fields in the order of the type: the same content, the same bytes.
+    /// JSON with the fields in the order of the type, so that the same content gives the same
+    /// bytes.
     pub(super) fn encode(&self, content: &impl serde::Serialize) -> Result<Vec<u8>, StoreError> {
         serde_json::to_vec(content).map_err(|e| StoreError::io("encode for", self.dir())(e.into()))
     }
 
     /// Reads the sections of a manifest's chunks from its table.
     pub(super) fn fill(&self, manifest: &mut Manifest) -> Result<(), StoreError> {
-        let (twin, table) = (&manifest.twin, &manifest.table.object);
-        let path = self.objects.path(twin, table);
+        let twin = &manifest.twin;
+        let table = &manifest.table.object;
+        let path = self.objects.object_path(twin, table);
         let table = self.objects.read_object(twin, table, limits::TABLE_BYTES)?;
         let Manifest { chunks, sh_degree, record, .. } = manifest;
         chunk_file::fill(chunks, *sh_degree, *record, &table)
@@ -262,10 +285,10 @@ impl Catalog {
 
     /// Reads a manifest without the sections of its chunks.
     pub(super) fn manifest(&self, name: &str, hash: &str) -> Result<Manifest, StoreError> {
-        let path = self.objects.path(name, hash);
+        let path = self.objects.object_path(name, hash);
         let bytes = self.objects.read_object(name, hash, limits::MANIFEST_BYTES)?;
         let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
-        // The format first: of a later one, nothing else is known.
+        // The format comes first: nothing else is known of a later one.
         let Format { format } =
             serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
         if format != Manifest::FORMAT {
@@ -294,7 +317,7 @@ struct Format {
     format: u32,
 }
 
-/// Whether a name can be a twin's, and part of a path.
+/// Checks that a name can be a twin's, and part of a path.
 pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
     if is_name(name) { Ok(()) } else { Err(StoreError::Name { name: name.to_owned() }) }
 }

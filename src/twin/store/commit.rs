@@ -1,24 +1,25 @@
-//! Making a version: cells are put one after the other, seen by nobody, and then published at once.
+//! Making a version: cells are written one after the other, invisible to readers, and then
+//! published at once.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ingest::IngestError;
 use crate::limits;
-use wildcity_scene::manifest::{ChunkEntry, ObjectRef, Provenance};
+use wildcity_scene::manifest::{ChunkEntry, ObjectRef};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::validate::{self, Field};
-use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Rig, Trajectory};
+use wildcity_scene::{Gaussians, Manifest};
 
+use super::backend::Staging;
 use super::catalog::check_name;
 use super::diff::Diff;
 use super::log::{CommitKind, LogRecord};
-use super::objects::Staging;
-use super::pack::CellPacker;
-use super::sky::NewSky;
-use super::{Catalog, StoreError, Version, chunk_file, recover};
+use super::pack::{CellPacker, StorageOptions};
+use super::settings::{VersionChange, VersionSettings};
+use super::{Catalog, StoreError, Version, chunk_file};
 
-/// A version in the making. Dropped before it is published, it leaves nothing behind; several of one
-/// twin may be in preparation at once, and only publishing waits for others.
+/// A version in preparation. Dropped before it is published, it leaves nothing behind. Several
+/// commits of one twin may be in preparation at once; only publishing waits for others.
 #[derive(Debug)]
 pub struct Commit {
     catalog: Catalog,
@@ -27,25 +28,10 @@ pub struct Commit {
     kind: CommitKind,
     storage: StorageOptions,
     sh_degree: Option<u8>,
-    staging: Staging,
-    /// What was put, by (cell y, cell x).
+    staging: Box<dyn Staging>,
+    /// The cells that were put, by (cell y, cell x).
     chunks: BTreeMap<[i32; 2], ChunkEntry>,
     clamped: Clamped,
-}
-
-/// How Gaussians are stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct StorageOptions {
-    /// In how many bits.
-    pub record: RecordFormat,
-    /// Whether levels of detail are made, too.
-    pub levels: bool,
-}
-
-impl Default for StorageOptions {
-    fn default() -> Self {
-        Self { record: RecordFormat::default(), levels: true }
-    }
 }
 
 /// What one [`Commit::put`] stored.
@@ -53,45 +39,19 @@ impl Default for StorageOptions {
 pub struct StoredCells {
     /// A chunk for each cell, in order of (cell y, cell x).
     pub chunks: Vec<ChunkEntry>,
-    /// Gaussians of cells that were not asked for.
+    /// Number of Gaussians in cells that were not to be stored.
     pub left_out: u64,
 }
 
-/// What a version consists of beside its cells.
-#[derive(Clone, Debug)]
-pub struct VersionSettings {
-    /// How it must be rendered.
-    pub profile: RenderProfile,
-    /// The vehicle that recorded it.
-    pub rig: Option<Rig>,
-    /// Recorded drives.
-    pub trajectories: Vec<Trajectory>,
-    /// What is behind everything.
-    pub sky: Option<NewSky>,
-    /// Where it comes from.
-    pub provenance: Provenance,
+/// A manifest and its hash.
+struct HashedManifest {
+    manifest: Manifest,
+    /// 64 lower-case hex digits.
+    hash: String,
 }
-
-/// What changes of a version beside the cells that were put: what is none stays.
-#[derive(Clone, Debug)]
-pub struct VersionChange {
-    /// How it must be rendered.
-    pub profile: Option<RenderProfile>,
-    /// The vehicle that recorded it.
-    pub rig: Option<Rig>,
-    /// Recorded drives, all of them.
-    pub trajectories: Option<Vec<Trajectory>>,
-    /// What is behind everything; `Some(None)` takes the sky away.
-    pub sky: Option<Option<NewSky>>,
-    /// Where the new version comes from.
-    pub provenance: Provenance,
-}
-
-/// A manifest and its hash, 64 lower-case hex digits.
-type Hashed = (Manifest, String);
 
 impl Catalog {
-    /// Begins a version of a twin, `[a-z0-9._-]+`; a new name makes a new twin when it is published.
+    /// Begins a version of a twin, `[a-z0-9._-]+`. Publishing under a new name makes a new twin.
     ///
     /// # Errors
     /// [`StoreError::Name`]; what killed commits left cannot be removed, or nothing can be written.
@@ -102,10 +62,10 @@ impl Catalog {
         storage: StorageOptions,
     ) -> Result<Commit, StoreError> {
         check_name(name)?;
-        recover::clean(self)?;
+        self.remove_abandoned_commits()?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         Ok(Commit {
-            staging: self.objects.stage(name, &id)?,
+            staging: self.objects.begin_staging(name, &id)?,
             catalog: self.clone(),
             name: name.to_owned(),
             id,
@@ -116,23 +76,36 @@ impl Catalog {
             clamped: Clamped::default(),
         })
     }
+
+    /// Makes an old version the latest, under a new number, so that the versions since then are
+    /// kept. If it is the latest already, it is returned, and no new one is made.
+    ///
+    /// # Errors
+    /// As [`Catalog::version`]; a version that cannot be read in full is not restored. A failed
+    /// rollback leaves nothing behind, except for [`StoreError::NotSynced`].
+    pub fn rollback(&self, name: &str, number: u64) -> Result<Version, StoreError> {
+        // Checked early, before anything is written; restoring checks again, and more thoroughly.
+        self.version(name, Some(number))?;
+        self.begin(name, CommitKind::Rollback, StorageOptions::default())?.restore(number)
+    }
 }
 
 impl Commit {
-    /// Its identity, 32 hex digits: the log names it once it is published.
+    /// Its identity, 32 hex digits. The log names it once the version is published.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Writes Gaussians, in metres along the twin's axes, as whole cells, levels of detail included;
-    /// `only` those cells, if given. `progress` gets Gaussians written and Gaussians in all.
+    /// Writes Gaussians, in metres along the twin's axes, as whole cells with their levels of
+    /// detail; only the cells of `only`, if given. `progress` gets the number of Gaussians written
+    /// and in all.
     ///
-    /// A twin of any size is put part by part, as long as no cell is in two of them.
+    /// A twin of any size can be put part by part, as long as no cell is in two parts.
     ///
     /// # Errors
-    /// Before anything is written: a Gaussian that cannot be used, a cell that was put before, an SH
-    /// degree that is not that of an earlier part. Otherwise what could not be written; nothing of
-    /// this call is part of the version then.
+    /// Before anything is written: a Gaussian that cannot be used, a cell that was put before, an
+    /// SH degree other than that of an earlier part. Otherwise what could not be written; nothing
+    /// of this call is part of the version then.
     pub fn put(
         &mut self,
         gaussians: &Gaussians,
@@ -142,29 +115,28 @@ impl Commit {
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let sh_degree = gaussians.sh_degree;
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
-        let cells = CellPacker::new(gaussians, self.storage, only);
-        if let Some(cell) = cells.cells().find(|&[x, y]| self.chunks.contains_key(&[y, x])) {
+        let packer = CellPacker::new(gaussians, self.storage, only);
+        if let Some(cell) = packer.cells().find(|&[x, y]| self.chunks.contains_key(&[y, x])) {
             return Err(StoreError::DuplicateCell { name: self.name.clone(), cell });
         }
-        let (chunks, clamped) = cells.put(&mut self.staging, progress)?;
+        let (chunks, clamped) = packer.put(&mut *self.staging, progress)?;
         self.sh_degree = Some(sh_degree);
         self.clamped.merge(&clamped);
         let by_cell = |chunk: &ChunkEntry| ([chunk.cell[1], chunk.cell[0]], chunk.clone());
         self.chunks.extend(chunks.iter().map(by_cell));
-        Ok(StoredCells { left_out: gaussians.len() as u64 - cells.gaussians(), chunks })
+        Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
     }
 
-    /// Makes the latest version exactly what was put, all or nothing. The same content as the latest
-    /// version's is that version: no new one is made.
+    /// Publishes exactly what was put as the latest version, all or nothing. If the latest version
+    /// has the same content, it is returned, and no new one is made.
     ///
-    /// With a `base`, nothing is replaced that others committed since that version; with none, whatever
-    /// is there is.
+    /// With a `base`, nothing is replaced that other commits changed since that version. Without
+    /// one, the latest version is replaced, whatever it contains.
     ///
     /// # Errors
-    /// [`StoreError::Overlap`] if others changed since `base` what this would be in place of; what
-    /// cannot be accepted, or could not be written, and then nothing of it is left.
-    /// [`StoreError::NotSynced`] alone means that the version is there, but might not be after a
-    /// power cut.
+    /// [`StoreError::Overlap`] if others changed since `base` what this would replace; or what
+    /// cannot be accepted or written. Nothing of the commit is left then, with one exception:
+    /// [`StoreError::NotSynced`] means that the version exists, but might be lost in a power cut.
     pub fn replace(
         self,
         base: Option<u64>,
@@ -174,40 +146,24 @@ impl Commit {
         self.check_clamped()?;
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
         self.publish(base.as_ref().map(|base| base.number), |commit, latest| {
-            let VersionSettings { profile, rig, trajectories, sky, provenance } = settings.clone();
-            let sky = sky.map(|sky| sky.put(&mut commit.staging)).transpose()?;
-            let chunks: Vec<_> = commit.chunks.values().cloned().collect();
-            let (sh_degree, record) = (commit.sh_degree.unwrap_or(0), commit.storage.record);
-            let manifest = Manifest {
-                format: Manifest::FORMAT,
-                twin: commit.name.clone(),
-                profile,
-                sh_degree,
-                record,
-                table: ObjectRef { object: String::new(), bytes: 0 },
-                chunks,
-                rig,
-                trajectories,
-                sky,
-                provenance,
-            };
+            let manifest = commit.new_manifest(settings.clone())?;
             if let (Some(base), Some(latest)) = (&base, latest)
                 && latest != base.number
             {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 commit.check_overlap(base, &latest, &manifest)?;
             }
-            commit.complete(manifest)
+            commit.put_manifest(manifest)
         })
     }
 
-    /// Makes the latest version that of number `base` with the cells that were put in place of its
-    /// own, all or nothing. What others committed since `base` stays, as long as it is in other
-    /// cells.
+    /// Publishes the version `base` with the cells that were put in place of its own, all or
+    /// nothing. What others committed since `base` is kept, as long as it is in other cells.
     ///
     /// # Errors
-    /// [`StoreError::Overlap`] if others changed the same since `base`; [`StoreError::FieldMismatch`] if
-    /// Gaussians were stored in another way than the twin's; otherwise as [`Commit::replace`].
+    /// [`StoreError::Overlap`] if others changed the same since `base`;
+    /// [`StoreError::FieldMismatch`] if the Gaussians were stored in another way than the twin's;
+    /// otherwise as [`Commit::replace`].
     pub fn change(self, base: u64, change: VersionChange) -> Result<Version, StoreError> {
         change.check()?;
         self.check_clamped()?;
@@ -220,33 +176,53 @@ impl Commit {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 let merged = commit.merge(latest.manifest.clone(), &change)?;
                 commit.check_overlap(&base, &latest, &merged)?;
-                commit.complete(merged)
+                commit.put_manifest(merged)
             }
             _ => {
                 let merged = commit.merge(base.manifest.clone(), &change)?;
-                commit.complete(merged)
+                commit.put_manifest(merged)
             }
         })
     }
 
-    /// Makes the latest version an old one, if all of it is there.
-    pub(super) fn restore(self, number: u64) -> Result<Version, StoreError> {
+    /// Publishes an old version as the latest, if all of its objects exist.
+    fn restore(self, number: u64) -> Result<Version, StoreError> {
         self.publish(Some(number), |commit, _| {
-            // Whoever removed objects while this waited for its turn is done, and has said so; and what
-            // the disk cache keeps of them is not there.
-            let there = commit.catalog.uncached();
-            let Version { hash, manifest, .. } = there.version(&commit.name, Some(number))?;
+            // Publishing is locked: a garbage collection that removed objects has ended, and has
+            // recorded the versions. The disk cache may still have objects that were removed, so it
+            // is not used.
+            let uncached = commit.catalog.uncached();
+            let Version { hash, manifest, .. } = uncached.version(&commit.name, Some(number))?;
             for chunk in &manifest.chunks {
-                there.objects.check_present(&commit.name, &chunk.object, chunk.bytes)?;
+                uncached.objects.check_present(&commit.name, &chunk.object, chunk.bytes)?;
             }
             if let Some(sky) = &manifest.sky {
-                there.objects.check_present(&commit.name, &sky.object, sky.bytes)?;
+                uncached.objects.check_present(&commit.name, &sky.object, sky.bytes)?;
             }
-            Ok((manifest, hash))
+            Ok(HashedManifest { manifest, hash })
         })
     }
 
-    /// A version with the cells that were put in place of its own, and the table that it had.
+    /// A manifest with the cells that were put, and no others. Its table is not written yet.
+    fn new_manifest(&mut self, settings: VersionSettings) -> Result<Manifest, StoreError> {
+        let VersionSettings { profile, rig, trajectories, sky, provenance } = settings;
+        Ok(Manifest {
+            format: Manifest::FORMAT,
+            twin: self.name.clone(),
+            profile,
+            sh_degree: self.sh_degree.unwrap_or(0),
+            record: self.storage.record,
+            table: ObjectRef { object: String::new(), bytes: 0 },
+            chunks: self.chunks.values().cloned().collect(),
+            rig,
+            trajectories,
+            sky: sky.map(|sky| sky.put(&mut *self.staging)).transpose()?,
+            provenance,
+        })
+    }
+
+    /// A version's manifest with the cells that were put in place of its own. The table is still
+    /// the version's.
     fn merge(
         &mut self,
         mut manifest: Manifest,
@@ -256,7 +232,7 @@ impl Commit {
         self.check_field("record", Some(self.storage.record), manifest.record)?;
         let VersionChange { profile, rig, trajectories, sky, provenance } = change.clone();
         if let Some(sky) = sky {
-            manifest.sky = sky.map(|sky| sky.put(&mut self.staging)).transpose()?;
+            manifest.sky = sky.map(|sky| sky.put(&mut *self.staging)).transpose()?;
         }
         manifest.profile = profile.unwrap_or(manifest.profile);
         manifest.rig = rig.or(manifest.rig);
@@ -269,8 +245,9 @@ impl Commit {
         Ok(manifest)
     }
 
-    /// Whether nothing that others changed from the base to the latest becomes something else by what
-    /// is `new`. What they made the same is no loss, and may have been this commit's own first try.
+    /// Checks that the `new` manifest reverts nothing that others changed from the base to the
+    /// latest version. Where both made the same change, nothing is lost; the other may have been
+    /// this commit's own first attempt.
     fn check_overlap(
         &self,
         base: &Version,
@@ -287,40 +264,47 @@ impl Commit {
         if cells.is_empty() && settings.is_empty() {
             return Ok(());
         }
-        let (name, base, latest) = (self.name.clone(), base.number, latest.number);
-        Err(StoreError::Overlap { name, base, latest, cells, settings })
+        Err(StoreError::Overlap {
+            name: self.name.clone(),
+            base: base.number,
+            latest: latest.number,
+            cells,
+            settings,
+        })
     }
 
-    /// Puts the table and the manifest. Returns the manifest and its hash.
-    fn complete(&mut self, mut manifest: Manifest) -> Result<Hashed, StoreError> {
+    /// Writes the table and the manifest.
+    fn put_manifest(&mut self, mut manifest: Manifest) -> Result<HashedManifest, StoreError> {
         let Manifest { chunks, sh_degree, record, .. } = &manifest;
         let table = chunk_file::table(chunks, *sh_degree, *record)
             .map_err(StoreError::io("encode a table for", self.catalog.dir()))?;
         check_size("table", table.len(), limits::TABLE_BYTES)?;
-        let put = self.staging.put(|out| out.write_all(&table))?;
-        manifest.table = ObjectRef { object: put.hash, bytes: put.bytes };
+        let stored = self.staging.put(Box::new(|out| out.write_all(&table)))?;
+        manifest.table = ObjectRef { object: stored.hash, bytes: stored.bytes };
         let bytes = self.catalog.encode(&manifest)?;
         check_size("manifest", bytes.len(), limits::MANIFEST_BYTES)?;
-        let hash = self.staging.put(|out| out.write_all(&bytes))?.hash;
-        Ok((manifest, hash))
+        let hash = self.staging.put(Box::new(|out| out.write_all(&bytes)))?.hash;
+        Ok(HashedManifest { manifest, hash })
     }
 
-    /// Makes what `build` gives for the latest version's number the next one. Built again if somebody
-    /// else was faster.
+    /// Publishes the manifest that `build` makes, given the number of the latest version. If
+    /// another commit takes the next number first, the manifest is built again on that version.
     fn publish(
         mut self,
         parent: Option<u64>,
-        mut build: impl FnMut(&mut Self, Option<u64>) -> Result<Hashed, StoreError>,
+        mut build: impl FnMut(&mut Self, Option<u64>) -> Result<HashedManifest, StoreError>,
     ) -> Result<Version, StoreError> {
         self.staging.lock_publishing()?;
         let mut tries = 1;
         loop {
-            let latest = self.catalog.objects.numbers(&self.name)?.last().copied();
-            let (manifest, hash) = build(&mut self, latest)?;
+            let latest = self.catalog.objects.version_numbers(&self.name)?.last().copied();
+            let HashedManifest { manifest, hash } = build(&mut self, latest)?;
             let own = self.chunks.values().map(|chunk| chunk.object.as_str());
             let sky = manifest.sky.iter().map(|sky| sky.object.as_str());
             let named = [manifest.table.object.as_str(), hash.as_str()];
             let objects = own.chain(sky).chain(named).collect();
+
+            // The same content as the latest version's is that version.
             if let Some(number) = latest
                 && let Ok(record) = self.catalog.record(&self.name, number)
                 && record.manifest == hash
@@ -328,12 +312,14 @@ impl Commit {
                 self.staging.restore(&objects, number)?;
                 return Ok(Version { number, hash, created_us: record.created_us, manifest });
             }
+
+            // Otherwise a new one.
             let number = latest.unwrap_or(0) + 1;
             let record = LogRecord::new(hash.clone(), &self.id, parent, self.kind);
             let created_us = record.created_us;
             match self.staging.publish(&objects, number, &self.catalog.encode(&record)?) {
                 Ok(()) => return Ok(Version { number, hash, created_us, manifest }),
-                // It may have been this very commit, and the answer was lost.
+                // The winner may be this very commit, if the answer to its first attempt was lost.
                 Err(StoreError::Conflict { .. })
                     if self.catalog.record(&self.name, number)?.commit.as_ref()
                         == Some(&self.id) =>
@@ -346,7 +332,7 @@ impl Commit {
         }
     }
 
-    /// Whether what is stored here fits what is stored already.
+    /// Checks that what is stored here fits what is stored already.
     fn check_field<T: PartialEq + std::fmt::Display>(
         &self,
         field: &'static str,
@@ -364,7 +350,7 @@ impl Commit {
         }
     }
 
-    /// Whether the record can hold the Gaussians that were put.
+    /// Checks that the record format can hold the Gaussians that were put.
     fn check_clamped(&self) -> Result<(), StoreError> {
         let gaussians = self.chunks.values().map(|chunk| chunk.count).sum::<u64>();
         match self.clamped.worst() {
@@ -374,39 +360,6 @@ impl Commit {
             _ => Ok(()),
         }
     }
-}
-
-impl VersionSettings {
-    /// # Errors
-    /// Names what cannot be used.
-    pub(super) fn check(&self) -> Result<(), StoreError> {
-        check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)?;
-        self.sky.as_ref().map_or(Ok(()), |sky| sky.check(&self.profile))
-    }
-}
-
-impl VersionChange {
-    fn check(&self) -> Result<(), StoreError> {
-        let trajectories = self.trajectories.as_deref().unwrap_or_default();
-        check(self.profile.as_ref(), self.rig.as_ref(), trajectories)
-    }
-}
-
-fn check(
-    profile: Option<&RenderProfile>,
-    rig: Option<&Rig>,
-    trajectories: &[Trajectory],
-) -> Result<(), StoreError> {
-    profile.map_or(Ok(()), RenderProfile::check)?;
-    rig.map_or(Ok(()), Rig::check)?;
-    let mut names = BTreeSet::new();
-    for trajectory in trajectories {
-        trajectory.check()?;
-        if !names.insert(&*trajectory.name) {
-            return Err(StoreError::DuplicateTrajectory { name: trajectory.name.clone() });
-        }
-    }
-    Ok(())
 }
 
 fn check_size(what: &'static str, bytes: usize, limit: u64) -> Result<(), StoreError> {

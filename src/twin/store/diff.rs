@@ -1,4 +1,4 @@
-//! What differs between two versions of a twin.
+//! The differences between two versions of a twin.
 
 use std::collections::BTreeMap;
 
@@ -7,39 +7,41 @@ use wildcity_scene::manifest::ChunkEntry;
 
 use super::{Catalog, StoreError};
 
-/// What differs between two versions.
+/// The differences between two versions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Diff {
     /// Cells that differ, in order of (cell y, cell x).
     pub cells: Vec<CellDiff>,
-    /// Cells that both have alike.
+    /// Number of cells that are the same in both.
     pub kept: u64,
-    /// Fields of the manifest that differ: of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`.
+    /// Fields of the manifest that differ, among `profile`, `sh_degree`, `record`, `rig`,
+    /// `trajectories`, `sky`.
     pub settings: Vec<&'static str>,
 }
 
-/// A cell that is not the same in both.
+/// A cell that differs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CellDiff {
     /// Grid cell (x, y).
     pub cell: [i32; 2],
-    /// What it was; none if it was added.
+    /// Its size before; `None` if it was added.
     pub before: Option<CellSize>,
-    /// What it is; none if it was removed.
+    /// Its size after; `None` if it was removed.
     pub after: Option<CellSize>,
 }
 
-/// How much a cell holds.
+/// The size of a cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CellSize {
-    /// Gaussians at full detail.
+    /// Number of Gaussians at full detail.
     pub gaussians: u64,
     /// Size of its object, in bytes.
     pub bytes: u64,
 }
 
 impl Catalog {
-    /// What differs from version `before` to version `after` of a twin, from their manifests alone.
+    /// The differences between version `before` and version `after` of a twin, from their manifests
+    /// alone.
     ///
     /// # Errors
     /// As [`Catalog::version`].
@@ -51,7 +53,7 @@ impl Catalog {
 }
 
 impl Diff {
-    /// What differs from one manifest to another.
+    /// The differences between two manifests.
     pub fn between(before: &Manifest, after: &Manifest) -> Self {
         let mut cells: BTreeMap<_, [Option<&ChunkEntry>; 2]> = BTreeMap::new();
         for (which, manifest) in [before, after].into_iter().enumerate() {

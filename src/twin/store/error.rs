@@ -1,4 +1,4 @@
-//! What can go wrong with a twin on disk.
+//! Why a twin could not be read or written.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,22 +10,24 @@ use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
 use wildcity_scene::trajectory::TrajectoryError;
 
-/// Why a twin could not be read or written. A failed commit leaves nothing behind, except
+/// Why a twin could not be read or written. A failed commit leaves nothing behind, except after
 /// [`StoreError::NotSynced`] and [`StoreError::OutcomeUnknown`].
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// The operating system refused.
+    /// An I/O operation failed.
     #[error("cannot {action} {}: {cause}", path.display())]
     Io {
-        /// What was tried, as `write`.
+        /// The operation, such as `write`.
         action: &'static str,
-        /// On which file or directory.
+        /// The file, directory, or URL.
         path: PathBuf,
         /// The reason given.
         cause: io::Error,
     },
-    /// A twin's name could be mistaken for a path.
-    #[error("{name:?} is not a name of a twin: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
+    /// A text cannot be a twin's name.
+    #[error(
+        "{name:?} cannot be the name of a twin: names have 1 to 64 of a-z 0-9 . _ - and do not start with ."
+    )]
     Name {
         /// The refused name.
         name: String,
@@ -33,36 +35,34 @@ pub enum StoreError {
     /// No version of such a twin was ever committed.
     #[error("there is no twin {name:?} in {}; {}", dir.display(), known_twins(known))]
     NoTwin {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// Where it was looked for.
+        /// The directory or URL of twins.
         dir: PathBuf,
-        /// The twins that are there.
+        /// The twins that exist.
         known: Vec<String>,
     },
-    /// The twin has other versions.
+    /// The twin has no version of this number.
     #[error("twin {name:?} has no version {number}; the latest is {latest}")]
     NoVersion {
         /// The twin.
         name: String,
-        /// The version asked for.
+        /// The requested version.
         number: u64,
-        /// The newest one.
+        /// The latest version.
         latest: u64,
     },
-    /// The version's objects were removed.
-    #[error(
-        "version {number} of twin {name:?} was removed by `wildcity twin gc`: take a later one"
-    )]
+    /// Garbage collection removed the version's objects.
+    #[error("version {number} of twin {name:?} was removed by `wildcity twin gc`: use a later one")]
     GarbageCollected {
         /// The twin.
         name: String,
-        /// The version asked for.
+        /// The requested version.
         number: u64,
     },
-    /// A version came into use in the moment in which its objects were to be removed.
+    /// A version was leased at the moment when garbage collection was about to remove its objects.
     #[error(
-        "version {number} of twin {name:?} came into use just now: nothing was removed; try again"
+        "version {number} of twin {name:?} has just come into use: nothing was removed; try again"
     )]
     Leased {
         /// The twin.
@@ -70,7 +70,7 @@ pub enum StoreError {
         /// The version.
         number: u64,
     },
-    /// Bytes on disk are not what was committed.
+    /// Stored bytes differ from what was committed.
     #[error("{} is damaged: {reason}; import the twin again", path.display())]
     Damaged {
         /// The file.
@@ -91,18 +91,18 @@ pub enum StoreError {
         /// The format that can be read.
         supported: u32,
     },
-    /// Somebody else committed the same number first.
+    /// Another commit took the same number first.
     #[error("version {number} of twin {name:?} was committed by another import; try again")]
     Conflict {
         /// The twin.
         name: String,
-        /// The version that was taken.
+        /// The number that was taken.
         number: u64,
     },
-    /// A commit got the same cell twice.
+    /// The same cell was put twice into a commit.
     #[error(
-        "cell {cell:?} of twin {name:?} was put before: give all its Gaussians at once, or only \
-         the cells that are new"
+        "cell {cell:?} of twin {name:?} was put before: put all its Gaussians at once, or only \
+         cells that are new"
     )]
     DuplicateCell {
         /// The twin.
@@ -112,19 +112,20 @@ pub enum StoreError {
     },
     /// Gaussians were stored in another way than the rest of the twin.
     #[error(
-        "{field} is {stored}, but twin {name:?} has {needed}: store them so, or replace the whole twin"
+        "{field} is {stored}, but twin {name:?} has {needed}: store the Gaussians with {needed}, or replace \
+         the whole twin"
     )]
     FieldMismatch {
         /// The twin.
         name: String,
         /// `sh_degree` or `record`.
         field: &'static str,
-        /// What was put.
+        /// The value of what was put.
         stored: String,
-        /// What is there.
+        /// The value of the twin.
         needed: String,
     },
-    /// Others changed the same cells or settings since the base of a change.
+    /// Other commits changed the same cells or settings since the base of a change.
     #[error(
         "twin {name:?} changed since version {base}, in the same place: version {latest} has other \
          {}; make the change from version {latest}",
@@ -139,26 +140,26 @@ pub enum StoreError {
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// Of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, `sky`, what both changed.
+        /// What both changed of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, and `sky`.
         settings: Vec<&'static str>,
     },
-    /// What is written beside the versions is too large to be read again.
+    /// A side file (a lease, or the state of garbage collection) is too large to be read again.
     #[error(
         "{} would take {bytes} bytes; at most {limit} are read: give a lease a shorter holder, or \
          import a twin of so many versions anew",
         path.display()
     )]
     SideFileSize {
-        /// Where it would lie.
+        /// The file that would be written.
         path: PathBuf,
         /// Its size.
         bytes: u64,
-        /// The largest that is read.
+        /// The largest size that is read.
         limit: u64,
     },
-    /// A version is committed and visible, but the disk refused to say that it will stay.
+    /// A version is committed and visible, but syncing it to the disk failed.
     #[error(
-        "version {number} of twin {name:?} is in place, but might not last through a power cut \
+        "version {number} of twin {name:?} is in place, but might be lost in a power cut \
          ({cause}); import the same again"
     )]
     NotSynced {
@@ -169,10 +170,10 @@ pub enum StoreError {
         /// What failed.
         cause: Box<StoreError>,
     },
-    /// The answer to the last step of a commit was lost, and cannot be asked for.
+    /// The answer to the last request of a commit was lost, and the log cannot be read.
     #[error(
-        "whether version {number} of twin {name:?} is in place is not known ({cause}): look with \
-         `wildcity twin log`, and try again if it is not"
+        "it is unknown whether version {number} of twin {name:?} was committed ({cause}): look with \
+         `wildcity twin log`, and try again if it was not"
     )]
     OutcomeUnknown {
         /// The twin.
@@ -193,7 +194,7 @@ pub enum StoreError {
     /// The Gaussians of a commit cannot be used.
     #[error(transparent)]
     Gaussians(#[from] IngestError),
-    /// The record is too narrow for the scene.
+    /// The record format cannot hold the values of the scene.
     #[error(
         "{count} of {gaussians} Gaussians have a value of {field} that record {record} cannot hold; \
          at most {} % may: store it with --record h52 or f32",
@@ -202,11 +203,11 @@ pub enum StoreError {
     Clamped {
         /// The record.
         record: RecordFormat,
-        /// The field with most of them.
+        /// The field with the most such values.
         field: &'static str,
-        /// How many values.
+        /// Number of such values.
         count: u64,
-        /// How many Gaussians there are.
+        /// Number of Gaussians.
         gaussians: u64,
     },
     /// The render profile of a commit cannot be used.
@@ -224,23 +225,23 @@ pub enum StoreError {
         /// The name.
         name: String,
     },
-    /// What describes a twin is too large.
+    /// The manifest or the table of a twin is too large.
     #[error(
         "the {what} would take {bytes} bytes; at most {limit} are read: shorten trajectories, or \
          split the scene"
     )]
     ManifestSize {
-        /// `manifest`, or the `table` of its chunks' contents.
+        /// `manifest`, or `table` for the table of its chunks' sections.
         what: &'static str,
         /// Its size.
         bytes: u64,
-        /// The largest that is read.
+        /// The largest size that is read.
         limit: u64,
     },
 }
 
 impl StoreError {
-    /// Turns an I/O error into one that says what was tried on which file.
+    /// Turns an I/O error into one that names the operation and the file.
     pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |cause| Self::Io { action, path, cause }
@@ -254,7 +255,7 @@ fn known_twins(known: &[String]) -> String {
     }
 }
 
-/// The first few cells, and the settings.
+/// Names the first few cells, and the settings.
 fn overlap(cells: &[[i32; 2]], settings: &[&str]) -> String {
     const NAMED: usize = 8;
     let named = cells.iter().take(NAMED).map(|[x, y]| format!("({x}, {y})"));

@@ -1,4 +1,4 @@
-//! Looking after a twin: every object re-read, and everything that does not belong together.
+//! Checks a twin: re-reads every object, and finds what is missing, damaged, or left over.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,71 +8,72 @@ use super::catalog::check_name;
 use super::gc::ObjectTotals;
 use super::{Catalog, StoreError};
 
-/// What was found of a twin.
+/// The result of checking a twin.
 #[derive(Debug)]
 pub struct FsckReport {
     /// The objects that versions name.
     pub verified: VerifyReport,
-    /// Numbers that the log leaves out.
+    /// Numbers missing in the log.
     pub gaps: Vec<u64>,
     /// Records that cannot be read.
     pub records: Vec<(u64, StoreError)>,
-    /// Versions whose objects garbage collection removed.
+    /// Versions that garbage collection removed the objects of.
     pub collected: Vec<u64>,
-    /// ObjectBackend that no version names: garbage, or of a commit that runs.
+    /// Objects that no version names: garbage, or of a running commit.
     pub unreferenced: ObjectTotals,
-    /// Whether there is staging of a commit that runs or was killed.
+    /// Whether there is staging of a running or killed commit.
     pub staging: bool,
 }
 
-/// What was re-read.
+/// The result of re-reading objects.
 #[derive(Debug)]
 pub struct VerifyReport {
-    /// ObjectBackend that were compared with their hashes.
+    /// Number of objects that were compared with their hashes.
     pub objects: usize,
-    /// Size of the chunks together, in bytes, as the manifests say.
+    /// Total size of the chunks, in bytes, according to the manifests.
     pub bytes: u64,
-    /// The ones that are not what was committed.
+    /// Objects that differ from what was committed.
     pub damaged: Vec<DamagedObject>,
 }
 
-/// An object that is not what was committed.
+/// An object that differs from what was committed.
 #[derive(Debug)]
 pub struct DamagedObject {
     /// Its name, 64 lower-case hex digits.
     pub object: String,
-    /// What is wrong with it: missing, unreadable, or of another hash.
+    /// What is wrong with it: it is missing, unreadable, or has another hash.
     pub error: StoreError,
 }
 
 impl FsckReport {
-    /// Whether everything that was committed is there. Garbage and what is being made is no loss.
+    /// Whether everything that was committed exists. Garbage and running commits do not matter.
     pub fn is_sound(&self) -> bool {
         self.verified.damaged.is_empty() && self.gaps.is_empty() && self.records.is_empty()
     }
 }
 
 impl Catalog {
-    /// Compares every object of every version of a twin with its hash, and looks for what is missing
-    /// and what is left over. `progress` gets bytes done and bytes in all.
+    /// Compares every object of every version of a twin with its hash, and finds what is missing
+    /// and what is left over. `progress` gets the bytes done and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. DamagedObject is no error: it
-    /// is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed. Damage is no error,
+    /// but part of the result.
     pub fn fsck(
         &self,
         name: &str,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<FsckReport, StoreError> {
         check_name(name)?;
-        // ListedObject first, so that what is committed meanwhile is not taken for left over.
-        let listed = self.objects.list(name)?;
+        // Listed first, so that objects committed meanwhile are not reported as left over.
+        let listed = self.objects.list_objects(name)?;
         let numbers = self.numbers(name)?;
         let present: BTreeSet<u64> = numbers.iter().copied().collect();
         let last = numbers[numbers.len() - 1];
-        // However many there are, no more than the log has records are named.
+        // Bounded: a damaged log could have any number of gaps.
         let gaps = (1..last).filter(|number| !present.contains(number)).take(numbers.len());
-        let (mut records, mut readable) = (Vec::new(), Vec::new());
+        let mut records = Vec::new();
+        let mut readable = Vec::new();
         let collected = self.collected(name)?;
         for number in numbers.into_iter().filter(|number| !collected.contains(number)) {
             match self.record(name, number) {
@@ -91,15 +92,16 @@ impl Catalog {
             records,
             collected: collected.into_iter().collect(),
             unreferenced,
-            staging: self.objects.unfinished_commits()?.iter().any(|begun| begun == name),
+            staging: self.objects.unfinished_commits()?.iter().any(|unfinished| unfinished == name),
         })
     }
 
-    /// Compares every object of every version of a twin with its hash. `progress` gets bytes done
-    /// and bytes in all.
+    /// Compares every object of every version of a twin with its hash. `progress` gets the bytes
+    /// done and in all.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. DamagedObject is no error: it is the answer.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be read. Damage is no error,
+    /// but part of the result.
     pub fn verify(
         &self,
         name: &str,
@@ -112,36 +114,37 @@ impl Catalog {
         self.reread(name, &numbers, progress).map(|(verified, _)| verified)
     }
 
-    /// Compares the objects of some versions with their hashes. Returns the hashes that they name,
-    /// too.
+    /// Compares the objects of some versions with their hashes. Also returns the hashes that they
+    /// name.
     fn reread(
         &self,
         name: &str,
         numbers: &[u64],
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<(VerifyReport, BTreeSet<String>), StoreError> {
-        // What the disk cache keeps may be lost where the twin is.
-        let there = self.uncached();
+        // The disk cache may have objects that the store has lost.
+        let uncached = self.uncached();
         let mut damaged = Vec::new();
-        // By hash: versions share objects, and are often alike.
-        let (mut named, mut chunks) = (BTreeSet::new(), BTreeMap::new());
+        // By hash, because versions share most objects.
+        let mut named = BTreeSet::new();
+        let mut chunks = BTreeMap::new();
         for &number in numbers {
-            let hash = there.record(name, number)?.manifest;
+            let hash = uncached.record(name, number)?.manifest;
             if !named.insert(hash.clone()) {
                 continue;
             }
-            match there.manifest(name, &hash) {
+            match uncached.manifest(name, &hash) {
                 Ok(mut manifest) => {
                     let table = manifest.table.object.clone();
                     named.insert(table.clone());
                     if let Some(SkyRef { object, .. }) = manifest.sky.clone()
                         && named.insert(object.clone())
-                        && let Err(error) = there.objects.read_start(name, &object, 0)
+                        && let Err(error) = uncached.objects.read_start(name, &object, 0)
                     {
                         damaged.push(DamagedObject { object, error });
                     }
-                    // Without their table, chunks are still compared with their own hashes.
-                    if let Err(error) = there.fill(&mut manifest) {
+                    // Without the table, chunks are still compared with their own hashes.
+                    if let Err(error) = uncached.fill(&mut manifest) {
                         damaged.push(DamagedObject { object: table, error });
                     }
                     chunks.extend(manifest.chunks.into_iter().map(|c| (c.object.clone(), c)));
@@ -154,9 +157,9 @@ impl Catalog {
         let mut done = 0;
         for (object, chunk) in chunks {
             let checked = if chunk.sections.is_empty() {
-                there.objects.read_start(name, &object, 0).map(|_| ())
+                uncached.objects.read_start(name, &object, 0).map(|_| ())
             } else {
-                there.check_chunk(name, &chunk)
+                uncached.check_chunk(name, &chunk)
             };
             if let Err(error) = checked {
                 damaged.push(DamagedObject { object: object.clone(), error });

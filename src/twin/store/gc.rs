@@ -1,10 +1,12 @@
-//! Garbage collection: objects that no version to be kept names, nor any in use, go in two steps.
+//! Garbage collection: removes, in two steps, objects that no kept version and no version in use
+//! names.
 //!
-//! The first run notes which they are; a later one, after the grace period, removes those that are
-//! still garbage and were not written since. So whoever reads a version at the first run has that long
-//! to lease it, and whoever commits an object again has written it again. In a directory nobody can
-//! publish while objects are removed; in an object store a commit that puts an object again in the very
-//! seconds of its removal loses it: collect there while nobody pushes what was garbage for a day.
+//! The first run notes them as candidates. A later run, after the grace period, removes the
+//! candidates that are still garbage and were not written since. So a process that reads a version
+//! at the first run has that long to lease it, and a commit that needs an object again has written
+//! it again. In a directory, publishing is locked while objects are removed. In an object store, a
+//! commit that puts an object again in the seconds of its removal loses it: collect there only
+//! while no push can bring back what has been garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -18,47 +20,48 @@ use super::lease::LeaseRecord;
 use super::log::now_us;
 use super::{Catalog, StoreError};
 
-/// What is kept, and for how long.
+/// Which versions are kept, and for how long garbage is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Retention {
-    /// How many of the latest versions are kept, at least 1.
+    /// Number of latest versions that are kept, at least 1.
     pub versions: usize,
-    /// How long an object stays after it was first found to be garbage, and after it was written.
+    /// How long an object is kept after it was first found to be garbage, and after it was written.
     pub grace: Duration,
 }
 
-/// What a garbage collection found and did.
+/// The result of a garbage collection.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct CollectionReport {
-    /// Versions whose objects are kept, rising: the latest ones, and older ones in use.
+    /// Versions that are kept, ascending: the latest ones, and older ones in use.
     pub kept: Vec<u64>,
-    /// ObjectBackend that were removed.
+    /// Objects that were removed.
     pub removed: ObjectTotals,
-    /// ObjectBackend that are garbage, and may be removed after the grace period.
+    /// Objects that are garbage, and may be removed after the grace period.
     pub noted: ObjectTotals,
 }
 
-/// How many objects, and how large they are together.
+/// A number of objects, and their total size.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ObjectTotals {
-    /// ObjectBackend.
+    /// Number of objects.
     pub objects: u64,
-    /// Their bytes.
+    /// Their total size, in bytes.
     pub bytes: u64,
 }
 
-/// ObjectBackend that are garbage, by hash, and when they were first found to be, in microseconds since 1970.
+/// Objects that are garbage, by hash, with the time when they were first found to be, in
+/// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
-/// Where candidates are noted.
+/// The side file with the candidates.
 const CANDIDATES: &str = "gc/candidates";
-/// Where versions are noted that are no more.
+/// The side file with the versions that were removed.
 const COLLECTED: &str = "gc/collected";
 
-/// What a run would do.
+/// What a run does.
 #[derive(Debug, Default)]
 struct CollectionPlan {
-    collected: CollectionReport,
+    report: CollectionReport,
     candidates: Candidates,
     remove: Vec<String>,
     /// Versions that lose objects.
@@ -66,12 +69,12 @@ struct CollectionPlan {
 }
 
 impl Catalog {
-    /// Removes what was garbage for the grace period, and notes what is now. With `dry_run` nothing is
-    /// removed and nothing noted.
+    /// Removes what has been garbage for the grace period, and notes what is garbage now. With
+    /// `dry_run`, nothing is removed or noted.
     ///
     /// # Errors
-    /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read: then
-    /// nobody knows what it names, and nothing is removed.
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read.
+    /// Then it is unknown which objects it names, and nothing is removed.
     pub fn collect(
         &self,
         name: &str,
@@ -83,12 +86,12 @@ impl Catalog {
         let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
-            return Ok(plan.collected);
+            return Ok(plan.report);
         }
         if !plan.remove.is_empty() {
-            self.objects.remove(name, &mut || {
-                // Somebody may have published or leased since: looked at when nobody can publish, or just
-                // before.
+            self.objects.remove_objects(name, &mut || {
+                // Versions may have been published or leased since the first plan. This plan is
+                // made while publishing is locked; in an object store, just before the removal.
                 plan = self.plan(name, keep, &before, now_us)?;
                 self.mark_collected(name, &plan.gone, now_us)?;
                 Ok(plan.remove.clone())
@@ -98,15 +101,16 @@ impl Catalog {
         for lease in self.leases(name)?.iter().filter(|lease| !lease.is_live(now_us)) {
             lease.remove(self, name)?;
         }
-        Ok(plan.collected)
+        Ok(plan.report)
     }
 
-    /// Says that versions are no more, before it is so: one that lost an object without it would be
-    /// damaged.
+    /// Records that versions are collected, before their objects are removed: otherwise they would
+    /// seem damaged.
     ///
     /// # Errors
-    /// [`StoreError::Leased`] if somebody leased one in this moment. Who leases writes and then looks
-    /// here, and this writes and then looks there, so that one of the two sees the other.
+    /// [`StoreError::Leased`] if one was leased at this moment. A lease is written first and then
+    /// reads this record; here, the record is written first and then the leases are read. So at
+    /// least one of the two sees the other.
     fn mark_collected(
         &self,
         name: &str,
@@ -123,11 +127,12 @@ impl Catalog {
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
     }
 
-    /// Versions whose objects were removed.
+    /// Versions that lost objects to garbage collection.
     pub(super) fn collected(&self, name: &str) -> Result<BTreeSet<u64>, StoreError> {
         self.read_side_json(name, COLLECTED)
     }
 
+    /// Decides what to keep, to note, and to remove. `before` are the candidates of the last run.
     fn plan(
         &self,
         name: &str,
@@ -135,6 +140,7 @@ impl Catalog {
         before: &Candidates,
         now_us: i64,
     ) -> Result<CollectionPlan, StoreError> {
+        // Versions to keep: the latest ones, and those in use.
         let numbers = self.numbers(name)?;
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
@@ -143,6 +149,7 @@ impl Catalog {
         let gone = self.collected(name)?;
         kept.retain(|number| !gone.contains(number));
 
+        // Their objects are needed; all others are garbage.
         let mut named = BTreeSet::new();
         for &number in &kept {
             named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);
@@ -150,27 +157,28 @@ impl Catalog {
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
         let mut plan = CollectionPlan::default();
-        for object in self.objects.list(name)? {
+        for object in self.objects.list_objects(name)? {
             if named.contains(&object.hash) {
                 continue;
             }
             let noted_us = before.get(&object.hash).copied();
             if noted_us.is_some_and(is_old) && is_old(object.written_us) {
-                plan.collected.removed.add(object.bytes);
+                plan.report.removed.add(object.bytes);
                 plan.remove.push(object.hash);
             } else if plan.candidates.len() < limits::GC_CANDIDATES {
-                plan.collected.noted.add(object.bytes);
+                plan.report.noted.add(object.bytes);
                 plan.candidates.insert(object.hash, noted_us.unwrap_or(now_us));
             }
         }
-        // A record that cannot be read names nothing that could be lost.
+        // Versions that lose their manifest. A record that cannot be read names no object that could
+        // be removed.
         for number in numbers.into_iter().filter(|number| !kept.contains(number)) {
             if self.record(name, number).is_ok_and(|record| plan.remove.contains(&record.manifest))
             {
                 plan.gone.insert(number);
             }
         }
-        plan.collected.kept = kept.into_iter().collect();
+        plan.report.kept = kept.into_iter().collect();
         Ok(plan)
     }
 
@@ -182,15 +190,15 @@ impl Catalog {
         Ok(chunks.chain(sky).chain([manifest.table.object, hash.to_owned()]).collect())
     }
 
-    /// A note, or an empty one.
+    /// A side file's JSON, or the default if it does not exist.
     fn read_side_json<T: Default + for<'a> Deserialize<'a>>(
         &self,
         name: &str,
-        note: &str,
+        file: &str,
     ) -> Result<T, StoreError> {
-        let Some(bytes) = self.objects.read_side_file(name, note)? else { return Ok(T::default()) };
+        let Some(bytes) = self.objects.read_side_file(name, file)? else { return Ok(T::default()) };
         serde_json::from_slice(&bytes).map_err(|error| StoreError::Damaged {
-            path: self.objects.root().join(name).join(note),
+            path: self.objects.root().join(name).join(file),
             reason: error.to_string(),
         })
     }

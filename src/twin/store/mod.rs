@@ -1,23 +1,51 @@
 //! Twins on disk or in an object store: immutable versions, content-addressed.
 //!
 //! ```text
-//! <twins>/<name>/log/0000000001         which manifest version 1 is, since when, and how it came about
-//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks and skies, named by their BLAKE3
+//! <twins>/<name>/log/0000000001         the hash of version 1's manifest, when it was committed, and from what
+//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks, and skies, named by their BLAKE3
 //! <twins>/<name>/leases/...             versions in use, and until when
-//! <twins>/<name>/gc/candidates          objects that no version needs, and since when
-//! <twins>/<name>/gc/collected           versions whose objects were removed
+//! <twins>/<name>/gc/candidates          objects that no kept version needs, and since when
+//! <twins>/<name>/gc/collected           versions that were removed
 //!
-//! <twins>/.staging/<name>@<commit>/     objects of a commit in the making, invisible to everyone
-//! <twins>/.staging/<name>@<commit>/lock held by its process as long as it lives
-//! <twins>/.staging/<name>.lock          held while a version is published
+//! <twins>/.staging/<name>@<commit>/     objects of a commit in preparation, invisible to readers
+//! <twins>/.staging/<name>@<commit>/lock locked by the commit's process as long as the process lives
+//! <twins>/.staging/<name>.lock          locked while a version is published
 //! ```
 //!
-//! What begins with `.staging` is of directories alone; in an object store, objects are uploaded to
-//! where they stay.
+//! Paths that begin with `.staging` exist in directories only. In an object store, objects are
+//! uploaded to their final keys.
 //!
-//! ObjectBackend come first and the log's record last, put only if absent, so that whatever happens in
-//! the middle leaves the old version or the new one.
+//! # Decisions
+//!
+//! **A commit writes objects first and its log record last.** A version is a manifest, which names
+//! a table and chunks by their hashes; a twin is a numbered log of manifests. The record `log/<n +
+//! 1>` is *put only if absent*: with a hard link in a directory, with a conditional put in an
+//! object store. That is the only atomic operation, and the one that S3, GCS, Azure, and a disk
+//! have in common. Whenever a commit is interrupted, readers see either the old version or the new
+//! one.
+//!
+//! **On conflict, the commit reads the winning record.** Its own record means that the answer to an
+//! earlier attempt was lost: the commit succeeded. Changes to other cells mean that the commit is
+//! rebased on the winner. Changes to the same cells are an error that names them
+//! ([`StoreError::Overlap`]).
+//!
+//! **The log record, not the manifest, says when and how a version came about.** So a version's
+//! hash is a hash of its content, and a rollback is a record with an old hash.
+//!
+//! **In a directory, several commits of one twin may be in preparation**, each in a folder of its
+//! own. Its lock is released by the kernel when the process ends, however it ends. A second lock
+//! per twin is held while publishing, while removing what killed commits left, and during garbage
+//! collection, so that no commit relies on an object that is being removed. An object store has no
+//! such lock: what a killed commit left is garbage like any other, and garbage is removed in two
+//! steps, noted by one run and removed by another after a day.
+//!
+//! **Requests to object stores are timed and retried in one place** (`remote/retry.rs`);
+//! `object_store`'s own retries are off.
+//!
+//! **The disk cache compares every part with its hash on every read**, which takes less time than
+//! decoding it. So the cache needs neither fsync nor recovery, and a damaged part is fetched again.
 
+mod backend;
 mod catalog;
 mod chunk_file;
 mod commit;
@@ -25,18 +53,19 @@ mod diff;
 mod error;
 mod fsck;
 mod gc;
+mod layout;
 mod lease;
 mod local;
 mod log;
 mod new_version;
-mod objects;
 mod pack;
 mod recover;
 mod remote;
+mod settings;
 mod sky;
 
 pub use catalog::{Catalog, DiskCacheSettings, TwinListing, Version};
-pub use commit::{Commit, StorageOptions, StoredCells, VersionChange, VersionSettings};
+pub use commit::{Commit, StoredCells};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
 pub use fsck::{DamagedObject, FsckReport, VerifyReport};
@@ -44,5 +73,7 @@ pub use gc::{CollectionReport, ObjectTotals, Retention};
 pub use lease::Lease;
 pub use log::{CommitKind, LogEntry};
 pub use new_version::NewVersion;
+pub use pack::StorageOptions;
 pub use remote::{RetryPolicy, Traffic};
+pub use settings::{VersionChange, VersionSettings};
 pub use sky::{NewSky, SkyBytes};

@@ -1,4 +1,4 @@
-//! A whole version in one call, for what is in memory anyway.
+//! A whole version in one call, for scenes that are in memory anyway.
 
 use crate::ingest::IngestError;
 use wildcity_scene::manifest::Provenance;
@@ -9,20 +9,20 @@ use super::catalog::check_name;
 use super::sky::NewSky;
 use super::{Catalog, CommitKind, StorageOptions, StoreError, Version, VersionSettings};
 
-/// What a new version of a twin consists of.
+/// The content of a new version of a twin.
 #[derive(Clone, Debug)]
 pub struct NewVersion<'a> {
-    /// The twin's name, `[a-z0-9._-]+`; a new one makes a new twin.
+    /// The twin's name, `[a-z0-9._-]+`; a new name makes a new twin.
     pub name: &'a str,
     /// The Gaussians, in metres along the twin's axes.
     pub gaussians: &'a Gaussians,
     /// How they must be rendered.
     pub profile: RenderProfile,
-    /// The vehicle that recorded them.
+    /// The rig of the vehicle that recorded them.
     pub rig: Option<Rig>,
     /// Recorded drives.
     pub trajectories: Vec<Trajectory>,
-    /// What is behind them.
+    /// The sky behind them.
     pub sky: Option<NewSky>,
     /// Where they come from.
     pub provenance: Provenance,
@@ -31,7 +31,7 @@ pub struct NewVersion<'a> {
 }
 
 impl<'a> NewVersion<'a> {
-    /// Gaussians alone, rendered and stored by default.
+    /// Gaussians alone, rendered and stored with defaults.
     pub fn of(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
         Self {
             name,
@@ -47,9 +47,9 @@ impl<'a> NewVersion<'a> {
 }
 
 impl Catalog {
-    /// Writes a version and makes it the latest, all or nothing. The same content as the latest
-    /// version's is that version: no new one is made. `progress` gets Gaussians written and Gaussians
-    /// in all.
+    /// Writes a version and makes it the latest, all or nothing. If the latest version has the same
+    /// content, it is returned, and no new one is made. `progress` gets the number of Gaussians
+    /// written and in all.
     ///
     /// # Errors
     /// Names what cannot be accepted, before anything is written; or as [`super::Commit::replace`].

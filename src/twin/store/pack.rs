@@ -1,4 +1,5 @@
-//! Gaussians of whole cells become chunk objects: the blocks of many cells at once, level by level.
+//! Packs the Gaussians of whole cells into chunk objects: the blocks of many cells in parallel,
+//! level by level.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -12,12 +13,28 @@ use wildcity_scene::manifest::ChunkEntry;
 use wildcity_scene::record::Clamped;
 use wildcity_scene::{Chunk, Gaussians, RecordFormat, lod};
 
-use super::chunk_file::{self, PackedSection};
-use super::objects::Staging;
-use super::{StorageOptions, StoreError};
+use super::StoreError;
+use super::backend::Staging;
+use super::chunk_file::{self, ChunkHeader, LevelOfBlock, PackedSection};
 
-/// Gaussians whose blocks are made at once, at least: enough for all cores, few beside a scene.
-const TOGETHER: usize = 1 << 16;
+/// The smallest batch of Gaussians that is packed in parallel: enough to occupy all cores, and few
+/// compared with a scene.
+const BATCH_GAUSSIANS: usize = 1 << 16;
+
+/// How Gaussians are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StorageOptions {
+    /// The record format, which decides the number of bits per Gaussian.
+    pub record: RecordFormat,
+    /// Whether levels of detail are made.
+    pub levels: bool,
+}
+
+impl Default for StorageOptions {
+    fn default() -> Self {
+        Self { record: RecordFormat::default(), levels: true }
+    }
+}
 
 /// Gaussians by cell, and how those cells are stored.
 #[derive(Debug)]
@@ -29,7 +46,7 @@ pub(super) struct CellPacker<'a> {
 }
 
 impl<'a> CellPacker<'a> {
-    /// Sorts Gaussians into cells, and leaves out all but those that are asked for.
+    /// Sorts Gaussians into cells, and keeps only the cells of `only`, if given.
     pub(super) fn new(
         gaussians: &'a Gaussians,
         storage: StorageOptions,
@@ -45,26 +62,29 @@ impl<'a> CellPacker<'a> {
         self.cells.iter().map(|run| run.cell)
     }
 
-    /// Gaussians in the cells.
+    /// Number of Gaussians in the cells.
     pub(super) fn gaussians(&self) -> u64 {
         self.cells.iter().map(|run| run.run.len() as u64).sum()
     }
 
-    /// Writes an object for each cell. Returns them in order, and what the record could not hold.
-    /// `progress` gets Gaussians written and Gaussians in all.
+    /// Writes an object for each cell. Returns the chunks in order, and counts of the values that
+    /// the record could not hold. `progress` gets the number of Gaussians written and in all.
     pub(super) fn put(
         &self,
-        staging: &mut Staging,
+        staging: &mut dyn Staging,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<(Vec<ChunkEntry>, Clamped), StoreError> {
         let total = self.gaussians();
-        let (mut clamped, mut done) = (Clamped::default(), 0);
+        let mut clamped = Clamped::default();
+        let mut done = 0;
         let mut chunks = Vec::with_capacity(self.cells.len());
         let mut rest = &self.cells[..];
         while !rest.is_empty() {
-            let (together, after) = rest.split_at(together(rest));
+            let (batch, after) = rest.split_at(batch_cells(rest));
             rest = after;
-            let blocks: Vec<(&CellRun, &(u8, Range<usize>))> = together
+
+            // The blocks of all cells of the batch, in parallel.
+            let blocks: Vec<(&CellRun, &(u8, Range<usize>))> = batch
                 .iter()
                 .flat_map(|cell| cell.blocks.iter().map(move |block| (cell, block)))
                 .collect();
@@ -73,8 +93,10 @@ impl<'a> CellPacker<'a> {
             });
             let packed = packed.collect::<io::Result<Vec<_>>>();
             let packed = packed.map_err(StoreError::io("compress for", staging.dir()))?;
+
+            // Their objects, one after the other.
             let mut packed = packed.into_iter();
-            for cell in together {
+            for cell in batch {
                 let mut sections = Vec::new();
                 for (block, lost) in packed.by_ref().take(cell.blocks.len()) {
                     sections.extend(block);
@@ -88,7 +110,7 @@ impl<'a> CellPacker<'a> {
         Ok((chunks, clamped))
     }
 
-    /// All levels of one block, and what its record could not hold of level 0.
+    /// All levels of one block, and counts of the values that the record could not hold of level 0.
     fn pack_block(
         &self,
         cell: &CellRun,
@@ -102,11 +124,18 @@ impl<'a> CellPacker<'a> {
             full.push(&cell.record(self.gaussians, index as usize));
         }
         let mut clamped = Clamped::default();
-        let mut packed = vec![chunk_file::pack(&full, [block, 0], 0.0, record, &mut clamped)?];
+        let mut packed = vec![chunk_file::pack(
+            &full,
+            LevelOfBlock { block, level: 0, error_m: 0.0 },
+            record,
+            &mut clamped,
+        )?];
         if levels {
             for (level, lod::Level { error_m, chunk }) in (1..).zip(lod::levels(&full)) {
+                // Not counted: merged Gaussians are approximations anyway.
                 let lost = &mut Clamped::default();
-                packed.push(chunk_file::pack(&chunk, [block, level], error_m, record, lost)?);
+                let level = LevelOfBlock { block, level, error_m };
+                packed.push(chunk_file::pack(&chunk, level, record, lost)?);
             }
         }
         Ok((packed, clamped))
@@ -114,30 +143,41 @@ impl<'a> CellPacker<'a> {
 
     fn put_chunk(
         &self,
-        staging: &mut Staging,
+        staging: &mut dyn Staging,
         cell: &CellRun,
         packed: Vec<PackedSection>,
     ) -> Result<ChunkEntry, StoreError> {
         let CellRun { cell, origin_m, ref run, .. } = *cell;
-        let (sh_degree, record): (u8, RecordFormat) =
-            (self.gaussians.sh_degree, self.storage.record);
-        let (mut sections, mut bounds) = (Vec::new(), Bounds::EMPTY);
-        let put = staging.put(|out| {
-            (sections, bounds) =
-                chunk_file::write(out, (cell, origin_m), sh_degree, record, packed)?;
+        let mut sections = Vec::new();
+        let mut bounds = Bounds::EMPTY;
+        let header = ChunkHeader {
+            cell,
+            origin_m,
+            sh_degree: self.gaussians.sh_degree,
+            record: self.storage.record,
+        };
+        let stored = staging.put(Box::new(|out| {
+            (sections, bounds) = chunk_file::write(out, &header, packed)?;
             Ok(())
-        })?;
-        let (object, bytes, count) = (put.hash, put.bytes, run.len() as u64);
-        Ok(ChunkEntry { cell, object, count, bytes, bounds, origin_m, sections })
+        }))?;
+        Ok(ChunkEntry {
+            cell,
+            object: stored.hash,
+            count: run.len() as u64,
+            bytes: stored.bytes,
+            bounds,
+            origin_m,
+            sections,
+        })
     }
 }
 
-/// How many of the next cells are made at once.
-fn together(cells: &[CellRun]) -> usize {
+/// How many of the next cells are packed in parallel.
+fn batch_cells(cells: &[CellRun]) -> usize {
     let mut gaussians = 0;
     let few = cells.iter().take_while(|cell| {
         gaussians += cell.run.len();
-        gaussians < TOGETHER
+        gaussians < BATCH_GAUSSIANS
     });
     cells.len().min(few.count() + 1)
 }

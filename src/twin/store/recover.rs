@@ -1,35 +1,40 @@
-//! Cleaning up after commits that were killed.
+//! Removing what killed commits left.
 
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind};
 
 use super::{Catalog, StoreError};
 
-/// Removes what killed commits left: their staging, and objects they placed without a record.
-///
-/// Who may only read the directory leaves that to those who may write.
-pub(super) fn clean(catalog: &Catalog) -> Result<(), StoreError> {
-    for name in catalog.objects.unfinished_commits()? {
-        // With a damaged version nobody knows what it named, so every object stays.
-        match catalog.objects.remove_abandoned(&name, &|| named(catalog, &name).ok()) {
-            Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
-            cleaned => cleaned?,
+impl Catalog {
+    /// Removes what killed commits left: their staging, and objects that they placed without a
+    /// record.
+    ///
+    /// A process with read-only access leaves this to processes that may write.
+    pub(super) fn remove_abandoned_commits(&self) -> Result<(), StoreError> {
+        for name in self.objects.unfinished_commits()? {
+            // If a version is damaged, it is unknown which objects it named, so every object is
+            // kept.
+            match self.objects.remove_abandoned(&name, &|| self.named_by_all(&name).ok()) {
+                Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
+                removed => removed?,
+            }
         }
+        Ok(())
     }
-    Ok(())
+
+    /// Hashes of all objects that any version of a twin names.
+    fn named_by_all(&self, name: &str) -> Result<BTreeSet<String>, StoreError> {
+        let collected = self.collected(name)?;
+        let mut named = BTreeSet::new();
+        for number in self.objects.version_numbers(name)? {
+            if !collected.contains(&number) {
+                named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);
+            }
+        }
+        Ok(named)
+    }
 }
 
 fn is_read_only(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem)
-}
-
-/// Hashes of all objects that any version of a twin names.
-fn named(catalog: &Catalog, name: &str) -> Result<BTreeSet<String>, StoreError> {
-    let (collected, mut named) = (catalog.collected(name)?, BTreeSet::new());
-    for number in catalog.objects.numbers(name)? {
-        if !collected.contains(&number) {
-            named.extend(catalog.named_by(name, &catalog.record(name, number)?.manifest)?);
-        }
-    }
-    Ok(named)
 }

@@ -9,34 +9,35 @@ use crate::limits;
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{RenderProfile, Sky};
 
-use super::objects::Staging;
+use super::backend::Staging;
 use super::{Catalog, StoreError, Version};
 
-/// The sky of a version in the making.
+/// The sky of a version in preparation.
 #[derive(Clone, Debug)]
 pub enum NewSky {
-    /// That of an earlier version of the twin.
+    /// The sky of an earlier version of the twin.
     Kept(SkyRef),
-    /// One of its own.
+    /// A new sky.
     Put(SkyBytes),
 }
 
-/// A sky as it is stored, and how it is looked at.
+/// A sky as stored, and how to look at it.
 #[derive(Clone, Debug)]
 pub struct SkyBytes {
-    /// What [`sky::decode`] reads.
+    /// The bytes that [`sky::decode`] reads.
     pub bytes: Arc<[u8]>,
-    /// Whose appearance it is seen with: an index, or the mean of all.
+    /// Index of the training image with the appearance that it is drawn in; the mean of all if
+    /// `None`.
     pub image: Option<u32>,
-    /// Takes directions in the world to the sky's own axes; orthonormal.
+    /// Rotates directions in the world to the sky's own axes; orthonormal.
     pub sky_from_world: DMat3,
 }
 
 impl NewSky {
-    /// Whether it can be drawn as the profile asks.
+    /// Checks that it can be drawn with the profile's `sky_error`.
     ///
     /// # Errors
-    /// It cannot be read, or not be baked as finely as the profile asks.
+    /// It cannot be read, or cannot be baked finely enough.
     pub(super) fn check(&self, profile: &RenderProfile) -> Result<(), StoreError> {
         match self {
             Self::Kept(_) => Ok(()),
@@ -48,12 +49,12 @@ impl NewSky {
         }
     }
 
-    /// Writes what is new, and names it.
-    pub(super) fn put(&self, staging: &mut Staging) -> Result<SkyRef, StoreError> {
+    /// Writes a new sky. Returns what the manifest names.
+    pub(super) fn put(&self, staging: &mut dyn Staging) -> Result<SkyRef, StoreError> {
         match self {
             Self::Kept(sky) => Ok(sky.clone()),
             Self::Put(SkyBytes { bytes, image, sky_from_world }) => {
-                let put = staging.put(|out| out.write_all(bytes))?;
+                let put = staging.put(Box::new(|out| out.write_all(bytes)))?;
                 Ok(SkyRef {
                     object: put.hash,
                     bytes: put.bytes,
@@ -66,16 +67,16 @@ impl NewSky {
 }
 
 impl Catalog {
-    /// Reads the sky of a version, if it has one, and checks it against its hash.
+    /// Reads the sky of a version, if it has one, and compares it with its hash.
     ///
     /// # Errors
-    /// [`StoreError::Damaged`] if it is not what was committed.
+    /// [`StoreError::Damaged`] if it differs from what was committed.
     pub fn sky(&self, version: &Version) -> Result<Option<Sky>, StoreError> {
         let Some(named) = &version.manifest.sky else { return Ok(None) };
         let twin = &version.manifest.twin;
         let bytes = self.objects.read_object(twin, &named.object, limits::SKY_FILE_BYTES)?;
         let damaged = |reason: String| {
-            let path = self.objects.path(twin, &named.object);
+            let path = self.objects.object_path(twin, &named.object);
             StoreError::Damaged { path, reason }
         };
         let model = sky::decode(&bytes, named.image).map_err(|error| damaged(error.to_string()))?;

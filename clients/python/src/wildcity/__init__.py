@@ -1,7 +1,7 @@
 """Drive a city twin: poses out, camera images in.
 
-`connect` gives a blocking client; `wildcity.aio.connect` the same for asyncio. Everything is in SI
-units; frames and conventions are in `protocol/README.md` of the project.
+`connect` returns a blocking client, and `wildcity.aio.connect` returns the same client for asyncio. All numbers are
+in SI units, or have their unit in their name. Frames and conventions are in `protocol/README.md` of the project.
 """
 
 from importlib.metadata import version as _version
@@ -93,6 +93,7 @@ __all__ = [
     "WildCityError",
     "Windshield",
     "connect",
+    "png_data_uri",
     "push",
     "rollback",
 ]

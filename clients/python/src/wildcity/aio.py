@@ -8,10 +8,18 @@ from types import TracebackType
 from typing import TypeVar
 
 from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as dial
+from websockets.asyncio.client import connect as connect_websocket
 from websockets.exceptions import WebSocketException
 
-from .core import DIAL, Conversation, Exchange, Message, headers, keeps_connection, translated
+from .session_protocol import (
+    CONNECT_OPTIONS,
+    Exchange,
+    Message,
+    SessionProtocol,
+    authorization_headers,
+    can_reuse_connection,
+    translate_error,
+)
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -41,10 +49,12 @@ async def connect(
     timeout: float = 90.0,
     token: str | None = None,
 ) -> Client:
-    """Connects to `ws://host:port/v1/session` and says hello.
+    """Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`.
 
-    `timeout` is how long an answer may take, in seconds; the server's own limits are shorter.
-    `token` is for a server that has tokens.
+    `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
+    limits are shorter. `token` is for a server that was started with tokens.
+
+    Raises `ConnectFailed`, or `ProtocolError` if the server speaks another protocol.
     """
     client = Client(url, name=name, timeout=timeout, token=token)
     await client._connect()
@@ -55,12 +65,13 @@ class Client:
     """A connection to a server. Use `connect`, and close it or use it in an `async with` block."""
 
     welcome: Welcome
-    """What the server said to hello: its limits, its twins."""
+    """The server's answer to `hello`: its limits and its twins."""
 
     def __init__(self, url: str, *, name: str, timeout: float, token: str | None) -> None:
-        self.url, self.timeout = url, timeout
-        self._headers = headers(token)
-        self._conversation = Conversation(name)
+        self.url = url
+        self.timeout = timeout
+        self._headers = authorization_headers(token)
+        self._protocol = SessionProtocol(name)
         self._connection: ClientConnection | None = None
 
     async def open(
@@ -80,9 +91,12 @@ class Client:
         decision_us: int | None = None,
         warm_up_us: int | None = None,
     ) -> Session:
-        """Opens a session on a twin; what is left out is the server's or the twin's default."""
+        """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
+
+        Raises `Refused` if the server refuses.
+        """
         opened = await self._run(
-            self._conversation.open(
+            self._protocol.open(
                 twin,
                 version=version,
                 session=session,
@@ -101,13 +115,14 @@ class Client:
         return Session(self, opened)
 
     async def resume(self, session: str, last_seq: int) -> Session:
-        """Continues a session that another client opened and lost; see `wildcity.sync`."""
-        await self._run(self._conversation.resume(session, last_seq))
+        """Continues a session that another client opened; see `wildcity.sync`."""
+        await self._run(self._protocol.resume(session, last_seq))
         return Session(self, None)
 
     async def close(self) -> None:
-        """Closes the connection; an open session can be resumed for a while."""
-        connection, self._connection = self._connection, None
+        """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
+        connection = self._connection
+        self._connection = None
         if connection is not None:
             await connection.close()
 
@@ -120,26 +135,27 @@ class Client:
     async def _connect(self) -> None:
         await self.close()
         try:
-            connection = await dial(self.url, additional_headers=self._headers, **DIAL)
+            connection = await connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS)
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
         self._connection = connection
         if connection.subprotocol != PROTOCOL:
             await self.close()
             raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
-        self.welcome = await self._run(self._conversation.hello())
+        self.welcome = await self._run(self._protocol.hello())
 
     async def _reconnect(self) -> Resumed:
         await self._connect()
-        return await self._run(self._conversation.resume_own())
+        return await self._run(self._protocol.resume_own())
 
     async def _run(self, exchange: Exchange[T]) -> T:
-        # ValueError here, before anything is sent, changes nothing.
+        # May raise ValueError. Nothing has been sent or changed then.
         request = next(exchange)
-        # Taken away while a call runs: a second one at the same time is a mistake, not a queue.
-        connection, self._connection = self._connection, None
+        # The connection is taken away during a call, so a second call at the same time fails.
+        connection = self._connection
+        self._connection = None
         if connection is None:
-            raise Disconnected("there is no connection, or a call is under way on it")
+            raise Disconnected("there is no connection, or another call is under way on it")
         keep = False
         try:
             exchange.send(await asyncio.wait_for(_answer(connection, request), self.timeout))
@@ -148,8 +164,8 @@ class Client:
             result: T = done.value
             return result
         except BaseException as error:
-            keep = keeps_connection(error)
-            failure = translated(error, self.timeout)
+            keep = can_reuse_connection(error)
+            failure = translate_error(error, self.timeout)
             if failure is None:
                 raise
             raise failure from error
@@ -157,9 +173,9 @@ class Client:
             if keep:
                 self._connection = connection
             else:
-                # No closing handshake: this may be a cancellation, which must not wait.
+                # Without a closing handshake, because a cancellation must not wait for one.
                 connection.transport.abort()
-        raise AssertionError("an exchange is one message each way")
+        raise AssertionError("an exchange is one message in each direction")
 
 
 async def _answer(connection: ClientConnection, request: str) -> Message:
@@ -168,54 +184,55 @@ async def _answer(connection: ClientConnection, request: str) -> Message:
 
 
 class Session:
-    """An open session. Closed at the end of an `async with` block, if its connection stands."""
+    """An open session. An `async with` block closes it at its end, if the connection is still open."""
 
     def __init__(self, client: Client, opened: Opened | None) -> None:
         self._client = client
-        self._conversation = client._conversation
+        self._protocol = client._protocol
         self._opened = opened
 
     @property
     def opened(self) -> Opened:
-        """What the server resolved: cameras, start, hashes. Not known after `Client.resume`."""
+        """All settings of the session: cameras, start, hashes. Not available after `Client.resume`."""
         if self._opened is None:
-            raise WildCityError("this session was opened by another client")
+            raise WildCityError("another client opened this session, so its settings are not known here")
         return self._opened
 
     async def step(
         self, movement: Pose | Trajectory | Action, *, terminate: bool = False
     ) -> Observation:
-        """Moves the ego; `terminate` ends the episode with it.
+        """Moves the ego, advances the simulated time by one step, and returns the observation there.
 
-        To its next `world_from_rig`, if it teleports; by an action, if it is a car; along a trajectory in either case.
+        A `Pose` is the next `world_from_rig` of an ego that teleports, an `Action` moves a car, and a `Trajectory`
+        moves both. `terminate` ends the episode with this step.
         """
-        return await self._client._run(self._conversation.step(movement, terminate))
+        return await self._client._run(self._protocol.step(movement, terminate))
 
     async def observe(self, poses: Sequence[Pose]) -> Observation:
-        """What would be seen from poses, without moving: one view for each."""
-        return await self._client._run(self._conversation.observe(poses))
+        """Renders images from poses without moving the ego: `views[k]` of the observation shows `poses[k]`."""
+        return await self._client._run(self._protocol.observe(poses))
 
     async def prefetch(self, poses: Sequence[Pose]) -> None:
-        """Has loaded what is seen from poses, in the order of the way. Does not wait for it."""
-        return await self._client._run(self._conversation.prefetch(poses))
+        """Asks the server to load what is visible from poses, in driving order. Does not wait for it."""
+        return await self._client._run(self._protocol.prefetch(poses))
 
     async def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
-        """Starts a new episode, at the session's start if none is given."""
-        return await self._client._run(self._conversation.reset(seed, start))
+        """Starts a new episode at `start`, or at the session's start if it is None."""
+        return await self._client._run(self._protocol.reset(seed, start))
 
     async def switch_version(self, version: int | None = None) -> Switched:
-        """Sees another version of the twin from the next step on, or the latest; the episode goes on."""
-        return await self._client._run(self._conversation.switch_version(version))
+        """Shows another version of the twin from the next step on, or the latest. The episode continues."""
+        return await self._client._run(self._protocol.switch_version(version))
 
     async def close(self) -> Summary:
-        """Ends the session; another can be opened on the same client."""
-        return await self._client._run(self._conversation.close())
+        """Ends the session. Another one can be opened on the same client."""
+        return await self._client._run(self._protocol.close())
 
     async def resume(self) -> Resumed:
         """Connects again after `Disconnected` or `TimedOut`, and continues the session.
 
-        Then repeat the call that failed: it keeps its number, so it is carried out once, and if it
-        was carried out already its answer comes again.
+        Then repeat the call that failed. It keeps its number, so the server carries it out only once: if it
+        already did, it sends the same answer again.
         """
         return await self._client._reconnect()
 
@@ -228,11 +245,11 @@ class Session:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._client._connection is None or self._conversation.session is None:
+        if self._client._connection is None or self._protocol.session is None:
             return
         try:
             await self.close()
         except WildCityError:
-            # The error that ended the block says more than the one that followed it.
+            # The error that ended the block is more informative than the one of closing.
             if error is None:
                 raise

@@ -1,8 +1,8 @@
-"""Reads what `torch.save` wrote, with numpy alone and without running anything of it.
+"""Reads files of `torch.save` without PyTorch, and without running code from the file.
 
-A checkpoint of PyTorch 1.6 or later is a zip archive of a pickle and the bytes of its tensors. A
-pickle is a program that may call any function by name. Here it can call five: those that rebuild
-tensors and ordered dictionaries. Every other class becomes an `Opaque`, which holds nothing.
+A checkpoint of PyTorch 1.6 or later is a zip archive of a pickle and the bytes of its tensors. A pickle is a
+program that may call any function by name. This reader permits only the names that rebuild tensors and ordered
+dictionaries. Every other class becomes an `Opaque`, which holds nothing.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import numpy.typing as npt
 from .errors import WildCityError
 
 PICKLE_BYTES = 64 << 20
-"""Largest pickle that is read; that of a gsplat checkpoint has 2 kB."""
+"""Largest pickle that is read, in bytes; that of a gsplat checkpoint has 2 kB."""
 
 
 class CheckpointError(WildCityError):
-    """A file is no checkpoint that can be read, or not one of Gaussians."""
+    """A file is not a readable checkpoint, or has no Gaussians."""
 
 
 class Opaque:
-    """An object of a class that is not known, left empty."""
+    """Stands for an object of an unknown class, and holds nothing."""
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         pass
@@ -77,9 +77,9 @@ class _Storage:
 
 
 def load(path: str | PathLike[str]) -> Any:
-    """What was saved: dictionaries, lists and numbers, with numpy arrays for tensors.
+    """The saved objects: dictionaries, lists and numbers, with numpy arrays for tensors.
 
-    bfloat16 becomes float32. Raises `CheckpointError`.
+    bfloat16 becomes float32. Raises `CheckpointError` if the file cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -88,7 +88,7 @@ def load(path: str | PathLike[str]) -> Any:
         raise CheckpointError(f"{path}: {error}") from error
     except zipfile.BadZipFile as error:
         reason = "save it with PyTorch 1.6 or later, or copy it again"
-        raise CheckpointError(f"{path} is no zip archive ({error}): {reason}") from error
+        raise CheckpointError(f"{path} is not a zip archive ({error}): {reason}") from error
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error}") from error
     except (pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError) as error:
@@ -100,12 +100,12 @@ def load(path: str | PathLike[str]) -> Any:
 def _load(archive: zipfile.ZipFile) -> Any:
     names = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(names) != 1:
-        raise CheckpointError(f"it has {len(names)} files data.pkl, not one: no torch.save")
+        raise CheckpointError(f"it has {len(names)} files data.pkl, not one, so torch.save did not write it")
     folder = names[0].removesuffix("data.pkl")
     if f"{folder}byteorder" in archive.namelist():
         order = _read(archive, f"{folder}byteorder")
         if order != b"little":
-            raise CheckpointError(f"its byte order is {order!r}; little is read")
+            raise CheckpointError(f"its byte order is {order!r}; only little-endian files can be read")
     if archive.getinfo(names[0]).file_size > PICKLE_BYTES:
         raise CheckpointError(f"its pickle is larger than {PICKLE_BYTES} bytes")
     with archive.open(names[0]) as file:
@@ -117,9 +117,9 @@ def _read(archive: zipfile.ZipFile, name: str) -> bytes:
         info = archive.getinfo(name)
     except KeyError as error:
         raise CheckpointError(f"{name} is missing") from error
-    # torch.save never compresses; what is stored cannot be more than the file.
+    # torch.save never compresses. Data that is only stored cannot be larger than the file.
     if info.compress_type != zipfile.ZIP_STORED:
-        raise CheckpointError(f"{name} is compressed, as torch.save does not do")
+        raise CheckpointError(f"{name} is compressed, so torch.save did not write it")
     return archive.read(name)
 
 
@@ -141,7 +141,7 @@ class _Unpickler(pickle.Unpickler):
             return tuple
         if module == "torch" and name in _DTYPES:
             return _DTYPES[name]
-        # A class, so that the pickle may also make it with NEWOBJ.
+        # A class and not an instance, because a pickle can also create objects with NEWOBJ.
         return type(name, (Opaque,), {})
 
     def persistent_load(self, pid: Any) -> _Storage:
@@ -153,7 +153,7 @@ class _Unpickler(pickle.Unpickler):
                     whole = values[: len(values) // size * size]
                     self._storages[key] = _Storage(dtype, np.frombuffer(whole, dtype.numpy))
                 return self._storages[key]
-        raise CheckpointError(f"it names a tensor's bytes as {pid!r}")
+        raise CheckpointError(f"it refers to a tensor's bytes as {pid!r}")
 
 
 def _rebuild_tensor(
@@ -162,9 +162,10 @@ def _rebuild_tensor(
     numbers = [offset, *size, *stride]
     if not all(isinstance(number, int) and number >= 0 for number in numbers):
         raise CheckpointError(f"a tensor of size {size}, stride {stride}, offset {offset}")
-    count, held = math.prod(size), len(storage.values)
+    count = math.prod(size)
+    held = len(storage.values)
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    # A stride of 0 could make much of nothing.
+    # A stride of 0 could make a huge tensor from a few numbers.
     if count > held or (count > 0 and last >= held):
         raise CheckpointError(f"a tensor of size {size} in {held} numbers")
     if count == 0:

@@ -1,11 +1,11 @@
-"""Makes safetensors, which `wildcity import` reads, of the checkpoints of trainers.
+"""Converts checkpoints of trainers to safetensors, which `wildcity import` reads.
 
     python -m wildcity.convert ckpt_29999.pt street.safetensors
     python -m wildcity.convert checkpoint_final.pth street.safetensors --model Background
 
-A checkpoint's sky network goes into the same file: `wildcity import street.safetensors --sky
-street.safetensors` takes both. It knows gsplat (`splats`), drivestudio (`models`, of which one is taken), nerfstudio's splatfacto
-and INRIA's tuple. It needs numpy and no PyTorch, and runs nothing that is in the file.
+A checkpoint's sky network is written to the same file: `wildcity import street.safetensors --sky
+street.safetensors` reads both. Supported are gsplat (`splats`), drivestudio (`models`, of which one is converted),
+nerfstudio's splatfacto and INRIA's tuple. Conversion needs numpy but not PyTorch, and runs no code from the file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .checkpoint import CheckpointError, load
 
 __all__ = ["CheckpointError", "convert", "load", "models", "sky", "splats"]
 
-_NAMES = {
+_FIELD_NAMES = {
     "means": ("means", "xyz"),
     "quats": ("quats", "rotation"),
     "scales": ("scales", "scaling"),
@@ -34,10 +34,10 @@ _NAMES = {
     "sh0": ("sh0", "features_dc"),
     "shN": ("shN", "features_rest"),
 }
-"""gsplat's names, and what others call the same."""
+"""gsplat's names of the fields, and all names of the same field in other checkpoints."""
 
-_SKY = [f"sky_head.layers.{layer}.{part}" for layer in range(3) for part in ("weight", "bias")]
-"""drivestudio's SkyModel, with or without `appearance_embedding.weight`."""
+_SKY_TENSORS = [f"sky_head.layers.{layer}.{part}" for layer in range(3) for part in ("weight", "bias")]
+"""Tensors of drivestudio's SkyModel; it may also have `appearance_embedding.weight`."""
 
 _Arrays = dict[str, npt.NDArray[Any]]
 
@@ -45,11 +45,10 @@ _Arrays = dict[str, npt.NDArray[Any]]
 def convert(
     source: str | PathLike[str], target: str | PathLike[str], model: str | None = None
 ) -> int:
-    """Writes the Gaussians of a checkpoint, and its sky if it has one, as safetensors; returns how
-    many Gaussians they are.
+    """Writes the Gaussians of a checkpoint, and its sky if it has one, as safetensors.
 
-    `model` chooses one where a checkpoint has several. `target` appears whole or not at all.
-    Raises `CheckpointError`.
+    Returns the number of Gaussians. `model` selects one of several models of a checkpoint. `target` is written
+    completely or not at all. Raises `CheckpointError` if the checkpoint cannot be converted.
     """
     tensors = splats(source, model)
     _write_safetensors(target, tensors | sky(source))
@@ -57,8 +56,10 @@ def convert(
 
 
 def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
-    """The Gaussians of a checkpoint, with gsplat's names and shapes: means [N,3], quats [N,4]
-    (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3], shN [N,K,3].
+    """The Gaussians of a checkpoint, with gsplat's names and shapes.
+
+    means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (natural logarithm), opacities [N] (logit), sh0 [N,1,3],
+    shN [N,K,3]. Raises `CheckpointError` if there is no such model, or several and `model` is None.
     """
     found = models(source)
     if model is None:
@@ -73,15 +74,16 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
 
 
 def sky(source: str | PathLike[str]) -> _Arrays:
-    """The network of a checkpoint's sky, by the names that `wildcity import --sky` reads, as float32;
-    empty if there is none.
+    """The sky network of a checkpoint as float32, with the names that `wildcity import --sky` reads.
+
+    Empty if there is none.
     """
     for arrays in _mappings(load(source)):
-        prefixes = {key.removesuffix(_SKY[0]) for key in arrays if key.endswith(_SKY[0])}
+        prefixes = {key.removesuffix(_SKY_TENSORS[0]) for key in arrays if key.endswith(_SKY_TENSORS[0])}
         for prefix in sorted(prefixes):
-            names = [*_SKY, "appearance_embedding.weight"]
+            names = [*_SKY_TENSORS, "appearance_embedding.weight"]
             found = {name: arrays.get(prefix + name) for name in names}
-            if all(isinstance(found[name], np.ndarray) for name in _SKY):
+            if all(isinstance(found[name], np.ndarray) for name in _SKY_TENSORS):
                 return {
                     name: values.astype("<f4")
                     for name, values in found.items()
@@ -91,7 +93,7 @@ def sky(source: str | PathLike[str]) -> _Arrays:
 
 
 def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
-    """All mappings within others, whose keys are names."""
+    """All nested mappings, with their string keys."""
     if isinstance(value, Mapping) and depth <= 8:
         yield {key: item for key, item in value.items() if isinstance(key, str)}
         for item in value.values():
@@ -99,7 +101,7 @@ def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
 
 
 def models(source: str | PathLike[str]) -> dict[str, _Arrays]:
-    """All models of Gaussians of a checkpoint, by name, as `splats` gives one."""
+    """All models of Gaussians of a checkpoint, by name, each as `splats` returns it."""
     found: dict[str, _Arrays] = {}
     for name, arrays in _candidates(load(source), ""):
         try:
@@ -110,7 +112,7 @@ def models(source: str | PathLike[str]) -> dict[str, _Arrays]:
 
 
 def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _Arrays]]:
-    """Whatever has means, scales, quats and the rest, with the name that it is under."""
+    """All groups of arrays that have every field of Gaussians, with their path in the checkpoint."""
     if depth > 8:
         return
     if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], tuple):
@@ -123,18 +125,18 @@ def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _A
     for key, item in value.items():
         if isinstance(key, str) and isinstance(item, np.ndarray):
             prefix, _, field = key.rpartition(".")
-            known = (ours for ours, theirs in _NAMES.items() if field.lstrip("_") in theirs)
+            known = (ours for ours, theirs in _FIELD_NAMES.items() if field.lstrip("_") in theirs)
             for ours in known:
                 groups.setdefault(prefix, {})[ours] = item
         elif isinstance(key, str):
             yield from _candidates(item, key, depth + 1)
     for prefix, arrays in groups.items():
-        if _NAMES.keys() - {"shN"} <= arrays.keys():
+        if _FIELD_NAMES.keys() - {"shN"} <= arrays.keys():
             yield ".".join(part for part in (name, prefix) if part), arrays
 
 
 def _shaped(arrays: _Arrays) -> _Arrays:
-    """With gsplat's shapes, as float32; means of float64 stay so."""
+    """The arrays with gsplat's shapes, as float32. Means in float64 stay float64."""
     means = arrays["means"]
     n = len(means)
     rest = arrays.get("shN")
@@ -161,7 +163,8 @@ def _shaped(arrays: _Arrays) -> _Arrays:
 
 
 def _write_safetensors(target: str | PathLike[str], tensors: _Arrays) -> None:
-    header, offset = {}, 0
+    header = {}
+    offset = 0
     for name, values in tensors.items():
         header[name] = {
             "dtype": f"F{8 * values.itemsize}",
@@ -192,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("source", help="checkpoint of gsplat, drivestudio, splatfacto or INRIA")
     parser.add_argument("target", help="safetensors file to write")
-    parser.add_argument("--model", help="which model, where there are several")
+    parser.add_argument("--model", help="name of the model to convert, if there are several")
     chosen = parser.parse_args(arguments)
     try:
         count = convert(chosen.source, chosen.target, chosen.model)

@@ -1,4 +1,4 @@
-"""What can go wrong between a client and its server. Every exception is a `WildCityError`."""
+"""Exceptions of this package. All derive from `WildCityError`."""
 
 from __future__ import annotations
 
@@ -42,37 +42,37 @@ Code = Literal[
     "push_refused",
     "internal",
 ]
-"""The closed list of refusals; `protocol/README.md` says what each means and what to do."""
+"""The closed list of error codes. `protocol/README.md` explains each one and what to do."""
 
 
 class WildCityError(Exception):
-    """Any failure of this package."""
+    """Base class of all exceptions of this package."""
 
 
 class ConnectFailed(WildCityError):
-    """There is no connection to be had."""
+    """The client could not connect to the server."""
 
 
 class Disconnected(WildCityError):
-    """The connection is gone; `resume` may continue the session."""
+    """The connection was lost. `Session.resume` may continue the session."""
 
 
 class TimedOut(WildCityError):
-    """No answer in time. The connection was given up; `resume` may continue the session."""
+    """No answer came in time, and the client closed the connection. `Session.resume` may continue the session."""
 
 
 class ProtocolError(WildCityError):
-    """The server answered what the protocol does not allow; the connection was given up."""
+    """The server sent an answer that the protocol does not permit, and the client closed the connection."""
 
 
 class BadFrame(ProtocolError):
-    """A binary frame is not an observation, or an image in it cannot be decoded."""
+    """A binary frame is not a valid observation, or an image in it cannot be decoded."""
 
 
 class Refused(WildCityError):
-    """The server refused the request. Nothing changed, and it can be sent again.
+    """The server refused the request. Nothing changed, and the request can be sent again.
 
-    Unless `fatal`: then the connection ended with it.
+    `field` names the field at fault, if one field is. If `fatal`, the server also closed the connection.
     """
 
     def __init__(self, code: Code, message: str, field: str | None, fatal: bool) -> None:
@@ -84,10 +84,10 @@ class Refused(WildCityError):
 
 
 class PushFailed(WildCityError):
-    """A push was refused, or the server could not do it. Nothing changed.
+    """A push was refused, or the server failed to carry it out. Nothing changed.
 
-    `code` is `conflict` if others changed the same `cells`, and `push_refused` if the scene cannot be
-    used; `report` then says what was found.
+    `code` is `conflict` if other pushes changed the same `cells`, and `push_refused` if the scene is invalid.
+    `report` then has what the server found in the files.
     """
 
     def __init__(

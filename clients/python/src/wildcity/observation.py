@@ -1,4 +1,4 @@
-"""The binary frame: safetensors layout, read in place."""
+"""Decodes the binary frame, which has safetensors layout. Arrays are views of it, without a copy."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from .errors import BadFrame, ProtocolError
 from .protocol import Ego, ImageInfo, Metadata, decode, parse_json
 
 HEADER_BYTES = 1 << 20
-"""Largest header accepted: 256 images take a quarter of it."""
+"""Largest header that is accepted: 256 images take a quarter of it."""
 
 HISTORY_POSES = 16
 DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("u1"), "F32": np.dtype("<f4")}
 
 
 class Observation:
-    """What the ego sees. Arrays are read-only views of the frame; images are decoded when read.
+    """What the ego sees at one time. Arrays are read-only views of the frame; JPEG and PNG are decoded on demand.
 
-    `images["front"]` is uint8 [height, width, 3]; `depth` (metres) and `opacity` are float32
-    [height, width], where asked for. Depth is camera z, or distance for lenses that may see 90° and
-    more: fisheye and f-theta. All are those of the first pose; after an `observe` of several poses,
-    `views` has them all.
+    `images["front"]` is uint8 [height, width, 3]. `depth` (metres) and `opacity` are float32 [height, width],
+    if the session asked for them. Depth is camera z, or distance for the lenses that can see 90° and more:
+    fisheye and f-theta. After an `observe` of several poses these are the images of the first pose, and `views`
+    has all of them.
+
+    Raises `BadFrame` if the frame is not a valid observation.
     """
 
     def __init__(self, frame: bytes) -> None:
@@ -48,32 +50,32 @@ class Observation:
 
     @property
     def ego(self) -> Ego:
-        """The ego at this time."""
+        """State of the ego at this time."""
         return self.metadata.ego
 
     @property
     def history_xyz(self) -> NDArray[np.float32]:
-        """[16, 3]: past positions in metres in the rig frame of now, 0.1 s apart, last zero."""
+        """float32 [16, 3]: past positions in metres in the current rig frame, 0.1 s apart, the last one zero."""
         return self.tensor("ego.history_xyz")
 
     @property
     def history_rot(self) -> NDArray[np.float32]:
-        """[16, 3, 3]: past rotations, rig(now) from rig(then), the last one identity."""
+        """float32 [16, 3, 3]: past rotations, rig(now) from rig(then), the last one the identity."""
         return self.tensor("ego.history_rot")
 
     @property
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
-        """Colour images by camera."""
+        """Colour images by camera, uint8 [height, width, 3]."""
         return self.views[0].images
 
     @property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
-        """Expected camera z (distance for fisheye and f-theta) by camera, in metres, 0 where opacity is 0."""
+        """Camera z (distance for fisheye and f-theta) by camera, in metres, 0 where the opacity is 0."""
         return self.views[0].depth
 
     @property
     def opacity(self) -> Mapping[str, NDArray[np.float32]]:
-        """Accumulated opacity by camera."""
+        """Accumulated opacity by camera, 0 to 1."""
         return self.views[0].opacity
 
     @property
@@ -84,8 +86,8 @@ class Observation:
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
-        As many as `Outputs.frames` asked for, fewer at an episode's start. `frame_infos` says when
-        each was taken.
+        They are as many as `Outputs.frames` asked for, and fewer at the start of an episode. `frame_infos` has
+        their times. Raises `KeyError` if there are none.
         """
         frames = [_decode_image(self, image) for image in self.frame_infos(camera)]
         if not frames:
@@ -93,20 +95,20 @@ class Observation:
         return np.stack(frames)
 
     def frame_infos(self, camera: str) -> tuple[ImageInfo, ...]:
-        """What is known of each of `frames`: index of the camera, times, hash."""
+        """Metadata of each of `frames`: index of the camera, times, hash."""
         every = (*self.metadata.images, *self.metadata.history)
         infos = (image for image in every if image.camera == camera and image.pose == 0)
         return tuple(sorted(infos, key=lambda image: -image.back))
 
     def tensor(self, name: str) -> NDArray[Any]:
-        """A tensor of the frame as it came, without a copy."""
+        """A tensor of the frame by name, without a copy. Raises `KeyError` if there is none."""
         tensor = self._tensors[name]
         count = math.prod(tensor.shape)
         array = np.frombuffer(self.frame, tensor.dtype, count, tensor.start)
         return array.reshape(tensor.shape)
 
     def encoded(self, image: ImageInfo) -> memoryview:
-        """The bytes of an image as it travelled: a JPEG or PNG file, or raw pixels."""
+        """The bytes of an image as received: a JPEG or PNG file, or raw pixels."""
         tensor = self._tensors[image.tensor]
         return memoryview(self.frame)[tensor.start : tensor.start + math.prod(tensor.shape)]
 
@@ -129,7 +131,7 @@ class Observation:
                     self._expect(_sibling(image, output), "F32", shape)
 
     def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
-        """`shape` None: any number of bytes."""
+        """Checks type and shape of a tensor; with `shape` None, any one-dimensional one."""
         if name not in self._tensors:
             raise BadFrame(f"there is no tensor {name!r}")
         tensor = self._tensors[name]
@@ -142,7 +144,7 @@ class Observation:
 
 
 class View:
-    """The images from one pose."""
+    """The images of one pose."""
 
     def __init__(self, observation: Observation, pose: int) -> None:
         self._observation = observation
@@ -150,13 +152,13 @@ class View:
 
     @property
     def cameras(self) -> Mapping[str, ImageInfo]:
-        """Size, intrinsics, times and hash of each image, in order."""
+        """Metadata of each image by camera, in order: size, intrinsics, times and hash."""
         return self._infos
 
     @cached_property
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
-        """uint8 [height, width, 3] by camera; JPEG and PNG are decoded when read, and kept."""
-        return _Lazy(self._infos, lambda image: _decode_image(self._observation, image))
+        """uint8 [height, width, 3] by camera. JPEG and PNG are decoded at the first access, and kept."""
+        return _LazyArrays(self._infos, lambda image: _decode_image(self._observation, image))
 
     @cached_property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
@@ -165,27 +167,28 @@ class View:
 
     @cached_property
     def opacity(self) -> Mapping[str, NDArray[np.float32]]:
-        """float32 [height, width] by camera: accumulated opacity, where asked for."""
+        """float32 [height, width] by camera: accumulated opacity, if the session asked for it."""
         return self._floats("opacity")
 
     @cached_property
     def normals(self) -> Mapping[str, NDArray[np.float32]]:
-        """float32 [height, width, 3] by camera: unit normals of what is seen, where asked for."""
+        """float32 [height, width, 3] by camera: unit normals of the visible surface, if the session asked for them."""
         return self._floats("normals")
 
     def _floats(self, output: str) -> Mapping[str, NDArray[np.float32]]:
         tensors = self._observation._tensors
-        there = {name: i for name, i in self._infos.items() if _sibling(i, output) in tensors}
-        return _Lazy(there, lambda image: self._observation.tensor(_sibling(image, output)))
+        present = {name: i for name, i in self._infos.items() if _sibling(i, output) in tensors}
+        return _LazyArrays(present, lambda image: self._observation.tensor(_sibling(image, output)))
 
 
-class _Lazy(Mapping[str, NDArray[Any]]):
-    """Arrays by camera, made when first read."""
+class _LazyArrays(Mapping[str, NDArray[Any]]):
+    """Arrays by camera, made at the first access."""
 
     def __init__(
         self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]]
     ) -> None:
-        self._infos, self._make = infos, make
+        self._infos = infos
+        self._make = make
         self._made: dict[str, NDArray[Any]] = {}
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -205,11 +208,11 @@ class _Tensor:
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     start: int
-    """Where its bytes begin in the frame."""
+    """Offset of its first byte in the frame."""
 
 
 def _sibling(image: ImageInfo, output: str) -> str:
-    """`camera/front/rgb` and `depth` give `camera/front/depth`."""
+    """Name of another tensor of an image: `camera/front/rgb` and `depth` give `camera/front/depth`."""
     return image.tensor.removesuffix("rgb") + output
 
 
@@ -219,7 +222,7 @@ def _decode_image(observation: Observation, image: ImageInfo) -> NDArray[np.uint
     file = BytesIO(observation.encoded(image))
     try:
         with Image.open(file, formats=[image.encoding.upper()]) as opened:
-            # Checked before decoding, so that a small file cannot ask for a large buffer.
+            # Checked before decoding, so that a small file cannot cause a large allocation.
             if opened.size != (image.width, image.height):
                 raise BadFrame(
                     f"{image.tensor!r} is {opened.width}x{opened.height} px; "
@@ -243,7 +246,7 @@ def _read_layout(frame: bytes) -> tuple[dict[str, _Tensor], str]:
             f"after it, and at most {HEADER_BYTES} are accepted"
         )
     try:
-        # Decoded here, as `json` would guess at other encodings than UTF-8.
+        # Decoded here, because `json` would accept other encodings than UTF-8.
         header = parse_json(frame[8 : 8 + header_bytes].decode(), "the header")
     except (ProtocolError, UnicodeDecodeError) as error:
         raise BadFrame(f"the header cannot be read: {error}") from error
@@ -258,7 +261,8 @@ def _read_layout(frame: bytes) -> tuple[dict[str, _Tensor], str]:
 
 def _read_table(header: dict[str, Any], data_start: int, frame_bytes: int) -> dict[str, _Tensor]:
     rows = [(_offsets(name, info), name, info) for name, info in header.items()]
-    tensors, end = {}, 0
+    tensors = {}
+    end = 0
     for (start, stop), name, info in sorted(rows, key=lambda row: row[0]):
         if start != end:
             raise BadFrame(f"tensor {name!r} has offset {start}, the one before it ends at {end}")
@@ -266,7 +270,8 @@ def _read_table(header: dict[str, Any], data_start: int, frame_bytes: int) -> di
         wanted = math.prod(tensor.shape) * tensor.dtype.itemsize
         if stop - start != wanted:
             raise BadFrame(f"tensor {name!r} has {stop - start} bytes; its shape asks for {wanted}")
-        tensors[name], end = tensor, stop
+        tensors[name] = tensor
+        end = stop
     if data_start + end != frame_bytes:
         raise BadFrame(
             f"the tensors end at offset {end}, the frame at {frame_bytes - data_start}"
@@ -296,5 +301,5 @@ def _dtype(name: str, info: dict[str, Any]) -> np.dtype[Any]:
 
 
 def _are_counts(values: Any) -> TypeGuard[list[int]]:
-    """Whether a list of whole numbers from zero; True and False are none."""
+    """Whether a list of integers that are not negative. True and False are not integers here."""
     return isinstance(values, list) and all(type(v) is int and v >= 0 for v in values)

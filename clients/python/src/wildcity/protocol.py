@@ -1,4 +1,7 @@
-"""The types of the wire, and their way to and from JSON. Names are those on the wire."""
+"""The messages of the protocol as dataclasses, and their conversion to and from JSON.
+
+The names of the fields are those of the protocol; `protocol/README.md` explains all of them.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ PROTOCOL = "wildcity.v1"
 """The WebSocket subprotocol."""
 
 OBSERVATION_BYTES = 3 << 29
-"""Largest message accepted from a server."""
+"""Largest message that is accepted from a server, in bytes."""
 
 Encoding = Literal["jpeg", "png", "raw"]
 Vector = tuple[float, float, float]
@@ -34,7 +37,7 @@ class Pose:
     q: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        # Accepts lists and arrays; what is stored is plain floats, as many as there must be.
+        # Accepts lists and arrays, and stores tuples of floats.
         for name, count in (("xyz", 3), ("q", 4)):
             values = tuple(float(value) for value in getattr(self, name))
             if len(values) != count:
@@ -47,7 +50,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class TimedPose:
-    """A pose of a trajectory: the rig `time_us` after the step's start, in its frame there."""
+    """A pose of a planned trajectory, `time_us` after the start of the step, in the rig frame at that start."""
 
     time_us: int
     pose: Pose
@@ -55,14 +58,14 @@ class TimedPose:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the ego is to be next: 1 to 64 poses in order of time, to the step's end or beyond."""
+    """Planned poses of the ego: 1 to 64 in order of time, up to the end of the step or later."""
 
     poses: tuple[TimedPose, ...]
 
 
 @dataclass(frozen=True)
 class Action:
-    """Acceleration along the car (m/s²) and curvature of its way (1/m, to the left), for one step."""
+    """Longitudinal acceleration (m/s²) and curvature of the path (1/m, positive to the left) during one step."""
 
     acceleration: float
     curvature: float
@@ -73,7 +76,7 @@ Model = Literal["teleport", "kinematic", "dynamic"]
 
 @dataclass(frozen=True)
 class Dynamics:
-    """How the ego moves: its model, its speed (m/s) at the start, and whether braking ends in reverse."""
+    """How the ego moves: its motion model, its speed (m/s) at the start, and whether it can drive backwards."""
 
     model: Model
     speed: float = 0.0
@@ -82,7 +85,7 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class Station:
-    """A place along a recorded trajectory, `station_m` metres from its start."""
+    """A start along a recorded trajectory, `station_m` metres from the trajectory's start."""
 
     trajectory: str
     station_m: float = 0.0
@@ -90,10 +93,10 @@ class Station:
 
 @dataclass(frozen=True)
 class Lens:
-    """How a lens maps rays to pixels, where it is no pinhole; each model has its own fields.
+    """A lens model other than the pinhole. Each model has its own fields; the others are None.
 
-    `opencv`: k (6), p (2), s (4). `fisheye`: k (4), max_angle or none. `ftheta`: reference, polynomial
-    (6), linear_cde (3), max_angle. Angles are in radians off the axis.
+    `opencv`: k (6), p (2), s (4). `fisheye`: k (4), and optionally max_angle. `ftheta`: reference, polynomial
+    (6), linear_cde (3), max_angle. `max_angle` is in radians off the axis.
     """
 
     model: Literal["opencv", "fisheye", "ftheta"]
@@ -108,7 +111,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Windshield:
-    """What turns rays before the lens: polynomials of the angles to the right and downwards."""
+    """A windshield, which refracts rays in front of the lens: polynomials of the angles to the right and downwards."""
 
     reference: Literal["forward", "backward"]
     horizontal: tuple[float, ...]
@@ -117,7 +120,7 @@ class Windshield:
 
 @dataclass(frozen=True)
 class Shutter:
-    """A shutter that exposes rows, or columns, one after the other."""
+    """A rolling shutter, which exposes rows, or columns, one after the other."""
 
     direction: Literal["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
     duration_us: int
@@ -125,7 +128,7 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a camera makes of colours: matrix @ rgb + offset, or gain * rgb + offset."""
+    """Colour correction of a camera: matrix @ rgb + offset, or gain * rgb + offset."""
 
     matrix: tuple[tuple[float, ...], ...] | None = None
     gain: tuple[float, float, float] | None = None
@@ -133,18 +136,17 @@ class Exposure:
 
 
 def png_data_uri(png: bytes) -> str:
-    """A PNG file as `Camera.overlay` has it."""
+    """The bytes of a PNG file as a data URI, for `Camera.overlay`."""
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera on the vehicle, a pinhole unless it has a lens; sizes and intrinsics in pixels.
+    """A camera on the vehicle: a pinhole unless it has a lens. Sizes and intrinsics are in pixels.
 
-    `camera_to_rig` takes camera coordinates (x right, y down, z forward) to the rig's. An f-theta lens
-    has its focal lengths from its polynomial: leave fx and fy None there. `overlay` is what the camera
-    sees of its own car: `png_data_uri(bytes)` of a PNG with opacity, of the image's size; answers leave
-    it out.
+    `camera_to_rig` transforms camera coordinates (x right, y down, z forward) to the rig frame. The polynomial of
+    an f-theta lens determines its focal lengths: leave fx and fy None there. `overlay` is the part of the own
+    car that the camera sees: `png_data_uri(bytes)` of a PNG with opacity, of the image's size. Answers omit it.
     """
 
     name: str
@@ -164,7 +166,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a vehicle, in the order in which images are answered."""
+    """The cameras of a vehicle, in the order of the images in observations."""
 
     name: str
     cameras: tuple[Camera, ...]
@@ -172,7 +174,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class ImagePart:
-    """What is sent of a camera's image: crop is (left, top, width, height), size (width, height)."""
+    """Crop (left, top, width, height) and size (width, height) of a camera's image, in pixels."""
 
     crop: tuple[int, int, int, int] | None = None
     size: tuple[int, int] | None = None
@@ -180,11 +182,11 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What each observation holds: which cameras (all if absent), how encoded, with what.
+    """What each observation holds: the cameras (all if None), their encoding, and additional tensors.
 
-    `images` are other parts and sizes than the rig's, by the camera's name.
-    `frames` is how many last frames of each camera, 1 if absent; `period_us` is the time between two
-    frames of a camera that does not take one with every step; `trust` says how far each image may be believed.
+    `images` has crops and sizes that differ from the rig's, by camera name. `frames` is the number of last frames
+    of each camera, 1 if None. `period_us` is the time between two frames of a camera, by name, for cameras that do
+    not take one with every step. `trust` adds a confidence to each image.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -209,7 +211,7 @@ class ServerInfo:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the server accepts."""
+    """Limits of the server."""
 
     message_bytes: int
     observe_poses: int
@@ -243,7 +245,7 @@ class TwinInfo:
 
 @dataclass(frozen=True)
 class Welcome:
-    """Answer to hello: who the server is and what it offers."""
+    """Answer to `hello`: name, limits and twins of the server."""
 
     seq: int
     protocol: str
@@ -255,7 +257,7 @@ class Welcome:
 
 @dataclass(frozen=True)
 class Opened:
-    """Answer to open: everything resolved, nothing implicit."""
+    """Answer to `open`: every setting of the session, defaults included."""
 
     seq: int
     session: str
@@ -280,7 +282,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Resumed:
-    """Answer to resume: where the session stands."""
+    """Answer to `resume`: the state of the session."""
 
     seq: int
     session: str
@@ -291,7 +293,7 @@ class Resumed:
 
 @dataclass(frozen=True)
 class Switched:
-    """Answer to switch_version: what the session sees from now on."""
+    """Answer to `switch_version`: the version that the session shows from the next step on."""
 
     seq: int
     version: int
@@ -302,7 +304,7 @@ class Switched:
 
 @dataclass(frozen=True)
 class Summary:
-    """How an episode went."""
+    """Summary of an episode."""
 
     outcome: Literal[
         "completed", "off_model", "agent_error", "agent_timeout", "agent_lost", "server_error"
@@ -315,14 +317,14 @@ class Summary:
 
 @dataclass(frozen=True)
 class Ok:
-    """Answer to prefetch."""
+    """Answer to `prefetch`."""
 
     seq: int
 
 
 @dataclass(frozen=True)
 class Closed:
-    """Answer to close."""
+    """Answer to `close`."""
 
     seq: int
     summary: Summary
@@ -330,7 +332,7 @@ class Closed:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Answer to any request that was refused; `Refused` is raised from it."""
+    """Answer to a refused request. The client raises `Refused` from it."""
 
     code: Code
     message: str
@@ -341,11 +343,11 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Ego:
-    """The ego vehicle: `world_from_rig`, velocity (m/s) and acceleration (m/s²) in world axes.
+    """State of the ego: `world_from_rig`, velocity (m/s) and acceleration (m/s²) in world axes.
 
-    `yaw_rate` is in rad/s, `steering` the angle of the front wheels in radians, both to the left; an ego that
-    teleports has no wheels. The last `history_count` poses of the history were driven; earlier ones repeat the
-    start.
+    `yaw_rate` (rad/s) and `steering`, the angle of the front wheels (radians), are positive to the left. An ego that
+    teleports has no `steering`. The last `history_count` poses of the history were driven; earlier ones repeat
+    the start.
     """
 
     pose: Pose
@@ -358,10 +360,11 @@ class Ego:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far an image may be believed: `value` is 1 as recorded, 0 where nothing is known.
+    """Confidence in an image: `value` is 1 at a recorded pose, 0 where nothing is known.
 
-    Its parts: metres and radians to the nearest recorded keyframe; of what looks down, the shares of pixels
-    with less than half opacity and of rays that meet nothing of the twin.
+    It is computed from the others: distance (metres) and angle (radians) to the nearest recorded keyframe, and,
+    among the pixels that look down at the ground, the fraction with an opacity below one half and the fraction
+    of rays that meet nothing of the twin.
     """
 
     value: float
@@ -373,11 +376,11 @@ class Trust:
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """One image: its camera, the request's pose it shows, size, intrinsics, times, hash.
+    """Metadata of one image: its camera, the index of the request's pose, size, intrinsics, times, hash.
 
-    `tensor` names its colour in the frame; `hash` is BLAKE3 of its pixels before encoding. `back` counts
-    frames of this camera back from the newest, which is 0. `seen` is the share of it that the lens sees,
-    where that is not all: the rest is 0.
+    `tensor` is the name of its colour tensor, and `hash` is BLAKE3 of its pixels before encoding. `back` counts the
+    frames of this camera back from the newest, which is 0. `seen` is the fraction of the image that the lens sees,
+    if that is not all of it; the rest is 0.
     """
 
     camera: str
@@ -412,7 +415,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Timings:
-    """What an observation cost, in milliseconds."""
+    """Wall time that an observation took, in milliseconds."""
 
     queue_ms: float
     render_ms: float
@@ -422,7 +425,7 @@ class Timings:
 
 @dataclass(frozen=True)
 class Residency:
-    """The server's memory: what Gaussians take in it and may take, and what had to be waited for."""
+    """Memory of the server: bytes that Gaussians take and may take, and how long the request waited for loading."""
 
     held_bytes: int
     limit_bytes: int
@@ -432,7 +435,7 @@ class Residency:
 
 @dataclass(frozen=True)
 class Metadata:
-    """What an observation says beside its tensors."""
+    """Everything that an observation holds beside its tensors."""
 
     seq: int
     step: int
@@ -465,15 +468,15 @@ ANSWERS: dict[str, type[Any]] = {
 
 
 def parse_json(text: str | bytes, what: str) -> Any:
-    """JSON without the extensions that Python's reader allows."""
+    """Parses JSON without the extensions that Python's parser accepts. `what` names it in errors."""
     try:
-        return json.loads(text, parse_constant=_no_constant)
+        return json.loads(text, parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
         raise ProtocolError(f"{what} is not JSON: {error}") from error
 
 
 def decode_answer(text: str) -> Any:
-    """A text frame from the server, as one of `ANSWERS`."""
+    """Decodes a text frame from the server as one of `ANSWERS`."""
     value = parse_json(text, "an answer")
     kind = value.get("type") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in ANSWERS:
@@ -482,7 +485,7 @@ def decode_answer(text: str) -> Any:
 
 
 def encode(value: Any) -> Any:
-    """A dataclass as what `json` writes; what is None is left out."""
+    """Converts a dataclass to what `json` can write. Fields that are None are left out."""
     if dataclasses.is_dataclass(value):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         return {name: encode(item) for name, item in fields.items() if item is not None}
@@ -494,9 +497,9 @@ def encode(value: Any) -> Any:
 
 
 def decode(kind: Any, value: Any, path: str) -> Any:
-    """JSON as the type it must be; a mismatch names the path, as `opened.cameras[0].fx`.
+    """Converts JSON to the type `kind`. An error names the path, for example `opened.cameras[0].fx`.
 
-    Unknown fields are ignored: a server may say more than this client knows.
+    Unknown fields are ignored, because a newer server may send more fields than this client knows.
     """
     if kind is Any:
         return value
@@ -512,7 +515,7 @@ def decode(kind: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(kind):
         return _decode_dataclass(typing.cast(type[Any], kind), value, path)
     if kind is float:
-        # Python's reader turns 1e999 into infinity, which is no JSON number.
+        # Python's parser turns 1e999 into infinity, which is not a JSON number.
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not math.isfinite(value):
             return _mismatch(path, value, "a finite number")
@@ -549,5 +552,5 @@ def _mismatch(path: str, value: Any, expected: str) -> NoReturn:
     raise ProtocolError(f"{path} is {str(value)[:100]!r}; expected {expected}")
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
+def _reject_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a JSON number")

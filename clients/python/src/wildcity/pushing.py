@@ -1,4 +1,4 @@
-"""Pushing trained scenes to a server, as a new version of a twin."""
+"""Pushes trained scenes to a server as new versions of a twin."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from typing import Any, BinaryIO, Literal
 from .errors import Code, ConnectFailed, ProtocolError, PushFailed, Refused
 
 CHUNK_BYTES = 1 << 20
-"""Bytes of a file that are read at once."""
-TRIES = 6
-"""How often a lost connection is tried again without a byte getting through."""
-POLL_S = 0.1
-"""How often the server is asked how it stands with a push."""
+"""Bytes of a file that are read at a time."""
+ATTEMPTS = 6
+"""How many attempts in a row may fail without transferring a byte."""
+RETRY_DELAY_S = 0.2
+"""Delay before the first repetition of a failed attempt; it doubles with each further one."""
+POLL_INTERVAL_S = 0.1
+"""How often the client asks for the state of a push."""
 
 State = Literal[
     "uploading",
@@ -39,7 +41,7 @@ State = Literal[
 
 @dataclass(frozen=True)
 class PushProgress:
-    """How far a push is: `done` of `total` within its state (bytes, Gaussians or views)."""
+    """Progress of a push: `done` of `total` items within its state (bytes, Gaussians or views)."""
 
     state: State
     done: int
@@ -48,7 +50,7 @@ class PushProgress:
 
 @dataclass(frozen=True)
 class Push:
-    """A push that is ready: the version that it made, and what was found in its files."""
+    """A finished push: the new version, and what the server found in the files."""
 
     id: str
     twin: str
@@ -76,50 +78,62 @@ def push(
     progress: Callable[[PushProgress], None] | None = None,
     timeout: float = 60.0,
 ) -> Push:
-    """Uploads scene files and makes them the next version of a twin; returns when it is ready.
+    """Uploads scene files, makes them the next version of a twin, and returns when that version is ready.
 
-    The files become one scene. It replaces the 64 m cells that its Gaussians lie in, or `cells`, or all.
-    With `base`, the version it was trained from, cells that changed since are not overwritten. An upload
-    that was cut goes on where it stopped. `token` is `$WILDCITY_TOKEN` unless given. The same `push_id`
-    again is the same push.
+    files: one or more files, which are merged into one scene.
+    twin: name of the twin; it is created if it does not exist.
+    server: `http://HOST:PORT` or `https://HOST:PORT`.
+    token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
+    axes, scale: axis convention and metres per unit of the files, as in `wildcity import`.
+    cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
+    base: the version that the scene was trained from; cells that changed since then are not overwritten.
+    record, levels, profile, note: storage format, levels of detail, changes of the render profile as
+        `["near=0.2"]`, and a description for people.
+    min_psnr_db: refuse the push if a view along the twin's trajectory has a lower PSNR than this, in dB.
+    push_id: id of the push; sending the same id again does not make a second version.
+    progress: is called with every change of the progress.
+    timeout: how long one HTTP answer may take, in seconds.
 
-    Raises `PushFailed` if the scene was refused, `Refused` if a request was, `ConnectFailed` if the
+    An interrupted upload continues where it stopped.
+
+    Raises `PushFailed` if the scene is refused, `Refused` if a request is refused, and `ConnectFailed` if the
     server does not answer.
     """
     paths = [files] if isinstance(files, (str, os.PathLike)) else list(files)
-    wire = _Wire(server, token, timeout)
-    told = progress or (lambda _: None)
-    asked: dict[str, Any] = {
+    http_client = _HttpClient(server, token, timeout)
+    report = progress or (lambda _: None)
+    request: dict[str, Any] = {
         "id": push_id or uuid.uuid4().hex,
         "files": [
-            {"upload": _upload(wire, Path(path), told), "axes": axes, "scale": scale}
+            {"upload": _upload(http_client, Path(path), report), "axes": axes, "scale": scale}
             for path in paths
         ],
         "levels": levels,
         "profile": list(profile),
     }
     if min_psnr_db is not None:
-        asked["golden"] = {"min_psnr_db": min_psnr_db}
+        request["golden"] = {"min_psnr_db": min_psnr_db}
     cells = cells if cells is None or isinstance(cells, str) else [(x, y) for x, y in cells]
     optional = {"cells": cells, "base": base, "record": record, "note": note}
-    asked |= {name: value for name, value in optional.items() if value is not None}
-    at = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
-    # Asked again under the same id if the answer is lost: carried out once.
-    answer, again = wire.patiently("POST", at, asked), 0
+    request |= {name: value for name, value in optional.items() if value is not None}
+    path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
+    # The request has an id, so the server carries it out once even if it is repeated after a lost answer.
+    answer = http_client.json_with_retries("POST", path, request)
+    repetitions = 0
     while True:
-        done, total = answer["progress"]["done"], answer["progress"]["total"]
-        told(PushProgress(answer["state"], done, total))
+        counts = answer["progress"]
+        report(PushProgress(answer["state"], counts["done"], counts["total"]))
         if answer["state"] in ("ready", "refused", "failed"):
-            return _ended(answer)
-        time.sleep(POLL_S)
+            return _finished_push(answer)
+        time.sleep(POLL_INTERVAL_S)
         try:
-            answer = wire.patiently("GET", f"{at}/{answer['id']}", None)
+            answer = http_client.json_with_retries("GET", f"{path}/{answer['id']}", None)
         except Refused as refused:
-            # The server started again, and knows no pushes from before. Its uploads are still there.
-            if refused.code != "unknown_push" or again >= TRIES:
+            # The server was restarted and does not know the push any more. The uploads are still there.
+            if refused.code != "unknown_push" or repetitions >= ATTEMPTS:
                 raise
-            again += 1
-            answer = wire.patiently("POST", at, asked)
+            repetitions += 1
+            answer = http_client.json_with_retries("POST", path, request)
 
 
 def rollback(
@@ -130,83 +144,98 @@ def rollback(
     token: str | None = None,
     timeout: float = 60.0,
 ) -> int:
-    """Makes an old version of a twin the latest again, as a new one, whose number it returns."""
-    at = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/rollback"
-    answer = _Wire(server, token, timeout).json("POST", at, {"version": version})
+    """Makes an old version of a twin the latest again, as a new version, and returns the new number.
+
+    Raises `Refused` if the server refuses, and `ConnectFailed` if it does not answer.
+    """
+    path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/rollback"
+    answer = _HttpClient(server, token, timeout).json("POST", path, {"version": version})
     return int(answer["version"])
 
 
-def _ended(answer: dict[str, Any]) -> Push:
+def _finished_push(answer: dict[str, Any]) -> Push:
+    """The push if it is ready; raises `PushFailed` if it was refused or failed."""
     if answer["state"] == "ready":
-        made = answer["version"], answer["version_hash"], answer.get("report") or {}
-        return Push(answer["id"], answer["twin"], *made)
+        return Push(
+            answer["id"],
+            answer["twin"],
+            answer["version"],
+            answer["version_hash"],
+            answer.get("report") or {},
+        )
     error = answer["error"]
     code: Code = error["code"]
     cells = tuple((x, y) for x, y in error.get("cells", ()))
     raise PushFailed(code, error["message"], cells, answer.get("report"))
 
 
-def _upload(wire: _Wire, path: Path, told: Callable[[PushProgress], None]) -> str:
-    """The id of a file's upload, with all of its bytes on the server."""
-    digest, size = hashlib.sha256(), 0
+def _upload(http_client: _HttpClient, path: Path, report: Callable[[PushProgress], None]) -> str:
+    """Uploads the bytes of a file that the server lacks, and returns the id of the upload."""
+    digest = hashlib.sha256()
+    size = 0
     with path.open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
             digest.update(chunk)
             size += len(chunk)
-        announced = {"name": path.name, "size": size, "digest": f"sha-256:{digest.hexdigest()}"}
-        tries, furthest = 0, -1
+        announcement = {"name": path.name, "size": size, "digest": f"sha-256:{digest.hexdigest()}"}
+        failures = 0
+        furthest = -1
         while True:
-            upload = wire.patiently("POST", "/v1/uploads", announced)
+            upload = http_client.json_with_retries("POST", "/v1/uploads", announcement)
             if upload["complete"]:
-                told(PushProgress("uploading", size, size))
+                report(PushProgress("uploading", size, size))
                 return str(upload["id"])
             offset = int(upload["offset"])
-            tries = 0 if offset > furthest else tries + 1
+            # An attempt that transferred something starts the count of failures again.
+            failures = 0 if offset > furthest else failures + 1
             furthest = max(furthest, offset)
-            if tries:
-                time.sleep(0.2 * 2**tries)
+            if failures:
+                time.sleep(RETRY_DELAY_S * 2**failures)
             file.seek(offset)
             headers = {"Upload-Offset": str(offset), "Content-Length": str(size - offset)}
             try:
-                body = _chunks(file, offset, size, told)
-                wire.json("PATCH", f"/v1/uploads/{upload['id']}", body, headers)
+                body = _chunks(file, offset, size, report)
+                http_client.json("PATCH", f"/v1/uploads/{upload['id']}", body, headers)
             except ConnectFailed:
-                if tries >= TRIES:
+                if failures >= ATTEMPTS:
                     raise
             except Refused as refused:
-                # Another connection of ours is further, or the server was busy.
-                if refused.code not in ("upload_offset", "busy", "timed_out") or tries >= TRIES:
+                # An earlier connection has sent more, or the server was busy.
+                if refused.code not in ("upload_offset", "busy", "timed_out") or failures >= ATTEMPTS:
                     raise
 
 
 def _chunks(
-    file: BinaryIO, offset: int, size: int, told: Callable[[PushProgress], None]
+    file: BinaryIO, offset: int, size: int, report: Callable[[PushProgress], None]
 ) -> Iterator[bytes]:
+    """The bytes of a file from `offset` on, with a report after each chunk."""
     while offset < size and (chunk := file.read(min(CHUNK_BYTES, size - offset))):
         yield chunk
         offset += len(chunk)
-        told(PushProgress("uploading", offset, size))
+        report(PushProgress("uploading", offset, size))
 
 
-class _Wire:
-    """Requests of HTTP, each on a connection of its own."""
+class _HttpClient:
+    """Sends HTTP requests, each on a connection of its own."""
 
     def __init__(self, server: str, token: str | None, timeout: float) -> None:
         parts = urllib.parse.urlsplit(server)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError(f"{server!r} is not a server; expected http://HOST:PORT")
+            raise ValueError(f"{server!r} is not a server; expected http://HOST:PORT or https://HOST:PORT")
         secure = parts.scheme == "https"
-        self._dial = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-        self._host, self._port, self._timeout = parts.hostname, parts.port, timeout
+        self._connection_type = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+        self._host = parts.hostname
+        self._port = parts.port
+        self._timeout = timeout
         self._token = token or os.environ.get("WILDCITY_TOKEN")
 
-    def patiently(self, method: str, path: str, body: Any) -> Any:
-        """As `json`, again and again while the connection is lost."""
-        for tries in range(TRIES):
+    def json_with_retries(self, method: str, path: str, body: Any) -> Any:
+        """As `json`, and repeats the request up to `ATTEMPTS` times if no answer comes."""
+        for failures in range(ATTEMPTS):
             try:
                 return self.json(method, path, body)
             except ConnectFailed:
-                time.sleep(0.2 * 2**tries)
+                time.sleep(RETRY_DELAY_S * 2**failures)
         return self.json(method, path, body)
 
     def json(
@@ -216,19 +245,20 @@ class _Wire:
         body: dict[str, Any] | Iterator[bytes] | None,
         headers: dict[str, str] | None = None,
     ) -> Any:
-        """Sends JSON or bytes, and gives the JSON that is answered."""
+        """Sends JSON or bytes, and returns the JSON of the answer."""
         sent = dict(headers or {})
         if self._token:
             sent["Authorization"] = f"Bearer {self._token}"
         content = json.dumps(body, allow_nan=False).encode() if isinstance(body, dict) else body
-        connection = self._dial(self._host, self._port, timeout=self._timeout)
+        connection = self._connection_type(self._host, self._port, timeout=self._timeout)
         try:
             connection.connect()
-            # A server that refuses a body need not read all of it: its answer says why.
+            # A server that refuses may close before it has read the whole body. Its answer says why.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 connection.request(method, path, content, sent)
             response = connection.getresponse()
-            status, text = response.status, response.read()
+            status = response.status
+            text = response.read()
         except (OSError, http.client.HTTPException) as error:
             raise ConnectFailed(f"no answer from {self._host}:{self._port}: {error}") from error
         finally:
@@ -236,9 +266,9 @@ class _Wire:
         try:
             answer = json.loads(text)
         except ValueError as error:
-            raise ProtocolError(f"HTTP {status}, and no JSON: {text[:200]!r}") from error
+            raise ProtocolError(f"the answer with HTTP status {status} is not JSON: {text[:200]!r}") from error
         if 200 <= status < 300:
             return answer
         if not isinstance(answer, dict) or "code" not in answer:
-            raise ProtocolError(f"HTTP {status}: {text[:200]!r}")
+            raise ProtocolError(f"HTTP status {status} without an error code: {text[:200]!r}")
         raise Refused(answer["code"], answer["message"], answer.get("field"), False)

@@ -11,9 +11,17 @@ from typing import TypeVar
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
-from websockets.sync.client import connect as dial
+from websockets.sync.client import connect as connect_websocket
 
-from .core import DIAL, Conversation, Exchange, Message, headers, keeps_connection, translated
+from .session_protocol import (
+    CONNECT_OPTIONS,
+    Exchange,
+    Message,
+    SessionProtocol,
+    authorization_headers,
+    can_reuse_connection,
+    translate_error,
+)
 from .errors import ConnectFailed, Disconnected, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -43,10 +51,12 @@ def connect(
     timeout: float = 90.0,
     token: str | None = None,
 ) -> Client:
-    """Connects to `ws://host:port/v1/session` and says hello.
+    """Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`.
 
-    `timeout` is how long an answer may take, in seconds; the server's own limits are shorter.
-    `token` is for a server that has tokens.
+    `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
+    limits are shorter. `token` is for a server that was started with tokens.
+
+    Raises `ConnectFailed`, or `ProtocolError` if the server speaks another protocol.
     """
     return Client(url, name=name, timeout=timeout, token=token)
 
@@ -55,12 +65,13 @@ class Client:
     """A connection to a server. Use `connect`, and close it or use it in a `with` block."""
 
     def __init__(self, url: str, *, name: str, timeout: float, token: str | None) -> None:
-        self.url, self.timeout = url, timeout
-        self._headers = headers(token)
-        self._conversation = Conversation(name)
+        self.url = url
+        self.timeout = timeout
+        self._headers = authorization_headers(token)
+        self._protocol = SessionProtocol(name)
         self._connection: ClientConnection | None = None
         self.welcome: Welcome = self._connect()
-        """What the server said to hello: its limits, its twins."""
+        """The server's answer to `hello`: its limits and its twins."""
 
     def open(
         self,
@@ -79,9 +90,12 @@ class Client:
         decision_us: int | None = None,
         warm_up_us: int | None = None,
     ) -> Session:
-        """Opens a session on a twin; what is left out is the server's or the twin's default."""
+        """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
+
+        Raises `Refused` if the server refuses.
+        """
         opened = self._run(
-            self._conversation.open(
+            self._protocol.open(
                 twin,
                 version=version,
                 session=session,
@@ -100,17 +114,18 @@ class Client:
         return Session(self, opened)
 
     def resume(self, session: str, last_seq: int) -> Session:
-        """Continues a session that another client opened and lost.
+        """Continues a session that another client opened, for example one in a process that ended.
 
-        `last_seq` is the number of the last answer that arrived there (`metadata.seq`). Only on a
-        fresh connection.
+        `last_seq` is the number of the last answer that the other client received (`metadata.seq`). Call it
+        directly after connecting.
         """
-        self._run(self._conversation.resume(session, last_seq))
+        self._run(self._protocol.resume(session, last_seq))
         return Session(self, None)
 
     def close(self) -> None:
-        """Closes the connection; an open session can be resumed for a while."""
-        connection, self._connection = self._connection, None
+        """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
+        connection = self._connection
+        self._connection = None
         if connection is not None:
             connection.close()
 
@@ -123,27 +138,28 @@ class Client:
     def _connect(self) -> Welcome:
         self.close()
         try:
-            # Entered here and closed in `close`, as it outlives any block.
-            connection = dial(self.url, additional_headers=self._headers, **DIAL).__enter__()
+            # Entered here and closed in `close`, because it outlives any block.
+            connection = connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS).__enter__()
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
         self._connection = connection
         if connection.subprotocol != PROTOCOL:
             self.close()
             raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
-        return self._run(self._conversation.hello())
+        return self._run(self._protocol.hello())
 
     def _reconnect(self) -> Resumed:
         self.welcome = self._connect()
-        return self._run(self._conversation.resume_own())
+        return self._run(self._protocol.resume_own())
 
     def _run(self, exchange: Exchange[T]) -> T:
-        # ValueError here, before anything is sent, changes nothing.
+        # May raise ValueError. Nothing has been sent or changed then.
         request = next(exchange)
-        # Taken away while a call runs: a second one at the same time is a mistake, not a queue.
-        connection, self._connection = self._connection, None
+        # The connection is taken away during a call, so a second call at the same time fails.
+        connection = self._connection
+        self._connection = None
         if connection is None:
-            raise Disconnected("there is no connection, or a call is under way on it")
+            raise Disconnected("there is no connection, or another call is under way on it")
         keep = False
         try:
             exchange.send(self._answer(connection, request))
@@ -152,8 +168,8 @@ class Client:
             result: T = done.value
             return result
         except BaseException as error:
-            keep = keeps_connection(error)
-            failure = translated(error, self.timeout)
+            keep = can_reuse_connection(error)
+            failure = translate_error(error, self.timeout)
             if failure is None:
                 raise
             raise failure from error
@@ -162,14 +178,13 @@ class Client:
                 self._connection = connection
             else:
                 connection.close()
-        raise AssertionError("an exchange is one message each way")
-
+        raise AssertionError("an exchange is one message in each direction")
 
     def _answer(self, connection: ClientConnection, request: str) -> Message:
         deadline = time.monotonic() + self.timeout
-        # Sending has no time-out of its own: a server that does not read would hold it for ever.
-        hang_up = threading.Timer(self.timeout, connection.socket.shutdown, (socket.SHUT_RDWR,))
-        hang_up.start()
+        # `send` has no time-out: it would block forever on a server that does not read.
+        shutdown_timer = threading.Timer(self.timeout, connection.socket.shutdown, (socket.SHUT_RDWR,))
+        shutdown_timer.start()
         try:
             connection.send(request)
         except ConnectionClosed as error:
@@ -177,59 +192,60 @@ class Client:
                 raise TimeoutError from error
             raise
         finally:
-            hang_up.cancel()
+            shutdown_timer.cancel()
         return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
 
 
 class Session:
-    """An open session. Closed at the end of a `with` block, if its connection still stands."""
+    """An open session. A `with` block closes it at its end, if the connection is still open."""
 
     def __init__(self, client: Client, opened: Opened | None) -> None:
         self._client = client
-        self._conversation = client._conversation
+        self._protocol = client._protocol
         self._opened = opened
 
     @property
     def opened(self) -> Opened:
-        """What the server resolved: cameras, start, hashes. Not known after `Client.resume`."""
+        """All settings of the session: cameras, start, hashes. Not available after `Client.resume`."""
         if self._opened is None:
-            raise WildCityError("this session was opened by another client")
+            raise WildCityError("another client opened this session, so its settings are not known here")
         return self._opened
 
     def step(
         self, movement: Pose | Trajectory | Action, *, terminate: bool = False
     ) -> Observation:
-        """Moves the ego; `terminate` ends the episode with it.
+        """Moves the ego, advances the simulated time by one step, and returns the observation there.
 
-        To its next `world_from_rig`, if it teleports; by an action, if it is a car; along a trajectory in either case.
+        A `Pose` is the next `world_from_rig` of an ego that teleports, an `Action` moves a car, and a `Trajectory`
+        moves both. `terminate` ends the episode with this step.
         """
-        return self._client._run(self._conversation.step(movement, terminate))
+        return self._client._run(self._protocol.step(movement, terminate))
 
     def observe(self, poses: Sequence[Pose]) -> Observation:
-        """What would be seen from poses, without moving: one view for each."""
-        return self._client._run(self._conversation.observe(poses))
+        """Renders images from poses without moving the ego: `views[k]` of the observation shows `poses[k]`."""
+        return self._client._run(self._protocol.observe(poses))
 
     def prefetch(self, poses: Sequence[Pose]) -> None:
-        """Has loaded what is seen from poses, in the order of the way. Does not wait for it."""
-        return self._client._run(self._conversation.prefetch(poses))
+        """Asks the server to load what is visible from poses, in driving order. Does not wait for it."""
+        return self._client._run(self._protocol.prefetch(poses))
 
     def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
-        """Starts a new episode, at the session's start if none is given."""
-        return self._client._run(self._conversation.reset(seed, start))
+        """Starts a new episode at `start`, or at the session's start if it is None."""
+        return self._client._run(self._protocol.reset(seed, start))
 
     def switch_version(self, version: int | None = None) -> Switched:
-        """Sees another version of the twin from the next step on, or the latest; the episode goes on."""
-        return self._client._run(self._conversation.switch_version(version))
+        """Shows another version of the twin from the next step on, or the latest. The episode continues."""
+        return self._client._run(self._protocol.switch_version(version))
 
     def close(self) -> Summary:
-        """Ends the session; another can be opened on the same client."""
-        return self._client._run(self._conversation.close())
+        """Ends the session. Another one can be opened on the same client."""
+        return self._client._run(self._protocol.close())
 
     def resume(self) -> Resumed:
         """Connects again after `Disconnected` or `TimedOut`, and continues the session.
 
-        Then repeat the call that failed: it keeps its number, so it is carried out once, and if it
-        was carried out already its answer comes again.
+        Then repeat the call that failed. It keeps its number, so the server carries it out only once: if it
+        already did, it sends the same answer again.
         """
         return self._client._reconnect()
 
@@ -242,11 +258,11 @@ class Session:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._client._connection is None or self._conversation.session is None:
+        if self._client._connection is None or self._protocol.session is None:
             return
         try:
             self.close()
         except WildCityError:
-            # The error that ended the block says more than the one that followed it.
+            # The error that ended the block is more informative than the one of closing.
             if error is None:
                 raise

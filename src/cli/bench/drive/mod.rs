@@ -1,6 +1,7 @@
 //! `wildcity bench drive`.
 
 mod report;
+mod step;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,16 +22,17 @@ use wildcity_session::{
 use wildcity_twin::residency::{Cache, Stats};
 
 use report::{Report, Row};
+use step::DriveStep;
 
-/// Time a drive along a twin's first trajectory, as a session does it, without a network.
+/// Time a drive along a twin's first trajectory, in a session without a network.
 ///
-/// Ten steps a second at a constant speed, however long they take; a step that is done early waits
-/// for its time, as an agent in real time would. Reports for every kilometre how long the steps took,
-/// how many waited for the disk and how long, and what was in memory.
+/// Drives ten steps per second at a constant speed. A step that finishes early waits for its time, as an
+/// agent in real time would. Prints for every kilometre how long the steps took, how many waited for the
+/// disk and how long, and how much memory was in use.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
-    /// The twin, or NAME@NUMBER for an older version.
+    /// The twin: NAME, or NAME@NUMBER for an older version.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
@@ -41,35 +43,35 @@ pub(super) struct Drive {
     backend: BackendOptions,
 
     /// Memory for the twin, in GiB [default: three quarters of the machine's]
-    #[arg(long, value_name = "N", value_parser = backend_options::gib)]
+    #[arg(long, value_name = "GIB", value_parser = backend_options::gib)]
     memory_gib: Option<f64>,
 
-    /// How fast, in m/s.
-    #[arg(long, value_name = "V", default_value_t = 30.0, value_parser = speed)]
+    /// Speed, in m/s.
+    #[arg(long, value_name = "M_PER_S", default_value_t = 30.0, value_parser = speed)]
     speed_m_s: f64,
 
-    /// Where on the trajectory to begin, in metres.
+    /// Start on the trajectory, in metres.
     #[arg(long, value_name = "M", default_value_t = 0.0, value_parser = distance)]
     from_m: f64,
 
-    /// Steps, a tenth of a second each [default: to the end of the trajectory]
+    /// Steps, of 0.1 s each [default: to the end of the trajectory]
     #[arg(long, value_name = "N")]
     steps: Option<u32>,
 
-    /// Cut width and height of every camera to one in so many, around its middle: as much in memory
-    /// as for whole images, and less to draw.
+    /// Divide the width and height of every camera by N and keep the middle of its image. The same Gaussians
+    /// are needed in memory as for whole images, with less to render.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     crop: u32,
 
-    /// Take the next step as soon as one is done: faster than in real time, if the machine can.
+    /// Start each step as soon as the one before is done, instead of in real time.
     #[arg(long)]
     unpaced: bool,
 
-    /// After the drive, jump so many times to a random place of the trajectory.
+    /// Jumps to scattered places of the trajectory after the drive.
     #[arg(long, value_name = "N", default_value_t = 0)]
     teleports: u32,
 
-    /// Write every step and jump to a CSV file.
+    /// CSV file to write, with a line for every step and jump.
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
 
@@ -83,29 +85,15 @@ Examples:
   wildcity bench drive city --memory-gib 2 --crop 4 --teleports 200
   wildcity bench drive city --from-m 9000 --steps 600 --json | jq .all";
 
-/// One pose, drawn.
-#[derive(Clone, Copy, Debug)]
-struct Step {
-    station_m: f64,
-    step: Duration,
-    waited: Duration,
-    /// Sections that were not there when the frame asked.
-    misses: u64,
-    loads: u64,
-    evictions: u64,
-    held_bytes: u64,
-    rss_bytes: u64,
-}
-
 impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
-        let scratch = Scratch::new()?;
+        let episodes = TemporaryDir::new()?;
         let engine = wildcity_session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
-            episodes: scratch.0.clone(),
+            episodes: episodes.0.clone(),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
         })?;
@@ -126,16 +114,19 @@ impl Drive {
         let trajectory =
             trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
         let route = Route::new(trajectory)?;
+
+        // Open the session, and render the first frame.
         let opened = Instant::now();
         let session = Session::open(engine.clone(), "bench".into(), self.opening(manifest)).await?;
         let open = opened.elapsed();
         let start = Start::Pose(route.at(self.from_m).world_from_rig);
-        let mut driven = Driven { session, engine, last: Stats::default() };
+        let mut driving = DrivingSession { session, engine, last: Stats::default() };
         let first = Instant::now();
-        driven.session.reset(0, Some(start)).await?;
+        driving.session.reset(0, Some(start)).await?;
         let first = first.elapsed();
-        driven.last = driven.engine.residency();
+        driving.last = driving.engine.residency();
 
+        // Drive.
         let step_m = self.speed_m_s * wildcity_session::limits::DT_US as f64 * 1e-6;
         let to_the_end = ((route.length_m() - self.from_m) / step_m).max(0.0) as u32;
         let count = self.steps.unwrap_or(to_the_end).min(to_the_end);
@@ -152,32 +143,33 @@ impl Drive {
             }
             let station_m = self.from_m + f64::from(number) * step_m;
             let pose = route.at(station_m).world_from_rig;
-            steps.push(driven.step(station_m, pose).await?);
+            steps.push(driving.step(station_m, pose).await?);
             bar.inc(1);
         }
+
+        // Jump.
         let mut jumps = Vec::with_capacity(self.teleports as usize);
         for number in 0..self.teleports {
             let station_m = route.length_m() * scattered(number);
             let pose = route.at(station_m).world_from_rig;
-            jumps.push(driven.step(station_m, pose).await?);
+            jumps.push(driving.step(station_m, pose).await?);
             bar.inc(1);
         }
         bar.finish_and_clear();
-        let (_, peak_rss_bytes) = rss_bytes()?;
         Ok(Report {
             twin: manifest.twin.clone(),
             gaussians: manifest.gaussians(),
             length_m: route.length_m(),
             speed_m_s: self.speed_m_s,
-            backend: driven.engine.backend(),
-            cameras: Row::cameras(driven.session.cameras()),
-            reserved_bytes: driven.session.reserved_bytes(),
+            backend: driving.engine.backend(),
+            cameras: Row::cameras(driving.session.cameras()),
+            reserved_bytes: driving.session.reserved_bytes(),
             open,
             first,
             steps,
             jumps,
-            peak_rss_bytes,
-            stats: driven.engine.residency(),
+            peak_rss_bytes: rss_bytes()?.peak,
+            stats: driving.engine.residency(),
         })
     }
 
@@ -193,23 +185,23 @@ impl Drive {
     }
 }
 
-/// A session that is driven, and what its engine had counted before the next step.
-struct Driven {
+/// A session that drives, with the statistics of its engine after the last step.
+struct DrivingSession {
     session: Session,
     engine: Arc<wildcity_session::Engine>,
     last: Stats,
 }
 
-impl Driven {
-    async fn step(&mut self, station_m: f64, pose: Pose) -> anyhow::Result<Step> {
+impl DrivingSession {
+    async fn step(&mut self, station_m: f64, pose: Pose) -> anyhow::Result<DriveStep> {
         let begun = Instant::now();
         let stepped = self.session.step(pose, false).await;
         stepped.with_context(|| format!("at {station_m:.1} m of the trajectory"))?;
         let step = begun.elapsed();
-        let (before, now) = (self.last, self.engine.residency());
+        let before = self.last;
+        let now = self.engine.residency();
         self.last = now;
-        let (rss_bytes, _) = rss_bytes()?;
-        Ok(Step {
+        Ok(DriveStep {
             station_m,
             step,
             waited: now.wait_time.saturating_sub(before.wait_time),
@@ -217,15 +209,16 @@ impl Driven {
             loads: now.loads - before.loads,
             evictions: now.evictions - before.evictions,
             held_bytes: now.held_bytes,
-            rss_bytes,
+            rss_bytes: rss_bytes()?.now,
         })
     }
 }
 
-/// The same cameras with the middle of their images alone.
+/// The rig with only the middle of each image.
 fn cropped(mut rig: Rig, crop: u32) -> Rig {
     for camera in rig.cameras.iter_mut().map(|camera| &mut camera.camera) {
-        let [width_px, height_px] = [camera.width_px, camera.height_px];
+        let width_px = camera.width_px;
+        let height_px = camera.height_px;
         camera.width_px = (width_px / crop).max(1);
         camera.height_px = (height_px / crop).max(1);
         camera.pinhole.cx -= 0.5 * f64::from(width_px - camera.width_px);
@@ -234,36 +227,42 @@ fn cropped(mut rig: Rig, crop: u32) -> Rig {
     rig
 }
 
-/// Numbers that fill [0, 1) evenly and come in no order: multiples of the golden ratio.
+/// Numbers that fill [0, 1) evenly without being sorted: multiples of the golden ratio, modulo 1.
 fn scattered(number: u32) -> f64 {
     (0.5 + 0.618_033_988_749_895 * f64::from(number)).fract()
 }
 
-/// What this process has in memory now and had at most, in bytes.
-fn rss_bytes() -> anyhow::Result<(u64, u64)> {
+/// Memory of this process, in bytes.
+struct Rss {
+    now: u64,
+    peak: u64,
+}
+
+fn rss_bytes() -> anyhow::Result<Rss> {
     let text = fs::read_to_string("/proc/self/status").context("/proc/self/status")?;
     let field = |name: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix(name))?;
         line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
     };
     let both = field("VmRSS:").zip(field("VmHWM:"));
-    both.context("/proc/self/status does not say how much memory is used")
+    let memory = both.map(|(now, peak)| Rss { now, peak });
+    memory.context("/proc/self/status does not say how much memory is used")
 }
 
-/// A directory for the episode, which nobody wants to keep.
-struct Scratch(PathBuf);
+/// A temporary directory for the recorded episode.
+struct TemporaryDir(PathBuf);
 
-impl Scratch {
+impl TemporaryDir {
     fn new() -> anyhow::Result<Self> {
         let dir = std::env::temp_dir().join(format!("wildcity-bench-{}", std::process::id()));
-        output::make_dir(&dir)?;
+        output::create_dir(&dir)?;
         Ok(Self(dir))
     }
 }
 
-impl Drop for Scratch {
+impl Drop for TemporaryDir {
     fn drop(&mut self) {
-        // What cannot be removed is left to whoever cleans the directory for temporary files.
+        // If it cannot be removed, the system's cleaning of temporary files removes it.
         let _ = fs::remove_dir_all(Path::new(&self.0));
     }
 }
@@ -271,13 +270,13 @@ impl Drop for Scratch {
 fn speed(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(speed_m_s) if (0.1..=1000.0).contains(&speed_m_s) => Ok(speed_m_s),
-        _ => Err("expected 0.1 to 1000 m/s".to_owned()),
+        _ => Err("expected 0.1 to 1000 m/s, for example 30".to_owned()),
     }
 }
 
 fn distance(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(distance_m) if (0.0..=1e7).contains(&distance_m) => Ok(distance_m),
-        _ => Err("expected 0 to 1e7 m".to_owned()),
+        _ => Err("expected 0 to 1e7 m, for example 9000".to_owned()),
     }
 }

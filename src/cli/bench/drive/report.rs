@@ -1,4 +1,4 @@
-//! What a drive was like.
+//! The results of a drive, as a table, as JSON, and as CSV.
 
 use std::fmt::Write as _;
 use std::io::{self, Write};
@@ -6,34 +6,35 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use super::Step;
+use super::step::DriveStep;
 use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Stats;
 
-/// Steps that may wait before a drive is warm: 3 s, in which the pager learns how fast it is.
+/// Steps before a drive counts as warm: 3 s, in which the cache learns how fast the rig moves.
 const WARM_UP: usize = 30;
 
-/// A drive, and jumps after it.
+/// A drive, and the jumps after it.
 pub(super) struct Report {
     pub(super) twin: String,
     pub(super) gaussians: u64,
     pub(super) length_m: f64,
     pub(super) speed_m_s: f64,
     pub(super) backend: &'static str,
-    /// Names and sizes.
+    /// Names and sizes of the cameras.
     pub(super) cameras: String,
+    /// Memory that is reserved for the worst frame.
     pub(super) reserved_bytes: u64,
-    /// Until the session was open.
+    /// Time to open the session.
     pub(super) open: Duration,
-    /// The first frame.
+    /// Time of the first frame.
     pub(super) first: Duration,
-    pub(super) steps: Vec<Step>,
-    pub(super) jumps: Vec<Step>,
+    pub(super) steps: Vec<DriveStep>,
+    pub(super) jumps: Vec<DriveStep>,
     pub(super) peak_rss_bytes: u64,
     pub(super) stats: Stats,
 }
 
-/// Some steps together.
+/// Statistics over some steps: a row of the table.
 #[derive(Clone, Debug, serde::Serialize)]
 pub(super) struct Row {
     steps: usize,
@@ -51,32 +52,32 @@ pub(super) struct Row {
 }
 
 impl Row {
-    fn of(steps: &[Step]) -> Self {
-        let mut times: Vec<f64> = steps.iter().map(|step| ms(step.step)).collect();
-        times.sort_by(f64::total_cmp);
-        let at = |share: f64| {
-            let last = times.len().saturating_sub(1) as f64;
-            times.get((last * share).round() as usize).copied().unwrap_or(0.0)
+    fn of(steps: &[DriveStep]) -> Self {
+        let mut steps_ms: Vec<f64> = steps.iter().map(|step| ms(step.step)).collect();
+        steps_ms.sort_by(f64::total_cmp);
+        let quantile_ms = |share: f64| {
+            let last = steps_ms.len().saturating_sub(1) as f64;
+            steps_ms.get((last * share).round() as usize).copied().unwrap_or(0.0)
         };
-        let most = |of: fn(&Step) -> u64| steps.iter().map(of).max().unwrap_or(0);
+        let max = |of: fn(&DriveStep) -> u64| steps.iter().map(of).max().unwrap_or(0);
         let waited = steps.iter().map(|step| ms(step.waited));
         Self {
             steps: steps.len(),
-            step_ms_p50: at(0.5),
-            step_ms_p99: at(0.99),
-            step_ms_max: at(1.0),
+            step_ms_p50: quantile_ms(0.5),
+            step_ms_p99: quantile_ms(0.99),
+            step_ms_max: quantile_ms(1.0),
             waits: steps.iter().filter(|step| step.misses > 0).count(),
             waited_ms: waited.clone().sum(),
             waited_ms_max: waited.fold(0.0, f64::max),
             misses: steps.iter().map(|step| step.misses).sum(),
             loads: steps.iter().map(|step| step.loads).sum(),
             evictions: steps.iter().map(|step| step.evictions).sum(),
-            held_bytes_max: most(|step| step.held_bytes),
-            rss_bytes_max: most(|step| step.rss_bytes),
+            held_bytes_max: max(|step| step.held_bytes),
+            rss_bytes_max: max(|step| step.rss_bytes),
         }
     }
 
-    /// Names and sizes of cameras.
+    /// Names and sizes of cameras, as text.
     pub(super) fn cameras(cameras: &[RigCamera]) -> String {
         let one = |rig: &RigCamera| {
             format!("{} {}x{}", rig.name, rig.camera.width_px, rig.camera.height_px)
@@ -86,9 +87,9 @@ impl Row {
 }
 
 impl Report {
-    /// Steps by the kilometre.
+    /// Statistics of each kilometre.
     fn kilometres(&self) -> Vec<(u64, Row)> {
-        let km = |step: &Step| (1e-3 * step.station_m) as u64;
+        let km = |step: &DriveStep| (1e-3 * step.station_m) as u64;
         let runs = self.steps.chunk_by(|a, b| km(a) == km(b));
         runs.map(|run| (km(&run[0]), Row::of(run))).collect()
     }
@@ -191,16 +192,17 @@ impl Report {
         })
     }
 
-    /// A line for every step and every jump.
+    /// CSV with a line for every step and every jump.
     pub(super) fn csv(&self) -> String {
         let mut csv = String::from(
             "kind,station_m,step_ms,waited_ms,misses,loads,evictions,held_bytes,rss_bytes\n",
         );
         let steps = self.steps.iter().map(|step| ("step", step));
         for (kind, step) in steps.chain(self.jumps.iter().map(|jump| ("teleport", jump))) {
-            let Step { station_m, misses, loads, evictions, held_bytes, rss_bytes, .. } = step;
-            let (step_ms, waited_ms) = (ms(step.step), ms(step.waited));
-            // Writing to a string does not fail.
+            let DriveStep { station_m, misses, loads, evictions, held_bytes, rss_bytes, .. } = step;
+            let step_ms = ms(step.step);
+            let waited_ms = ms(step.waited);
+            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{kind},{station_m:.3},{step_ms:.3},{waited_ms:.3},{misses},{loads},{evictions},\

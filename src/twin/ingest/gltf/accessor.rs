@@ -1,10 +1,10 @@
-//! Numbers in buffers.
+//! Accessors: arrays of numbers in buffers.
 
 use super::document::Document;
 
-/// An attribute of all Gaussians.
+/// One attribute of all Gaussians.
 pub(super) struct Column<'a> {
-    /// Rows.
+    /// Number of rows.
     pub(super) count: usize,
     bytes: &'a [u8],
     stride: usize,
@@ -22,7 +22,10 @@ enum Component {
 }
 
 impl<'a> Column<'a> {
-    /// An accessor of rows of `width` numbers; or why there is none.
+    /// Finds an accessor with `width` numbers per row.
+    ///
+    /// # Errors
+    /// Says why it cannot be used.
     pub(super) fn find(
         document: &Document,
         buffers: &[&'a [u8]],
@@ -39,16 +42,17 @@ impl<'a> Column<'a> {
             return Err(format!("accessor {index} is sparse; export it dense"));
         }
         let view = accessor.buffer_view.and_then(|view| document.buffer_views.get(view));
-        let view = view.ok_or(format!("accessor {index} has no bufferView that is there"))?;
+        let view = view.ok_or(format!("accessor {index} has no bufferView that exists"))?;
         if let Some(name) = view.extensions.keys().next() {
-            return Err(format!("its bufferView is packed by {name}; export it without"));
+            return Err(format!("its bufferView is compressed by {name}; export it without"));
         }
         let component = Component::of(accessor.component_type);
         let component =
             component.ok_or(format!("componentType {} is not read", accessor.component_type))?;
         let row_bytes = (component.bytes() * width) as u64;
         let stride = view.byte_stride.unwrap_or(row_bytes);
-        // Between 4 and 252 says glTF; below a row, rows overlap, and few bytes are many.
+        // glTF allows 4 to 252. A stride shorter than a row would make rows overlap, so that few
+        // bytes become many rows.
         if stride < row_bytes || stride > 252 {
             return Err(format!("byteStride {stride}; {row_bytes} to 252 are possible"));
         }
@@ -111,7 +115,7 @@ impl Component {
         }
     }
 
-    /// What stands for 1 where numbers are normalised.
+    /// The integer that stands for 1 where numbers are normalised.
     fn most(self) -> f64 {
         match self {
             Self::I8 => i8::MAX.into(),

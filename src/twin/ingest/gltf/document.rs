@@ -1,4 +1,5 @@
-//! The part of a glTF document that splats need; everything else is skipped.
+//! The parts of a glTF document that splats need; others are skipped. The gltf crate drops
+//! attributes that core glTF does not define, so splats have a document type of their own.
 
 use std::collections::BTreeMap;
 
@@ -36,7 +37,7 @@ pub(super) struct Node {
     pub(super) mesh: Option<usize>,
     #[serde(default)]
     pub(super) children: Vec<usize>,
-    /// Column by column.
+    /// Column-major.
     pub(super) matrix: Option<[f64; 16]>,
     pub(super) translation: Option<[f64; 3]>,
     /// x, y, z, w.
@@ -57,8 +58,8 @@ pub(super) struct Primitive {
 }
 
 impl Primitive {
-    /// The extension that packs the attributes away, if one does.
-    pub(super) fn packed_by(&self) -> Option<&str> {
+    /// The extension that compresses the attributes, if there is one.
+    pub(super) fn compressed_by(&self) -> Option<&str> {
         let inner = self.extensions.get(EXTENSION)?.get("extensions")?.as_object()?;
         inner.keys().map(String::as_str).find(|name| name.contains("compression"))
     }

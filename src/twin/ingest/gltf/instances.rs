@@ -1,4 +1,4 @@
-//! Where the nodes of the scene put meshes.
+//! Mesh instances: the meshes of the scene's nodes, with their transforms.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
@@ -8,34 +8,37 @@ use wildcity_scene::Gaussians;
 use super::bad;
 use super::document::{Document, Mesh, Node};
 
-/// A mesh of a node.
+/// A node's mesh.
 pub(super) struct MeshInstance<'a> {
     pub(super) node: usize,
-    /// Which mesh of the document, and the mesh.
+    /// Index of the mesh in the document.
     pub(super) index: usize,
     pub(super) mesh: &'a Mesh,
     pub(super) scene_from_mesh: DMat4,
 }
 
-/// All meshes of the scene, in the order of its tree.
+/// All mesh instances of the scene, in depth-first order.
 pub(super) fn mesh_instances(document: &Document) -> Result<Vec<MeshInstance<'_>>, IngestError> {
     let scene = document.scenes.get(document.scene.unwrap_or(0));
-    // Without scenes everything that is no child of another is shown.
+    // Without scenes, every node that is not a child of another is a root.
     let roots = scene.map_or_else(|| roots(document), |scene| scene.nodes.clone());
     let mut waiting: Vec<_> = roots.into_iter().rev().map(|node| (node, DMat4::IDENTITY)).collect();
     let mut seen = vec![false; document.nodes.len()];
     let mut placed = Vec::new();
     while let Some((index, scene_from_parent)) = waiting.pop() {
         let place = format!("node {index}");
-        let node = document.nodes.get(index).ok_or_else(|| bad(&place, "is not there".into()))?;
+        let node = document.nodes.get(index).ok_or_else(|| bad(&place, "does not exist".into()))?;
         if std::mem::replace(&mut seen[index], true) {
-            return Err(bad(&place, "is reached twice; a tree has one way to each".into()));
+            return Err(bad(
+                &place,
+                "is reached twice; in a tree, each node has one parent".into(),
+            ));
         }
         let scene_from_mesh = scene_from_parent * parent_from_node(node);
         waiting.extend(node.children.iter().rev().map(|&child| (child, scene_from_mesh)));
         if let Some(own) = node.mesh {
             let mesh = document.meshes.get(own);
-            let mesh = mesh.ok_or_else(|| bad(&place, "its mesh is not there".into()))?;
+            let mesh = mesh.ok_or_else(|| bad(&place, "its mesh does not exist".into()))?;
             placed.push(MeshInstance { node: index, index: own, mesh, scene_from_mesh });
         }
     }
@@ -64,7 +67,7 @@ fn parent_from_node(node: &Node) -> DMat4 {
 }
 
 impl MeshInstance<'_> {
-    /// Puts Gaussians of the mesh there. The identity changes no bit.
+    /// Transforms Gaussians of the mesh to the scene. The identity changes no bit.
     pub(super) fn apply(&self, gaussians: &mut Gaussians) -> Result<(), IngestError> {
         if self.scene_from_mesh == DMat4::IDENTITY {
             return Ok(());
@@ -74,8 +77,8 @@ impl MeshInstance<'_> {
         let rows = (turn * scale.recip()).transpose().to_cols_array_2d();
         let axes = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));
         let axes = axes.map_err(|_| {
-            let reason = "its matrix is no rotation, mirror or scale from 1e-6 to 1e6 of all axes \
-                          alike; bake it into the splats";
+            let reason = "its matrix is not a rotation, perhaps with a reflection and a uniform scale from 1e-6 to 1e6; bake \
+                          it into the splats";
             bad(&format!("node {}", self.node), reason.into())
         })?;
         axes.apply(gaussians);

@@ -1,20 +1,19 @@
 //! glTF and GLB with KHR_gaussian_splatting.
 //!
 //! Source: the extension's text in KhronosGroup/glTF. Every primitive that has the extension is
-//! read, where its nodes put it: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1) and
-//! SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in earlier
-//! drafts it was its logarithm, which is told by what no standard deviation is: negative. Kernel,
-//! colour space, projection and sorting are not looked at, as the extension allows: the trainer's
-//! are the render profile's.
+//! read, with the transforms of its nodes: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1)
+//! and SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in
+//! earlier drafts it was its logarithm, which is detected by negative values: no standard deviation
+//! is negative. Kernel, colour space, projection, and sorting are ignored, as the extension allows;
+//! the render profile says how the trainer rendered.
 //!
-//! A scene without splats is read as what it is: its triangles are covered with flat Gaussians
-//! (`mesh.rs`). The gltf crate keeps only attributes that glTF itself knows, so the document of splats is
-//! our own.
+//! The triangles of a scene without splats are covered with flat Gaussians (`mesh.rs`).
 
 mod accessor;
 mod document;
 mod instances;
 mod mesh;
+mod triangle;
 
 use std::collections::BTreeMap;
 
@@ -32,7 +31,7 @@ use document::{Document, Primitive};
 const FORMAT: &str = "glTF";
 const EXTENSION: &str = "KHR_gaussian_splatting";
 
-/// Whether JSON is glTF: all glTF has an asset.
+/// Whether JSON is glTF, in which an asset is required.
 pub(super) fn is_likely(json: &[u8]) -> bool {
     #[derive(serde::Deserialize)]
     struct Kind {
@@ -44,11 +43,11 @@ pub(super) fn is_likely(json: &[u8]) -> bool {
         version: Option<serde::de::IgnoredAny>,
     }
     let kind = serde_json::from_slice::<Kind>(json);
-    // SOG has an asset too, but neither meshes nor a version of that.
+    // SOG has an asset, too, but neither meshes nor a version of the asset.
     kind.is_ok_and(|kind| kind.meshes.is_some() || kind.asset.is_some_and(|a| a.version.is_some()))
 }
 
-/// Reads a binary glTF file, held whole.
+/// Reads a binary glTF file, which is in memory.
 pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussians, IngestError> {
     const JSON: u32 = u32::from_le_bytes(*b"JSON");
     const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
@@ -61,17 +60,26 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussi
         return Err(bad("bytes 4 to 7", format!("version {version}; 2 is read")));
     }
     if length as usize != file.len() {
-        let (promised, held) = (length.into(), file.len() as u128);
-        return Err(IngestError::Size { format: FORMAT, promised, held, content: "all".into() });
+        return Err(IngestError::Size {
+            format: FORMAT,
+            promised: length.into(),
+            held: file.len() as u128,
+            content: "all".into(),
+        });
     }
-    let (mut json, mut buffer, mut rest) = (None, None, &file[12..]);
+    let mut json = None;
+    let mut buffer = None;
+    let mut rest = &file[12..];
     while let Some((head, after)) = rest.split_first_chunk::<8>() {
         let [length, kind] = [0, 4]
             .map(|at| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]));
         let Some((chunk, after)) = after.split_at_checked(length as usize) else {
-            let (promised, held) = (length.into(), after.len() as u128);
-            let content = "a chunk".into();
-            return Err(IngestError::Size { format: FORMAT, promised, held, content });
+            return Err(IngestError::Size {
+                format: FORMAT,
+                promised: length.into(),
+                held: after.len() as u128,
+                content: "a chunk".into(),
+            });
         };
         match kind {
             JSON => json = json.or(Some(chunk)),
@@ -84,7 +92,7 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussi
     read(json, buffer, parts)
 }
 
-/// Reads a document, with the buffer that a GLB file brings.
+/// Reads a document, with the buffer within a GLB file.
 pub(super) fn read(
     json: &[u8],
     own_buffer: Option<&[u8]>,
@@ -92,6 +100,7 @@ pub(super) fn read(
 ) -> Result<Gaussians, IngestError> {
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
+    // Buffers: from URIs, or within the GLB file.
     let mut fetched = Vec::new();
     for (index, buffer) in document.buffers.iter().enumerate() {
         fetched.push(match &buffer.uri {
@@ -103,12 +112,17 @@ pub(super) fn read(
     for (index, (bytes, buffer)) in fetched.iter().zip(&document.buffers).enumerate() {
         let bytes = bytes.as_deref().or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
         let Some(bytes) = bytes.get(..buffer.byte_length as usize) else {
-            let (promised, held) = (buffer.byte_length.into(), bytes.len() as u128);
-            let content = format!("buffer {index}");
-            return Err(IngestError::Size { format: FORMAT, promised, held, content });
+            return Err(IngestError::Size {
+                format: FORMAT,
+                promised: buffer.byte_length.into(),
+                held: bytes.len() as u128,
+                content: format!("buffer {index}"),
+            });
         };
         buffers.push(bytes);
     }
+
+    // Splats of all mesh instances, or else the triangles.
     let mut all = Gaussians::default();
     let mut found = false;
     let placed = instances::mesh_instances(&document)?;
@@ -132,7 +146,7 @@ pub(super) fn read(
     Ok(all)
 }
 
-/// The bytes of what is not in the GLB file.
+/// The bytes of a URI: a file, or base64 within the URI.
 fn fetch(uri: &str, place: &str, parts: &mut dyn SceneFiles) -> Result<Vec<u8>, IngestError> {
     if !uri.starts_with("data:") {
         return parts.read(uri, limits::SCENE_PART_BYTES);
@@ -143,7 +157,7 @@ fn fetch(uri: &str, place: &str, parts: &mut dyn SceneFiles) -> Result<Vec<u8>, 
     BASE64.decode(text.as_bytes()).map_err(|e| bad(place, format!("its base64: {e}")))
 }
 
-/// Reads one primitive in its own axes.
+/// Reads one primitive, in the axes of its mesh.
 fn read_primitive(
     document: &Document,
     buffers: &[&[u8]],
@@ -151,8 +165,8 @@ fn read_primitive(
     place: &str,
     parts: &mut dyn SceneFiles,
 ) -> Result<Gaussians, IngestError> {
-    if let Some(packed) = primitive.packed_by() {
-        return Err(bad(place, format!("is packed by {packed}; export it without")));
+    if let Some(extension) = primitive.compressed_by() {
+        return Err(bad(place, format!("is compressed by {extension}; export it without")));
     }
     let column = |name: &str, width: usize| {
         let index = primitive.attributes.get(name);
@@ -162,8 +176,9 @@ fn read_primitive(
     };
     let own = |name: &str, width: usize| column(&format!("{EXTENSION}:{name}"), width);
     let positions = column("POSITION", 3)?;
-    let (rotations, scales, opacities) =
-        (own("ROTATION", 4)?, own("SCALE", 3)?, own("OPACITY", 1)?);
+    let rotations = own("ROTATION", 4)?;
+    let scales = own("SCALE", 3)?;
+    let opacities = own("OPACITY", 1)?;
     let sh_degree = degree(&primitive.attributes);
     let mut colours = Vec::new();
     for (degree, n) in (0..=sh_degree.unwrap_or(0)).flat_map(|l| (0..=2 * l).map(move |n| (l, n))) {
@@ -175,11 +190,11 @@ fn read_primitive(
     let count = positions.count;
     for column in [&rotations, &scales, &opacities].into_iter().chain(&colours) {
         if column.count != count {
-            let reason = format!("{} of an attribute for {count} positions", column.count);
+            let reason = format!("an attribute has {} rows for {count} positions", column.count);
             return Err(bad(place, reason));
         }
     }
-    // Nodes may show one mesh many times: that is unpacking, too.
+    // Nodes may instance one mesh many times, so that counts as unpacking, too.
     let sh_degree_held = sh_degree.unwrap_or(0);
     let row_bytes = 56 + 12 * sh::coefficients(sh_degree_held) as u128;
     parts.budget().unpack(FORMAT, place, row_bytes * count as u128)?;
@@ -190,7 +205,7 @@ fn read_primitive(
         [w, x, y, z]
     }));
     let is_negative = |i: &usize| scales.row::<3>(*i).iter().any(|&s| s < 0.0);
-    // Of logarithms nearly all are negative; of standard deviations none, but for damage.
+    // Nearly all logarithms are negative, and no standard deviation is, except for damaged ones.
     let are_logarithms = (0..count).filter(is_negative).count() * 10 > count;
     g.ln_scales.extend((0..count).map(|i| {
         scales.row::<3>(i).map(|s| if are_logarithms { s as f32 } else { activation::ln_scale(s) })
@@ -207,7 +222,7 @@ fn read_primitive(
     Ok(g)
 }
 
-/// The highest SH degree of which there is an attribute.
+/// The highest SH degree with an attribute.
 fn degree(attributes: &BTreeMap<String, usize>) -> Option<u8> {
     let has = |l: &u8| {
         let prefix = format!("{EXTENSION}:SH_DEGREE_{l}_");

@@ -2,10 +2,10 @@
 //!
 //! Source: what NVIDIA's 3dgrut writes. `nre_data.state_dict` has, per layer of
 //! `.gaussians_nodes.LAYER`, arrays of f16 or f32 with their shapes: positions, rotations (w, x, y,
-//! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the
-//! higher degrees, coefficient-major, then red, green, blue), of which n_active_features degrees
-//! count. A layer of tracked objects is left out: it stands nowhere by itself. Positions are in the
-//! payload's axes; the USD layers around it, which may turn and move it, are not read.
+//! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the higher
+//! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
+//! layer of tracked objects is skipped, because it has no fixed place. Positions are in the
+//! payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;
 
@@ -37,11 +37,14 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
     let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
     let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
     let names = state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
-    let is_fixed = |layer: &&str| !matches!(tracks.and_then(|t| t.get(layer)), Some(Value::Array(ids)) if !ids.is_empty());
+    let is_static = |layer: &&str| match tracks.and_then(|tracks| tracks.get(layer)) {
+        Some(Value::Array(ids)) => ids.is_empty(),
+        _ => true,
+    };
     let mut all = Gaussians::default();
-    let mut layers = names.filter(is_fixed).peekable();
+    let mut layers = names.filter(is_static).peekable();
     if layers.peek().is_none() {
-        return Err(missing("a layer of Gaussians that stand still"));
+        return Err(missing("a layer of static Gaussians"));
     }
     for name in layers {
         check_activations(data, name)?;
@@ -53,7 +56,7 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
     Ok(all)
 }
 
-/// Refuses numbers that mean something else.
+/// Checks that parameters have the activations that this reader assumes.
 fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     let layers = data.get("config").and_then(|config| config.get("layers"));
     let Some(settings) = layers.and_then(|layers| layers.get(layer)) else { return Ok(()) };
@@ -74,7 +77,7 @@ fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     Ok(())
 }
 
-/// Arrays under one name.
+/// The arrays of one layer.
 struct Layer<'a> {
     state: &'a Value<'a>,
     name: &'a str,
@@ -113,7 +116,7 @@ impl Layer<'_> {
         format!("{LAYERS}{}.{field}", self.name)
     }
 
-    /// The degree that training had reached: an i64.
+    /// The SH degree that training had reached, stored as i64.
     fn active_degree(&self) -> Option<u8> {
         match self.state.get(&self.key("n_active_features")) {
             Some(Value::Bytes(bytes)) => {
@@ -146,20 +149,22 @@ impl Layer<'_> {
             return Err(bad(&format!("{key}.shape"), reason));
         }
         let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
-            return Err(bad(&key, "is no array of bytes".into()));
+            return Err(bad(&key, "is not an array of bytes".into()));
         };
         let values = found_rows as u128 * found_columns as u128;
         let is_f32 = values * 4 == bytes.len() as u128;
         if !is_f32 && values * 2 != bytes.len() as u128 {
-            let reason =
-                format!("{} bytes; {values} numbers of f16 or f32 have others", bytes.len());
+            let reason = format!(
+                "{} bytes, which is not the size of {values} numbers of f16 or f32",
+                bytes.len()
+            );
             return Err(bad(&key, reason));
         }
         Ok(Array { bytes, is_f32, rows: found_rows, columns: found_columns })
     }
 }
 
-/// Numbers in rows.
+/// A matrix of numbers.
 struct Array<'a> {
     bytes: &'a [u8],
     is_f32: bool,

@@ -4,7 +4,7 @@
 
 use crate::limits;
 
-/// A value; what nobody asks for is `Other`.
+/// A value; types that NuRec's reader does not need are `Other`.
 #[derive(Debug)]
 pub(super) enum Value<'a> {
     Map(Vec<(Value<'a>, Value<'a>)>),
@@ -15,10 +15,13 @@ pub(super) enum Value<'a> {
     Other,
 }
 
-/// Maps and arrays within each other.
+/// Deepest nesting of maps and arrays.
 const MAX_DEPTH: usize = 32;
 
-/// Parses one value that is all of the bytes; or why not.
+/// Parses one value, which must take all of the bytes.
+///
+/// # Errors
+/// Says what is wrong.
 pub(super) fn parse(bytes: &[u8]) -> Result<Value<'_>, String> {
     let mut parser = Parser { bytes, at: 0, values: 0 };
     let value = parser.value(0)?;
@@ -29,7 +32,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Value<'_>, String> {
 }
 
 impl<'a> Value<'a> {
-    /// What a map has under a name.
+    /// The value of a key of a map.
     pub(super) fn get(&self, name: &str) -> Option<&Value<'a>> {
         let Value::Map(entries) = self else { return None };
         entries
@@ -38,7 +41,7 @@ impl<'a> Value<'a> {
             .map(|e| &e.1)
     }
 
-    /// The names of a map.
+    /// The text keys of a map.
     pub(super) fn keys(&self) -> impl Iterator<Item = &'a str> {
         let entries = if let Value::Map(entries) = self { &entries[..] } else { &[] };
         entries
@@ -79,7 +82,7 @@ impl<'a> Parser<'a> {
                 let length = self.number(1 << (kind - 0xc4))?;
                 Value::Bytes(self.take(length)?)
             }
-            // Extensions have a byte of type more.
+            // Extensions have one more byte, their type.
             0xc7..=0xc9 => {
                 let length = self.number(1 << (kind - 0xc7))?;
                 self.skip(length.saturating_add(1))?
@@ -109,7 +112,7 @@ impl<'a> Parser<'a> {
         })
     }
 
-    // Lengths are what a file claims: nothing is reserved by them.
+    // A length is only a claim of the file, so nothing is allocated for it in advance.
 
     fn map(&mut self, length: u64, depth: usize) -> Result<Value<'a>, String> {
         let mut entries = Vec::new();

@@ -1,9 +1,10 @@
-//! PLY as PlayCanvas compresses it: 16 bytes per Gaussian, in chunks of 256 with their extremes.
+//! PLY as compressed by PlayCanvas: 16 bytes per Gaussian, in chunks of 256 that share a value
+//! range.
 //!
-//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has packed_position and
-//! packed_scale (11, 10, 11 bits from the top, between the chunk's extremes), packed_rotation (2
-//! bits for the largest component, 3 x 10 for the others) and packed_color (4 x 8: colour between
-//! the chunk's extremes, opacity). An element sh holds f_rest in 8 bits.
+//! Source: the format of the PlayCanvas engine and its SuperSplat editor. A vertex has
+//! packed_position and packed_scale (11, 10, 11 bits from the top, within the chunk's range),
+//! packed_rotation (2 bits for the largest component, 3 x 10 for the others) and packed_color (4 x
+//! 8: colour within the chunk's range, opacity). An element sh holds f_rest in 8 bits.
 
 use std::io::BufRead;
 
@@ -15,7 +16,7 @@ use crate::ingest::activation;
 use crate::ingest::validate::{self, Field};
 use crate::ingest::{IngestError, Progress, check_count};
 
-/// Gaussians that share extremes.
+/// Number of Gaussians in a chunk.
 const CHUNK: usize = 256;
 
 /// Reads the body.
@@ -25,9 +26,10 @@ pub(super) fn read(
     file_bytes: u64,
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
+    // Find the columns, and check the size of the file.
     let (chunk, vertex, colour) = tables(header)?;
     let sh_degree = colour.map_or(Ok(0), degree)?;
-    let extremes = Extremes::find(chunk)?;
+    let ranges = ValueRanges::find(chunk)?;
     let packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
     let packed = packed.map(|name| vertex.property(name).cloned());
     let [position, rotation, scale, color] = packed;
@@ -36,9 +38,10 @@ pub(super) fn read(
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;
 
+    // Value ranges, then vertices, then higher SH degrees: the order of the body.
     let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
     let mut body = Body { input, done: header.bytes, file_bytes, progress };
-    body.rows(chunk, |row| chunks.push(extremes.value(row)))?;
+    body.rows(chunk, |row| chunks.push(ranges.value(row)))?;
     let coefficients = sh::coefficients(sh_degree);
     let mut gaussians = Gaussians::with_capacity(sh_degree, count);
     body.rows(vertex, |row| {
@@ -76,7 +79,7 @@ fn higher_degrees(colour: &Element, sh_degree: u8) -> Result<Vec<Property>, Inge
     rest.map(|field| colour.property(&file_name(field, sh_degree)).cloned()).collect()
 }
 
-/// The tables chunk, vertex and, if there is one, sh, in that order and of fitting lengths.
+/// The tables chunk, vertex, and (if there is one) sh, in that order and of matching lengths.
 fn tables(header: &Header) -> Result<(&Element, &Element, Option<&Element>), IngestError> {
     let bad = |reason: String| error("compressed elements".into(), reason);
     let (chunk, vertex, colour) = match &header.elements[..] {
@@ -89,7 +92,8 @@ fn tables(header: &Header) -> Result<(&Element, &Element, Option<&Element>), Ing
         return Err(bad(format!("{} must be chunk, vertex, sh", names.join(", "))));
     }
     if chunk.count != vertex.count.div_ceil(CHUNK as u64) {
-        let (chunks, count) = (chunk.count, vertex.count);
+        let chunks = chunk.count;
+        let count = vertex.count;
         return Err(bad(format!("{chunks} chunks of {CHUNK} do not make {count} vertices")));
     }
     match colour {
@@ -100,10 +104,10 @@ fn tables(header: &Header) -> Result<(&Element, &Element, Option<&Element>), Ing
     }
 }
 
-/// Columns of a chunk's smallest and largest position, ln scale and colour, in that order.
-struct Extremes([Vec<Property>; 2]);
+/// Columns of a chunk's smallest and largest position, ln scale, and colour, in that order.
+struct ValueRanges([Vec<Property>; 2]);
 
-impl Extremes {
+impl ValueRanges {
     fn find(chunk: &Element) -> Result<Self, IngestError> {
         let fields = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
         let find = |end: &str| {
@@ -118,7 +122,7 @@ impl Extremes {
     }
 }
 
-/// A number of `bits` bits, shifted down to the bottom of `word`, as a fraction of its largest.
+/// The lowest `bits` bits of `word`, as a fraction of their largest value.
 fn unit(word: u32, bits: u32) -> f64 {
     let largest = (1 << bits) - 1;
     f64::from(word & largest) / f64::from(largest)
@@ -128,13 +132,14 @@ fn unpack_11_10_11(word: u32) -> [f64; 3] {
     [unit(word >> 21, 11), unit(word >> 11, 10), unit(word, 11)]
 }
 
-/// The largest component is left out, so the others are within ±√½.
+/// The largest component is omitted, so the others are within ±√½.
 fn unpack_rotation(word: u32) -> [f32; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word >> shift, 10) - 0.5) * 2f64.sqrt());
     activation::quat_of_smallest_three((word >> 30) as usize, others)
 }
 
-/// 8 bits over [-4, 4]: the ends exactly, the others at the middle of their step.
+/// Decodes 8 bits over [-4, 4]: 0 and 255 are the ends exactly, other values are at the middle of
+/// their step.
 fn unpack_coefficient(byte: f64) -> f64 {
     let unit = match byte {
         0.0 => 0.0,

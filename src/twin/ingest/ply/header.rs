@@ -7,7 +7,7 @@ use std::io::{BufRead, Read};
 use crate::ingest::IngestError;
 use crate::limits;
 
-/// What a header says.
+/// A parsed header.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Header {
     /// In the order of the body.
@@ -49,11 +49,13 @@ pub(super) enum Scalar {
 }
 
 impl Header {
-    /// Reads up to and with `end_header`, and no byte of the body.
+    /// Reads up to and including `end_header`, and no byte of the body.
     pub(super) fn read(input: &mut impl BufRead) -> Result<Self, IngestError> {
         let mut input = input.take(limits::PLY_HEADER_BYTES as u64);
         let mut elements: Vec<Element> = Vec::new();
-        let (mut bytes, mut number, mut has_format) = (0, 0, false);
+        let mut bytes = 0;
+        let mut number = 0;
+        let mut has_format = false;
         let mut line = Vec::new();
         loop {
             number += 1;
@@ -66,6 +68,7 @@ impl Header {
                     "the file or the limit of {limit} bytes ends before end_header"
                 )));
             }
+            // The first word says what the line declares.
             let text = std::str::from_utf8(&line).map_err(|_| bad("is not text".into()))?.trim();
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
             match words[..] {
@@ -86,18 +89,18 @@ impl Header {
                     elements.push(Element { name: name.to_owned(), count, ..Element::default() });
                 }
                 ["property", "list", ..] => {
-                    return Err(bad(format!("{text:?}: lists have no place among Gaussians")));
+                    return Err(bad(format!("{text:?}: Gaussians have no lists")));
                 }
                 ["property", kind, name] => {
                     let scalar = Scalar::parse(kind)
                         .ok_or_else(|| bad(format!("{kind:?} is not a type of PLY")))?;
                     let element = elements
                         .last_mut()
-                        .ok_or_else(|| bad("a property comes after its element".into()))?;
+                        .ok_or_else(|| bad("there is no element before the property".into()))?;
                     element.push(name, scalar).map_err(bad)?;
                 }
                 ["end_header"] => break,
-                _ => return Err(bad(format!("{text:?} means nothing in a header"))),
+                _ => return Err(bad(format!("{text:?} is unknown in a header"))),
             }
         }
         if !has_format {
@@ -107,12 +110,13 @@ impl Header {
         Ok(Self { elements, bytes })
     }
 
-    /// An element by its name.
+    /// The element of a name.
     pub(super) fn element(&self, name: &str) -> Option<&Element> {
         self.elements.iter().find(|element| element.name == name)
     }
 
-    /// Checks the promise of the header against the file before anything is allocated for it.
+    /// Compares the size that the header implies with the file's, before anything is allocated for
+    /// it.
     pub(super) fn check_size(&self, file_bytes: u64) -> Result<(), IngestError> {
         let size = |e: &Element| u128::from(e.count) * e.stride as u128;
         let promised = self.elements.iter().map(size).sum();
@@ -129,7 +133,7 @@ impl Header {
 }
 
 impl Element {
-    /// A column by its name.
+    /// The column of a name.
     pub(super) fn property(&self, name: &str) -> Result<&Property, IngestError> {
         self.properties.iter().find(|property| property.name == name).ok_or_else(|| {
             error(format!("element {}", self.name), format!("there is no property {name}"))
@@ -147,7 +151,7 @@ impl Element {
 }
 
 impl Property {
-    /// The value in a row, which has the stride of the element.
+    /// The value in a row. The row is as long as the element's stride.
     pub(super) fn value(&self, row: &[u8]) -> f64 {
         /// # Panics
         /// If the row is shorter than the element's stride.

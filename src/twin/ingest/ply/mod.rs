@@ -2,7 +2,7 @@
 //!
 //! Columns are found by name, in any order and of any type: x y z, rot_0..3 (w, x, y, z),
 //! scale_0..2 (ln), opacity (logit), f_dc_0..2, and f_rest_0.. of 0, 9, 24 or 45 coefficients,
-//! channel-major: all of red, then green, then blue. Others, as normals, are skipped.
+//! channel-major: all of red, then green, then blue. Other columns, such as normals, are skipped.
 
 mod compressed;
 mod header;
@@ -28,7 +28,7 @@ pub(super) fn read(
     if vertex.property("packed_position").is_ok() {
         return compressed::read(input, &header, file_bytes, progress);
     }
-    // A missing column changes the size too; its name says more.
+    // Columns come before the size: a missing column changes the size, too, and its name says more.
     let columns = Columns::find(vertex)?;
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;
@@ -49,7 +49,7 @@ pub(super) fn read(
 /// The bytes after the header.
 struct Body<'a, R> {
     input: R,
-    /// Bytes of the file that were read.
+    /// Bytes of the file that have been read.
     done: u64,
     file_bytes: u64,
     progress: Progress<'a>,
@@ -59,10 +59,11 @@ struct Body<'a, R> {
 const REPORT_EVERY: u64 = 16_384;
 
 impl<R: Read> Body<'_, R> {
-    /// Hands the rows of the next element to `take`, one after another.
+    /// Calls `take` with each row of the next element.
     fn rows(&mut self, element: &Element, mut take: impl FnMut(&[u8])) -> Result<(), IngestError> {
         let mut row = vec![0; element.stride];
-        for index in 0..if element.stride == 0 { 0 } else { element.count } {
+        let count = if element.stride == 0 { 0 } else { element.count };
+        for index in 0..count {
             self.input.read_exact(&mut row)?;
             take(&row);
             self.done += row.len() as u64;
@@ -75,14 +76,14 @@ impl<R: Read> Body<'_, R> {
     }
 }
 
-/// Where a vertex has what.
+/// The columns of a vertex.
 struct Columns {
     sh_degree: u8,
     means: Vec<Property>,
     quats: Vec<Property>,
     scales: Vec<Property>,
     opacity: Property,
-    /// Coefficient-major, then red, green, blue: the order in memory.
+    /// Coefficient-major, then red, green, blue, which is the order in memory.
     sh: Vec<Property>,
 }
 
@@ -118,7 +119,7 @@ impl Columns {
     }
 }
 
-/// The SH degree, from how many f_rest there are.
+/// The SH degree, from the number of f_rest columns.
 fn degree(element: &Element) -> Result<u8, IngestError> {
     let rest = element.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     let degree = (0..=sh::MAX_DEGREE).find(|&d| 3 * (sh::coefficients(d) - 1) == rest);
@@ -128,7 +129,7 @@ fn degree(element: &Element) -> Result<u8, IngestError> {
     })
 }
 
-/// What a PLY file calls a field.
+/// The name of a field in a PLY file.
 fn file_name(field: Field, sh_degree: u8) -> String {
     match field {
         Field::Mean(axis) => ["x", "y", "z"][axis].into(),

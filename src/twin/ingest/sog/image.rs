@@ -1,4 +1,4 @@
-//! WebP images whose pixels are numbers.
+//! WebP images with numbers as pixels.
 
 use std::io::Cursor;
 
@@ -10,6 +10,12 @@ use wildcity_scene::sh;
 
 use super::{FORMAT, body};
 
+/// A file of the scene, which is named in errors.
+pub(super) struct NamedFile {
+    pub(super) name: String,
+    pub(super) bytes: Vec<u8>,
+}
+
 /// A decoded image.
 pub(super) struct Image {
     bytes: Vec<u8>,
@@ -19,13 +25,13 @@ pub(super) struct Image {
 }
 
 impl Image {
-    /// Decodes a named image of at least so many pixels.
+    /// Decodes a named image of at least `count` pixels.
     pub(super) fn decode(
-        (name, file): (String, Vec<u8>),
+        NamedFile { name, bytes: file }: NamedFile,
         count: usize,
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
-        // The decoder would not miss what pads the end.
+        // The decoder would accept a truncated file.
         let promised = match file.as_slice() {
             [b'R', b'I', b'F', b'F', a, b, c, d, ..] => {
                 8 + u64::from(u32::from_le_bytes([*a, *b, *c, *d]))
@@ -34,15 +40,15 @@ impl Image {
         };
         let held = file.len() as u64;
         if promised > held {
-            let reason = format!("{held} of {promised} bytes are there: it is truncated");
+            let reason = format!("it has {held} of {promised} bytes: it is truncated");
             return Err(body(&name, reason));
         }
-        let damaged = |e| body(&name, format!("is no sound WebP image: {e}; copy it again"));
+        let damaged = |e| body(&name, format!("is a damaged WebP image: {e}; copy it again"));
         let mut decoder = WebPDecoder::new(Cursor::new(file)).map_err(damaged)?;
         if decoder.is_lossy() {
             return Err(body(
                 &name,
-                "is lossy, which no number survives; encode it lossless".into(),
+                "is lossy, which would change the numbers; encode it lossless".into(),
             ));
         }
         let (width_px, height_px) = decoder.dimensions();
@@ -52,7 +58,7 @@ impl Image {
             let reason = format!("{width_px}x{height_px} pixels for {count} Gaussians");
             return Err(body(&name, reason));
         }
-        // The decoder works on four bytes per pixel, whether there is alpha or not.
+        // The decoder uses four bytes per pixel, with or without alpha.
         budget.unpack(FORMAT, &name, 4 * pixels)?;
         let channels = if decoder.has_alpha() { 4 } else { 3 };
         let mut bytes = vec![0; channels * size_px[0] * size_px[1]];
@@ -60,7 +66,7 @@ impl Image {
         Ok(Self { bytes, channels, size_px })
     }
 
-    /// The first so many pixels.
+    /// The first `count` pixels.
     pub(super) fn pixels(&self, count: usize) -> impl Iterator<Item = [u8; 4]> {
         self.bytes.chunks_exact(self.channels).take(count).map(|pixel| {
             let alpha = pixel.get(3).copied().unwrap_or(255);
@@ -69,11 +75,11 @@ impl Image {
     }
 }
 
-/// The colours of higher degrees that labels choose from.
+/// The palette of higher SH degrees. Labels are indices of its entries.
 pub(super) struct Palette {
     image: Image,
     pub(super) sh_degree: u8,
-    /// Pixels of an entry: coefficients without the first.
+    /// Pixels of an entry: one per coefficient above degree 0.
     coefficients: usize,
     entries: usize,
 }
@@ -82,16 +88,16 @@ pub(super) struct Palette {
 const ENTRIES_PER_ROW: usize = 64;
 
 impl Palette {
-    /// Decodes an image of so many entries and such a degree, where that is known; the width says
-    /// the degree, too.
+    /// Decodes an image, and checks its number of entries and its degree where they are known. Its
+    /// width implies the degree, too.
     pub(super) fn decode(
-        part: (String, Vec<u8>),
+        file: NamedFile,
         entries: Option<u64>,
         bands: Option<u8>,
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
-        let name = part.0.clone();
-        let image = Image::decode(part, 0, budget)?;
+        let name = file.name.clone();
+        let image = Image::decode(file, 0, budget)?;
         let [width_px, height_px] = image.size_px;
         let wide = |d: &u8| ENTRIES_PER_ROW * (sh::coefficients(*d) - 1) == width_px;
         let degree = (1..=sh::MAX_DEGREE).find(wide).filter(|d| bands.is_none_or(|b| b == *d));
@@ -112,7 +118,8 @@ impl Palette {
 
     /// The bytes of an entry: coefficient-major, then red, green, blue.
     pub(super) fn entry(&self, label: u16) -> Option<impl Iterator<Item = u8>> {
-        let (label, stride) = (usize::from(label), self.image.channels);
+        let label = usize::from(label);
+        let stride = self.image.channels;
         if label >= self.entries {
             return None;
         }

@@ -1,11 +1,11 @@
-//! meta.json, of both versions, and what the bytes of the images mean by it.
+//! meta.json in both versions, and tables that map the bytes of the images to values.
 
 use serde::Deserialize;
 
 use crate::ingest::activation;
 use wildcity_scene::sh;
 
-/// What meta.json says; unknown keys are skipped.
+/// The keys of meta.json that are used; others are skipped.
 #[derive(Deserialize)]
 pub(super) struct Meta {
     version: Option<u32>,
@@ -53,10 +53,10 @@ pub(super) struct Higher {
     pub(super) files: (String, String),
 }
 
-/// What the bytes mean.
+/// Maps from bytes to values.
 pub(super) struct Tables {
     pub(super) count: u64,
-    /// Least and most of each axis.
+    /// Smallest and largest value of each axis.
     pub(super) means: [[f64; 2]; 3],
     pub(super) scales: [[f32; 256]; 3],
     pub(super) colours: [[f32; 256]; 3],
@@ -66,13 +66,14 @@ pub(super) struct Tables {
 
 pub(super) struct HigherTable {
     pub(super) values: [f32; 256],
-    /// Entries of the palette and the colours' degree, where meta.json says so.
+    /// Number of entries of the palette, if meta.json says it.
     pub(super) entries: Option<u64>,
     pub(super) bands: Option<u8>,
 }
 
 impl Tables {
-    /// Or why not.
+    /// # Errors
+    /// Says what is missing or wrong.
     pub(super) fn of(meta: &Meta) -> Result<Self, String> {
         let means = std::array::from_fn(|axis| [meta.means.mins[axis], meta.means.maxs[axis]]);
         match meta.version {

@@ -1,9 +1,9 @@
-//! SOG, PlayCanvas' spatially ordered Gaussians: a meta.json and lossless WebP images, one pixel per
-//! Gaussian, in a folder or an archive.
+//! SOG, the spatially ordered Gaussians of PlayCanvas: a meta.json and lossless WebP images, one
+//! pixel per Gaussian, in a folder or an archive.
 //!
 //! Source: the format's description and readers in playcanvas/splat-transform. Images: means_l and
 //! means_u (low and high bytes of 16 bits between mins and maxs, of `sign(x) ln(1 + |x|)`), quats
-//! (three smallest components in 8 bits, alpha 252 to 255 says which is left out), scales (ln), sh0
+//! (three smallest components in 8 bits, alpha 252 to 255 says which is omitted), scales (ln), sh0
 //! (colour; opacity in alpha) and, for higher degrees, shN: labels of 16 bits into centroids, 64 in
 //! a row. Version 2 looks bytes up in codebooks of 256, and alpha is the opacity; version 1, which
 //! names no version, spreads bytes between mins and maxs, and alpha is the logit.
@@ -18,13 +18,13 @@ use wildcity_scene::{Gaussians, sh};
 use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
 use super::{IngestError, activation, check_count};
-use image::Image;
+use image::{Image, NamedFile};
 use meta::{Meta, Tables};
 
 const FORMAT: &str = "SOG";
 
-/// Reads a scene, given its meta.json or lod-meta.json and the folder of it, which is empty or ends
-/// in `/`.
+/// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty
+/// or ends in `/`.
 pub(super) fn read(
     json: &[u8],
     folder: &str,
@@ -38,7 +38,7 @@ pub(super) fn read(
     }
 }
 
-/// What tells the two JSON files apart.
+/// The keys that distinguish the two JSON files.
 #[derive(serde::Deserialize)]
 struct Kind {
     means: Option<serde::de::IgnoredAny>,
@@ -46,7 +46,7 @@ struct Kind {
     lod_levels: Option<serde::de::IgnoredAny>,
 }
 
-/// Reads a scene of one meta.json; `name` is what errors call that.
+/// Reads a scene of one meta.json; errors call that file `name`.
 fn read_one(
     json: &[u8],
     name: &str,
@@ -56,10 +56,11 @@ fn read_one(
     let meta: Meta = serde_json::from_slice(json).map_err(|e| bad(name, e.to_string()))?;
     let tables = Tables::of(&meta).map_err(|reason| bad(name, reason))?;
     let count = check_count(tables.count)?;
-    // All first, since what they may unpack to depends on what they are together.
-    let mut fetch = |file: &str| -> Result<(String, Vec<u8>), IngestError> {
+    // All files are read first, because the limit of unpacking depends on their total size.
+    let mut fetch = |file: &str| -> Result<NamedFile, IngestError> {
         let file = format!("{folder}{file}");
-        parts.read(&file, limits::SCENE_PART_BYTES).map(|bytes| (file, bytes))
+        let bytes = parts.read(&file, limits::SCENE_PART_BYTES)?;
+        Ok(NamedFile { name: file, bytes })
     };
     let [means_l, means_u] = [fetch(&meta.means.files.0)?, fetch(&meta.means.files.1)?];
     let scales = fetch(&meta.scales.files.0)?;
@@ -69,8 +70,9 @@ fn read_one(
         Some(sh_n) => Some([fetch(&sh_n.files.0)?, fetch(&sh_n.files.1)?]),
         None => None,
     };
-    let mut decode = |part: (String, Vec<u8>)| Image::decode(part, count, parts.budget());
+    let mut decode = |file: NamedFile| Image::decode(file, count, parts.budget());
 
+    // Centres: 16 bits between mins and maxs, of the signed logarithm.
     let [low, high] = [decode(means_l)?, decode(means_u)?];
     let mut gaussians = Gaussians { means_m: Vec::with_capacity(count), ..Gaussians::default() };
     for (low, high) in low.pixels(count).zip(high.pixels(count)) {
@@ -83,6 +85,8 @@ fn read_one(
         gaussians.means_m.push(mean);
     }
     drop([low, high]);
+
+    // Rotations, scales, and opacities.
     for [r, g, b, largest] in decode(quats)?.pixels(count) {
         if largest < 252 {
             let index = gaussians.quats_wxyz.len();
@@ -100,13 +104,16 @@ fn read_one(
     }
     let colours = decode(sh0)?;
     gaussians.logit_opacities.extend(colours.pixels(count).map(|p| pick(&tables.logits, p[3])));
+
+    // Colours: degree 0, and higher degrees by labels.
     let dc = |pixel: [u8; 4]| -> [f32; 3] {
         std::array::from_fn(|channel| pick(&tables.colours[channel], pixel[channel]))
     };
     match (higher, tables.higher) {
         (Some([centroids, labels]), Some(table)) => {
-            let (name, entries) = (centroids.0.clone(), table.entries);
-            let palette = image::Palette::decode(centroids, entries, table.bands, parts.budget())?;
+            let name = centroids.name.clone();
+            let palette =
+                image::Palette::decode(centroids, table.entries, table.bands, parts.budget())?;
             let labels = Image::decode(labels, count, parts.budget())?;
             gaussians.sh_degree = palette.sh_degree;
             gaussians.sh.reserve_exact(count * 3 * sh::coefficients(palette.sh_degree));

@@ -1,7 +1,7 @@
 //! Streamed SOG: lod-meta.json and a SOG folder per block of every level of detail.
 //!
-//! Its tree has, at every leaf, one range of Gaussians per level, 0 being the finest. A twin makes
-//! levels of its own from the full detail, so the finest one of every leaf is read.
+//! Every leaf of its tree has one range of Gaussians per level, 0 being the finest. A twin makes
+//! its own levels of detail, so only the finest range of every leaf is read.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -16,13 +16,13 @@ use super::{bad, read_one};
 
 const NAME: &str = "lod-meta.json";
 
-/// What lod-meta.json says; unknown keys are skipped.
+/// The keys of lod-meta.json that are used; others are skipped.
 #[derive(Deserialize)]
 struct LodMeta {
     version: Option<u32>,
-    /// Paths of a meta.json each.
+    /// Paths of meta.json files.
     filenames: Vec<String>,
-    /// One more, of what surrounds the scene.
+    /// Path of one more, with the surroundings of the scene.
     environment: Option<String>,
     tree: Node,
 }
@@ -32,18 +32,18 @@ struct Node {
     #[serde(default)]
     children: Vec<Node>,
     #[serde(default)]
-    lods: BTreeMap<u32, Place>,
+    lods: BTreeMap<u32, FileRange>,
 }
 
 /// Gaussians `offset` to `offset + count - 1` of a file.
 #[derive(Clone, Copy, Deserialize)]
-struct Place {
+struct FileRange {
     file: usize,
     offset: u64,
     count: u64,
 }
 
-/// Reads the finest level, and the environment behind it.
+/// Reads the finest level, and the environment around it.
 pub(super) fn read(
     json: &[u8],
     folder: &str,
@@ -57,14 +57,15 @@ pub(super) fn read(
     if let Some(twice) = meta.filenames.iter().find(|name| !names.insert(name.as_str())) {
         return Err(bad(NAME, format!("file {twice:?} is named twice")));
     }
-    let places = places_by_file(&meta)?;
+    let places = ranges_by_file(&meta)?;
     let total = places.values().flatten().map(|place| u128::from(place.count)).sum::<u128>();
     check_count(u64::try_from(total).unwrap_or(u64::MAX))?;
     let mut all = Gaussians::default();
     for (file, places) in places {
         let block = read_block(&meta.filenames[file], folder, parts)?;
-        for Place { offset, count, .. } in places {
-            let (held, end) = (block.len() as u64, offset.saturating_add(count));
+        for FileRange { offset, count, .. } in places {
+            let held = block.len() as u64;
+            let end = offset.saturating_add(count);
             if end > held {
                 let reason =
                     format!("Gaussians to {end} of {:?}, which has {held}", meta.filenames[file]);
@@ -80,9 +81,9 @@ pub(super) fn read(
     Ok(all)
 }
 
-/// The finest ranges of every file, in order and apart from each other.
-fn places_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<Place>>, IngestError> {
-    let mut places: BTreeMap<usize, Vec<Place>> = BTreeMap::new();
+/// The finest ranges of every file, in order, and checked not to overlap.
+fn ranges_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<FileRange>>, IngestError> {
+    let mut places: BTreeMap<usize, Vec<FileRange>> = BTreeMap::new();
     let mut nodes = vec![&meta.tree];
     while let Some(node) = nodes.pop() {
         nodes.extend(&node.children);
@@ -99,8 +100,7 @@ fn places_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<Place>>, IngestE
         let apart =
             places.windows(2).all(|w| w[0].offset.saturating_add(w[0].count) <= w[1].offset);
         if !apart {
-            let reason =
-                format!("two leaves have the same Gaussians of {:?}", meta.filenames[*file]);
+            let reason = format!("two leaves share Gaussians of {:?}", meta.filenames[*file]);
             return Err(bad(NAME, reason));
         }
     }

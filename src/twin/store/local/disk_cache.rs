@@ -1,14 +1,14 @@
-//! Parts of remote twins on the local disk, by hash, shared by all processes of a user.
+//! A cache of parts of remote twins on the local disk, by hash, shared by all processes of a user.
 //!
 //! ```text
 //! <cache>/3f/3f9c...          sections, manifests and tables, named by the BLAKE3 of their bytes
-//! <cache>/~<process>.<n>      one that is being written
-//! <cache>/lock                held by the process that makes room
+//! <cache>/~<process>.<n>      a part that is being written
+//! <cache>/lock                locked by the process that removes parts to make room
 //! ```
 //!
-//! Every part is compared with its hash when it is read, which costs less than decoding it. So nothing
-//! needs to be synced: what a power cut tore is fetched again. A part's time of modification is when
-//! it was last of use.
+//! Every part is compared with its hash on every read, which costs less than decoding it. So
+//! nothing needs to be synced: a part that a power cut damaged is fetched again. A part's
+//! modification time is the time of its last use, to within a minute.
 
 use std::fs::{self, File};
 use std::io::ErrorKind;
@@ -18,19 +18,19 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use crate::store::StoreError;
-use crate::store::objects::{check_hash, is_hash};
+use crate::store::layout::{check_hash, is_hash};
 
-use super::{WRITING, create_dirs, entries};
+use super::files::{WRITING, create_dirs, entries};
 
-/// A part whose time is older than this gets a new one when it is used.
+/// A part gets a new modification time when it is used and the old one is older than this.
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
-/// How old a part is that its writer left behind, at least.
+/// Age after which an unfinished file is taken for one that a killed process left.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);
-/// Room is made once this share of the limit was written since the last time, so that several
-/// processes together stay close to it.
+/// Each process makes room once it has written one part in this many of the limit, so that several
+/// processes together stay close to the limit.
 const SLACK: u64 = 16;
 
-/// A directory of parts.
+/// A directory of cached parts.
 #[derive(Clone, Debug)]
 pub(in crate::store) struct DiskCache {
     dir: PathBuf,
@@ -42,17 +42,17 @@ pub(in crate::store) struct DiskCache {
 struct Counts {
     hits: AtomicU64,
     misses: AtomicU64,
-    /// Files that were begun, for their names.
+    /// Number of files begun, which makes their names unique.
     begun: AtomicU64,
-    /// Bytes written since room was made.
+    /// Bytes written since room was last made.
     written: AtomicU64,
 }
 
 impl DiskCache {
-    /// Uses a directory, made if need be, for at most so many bytes.
+    /// Uses a directory, created if need be, for at most `limit_bytes`.
     ///
     /// # Errors
-    /// It cannot be made or listed.
+    /// It cannot be created or listed.
     pub(in crate::store) fn open(dir: &Path, limit_bytes: u64) -> Result<Self, StoreError> {
         create_dirs(dir)?;
         let cache = Self { dir: dir.to_owned(), limit_bytes, counts: Arc::default() };
@@ -60,14 +60,14 @@ impl DiskCache {
         Ok(cache)
     }
 
-    /// A part, if it is there and sound.
+    /// A part, if it is cached and undamaged.
     pub(in crate::store) fn get(&self, hash: &str) -> Option<Vec<u8>> {
         let path = self.path(hash);
         let bytes = fs::read(&path).ok();
         let sound = bytes.filter(|bytes| {
             let sound = check_hash(bytes, hash).is_ok();
             if !sound {
-                // Fetched again, and put again: nobody needs to know.
+                // The caller fetches it again and puts it back, so there is nothing to report.
                 let _ = fs::remove_file(&path);
             }
             sound
@@ -80,8 +80,8 @@ impl DiskCache {
         sound
     }
 
-    /// Keeps a part that has this hash. A disk that is full or gone makes reading slow, not wrong, so
-    /// there is nothing to report.
+    /// Caches a part that has this hash. Failures are ignored: without the cache, reading is slow
+    /// but correct.
     pub(in crate::store) fn put(&self, hash: &str, bytes: &[u8]) {
         let size = bytes.len() as u64;
         if size > self.limit_bytes / SLACK {
@@ -112,8 +112,8 @@ impl DiskCache {
         self.dir.join(&hash[..2]).join(hash)
     }
 
-    /// Removes what was of no use for longest, until there is room for what is written before this
-    /// is done again. One process at a time; who comes meanwhile leaves it to that.
+    /// Removes the least recently used parts until there is room for what is written before the
+    /// next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");
         let lock = File::options().create(true).append(true).open(&path);
@@ -132,7 +132,7 @@ impl DiskCache {
             }
             for part in entries(&path)?.into_iter().filter(|part| is_hash(part)) {
                 let path = path.join(part);
-                // Another process may have removed it: it was damaged.
+                // Another process may have removed it because it was damaged.
                 if let Ok(found) = fs::metadata(&path)
                     && let Ok(used) = found.modified()
                 {
@@ -147,7 +147,7 @@ impl DiskCache {
                 break;
             }
             match fs::remove_file(&path) {
-                // Another process was faster.
+                // Another process has removed it.
                 Err(error) if error.kind() != ErrorKind::NotFound => {
                     return Err(StoreError::io("remove", &path)(error));
                 }
@@ -158,7 +158,7 @@ impl DiskCache {
     }
 }
 
-/// Notes that a part was of use. If that cannot be had, it is removed earlier than it should be.
+/// Marks a part as used. If that fails, the part is only removed earlier than it should be.
 fn touch(path: &Path) {
     if age(path).is_some_and(|age| age > TOUCH_AFTER)
         && let Ok(file) = File::options().append(true).open(path)
@@ -190,12 +190,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_put_is_there_for_everybody_until_there_is_no_room() {
+    fn parts_are_shared_by_processes_until_there_is_no_room() {
         let dir = tempfile::tempdir().unwrap();
         let [one, two] = [(); 2].map(|()| DiskCache::open(dir.path(), 32_000).unwrap());
         for number in 0..100 {
             one.put(&hash(&part(number)), &part(number));
-            // The first one stays of use.
+            // The first part stays in use.
             let path = one.path(&hash(&part(0)));
             let old = SystemTime::now() - 2 * TOUCH_AFTER;
             File::options().append(true).open(&path).unwrap().set_modified(old).unwrap();
@@ -206,13 +206,13 @@ mod tests {
         assert_eq!(two.get(&hash(&part(99))), Some(part(99)));
         assert_eq!(two.get(&hash(&part(1))), None);
         assert_eq!(two.hits_and_misses(), (101, 1));
-        // Larger than all that is kept together should be.
+        // Larger than a part may be.
         one.put(&hash(&[7; 3_000]), &[7; 3_000]);
         assert_eq!(one.get(&hash(&[7; 3_000])), None);
     }
 
     #[test]
-    fn what_is_damaged_is_not_there() {
+    fn a_damaged_part_is_not_returned() {
         let dir = tempfile::tempdir().unwrap();
         let cache = DiskCache::open(dir.path(), 1 << 20).unwrap();
         let name = hash(&part(1));
@@ -224,7 +224,7 @@ mod tests {
             cache.put(&name, &part(1));
             assert_eq!(cache.get(&name), Some(part(1)));
         }
-        // What a killed process was writing goes, after a while.
+        // What a killed process was writing is removed after a while.
         let [old, new] = ["~1.0", "~1.1"].map(|name| dir.path().join(name));
         for path in [&old, &new] {
             fs::write(path, "half").unwrap();

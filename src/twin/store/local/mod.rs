@@ -1,53 +1,49 @@
-//! Twins in a directory. Only this folder opens files of a twin.
+//! Twins in a directory. In the store, only this folder opens files.
 
-pub(super) mod disk_cache;
-pub(super) mod staging;
+mod directory;
+mod disk_cache;
+mod files;
+mod staging;
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
-use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::UNIX_EPOCH;
 
 use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::objects::{self, ListedObject, ObjectBackend, Staging, is_hash, log_numbers};
+use super::backend::{ListedObject, ObjectBackend, Staging};
+use super::layout::{check_hash, check_side_file, is_hash, log_numbers};
 
-/// Bytes read or written at once.
-const BUFFER_BYTES: usize = 256 << 10;
-const STAGING: &str = ".staging";
-/// Between the twin's name and the commit's in the name of a staging directory; in neither of them.
-const OF: char = '@';
-/// The file of a staging directory that its commit holds locked.
-const LOCK: &str = "lock";
-/// How the name of a note begins that is being written.
-const WRITING: char = '~';
+pub(super) use directory::Local;
+pub(super) use disk_cache::DiskCache;
 
-/// The directory of twins.
-#[derive(Clone, Debug)]
-pub(in crate::store) struct Local {
-    root: PathBuf,
-}
+use directory::{OpenObject, PublishLock, SEPARATOR, STAGING, is_abandoned};
+use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, sync_parent};
+use staging::LocalStaging;
 
 impl ObjectBackend for Local {
     fn root(&self) -> &Path {
         &self.root
     }
 
-    fn names(&self) -> Result<Vec<String>, StoreError> {
+    fn twin_names(&self) -> Result<Vec<String>, StoreError> {
         let mut names = entries(&self.root)?;
-        names.retain(|name| is_name(name) && !self.numbers(name).is_ok_and(|n| n.is_empty()));
+        names.retain(|name| {
+            is_name(name) && !self.version_numbers(name).is_ok_and(|n| n.is_empty())
+        });
         Ok(names)
     }
 
-    fn numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
+    fn version_numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
         Ok(log_numbers(entries(&self.root.join(name).join("log"))?))
     }
 
-    fn record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
+    fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
         let path = self.record_path(name, number);
         let file = File::open(&path).map_err(StoreError::io("open", &path))?;
         let mut bytes = Vec::new();
@@ -58,7 +54,7 @@ impl ObjectBackend for Local {
     }
 
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
-        let (path, mut file, size) = self.open(name, hash)?;
+        let OpenObject { path, mut file, bytes: size } = self.open(name, hash)?;
         if size > limit_bytes {
             let reason = format!("{size} bytes are above {limit_bytes}");
             return Err(StoreError::Damaged { path, reason });
@@ -68,16 +64,16 @@ impl ObjectBackend for Local {
             .take(limit_bytes)
             .read_to_end(&mut bytes)
             .map_err(StoreError::io("read", &path))?;
-        match objects::check_hash(&bytes, hash) {
+        match check_hash(&bytes, hash) {
             Ok(()) => Ok(bytes),
             Err(reason) => Err(StoreError::Damaged { path, reason }),
         }
     }
 
     fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
-        let (path, file, _) = self.open(name, hash)?;
+        let OpenObject { path, file, .. } = self.open(name, hash)?;
         let failed = || StoreError::io("read", &path);
-        let mut reader = Hashing { inner: file, hasher: blake3::Hasher::new() };
+        let mut reader = HashingFile::new(file);
         let mut start = Vec::new();
         (&mut reader).take(most_bytes as u64).read_to_end(&mut start).map_err(failed())?;
         let mut buffer = vec![0; BUFFER_BYTES];
@@ -96,7 +92,7 @@ impl ObjectBackend for Local {
         bytes: Range<u64>,
         hash: &[u8; 32],
     ) -> Result<Vec<u8>, StoreError> {
-        let (path, mut file, size) = self.open(name, object)?;
+        let OpenObject { path, mut file, bytes: size } = self.open(name, object)?;
         if bytes.end > size {
             let reason = format!("it has {size} bytes; {} are needed", bytes.end);
             return Err(StoreError::Damaged { path, reason });
@@ -113,8 +109,9 @@ impl ObjectBackend for Local {
     }
 
     fn read_and_discard(&self, name: &str, hash: &str) -> Result<u64, StoreError> {
-        let (path, mut file, _) = self.open(name, hash)?;
-        let (mut buffer, mut bytes) = (vec![0; BUFFER_BYTES], 0);
+        let OpenObject { path, mut file, .. } = self.open(name, hash)?;
+        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut bytes = 0;
         loop {
             match file.read(&mut buffer).map_err(StoreError::io("read", &path))? {
                 0 => return Ok(bytes),
@@ -124,21 +121,21 @@ impl ObjectBackend for Local {
     }
 
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {
-        let (path, _, found) = self.open(name, hash)?;
+        let OpenObject { path, bytes: found, .. } = self.open(name, hash)?;
         if found == bytes {
             return Ok(());
         }
         Err(StoreError::Damaged { path, reason: format!("it has {found} bytes, not {bytes}") })
     }
 
-    fn stage(&self, name: &str, commit: &str) -> Result<Staging, StoreError> {
-        self.begin(name, commit).map(Staging::Local)
+    fn begin_staging(&self, name: &str, commit: &str) -> Result<Box<dyn Staging>, StoreError> {
+        Ok(Box::new(LocalStaging::begin(self, name, commit)?))
     }
 
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError> {
         let mut names = Vec::new();
         for entry in entries(&self.root.join(STAGING))? {
-            let name = entry.split_once(OF).map(|(name, _)| name);
+            let name = entry.split_once(SEPARATOR).map(|(name, _)| name);
             names.extend(name.filter(|name| is_name(name)).map(str::to_owned));
         }
         names.dedup();
@@ -150,24 +147,25 @@ impl ObjectBackend for Local {
         name: &str,
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError> {
-        let (path, turn) = self.publish_lock_file(name)?;
-        match turn.try_lock() {
+        let PublishLock { path, file } = self.publish_lock(name)?;
+        match file.try_lock() {
             Ok(()) => {}
-            // Somebody publishes or sweeps.
+            // Another process publishes a version or does this.
             Err(TryLockError::WouldBlock) => return Ok(()),
             Err(TryLockError::Error(cause)) => return Err(StoreError::io("lock", &path)(cause)),
         }
         let mut abandoned = Vec::new();
         for entry in entries(&self.root.join(STAGING))? {
             let dir = self.root.join(STAGING).join(&entry);
-            if entry.split_once(OF).is_some_and(|(of, _)| of == name) && is_abandoned(&dir)? {
+            if entry.split_once(SEPARATOR).is_some_and(|(of, _)| of == name) && is_abandoned(&dir)?
+            {
                 abandoned.push(dir);
             }
         }
         if abandoned.is_empty() {
             return Ok(());
         }
-        // The staging goes last: while it is there, the next start comes here again.
+        // The staging directories are removed last: while they exist, the next start tries again.
         if let Some(named) = named() {
             self.remove_unnamed(name, &named)?;
         }
@@ -183,7 +181,7 @@ impl ObjectBackend for Local {
         Ok(())
     }
 
-    fn list(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
+    fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
         let objects = self.root.join(name).join("objects");
         let mut listed = Vec::new();
         for prefix in entries(&objects)? {
@@ -201,14 +199,14 @@ impl ObjectBackend for Local {
         Ok(listed)
     }
 
-    fn remove(
+    fn remove_objects(
         &self,
         name: &str,
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
-        let _turn = self.lock_publishing(name)?;
+        let _publish_lock = self.lock_publishing(name)?;
         for hash in which()? {
-            let path = self.path(name, &hash);
+            let path = self.object_file(name, &hash);
             fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
         }
         self.remove_empty(name);
@@ -216,13 +214,13 @@ impl ObjectBackend for Local {
     }
 
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
-        let mut notes = entries(&self.root.join(name).join(folder))?;
-        notes.retain(|note| !note.starts_with(WRITING));
-        Ok(notes)
+        let mut files = entries(&self.root.join(name).join(folder))?;
+        files.retain(|file| !file.starts_with(WRITING));
+        Ok(files)
     }
 
-    fn read_side_file(&self, name: &str, note: &str) -> Result<Option<Vec<u8>>, StoreError> {
-        let path = self.root.join(name).join(note);
+    fn read_side_file(&self, name: &str, file: &str) -> Result<Option<Vec<u8>>, StoreError> {
+        let path = self.root.join(name).join(file);
         let file = match File::open(&path) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
@@ -238,11 +236,11 @@ impl ObjectBackend for Local {
         Ok(Some(bytes))
     }
 
-    fn write_side_file(&self, name: &str, note: &str, bytes: &[u8]) -> Result<(), StoreError> {
-        let path = self.root.join(name).join(note);
-        objects::check_side_file(path.clone(), bytes)?;
+    fn write_side_file(&self, name: &str, file: &str, bytes: &[u8]) -> Result<(), StoreError> {
+        let path = self.root.join(name).join(file);
+        check_side_file(path.clone(), bytes)?;
         create_parent(&path)?;
-        // A name of its own: threads of one process may write the same note.
+        // A unique name, because threads of one process may write the same side file.
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let writing = path.with_file_name(format!("{WRITING}{id}"));
         let mut file = File::create(&writing).map_err(StoreError::io("write", &writing))?;
@@ -253,8 +251,8 @@ impl ObjectBackend for Local {
         sync_parent(&path)
     }
 
-    fn remove_side_file(&self, name: &str, note: &str) -> Result<(), StoreError> {
-        let path = self.root.join(name).join(note);
+    fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError> {
+        let path = self.root.join(name).join(file);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => {
                 Err(StoreError::io("remove", &path)(error))
@@ -264,183 +262,22 @@ impl ObjectBackend for Local {
     }
 }
 
-impl Local {
-    pub(in crate::store) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned() }
-    }
-
-    /// Opens an object: where it lies, it, and its size in bytes.
-    fn open(&self, name: &str, hash: &str) -> Result<(PathBuf, File, u64), StoreError> {
-        let path = self.path(name, hash);
-        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
-        let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
-        Ok((path, file, bytes))
-    }
-
-    /// A directory of its own, locked for as long as the process lives.
-    fn begin(&self, name: &str, commit: &str) -> Result<staging::Staging, StoreError> {
-        // Whoever sweeps has the turn, and must not find the directory before its lock is taken.
-        let _turn = self.lock_publishing(name)?;
-        let dir = self.root.join(STAGING).join(format!("{name}{OF}{commit}"));
-        fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;
-        let path = dir.join(LOCK);
-        let lock = File::create_new(&path).map_err(StoreError::io("create", &path))?;
-        lock.lock().map_err(StoreError::io("lock", &path))?;
-        Ok(staging::Staging {
-            objects: self.clone(),
-            name: name.to_owned(),
-            dir,
-            placed: Vec::new(),
-            turn: None,
-            _lock: lock,
-        })
-    }
-
-    fn remove_unnamed(&self, name: &str, named: &BTreeSet<String>) -> Result<(), StoreError> {
-        let objects = self.root.join(name).join("objects");
-        for prefix in entries(&objects)? {
-            for hash in entries(&objects.join(&prefix))? {
-                if !named.contains(&hash) {
-                    let path = objects.join(&prefix).join(&hash);
-                    fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Removes the empty directories of a twin: all, if it never had a version, and then nobody noted
-    /// anything of it. Notes are written without a turn, so their directories stay. Whoever calls has
-    /// the turn.
-    fn remove_empty(&self, name: &str) {
-        let twin = self.root.join(name);
-        for prefix in entries(&twin.join("objects")).unwrap_or_default() {
-            let _ = fs::remove_dir(twin.join("objects").join(prefix));
-        }
-        for dir in [twin.join("objects"), twin.join("log"), twin] {
-            let _ = fs::remove_dir(dir);
-        }
-    }
-
-    /// Waits until nobody else publishes a version of a twin.
-    fn lock_publishing(&self, name: &str) -> Result<File, StoreError> {
-        create_dirs(&self.root.join(STAGING))?;
-        let (path, turn) = self.publish_lock_file(name)?;
-        turn.lock().map_err(StoreError::io("lock", &path))?;
-        Ok(turn)
-    }
-
-    /// The file stays for ever: were it removed, two commits could lock two files of a name.
-    fn publish_lock_file(&self, name: &str) -> Result<(PathBuf, File), StoreError> {
-        let path = self.root.join(STAGING).join(format!("{name}.lock"));
-        let file = File::options().create(true).append(true).open(&path);
-        let file = file.map_err(StoreError::io("create", &path))?;
-        Ok((path, file))
-    }
-}
-
-/// Whether nobody holds a staging directory. Whoever asks has the turn.
-fn is_abandoned(dir: &Path) -> Result<bool, StoreError> {
-    let path = dir.join(LOCK);
-    match File::options().append(true).open(&path) {
-        Ok(lock) => match lock.try_lock() {
-            Ok(()) => Ok(true),
-            Err(TryLockError::WouldBlock) => Ok(false),
-            Err(TryLockError::Error(cause)) => Err(StoreError::io("lock", &path)(cause)),
-        },
-        // Killed before there was one, or its own process removes it right now.
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(dir.exists()),
-        Err(error) => Err(StoreError::io("open", &path)(error)),
-    }
-}
-
-/// A file and the hash of what passed through it.
-#[derive(Debug)]
-struct Hashing {
-    inner: File,
-    hasher: blake3::Hasher,
-}
-
-impl Read for Hashing {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let read = self.inner.read(buffer)?;
-        self.hasher.update(&buffer[..read]);
-        Ok(read)
-    }
-}
-
-impl Write for Hashing {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.inner.write(bytes)?;
-        self.hasher.update(&bytes[..written]);
-        Ok(written)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.inner.flush()
-    }
-}
-
-/// Names in a directory, sorted; none if it does not exist.
-fn entries(dir: &Path) -> Result<Vec<String>, StoreError> {
-    let failed = || StoreError::io("list", dir);
-    let listing = match fs::read_dir(dir) {
-        Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-            return Ok(Vec::new());
-        }
-        listing => listing.map_err(failed())?,
-    };
-    let mut names = Vec::new();
-    for entry in listing {
-        // A name that is not UTF-8 is not ours.
-        names.extend(entry.map_err(failed())?.file_name().into_string());
-    }
-    names.sort_unstable();
-    Ok(names)
-}
-
-fn create_parent(path: &Path) -> Result<(), StoreError> {
-    path.parent().map_or(Ok(()), create_dirs)
-}
-
-/// Makes a directory and those above it that are missing, each to last through a power cut: what is
-/// written into a directory is lost with the directory's own entry.
-fn create_dirs(dir: &Path) -> Result<(), StoreError> {
-    // The parent of "twins" is "", which is the directory that we are in.
-    if dir.as_os_str().is_empty() || dir.is_dir() {
-        return Ok(());
-    }
-    create_parent(dir)?;
-    match fs::create_dir(dir) {
-        // Another process may have been faster.
-        Err(error) if error.kind() != ErrorKind::AlreadyExists || !dir.is_dir() => {
-            Err(StoreError::io("create", dir)(error))
-        }
-        _ => sync_parent(dir),
-    }
-}
-
-/// Makes a new name last through a power cut: the directory is written out, too.
-fn sync_parent(path: &Path) -> Result<(), StoreError> {
-    path.parent().map_or(Ok(()), sync)
-}
-
-fn sync(dir: &Path) -> Result<(), StoreError> {
-    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-    File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
-}
-
 #[cfg(test)]
 mod tests {
+    use super::directory::LOCK;
     use super::*;
 
+    fn begin(local: &Local, name: &str, commit: &str) -> Result<LocalStaging, StoreError> {
+        LocalStaging::begin(local, name, commit)
+    }
+
     #[test]
-    fn a_number_is_taken_once_and_the_loser_leaves_nothing() {
+    fn a_number_is_taken_once_and_a_refused_commit_leaves_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let objects = Local::new(dir.path());
         let commit = |content: &[u8]| {
-            let mut staging = objects.begin("street", "a")?;
-            let put = staging.put(|out| out.write_all(content))?;
+            let mut staging = begin(&objects, "street", "a")?;
+            let put = staging.put(Box::new(|out| out.write_all(content)))?;
             staging.lock_publishing()?;
             staging.publish(&BTreeSet::from([&*put.hash]), 1, content).map(|()| put)
         };
@@ -451,19 +288,19 @@ mod tests {
         );
         let error = commit(b"second").unwrap_err();
         assert!(matches!(error, StoreError::Conflict { number: 1, .. }), "{error}");
-        assert_eq!(objects.record("street", 1).unwrap(), b"first");
-        assert_eq!(objects.numbers("street").unwrap(), [1]);
+        assert_eq!(objects.read_record("street", 1).unwrap(), b"first");
+        assert_eq!(objects.version_numbers("street").unwrap(), [1]);
         objects.read_start("street", &first.hash, 0).unwrap();
-        let lost = objects.path("street", &blake3::hash(b"second").to_hex());
+        let lost = objects.object_path("street", &blake3::hash(b"second").to_hex());
         assert!(!lost.exists() && !lost.parent().unwrap().exists());
         assert_eq!(objects.unfinished_commits().unwrap(), [""; 0]);
     }
 
     #[test]
-    fn a_version_that_may_not_last_is_not_said_to_be_gone() {
+    fn the_error_of_a_version_that_is_not_synced_says_that_it_is_in_place() {
         let dir = tempfile::tempdir().unwrap();
         let objects = Local::new(dir.path());
-        let staging = objects.begin("street", "a").unwrap();
+        let staging = begin(&objects, "street", "a").unwrap();
         let source = StoreError::io("sync", dir.path())(ErrorKind::StorageFull.into());
         let said = staging.not_synced(3, source).to_string();
         assert!(said.starts_with("version 3 of twin \"street\" is in place, but"), "{said}");
@@ -471,30 +308,20 @@ mod tests {
     }
 
     #[test]
-    fn directories_are_made_with_those_above_them() {
-        let dir = tempfile::tempdir().unwrap();
-        create_dirs(&dir.path().join("a/b/c")).unwrap();
-        create_dirs(&dir.path().join("a/b/c")).unwrap();
-        assert!(dir.path().join("a/b/c").is_dir());
-        fs::write(dir.path().join("file"), "").unwrap();
-        let said = create_dirs(&dir.path().join("file/d")).unwrap_err().to_string();
-        assert!(said.starts_with("cannot create"), "{said}");
-    }
-
-    #[test]
-    fn only_what_was_abandoned_is_swept() {
+    fn only_abandoned_staging_is_removed() {
         let dir = tempfile::tempdir().unwrap();
         let objects = Local::new(dir.path());
         let staged = || {
             let mut names = entries(&dir.path().join(STAGING)).unwrap();
-            names.retain(|name| name.contains(OF));
+            names.retain(|name| name.contains(SEPARATOR));
             names
         };
-        let running = objects.begin("street", "a").unwrap();
-        let mut killed = objects.begin("street", "b").unwrap();
-        killed.put(|out| out.write_all(b"staged")).unwrap();
-        let (other, dir_of_b) = (objects.begin("avenue", "c").unwrap(), killed.dir.clone());
-        // As the kernel lets go of a killed process's files, and nothing else happens.
+        let running = begin(&objects, "street", "a").unwrap();
+        let mut killed = begin(&objects, "street", "b").unwrap();
+        killed.put(Box::new(|out| out.write_all(b"staged"))).unwrap();
+        let other = begin(&objects, "avenue", "c").unwrap();
+        let dir_of_b = killed.dir.clone();
+        // As after a kill: the kernel releases the process's locks, and no file is removed.
         killed.dir = dir.path().join("elsewhere");
         drop(killed);
         assert!(dir_of_b.join(LOCK).exists());

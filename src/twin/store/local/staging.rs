@@ -1,108 +1,58 @@
-//! A commit in the making, in a directory of its own.
+//! A commit in preparation, in a directory of its own.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, ErrorKind, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use crate::store::StoreError;
-use crate::store::objects::{ObjectBackend as _, StoredObject};
+use crate::store::backend::{Staging, StoredObject, WriteObject};
 
-use super::{BUFFER_BYTES, Hashing, Local, create_parent, sync, sync_parent};
+use super::directory::{LOCK, Local, SEPARATOR, STAGING};
+use super::files::{BUFFER_BYTES, HashingFile, create_parent, sync, sync_parent};
 
-/// ObjectBackend of a commit that nobody sees yet. Dropped before [`Staging::publish`] succeeds, it
-/// leaves nothing behind.
+/// Objects of a commit that no reader sees yet. Dropped before it is published, it leaves nothing
+/// behind.
 #[derive(Debug)]
-pub(in crate::store) struct Staging {
-    pub(super) objects: Local,
-    pub(super) name: String,
+pub(super) struct LocalStaging {
+    local: Local,
+    name: String,
     pub(super) dir: PathBuf,
-    /// ObjectBackend that were not there before this commit put them.
-    pub(super) placed: Vec<PathBuf>,
-    /// Held while publishing: others must not rely on an object that may be taken back.
-    pub(super) turn: Option<File>,
+    /// Objects that did not exist before this commit placed them.
+    placed: Vec<PathBuf>,
+    /// The publish lock. While it is held, no other commit can rely on an object that may be
+    /// removed again.
+    publish_lock: Option<File>,
     /// Released by the kernel when the process ends, however it ends.
-    pub(super) _lock: File,
+    _lock: File,
 }
 
-impl Staging {
-    /// Where it lies.
-    pub(in crate::store) fn dir(&self) -> &Path {
-        &self.dir
-    }
-
-    /// Writes one object, hashing on the way, and names it by its hash.
-    pub(in crate::store) fn put(
-        &mut self,
-        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> Result<StoredObject, StoreError> {
-        let path = self.dir.join("writing");
-        let failed = || StoreError::io("write", &path);
-        let file = File::create(&path).map_err(failed())?;
-        let hashing = Hashing { inner: file, hasher: blake3::Hasher::new() };
-        let mut writer = BufWriter::with_capacity(BUFFER_BYTES, hashing);
-        write(&mut writer).map_err(failed())?;
-        let Hashing { inner: file, hasher } =
-            writer.into_inner().map_err(|e| e.into_error()).map_err(failed())?;
-        file.sync_all().map_err(failed())?;
-        let (hash, bytes) = (hasher.finalize().to_hex().to_string(), hasher.count());
-        let staged = self.dir.join(&hash);
-        fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
-        Ok(StoredObject { hash, bytes })
-    }
-
-    /// Waits until nobody else publishes a version of this twin, and then nobody does until this is
-    /// dropped.
-    pub(in crate::store) fn lock_publishing(&mut self) -> Result<(), StoreError> {
-        self.turn = Some(self.objects.lock_publishing(&self.name)?);
-        Ok(())
-    }
-
-    /// Makes objects that were put and then the log record visible. Whoever calls has the turn.
-    ///
-    /// # Errors
-    /// Nothing is visible, unless it is [`StoreError::NotSynced`].
-    pub(in crate::store) fn publish(
-        &mut self,
-        hashes: &BTreeSet<&str>,
-        number: u64,
-        record: &[u8],
-    ) -> Result<(), StoreError> {
-        self.place(hashes)?;
-        let staged = self.dir.join("record");
-        let failed = || StoreError::io("write", &staged);
-        let mut file = File::create(&staged).map_err(failed())?;
-        file.write_all(record).and_then(|()| file.sync_all()).map_err(failed())?;
-        let path = self.objects.record_path(&self.name, number);
-        create_parent(&path)?;
-        // A link, unlike a rename, fails if the number is taken: put if absent.
-        fs::hard_link(&staged, &path).map_err(|source| match source.kind() {
-            ErrorKind::AlreadyExists => StoreError::Conflict { name: self.name.clone(), number },
-            _ => StoreError::io("write", &path)(source),
-        })?;
-        // Whoever looks has seen the version from here on, so it is not taken back.
-        self.placed.clear();
-        sync_parent(&path).map_err(|error| self.not_synced(number, error))
-    }
-
-    /// Puts objects in the place of those of a version that is there already, which heals damaged
-    /// and lost ones, and sees to it that its record lasts. Whoever calls has the turn.
-    pub(in crate::store) fn restore(
-        &mut self,
-        hashes: &BTreeSet<&str>,
-        number: u64,
-    ) -> Result<(), StoreError> {
-        self.place(hashes)?;
-        self.placed.clear();
-        let path = self.objects.record_path(&self.name, number);
-        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+impl LocalStaging {
+    /// Creates the directory, and locks it for as long as the process lives.
+    pub(super) fn begin(local: &Local, name: &str, commit: &str) -> Result<Self, StoreError> {
+        // Removing abandoned directories takes this lock, too, and must not find this one before
+        // its own lock is taken.
+        let _publish_lock = local.lock_publishing(name)?;
+        let dir = local.root.join(STAGING).join(format!("{name}{SEPARATOR}{commit}"));
+        fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;
+        let path = dir.join(LOCK);
+        let lock = File::create_new(&path).map_err(StoreError::io("create", &path))?;
+        lock.lock().map_err(StoreError::io("lock", &path))?;
+        Ok(Self {
+            local: local.clone(),
+            name: name.to_owned(),
+            dir,
+            placed: Vec::new(),
+            publish_lock: None,
+            _lock: lock,
+        })
     }
 
     pub(super) fn not_synced(&self, number: u64, error: StoreError) -> StoreError {
         StoreError::NotSynced { name: self.name.clone(), number, cause: Box::new(error) }
     }
 
-    /// Moves those of the objects that were put here to their places, over older copies, too.
+    /// Moves those of the objects that were put here to their final places, over older copies, too.
     fn place(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
         let mut changed = BTreeSet::new();
         for hash in hashes {
@@ -110,7 +60,7 @@ impl Staging {
             if !staged.exists() {
                 continue;
             }
-            let path = self.objects.path(&self.name, hash);
+            let path = self.local.object_file(&self.name, hash);
             create_parent(&path)?;
             if !path.exists() {
                 self.placed.push(path.clone());
@@ -122,14 +72,70 @@ impl Staging {
     }
 }
 
-impl Drop for Staging {
-    /// What cannot be removed here is removed by the next start, so failures need no report.
+impl Staging for LocalStaging {
+    fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError> {
+        let path = self.dir.join("writing");
+        let failed = || StoreError::io("write", &path);
+        let file = File::create(&path).map_err(failed())?;
+        let mut writer = BufWriter::with_capacity(BUFFER_BYTES, HashingFile::new(file));
+        write(&mut writer).map_err(failed())?;
+        let HashingFile { inner: file, hasher } =
+            writer.into_inner().map_err(|e| e.into_error()).map_err(failed())?;
+        file.sync_all().map_err(failed())?;
+        let hash = hasher.finalize().to_hex().to_string();
+        let staged = self.dir.join(&hash);
+        fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
+        Ok(StoredObject { hash, bytes: hasher.count() })
+    }
+
+    fn lock_publishing(&mut self) -> Result<(), StoreError> {
+        self.publish_lock = Some(self.local.lock_publishing(&self.name)?);
+        Ok(())
+    }
+
+    fn publish(
+        &mut self,
+        hashes: &BTreeSet<&str>,
+        number: u64,
+        record: &[u8],
+    ) -> Result<(), StoreError> {
+        self.place(hashes)?;
+        let staged = self.dir.join("record");
+        let failed = || StoreError::io("write", &staged);
+        let mut file = File::create(&staged).map_err(failed())?;
+        file.write_all(record).and_then(|()| file.sync_all()).map_err(failed())?;
+        let path = self.local.record_file(&self.name, number);
+        create_parent(&path)?;
+        // Put if absent: a hard link, unlike a rename, fails if the number is taken.
+        fs::hard_link(&staged, &path).map_err(|source| match source.kind() {
+            ErrorKind::AlreadyExists => StoreError::Conflict { name: self.name.clone(), number },
+            _ => StoreError::io("write", &path)(source),
+        })?;
+        // From here on a reader may have seen the version, so its objects are not removed again.
+        self.placed.clear();
+        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+    }
+
+    fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError> {
+        self.place(hashes)?;
+        self.placed.clear();
+        let path = self.local.record_file(&self.name, number);
+        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+    }
+
+    fn dir(&self) -> &Path {
+        &self.dir
+    }
+}
+
+impl Drop for LocalStaging {
+    /// What cannot be removed here is removed by the next start, so failures are ignored.
     fn drop(&mut self) {
-        if self.turn.is_some() {
+        if self.publish_lock.is_some() {
             for path in &self.placed {
                 let _ = fs::remove_file(path);
             }
-            self.objects.remove_empty(&self.name);
+            self.local.remove_empty(&self.name);
         }
         let _ = fs::remove_dir_all(&self.dir);
     }

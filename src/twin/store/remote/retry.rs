@@ -1,34 +1,34 @@
-//! Requests run on threads of their own, each with a time-out, and again a bounded number of times.
+//! Requests run on threads of their own, each with a time-out and a bounded number of retries.
+//!
+//! The calling thread waits on a channel, because `block_on` panics on threads of another runtime.
 
 use std::io::{self, ErrorKind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc;
-use std::sync::{Arc, mpsc::Receiver};
+use std::sync::mpsc::{self, Receiver};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
 
 use crate::limits;
 
-use super::to_io;
-
-/// How long a store is waited for.
+/// Time-outs and retries of requests to an object store.
 #[derive(Clone, Copy, Debug)]
 pub struct RetryPolicy {
-    /// How long one request may take, its bytes included.
+    /// How long one request may take, including its bytes.
     pub timeout: Duration,
-    /// How often a request is made, at most.
+    /// The most attempts of one request.
     pub tries: u32,
-    /// How long to wait before the second try; twice as long before each further one.
+    /// Pause before the second attempt; it doubles before each further one.
     pub backoff: Duration,
-    /// How long one request for a section may take, which a step waits for.
+    /// How long one request for a section may take. Steps wait for these.
     pub section_timeout: Duration,
-    /// How often such a request is made, at most.
+    /// The most attempts of a request for a section.
     pub section_tries: u32,
 }
 
 impl RetryPolicy {
-    /// With what a step waits for, and with what tells how large something is.
+    /// The policy of requests that a step waits for, and of requests for the size of an object.
     pub(super) fn for_sections(self) -> Self {
         Self { timeout: self.section_timeout, tries: self.section_tries, ..self }
     }
@@ -46,22 +46,22 @@ impl Default for RetryPolicy {
     }
 }
 
-/// What was asked of a store since it was opened.
+/// Counts of requests to a store since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traffic {
-    /// Requests, each try for itself.
+    /// Requests; each attempt counts.
     pub requests: u64,
-    /// Requests that were made again.
+    /// Attempts after a request's first.
     pub retries: u64,
-    /// Requests that failed for good; not being there is no failure.
+    /// Requests that failed after the last attempt. An object that does not exist is no failure.
     pub failures: u64,
-    /// Parts that the disk cache had.
+    /// Parts that were found in the disk cache.
     pub cache_hits: u64,
-    /// Parts that it did not have.
+    /// Parts that were not.
     pub cache_misses: u64,
 }
 
-/// What is counted.
+/// A counter of [`Traffic`], as an index.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum RequestCounter {
     Request,
@@ -69,16 +69,17 @@ pub(super) enum RequestCounter {
     Failure,
 }
 
-/// Threads that requests run on, so that any thread may wait for one, even one of another runtime.
+/// The threads that requests run on. Any thread may wait for a request, even one of another
+/// runtime.
 #[derive(Debug)]
 pub(super) struct RequestRunner {
-    /// Taken when it is dropped.
+    /// `None` only while this is dropped.
     runtime: Option<Runtime>,
     retry: RetryPolicy,
     counts: Arc<[AtomicU64; 3]>,
 }
 
-/// A request that runs.
+/// A request that is running.
 #[derive(Debug)]
 pub(super) struct PendingRequest<T>(Receiver<io::Result<T>>);
 
@@ -106,8 +107,8 @@ impl RequestRunner {
         Traffic { requests, retries, failures, ..Traffic::default() }
     }
 
-    /// Makes a request until it succeeds, fails for good, or was made often enough. Only what may be
-    /// done twice may be made so.
+    /// Makes a request until it succeeds, fails with an error that retrying cannot change, or has
+    /// had all attempts. Only for idempotent requests.
     pub(super) fn run<T, F>(&self, request: impl Fn() -> F + Send + 'static) -> io::Result<T>
     where
         T: Send + 'static,
@@ -116,7 +117,7 @@ impl RequestRunner {
         self.start(self.retry, request).wait()
     }
 
-    /// As [`RequestRunner::run`], with a retry of its own and without waiting for it.
+    /// As [`RequestRunner::run`], with another policy, and without waiting for the result.
     pub(super) fn start<T, F>(
         &self,
         retry: RetryPolicy,
@@ -128,14 +129,15 @@ impl RequestRunner {
     {
         let counts = self.counts.clone();
         self.spawn(async move {
-            let (mut tries, mut backoff) = (1, retry.backoff);
+            let mut tries = 1;
+            let mut backoff = retry.backoff;
             loop {
                 let error = match once(retry, &counts, request()).await {
                     Ok(done) => return Ok(done),
                     Err(error) => error,
                 };
-                let passes = matches!(error.kind(), ErrorKind::Other | ErrorKind::TimedOut);
-                if !passes || tries >= retry.tries {
+                let is_transient = matches!(error.kind(), ErrorKind::Other | ErrorKind::TimedOut);
+                if !is_transient || tries >= retry.tries {
                     if error.kind() != ErrorKind::NotFound {
                         add(&counts, RequestCounter::Failure);
                     }
@@ -143,18 +145,20 @@ impl RequestRunner {
                 }
                 add(&counts, RequestCounter::Retry);
                 tokio::time::sleep(backoff).await;
-                (tries, backoff) = (tries + 1, backoff.saturating_mul(2));
+                tries += 1;
+                backoff = backoff.saturating_mul(2);
             }
         })
     }
 
-    /// Makes a request once.
+    /// Makes a request once, and waits for the result.
     pub(super) fn once<T, F>(&self, request: F) -> io::Result<T>
     where
         T: Send + 'static,
         F: Future<Output = object_store::Result<T>> + Send + 'static,
     {
-        let (retry, counts) = (self.retry, self.counts.clone());
+        let retry = self.retry;
+        let counts = self.counts.clone();
         self.spawn(async move { once(retry, &counts, request).await }).wait()
     }
 
@@ -165,7 +169,7 @@ impl RequestRunner {
         let (send, receive) = mpsc::sync_channel(1);
         if let Some(runtime) = &self.runtime {
             runtime.spawn(async move {
-                // Nobody waits any more for what was given up.
+                // Sending fails if the caller no longer waits.
                 let _ = send.send(request.await);
             });
         }
@@ -174,14 +178,14 @@ impl RequestRunner {
 }
 
 impl<T> PendingRequest<T> {
-    /// Waits for its end. A plain channel, and not `block_on`, which panics on threads of a runtime.
+    /// Waits for the result.
     pub(super) fn wait(self) -> io::Result<T> {
         self.0.recv().unwrap_or_else(|_| Err(io::Error::other("the store's threads are gone")))
     }
 }
 
 impl Drop for RequestRunner {
-    /// Without waiting, which would panic on threads of a runtime.
+    /// Does not wait for running requests: that would panic on threads of a runtime.
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
@@ -206,4 +210,18 @@ async fn once<T>(
 
 fn add(counts: &[AtomicU64; 3], what: RequestCounter) {
     counts[what as usize].fetch_add(1, Ordering::Relaxed);
+}
+
+/// The kind of an error, as one of the operating system's.
+fn to_io(error: &object_store::Error) -> io::Error {
+    use object_store::Error;
+    let kind = match error {
+        Error::NotFound { .. } => ErrorKind::NotFound,
+        Error::AlreadyExists { .. } | Error::Precondition { .. } => ErrorKind::AlreadyExists,
+        Error::PermissionDenied { .. } | Error::Unauthenticated { .. } => {
+            ErrorKind::PermissionDenied
+        }
+        _ => ErrorKind::Other,
+    };
+    io::Error::new(kind, error.to_string())
 }

@@ -1,91 +1,110 @@
-//! A commit in the making: objects are uploaded as they come, and the record is put if absent.
+//! A commit in preparation: objects are uploaded as they come, and the log record is put if absent.
 
-use std::collections::VecDeque;
-use std::io::{self, ErrorKind, Write};
+use std::collections::{BTreeSet, VecDeque};
+use std::io::{self, ErrorKind};
 use std::path::Path;
 
 use object_store::{ObjectStoreExt, PutMode, PutOptions, PutPayload};
 
 use crate::limits;
 use crate::store::StoreError;
-use crate::store::objects::{ObjectBackend as _, StoredObject, object_key, record_key};
+use crate::store::backend::{Staging, StoredObject, WriteObject};
+use crate::store::layout::{object_key, record_key};
 
-use super::Remote;
+use super::client::Remote;
 use super::retry::{PendingRequest, RequestCounter};
 
-/// ObjectBackend of a commit that no record names yet.
+/// Objects of a commit that no record names yet.
 #[derive(Debug)]
-pub(in crate::store) struct Staging {
+pub(super) struct RemoteStaging {
     remote: Remote,
     name: String,
-    /// Uploads that run, oldest first, and their keys.
-    uploads: VecDeque<(String, PendingRequest<()>)>,
+    /// Running uploads, the oldest first.
+    uploads: VecDeque<Upload>,
 }
 
-impl Staging {
+#[derive(Debug)]
+struct Upload {
+    key: String,
+    request: PendingRequest<()>,
+}
+
+impl RemoteStaging {
     pub(super) fn new(remote: Remote, name: &str) -> Self {
         Self { remote, name: name.to_owned(), uploads: VecDeque::new() }
     }
 
-    pub(in crate::store) fn root(&self) -> &Path {
-        self.remote.root()
-    }
-
-    /// Begins to upload one object, named by its hash; it is put even if it is there, so that garbage
-    /// collection takes it for new.
-    ///
-    /// # Errors
-    /// An earlier upload failed.
-    pub(in crate::store) fn put(
-        &mut self,
-        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> Result<StoredObject, StoreError> {
-        let mut object = Vec::new();
-        write(&mut object).map_err(StoreError::io("make an object for", self.root()))?;
-        let (hash, bytes) = (blake3::hash(&object).to_hex().to_string(), object.len() as u64);
-        while self.uploads.len() >= limits::UPLOADS_AT_ONCE {
-            self.settle_oldest()?;
-        }
-        let key = object_key(&self.name, &hash);
-        let (store, at) = (self.remote.store.clone(), self.remote.key(&key));
-        let payload = PutPayload::from(object);
-        let upload = self.remote.runner.start(self.remote.runner.retry(), move || {
-            let (store, at, payload) = (store.clone(), at.clone(), payload.clone());
-            async move { store.put(&at, payload).await.map(|_| ()) }
-        });
-        self.uploads.push_back((key, upload));
-        Ok(StoredObject { hash, bytes })
-    }
-
     /// Waits for all uploads.
-    pub(in crate::store) fn settle(&mut self) -> Result<(), StoreError> {
+    fn wait_for_uploads(&mut self) -> Result<(), StoreError> {
         while !self.uploads.is_empty() {
-            self.settle_oldest()?;
+            self.wait_for_oldest()?;
         }
         Ok(())
     }
 
-    fn settle_oldest(&mut self) -> Result<(), StoreError> {
-        let Some((key, upload)) = self.uploads.pop_front() else { return Ok(()) };
-        upload.wait().map_err(StoreError::io("write", &self.root().join(key)))
+    fn wait_for_oldest(&mut self) -> Result<(), StoreError> {
+        let Some(Upload { key, request }) = self.uploads.pop_front() else { return Ok(()) };
+        request.wait().map_err(StoreError::io("write", &self.remote.root.join(key)))
     }
 
-    /// Puts the record, if there is none of its number. An answer that was lost is asked for again:
-    /// no two commits have the same record.
+    fn outcome_unknown(&self, number: u64, cause: io::Error) -> StoreError {
+        StoreError::OutcomeUnknown { name: self.name.clone(), number, cause }
+    }
+}
+
+impl Staging for RemoteStaging {
+    /// Begins to upload one object. It is uploaded even if it exists, so that garbage collection
+    /// sees it as new.
     ///
     /// # Errors
-    /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if nobody can say what became of it.
-    pub(in crate::store) fn publish(
+    /// An earlier upload failed.
+    fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError> {
+        let mut object = Vec::new();
+        write(&mut object).map_err(StoreError::io("make an object for", &self.remote.root))?;
+        let hash = blake3::hash(&object).to_hex().to_string();
+        let bytes = object.len() as u64;
+        while self.uploads.len() >= limits::UPLOADS_AT_ONCE {
+            self.wait_for_oldest()?;
+        }
+        let key = object_key(&self.name, &hash);
+        let store = self.remote.store.clone();
+        let at = self.remote.key(&key);
+        let payload = PutPayload::from(object);
+        let request = self.remote.runner.start(self.remote.runner.retry(), move || {
+            let store = store.clone();
+            let at = at.clone();
+            let payload = payload.clone();
+            async move { store.put(&at, payload).await.map(|_| ()) }
+        });
+        self.uploads.push_back(Upload { key, request });
+        Ok(StoredObject { hash, bytes })
+    }
+
+    /// An object store has no locks: of two commits with one number, the second gets
+    /// [`StoreError::Conflict`].
+    fn lock_publishing(&mut self) -> Result<(), StoreError> {
+        Ok(())
+    }
+
+    /// Puts the record, if there is none with its number. If the answer is lost, the record that
+    /// exists tells what happened, because no two commits write the same record.
+    ///
+    /// # Errors
+    /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if the record cannot be read
+    /// either.
+    fn publish(
         &mut self,
+        _hashes: &BTreeSet<&str>,
         number: u64,
         record: &[u8],
     ) -> Result<(), StoreError> {
-        self.settle()?;
+        self.wait_for_uploads()?;
         let key = record_key(&self.name, number);
         let mut backoff = self.remote.runner.retry().backoff;
         let mut tries = 1;
         loop {
-            let (store, at) = (self.remote.store.clone(), self.remote.key(&key));
+            let store = self.remote.store.clone();
+            let at = self.remote.key(&key);
             let payload = PutPayload::from(record.to_vec());
             let put = self.remote.runner.once(async move {
                 let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
@@ -93,27 +112,32 @@ impl Staging {
             });
             let Err(cause) = put else { return Ok(()) };
             match cause.kind() {
-                // It was taken, or nobody knows: what is there tells.
+                // The number is taken, or the answer was lost: the record that exists tells which.
                 ErrorKind::AlreadyExists | ErrorKind::Other | ErrorKind::TimedOut => {}
-                _ => return Err(StoreError::io("write", &self.root().join(&key))(cause)),
+                _ => return Err(StoreError::io("write", &self.remote.root.join(&key))(cause)),
             }
-            match self.remote.record(&self.name, number) {
+            match self.remote.get(&key, limits::LOG_RECORD_BYTES) {
                 Ok(found) if found == record => return Ok(()),
                 Ok(_) => return Err(StoreError::Conflict { name: self.name.clone(), number }),
                 Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
-                Err(_) => return Err(self.unsettled(number, cause)),
+                Err(_) => return Err(self.outcome_unknown(number, cause)),
             }
             if tries >= self.remote.runner.retry().tries {
                 self.remote.runner.count(RequestCounter::Failure);
-                return Err(self.unsettled(number, cause));
+                return Err(self.outcome_unknown(number, cause));
             }
             self.remote.runner.count(RequestCounter::Retry);
             std::thread::sleep(backoff);
-            (tries, backoff) = (tries + 1, backoff.saturating_mul(2));
+            tries += 1;
+            backoff = backoff.saturating_mul(2);
         }
     }
 
-    fn unsettled(&self, number: u64, cause: io::Error) -> StoreError {
-        StoreError::OutcomeUnknown { name: self.name.clone(), number, cause }
+    fn restore(&mut self, _hashes: &BTreeSet<&str>, _number: u64) -> Result<(), StoreError> {
+        self.wait_for_uploads()
+    }
+
+    fn dir(&self) -> &Path {
+        &self.remote.root
     }
 }

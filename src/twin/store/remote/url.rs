@@ -1,4 +1,4 @@
-//! Which object store a URL names, and who we are there.
+//! The object store that a URL names, and the credentials for it.
 
 use std::sync::{Arc, Once};
 
@@ -12,10 +12,10 @@ use crate::limits;
 use crate::store::StoreError;
 
 /// Opens the store of a URL, as `s3://bucket/twins`, with credentials and endpoints from the
-/// environment: `AWS_*`, `GOOGLE_*`, `AZURE_*`. Returns what keys begin with, too.
+/// environment: `AWS_*`, `GOOGLE_*`, `AZURE_*`. Also returns the prefix of its keys.
 pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError> {
     let refused = |reason: String| StoreError::Url { url: url.to_owned(), reason };
-    let unknown = || refused("one of s3://, gs://, az:// and file:// is read".to_owned());
+    let unknown = || refused("one of s3://, gs://, az://, and file:// is needed".to_owned());
     let (scheme, place) = url.split_once("://").ok_or_else(unknown)?;
     let (bucket, prefix) = place.split_once('/').unwrap_or((place, ""));
     if bucket.is_empty() {
@@ -23,7 +23,7 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     }
     let prefix = Key::parse(prefix).map_err(|error| refused(error.to_string()))?;
     provide_tls();
-    // Requests are made again here, and not there.
+    // Retries are made in `retry.rs` alone.
     let retry = RetryConfig { max_retries: 0, ..RetryConfig::default() };
     let timeout = format!("{} s", limits::REMOTE_TIMEOUT.as_secs());
     let store: object_store::Result<Arc<dyn ObjectStore>> = match scheme {
@@ -50,11 +50,12 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     Ok((store.map_err(|error| refused(error.to_string()))?, prefix))
 }
 
-/// Says once who does the cryptography of TLS.
+/// Selects ring as the cryptography of TLS, once. aws-lc, the default, would compile more C than
+/// all else together.
 fn provide_tls() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        // It fails if the program that uses this library said so before, which is as good.
+        // This fails if the program has selected a provider already, which is used then.
         let _ = rustls::crypto::ring::default_provider().install_default();
     });
 }

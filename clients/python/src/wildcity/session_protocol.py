@@ -1,0 +1,222 @@
+"""The client's side of the protocol without any I/O: it numbers requests and matches answers to them.
+
+Each method of `SessionProtocol` is a generator. It yields the text of one request, receives the answering message
+through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Generator, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
+
+from .errors import Disconnected, ProtocolError, Refused, TimedOut, WildCityError
+from .observation import Observation
+from .protocol import (
+    OBSERVATION_BYTES,
+    PROTOCOL,
+    Action,
+    Closed,
+    Dynamics,
+    Model,
+    Ok,
+    Opened,
+    Outputs,
+    Pose,
+    Refusal,
+    Resumed,
+    Rig,
+    Station,
+    Summary,
+    Switched,
+    Trajectory,
+    Welcome,
+    decode_answer,
+    encode,
+)
+
+T = TypeVar("T")
+Message = str | bytes
+Exchange = Generator[str, Message, T]
+
+
+class SessionProtocol:
+    """State of one client. A request uses its number up only if its answer came and is not an error."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.next_seq = 1
+        self.session: str | None = None
+        """Name of the open session."""
+
+    def hello(self) -> Exchange[Welcome]:
+        """Starts a connection."""
+        client = {"name": self.name, "version": version("wildcity")}
+        fields = {"client": client, "protocols": [PROTOCOL]}
+        welcome = yield from self._ask("hello", 0, Welcome, fields)
+        if welcome.protocol != PROTOCOL:
+            raise ProtocolError(f"the server chose protocol {welcome.protocol!r}")
+        if self.session is None:
+            self.next_seq = 1
+        return welcome
+
+    def open(
+        self,
+        twin: str,
+        *,
+        version: int | None = None,
+        session: str | None = None,
+        seed: int = 0,
+        start: Pose | Station | None = None,
+        rig: str | Rig | None = None,
+        profile: Mapping[str, float | bool | None] | None = None,
+        outputs: Outputs | None = None,
+        dynamics: Model | Dynamics | None = None,
+        dt_us: int | None = None,
+        deadline_ms: int | None = None,
+        decision_us: int | None = None,
+        warm_up_us: int | None = None,
+    ) -> Exchange[Opened]:
+        """Opens a session."""
+        optional = {
+            "version": version,
+            "session": session,
+            "start": _start(start),
+            "rig": encode(rig),
+            "dynamics": encode(dynamics),
+            "profile": None if profile is None else dict(profile),
+            "dt_us": dt_us,
+            "deadline_ms": deadline_ms,
+            "decision_us": decision_us,
+            "warm_up_us": warm_up_us,
+        }
+        fields = {name: value for name, value in optional.items() if value is not None}
+        fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}
+        opened = yield from self._next("open", Opened, fields)
+        self.session = opened.session
+        return opened
+
+    def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
+        """Moves the ego and advances the time by one step."""
+        fields = {**_movement(movement), "terminate": terminate}
+        return (yield from self._next("step", Observation, fields))
+
+    def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
+        """Renders images from poses without moving."""
+        return (yield from self._next("observe", Observation, {"poses": encode(poses)}))
+
+    def prefetch(self, poses: Sequence[Pose]) -> Exchange[None]:
+        """Announces where the ego may go next."""
+        yield from self._next("prefetch", Ok, {"poses": encode(poses)})
+
+    def reset(self, seed: int, start: Pose | Station | None) -> Exchange[Observation]:
+        """Starts a new episode."""
+        fields: dict[str, Any] = {"seed": seed}
+        if start is not None:
+            fields["start"] = _start(start)
+        return (yield from self._next("reset", Observation, fields))
+
+    def switch_version(self, version: int | None) -> Exchange[Switched]:
+        """Shows another version of the twin."""
+        fields = {} if version is None else {"version": version}
+        return (yield from self._next("switch_version", Switched, fields))
+
+    def close(self) -> Exchange[Summary]:
+        """Ends the session."""
+        closed = yield from self._next("close", Closed, {})
+        self.session = None
+        return closed.summary
+
+    def resume(self, session: str, last_seq: int) -> Exchange[Resumed]:
+        """Continues a session on a new connection, on which `hello` had number 0 and this request has 1."""
+        fields = {"session": session, "last_seq": last_seq}
+        try:
+            resumed = yield from self._ask("resume", 1, Resumed, fields)
+        except Refused as refused:
+            if refused.code == "unknown_session":
+                # The session is over. A new one can be opened on this connection, and its request takes
+                # the number of this refused one.
+                self.session = None
+                self.next_seq = 1
+            raise
+        # One request is under way at a time, so the session has carried out either request `last_seq` or
+        # the one after it.
+        if resumed.last_seq not in (last_seq, last_seq + 1):
+            raise ProtocolError(f"the session is at {resumed.last_seq}, not at {last_seq}")
+        self.session = session
+        self.next_seq = last_seq + 1
+        return resumed
+
+    def resume_own(self) -> Exchange[Resumed]:
+        """As `resume`, for the session that this client opened."""
+        if self.session is None:
+            raise ProtocolError("this client has no open session to resume")
+        return (yield from self.resume(self.session, self.next_seq - 1))
+
+    def _next(self, kind: str, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
+        result = yield from self._ask(kind, self.next_seq, answer, fields)
+        self.next_seq += 1
+        return result
+
+    def _ask(self, kind: str, seq: int, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
+        # Raises ValueError for NaN and infinity, which JSON cannot represent.
+        request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
+        message = yield request
+        got = Observation(message) if isinstance(message, bytes) else decode_answer(message)
+        got_seq = got.metadata.seq if isinstance(got, Observation) else got.seq
+        # An error has no number if the server could not read the request.
+        if got_seq != seq and not (isinstance(got, Refusal) and got_seq is None):
+            raise ProtocolError(f"expected an answer to request {seq}, got one to {got_seq}")
+        if isinstance(got, Refusal):
+            raise Refused(got.code, got.message, got.field, got.fatal)
+        if not isinstance(got, answer):
+            raise ProtocolError(f"{kind} was answered with {type(got).__name__}")
+        return got
+
+
+CONNECT_OPTIONS: dict[str, Any] = {
+    "subprotocols": [Subprotocol(PROTOCOL)],
+    "compression": None,
+    "max_size": OBSERVATION_BYTES,
+    "open_timeout": 10,
+    "close_timeout": 1,
+    # The time-out of each answer already detects a dead server.
+    "ping_interval": None,
+    "proxy": None,
+}
+"""Options with which both clients connect."""
+
+
+def authorization_headers(token: str | None) -> dict[str, str]:
+    """Additional headers of the WebSocket upgrade request."""
+    return {} if token is None else {"Authorization": f"Bearer {token}"}
+
+
+def can_reuse_connection(error: BaseException) -> bool:
+    """Whether the next request may use the connection on which a request failed with `error`."""
+    return isinstance(error, Refused) and not error.fatal
+
+
+def translate_error(error: BaseException, timeout: float) -> WildCityError | None:
+    """An error of the transport as an error of this package; None if it is not one of the transport."""
+    # Before Python 3.11 asyncio.TimeoutError is another class.
+    if isinstance(error, (TimeoutError, asyncio.TimeoutError)):
+        return TimedOut(f"no answer within {timeout} s")
+    if isinstance(error, (ConnectionClosed, OSError)):
+        return Disconnected(str(error))
+    return None
+
+
+def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
+    if isinstance(movement, Trajectory):
+        return {"trajectory": encode(movement.poses)}
+    return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
+
+
+def _start(start: Pose | Station | None) -> Any:
+    return {"pose": encode(start)} if isinstance(start, Pose) else encode(start)

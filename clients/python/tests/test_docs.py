@@ -1,0 +1,105 @@
+"""The commands and programs of the documentation, run as a reader would run them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_push import write_ply
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGES = ["README.md", "docs/agents.md", "docs/operators.md", "docs/pipelines.md", "docs/scenes.md"]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a reader with `wildcity` on the path and the demo twin built."""
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    home = tmp_path_factory.mktemp("home")
+    environment = dict(os.environ)
+    environment["PATH"] = f"{Path(binary).parent}:{Path(sys.executable).parent}:{environment['PATH']}"
+    for name in ("DATA", "STATE", "CACHE"):
+        environment[f"XDG_{name}_HOME"] = str(home / name.lower())
+    run(["wildcity", "demo", "--steps", "1", "--out", str(home / "demo")], home, environment)
+    return environment
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_does_what_it_says(page: str, reader: dict[str, str], tmp_path: Path) -> None:
+    write_ply(tmp_path / "capture.ply", 0.0, 1)
+    write_ply(tmp_path / "block7.ply", 0.0, 2)
+    port = free_port()
+    text = (ROOT / page).read_text().replace("8080", str(port))
+    blocks = [block for block in BLOCK.findall(text) if block[0] in ("sh", "python")]
+    assert blocks, f"{page} has nothing to run"
+    servers: list[subprocess.Popen[str]] = []
+    try:
+        if page == "README.md":
+            servers.append(serve("wildcity serve", port, tmp_path, reader))
+        for language, block in blocks:
+            for part in parts(block) if language == "sh" else [block]:
+                if language == "sh" and part.rstrip().endswith("&"):
+                    servers.append(serve(part.rstrip(" &\n"), port, tmp_path, reader))
+                elif language == "sh":
+                    run(["bash", "-euo", "pipefail", "-c", part], tmp_path, reader)
+                else:
+                    run([sys.executable, "-c", part], tmp_path, reader)
+    finally:
+        for server in servers:
+            server.terminate()
+            server.communicate(timeout=30)
+
+
+def parts(block: str) -> Iterator[str]:
+    """A block as scripts; a line that starts a server is a script of its own."""
+    script = ""
+    for line in block.splitlines(keepends=True):
+        if line.rstrip().endswith(" &"):
+            if script.strip():
+                yield script
+            yield line
+            script = ""
+        else:
+            script += line
+    if script.strip():
+        yield script
+
+
+def serve(
+    command: str, port: int, folder: Path, environment: dict[str, str]
+) -> subprocess.Popen[str]:
+    """Starts a server on a port that nothing else has, and waits until it listens."""
+    words = [*shlex.split(command), "--listen", f"127.0.0.1:{port}"]
+    server = subprocess.Popen(
+        words, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert server.stdout is not None
+    line = server.stdout.readline()
+    assert "listening" in line, f"{command} said {line!r}"
+    return server
+
+
+def run(command: list[str], folder: Path, environment: dict[str, str]) -> None:
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command[-1]}\n{done.stdout}\n{done.stderr}"
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port
+
+
+def test_a_page_that_says_something_else_fails(reader: dict[str, str], tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="no-such-twin"):
+        run(["bash", "-euc", "wildcity inspect no-such-twin"], tmp_path, reader)

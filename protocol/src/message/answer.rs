@@ -1,0 +1,226 @@
+//! Answers: text messages from the server.
+
+use serde::{Deserialize, Serialize};
+
+use super::open::{Dynamics, Outputs, RigCamera};
+use super::pose::Pose;
+use crate::error::Code;
+
+/// A text message from the server.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum Answer {
+    /// Answer to `hello`.
+    Welcome {
+        /// Number of the request.
+        seq: u64,
+        /// The protocol version that the server chose.
+        protocol: String,
+        /// Name and version of the server.
+        server: ServerInfo,
+        /// The server's limits.
+        limits: Limits,
+        /// Name of the render backend.
+        backend: String,
+        /// Twins that can be opened.
+        twins: Vec<TwinInfo>,
+    },
+    /// Answer to `open`: every setting of the session, defaults included.
+    Opened(Box<Opened>),
+    /// Answer to `resume`.
+    Resumed {
+        /// Number of the request.
+        seq: u64,
+        /// Name of the session.
+        session: String,
+        /// Number of the last request that the session carried out. Repeat that request to get its answer
+        /// again, or continue with the next number.
+        last_seq: u64,
+        /// Steps done in the episode.
+        step: u64,
+        /// Simulated time, in microseconds.
+        time_us: i64,
+    },
+    /// Answer to `prefetch`.
+    Ok {
+        /// Number of the request.
+        seq: u64,
+    },
+    /// Answer to `switch_version`: the version that the session shows from the next step on.
+    Switched {
+        /// Number of the request.
+        seq: u64,
+        /// The version.
+        version: u64,
+        /// BLAKE3 of the version's manifest, in hex.
+        version_hash: String,
+        /// BLAKE3 of the render profile's JSON, in hex.
+        profile_hash: String,
+        /// The render profile: numbers and booleans by name.
+        profile: serde_json::Map<String, serde_json::Value>,
+    },
+    /// Answer to `close`.
+    Closed {
+        /// Number of the request.
+        seq: u64,
+        /// Summary of the last episode.
+        summary: Summary,
+    },
+    /// Answer to a refused request. A refused request changes nothing and can be sent again.
+    Error {
+        /// Number of the request. Absent if the server could not read it.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        seq: Option<u64>,
+        /// Error code.
+        code: Code,
+        /// What went wrong and how to fix it, for people.
+        message: String,
+        /// The field at fault, for example `pose.q[2]`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        field: Option<String>,
+        /// Whether the server closes the connection after this message.
+        fatal: bool,
+    },
+}
+
+/// Name and version of the server.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ServerInfo {
+    /// `wildcity`.
+    pub name: String,
+    /// Version of the package.
+    pub version: String,
+}
+
+/// The server's limits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Limits {
+    /// Largest message to the server, in bytes.
+    pub message_bytes: u64,
+    /// Largest number of poses of one `observe`.
+    pub observe_poses: u64,
+    /// Largest number of cameras of a rig.
+    pub cameras: u64,
+    /// Longest image side, in pixels.
+    pub side_px: u64,
+    /// Largest number of pixels of one answer, over all its images.
+    pub answer_pixels: u64,
+    /// How long a client may send nothing before the server closes the connection, in milliseconds.
+    pub idle_ms: u64,
+    /// How long a session can be resumed after its connection is lost, in milliseconds.
+    pub resume_ms: u64,
+}
+
+/// A twin that can be opened.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct TwinInfo {
+    /// Name.
+    pub name: String,
+    /// Latest version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// Number of Gaussians.
+    pub gaussians: u64,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: u8,
+    /// The recorded trajectories.
+    pub trajectories: Vec<TrajectoryInfo>,
+}
+
+/// A recorded trajectory.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct TrajectoryInfo {
+    /// Name.
+    pub name: String,
+    /// Length, in metres.
+    pub length_m: f64,
+    /// Number of keyframes.
+    pub keyframes: u64,
+}
+
+/// An open session.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Opened {
+    /// Number of the request.
+    pub seq: u64,
+    /// Name of the session.
+    pub session: String,
+    /// Name of the twin.
+    pub twin: String,
+    /// Version of the twin.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// BLAKE3 of the render profile's JSON, in hex.
+    pub profile_hash: String,
+    /// The render profile: numbers and booleans by name.
+    pub profile: serde_json::Map<String, serde_json::Value>,
+    /// Name of the backend.
+    pub backend: String,
+    /// Seed of the first episode.
+    pub seed: u64,
+    /// `world_from_rig` at time zero.
+    pub start: Pose,
+    /// How the ego moves.
+    pub dynamics: Dynamics,
+    /// Simulated time of a step, in microseconds.
+    pub dt_us: i64,
+    /// How long an answer may take, in milliseconds.
+    pub deadline_ms: u64,
+    /// Time between two observations with images, in microseconds.
+    pub decision_us: i64,
+    /// Length of the recorded drive before the start, in microseconds.
+    pub warm_up_us: i64,
+    /// The cameras in the order of the images, with the intrinsics of the images as sent.
+    pub cameras: Vec<RigCamera>,
+    /// What each observation holds.
+    pub outputs: Outputs,
+    /// The twin's recorded trajectories.
+    pub trajectories: Vec<TrajectoryInfo>,
+    /// Memory of the server that is reserved for the largest frame of the session, in bytes.
+    pub reserved_bytes: u64,
+}
+
+/// Summary of an episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Summary {
+    /// Why the episode ended.
+    pub outcome: Outcome,
+    /// Number of steps.
+    pub steps: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Distance driven, in metres.
+    pub distance_m: f64,
+    /// The lowest mean confidence of an observation's images. Only with `outputs.trust`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least_trust: Option<f64>,
+}
+
+/// Why an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The agent closed the session, or ended the episode with `terminate`.
+    Completed,
+    /// As `completed`, but the images of a reset or a step had a mean confidence below 0.1: the agent left
+    /// the recorded area. Only with `outputs.trust`.
+    OffModel,
+    /// The agent violated the protocol in a way that ended the connection.
+    AgentError,
+    /// The agent sent nothing, or did not read, for too long.
+    AgentTimeout,
+    /// The connection was lost and not resumed in time.
+    AgentLost,
+    /// An internal error of the server.
+    ServerError,
+}

@@ -1,0 +1,293 @@
+//! The request `open`, and the settings of a session.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::pose::Pose;
+use crate::camera::{Exposure, Lens, Shutter, Windshield};
+
+/// How the ego moves.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Dynamics {
+    /// The motion model.
+    pub model: DynamicsModel,
+    /// Speed at the start of an episode, in m/s.
+    #[serde(default)]
+    pub speed: f64,
+    /// Whether a car that brakes beyond standstill drives backwards. If false, it stands still.
+    #[serde(default)]
+    pub reverse: bool,
+}
+
+/// Motion model of the ego.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "schema", schemars(rename = "Model"))]
+pub enum DynamicsModel {
+    /// Moves to the requested pose.
+    Teleport,
+    /// Rolls without slipping, and reaches the requested acceleration and curvature at once.
+    Kinematic,
+    /// Single-track model with linear tyres. Its steering and drive lag by 0.1 s.
+    Dynamic,
+}
+
+/// Opens a session on a twin.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Open {
+    /// Number of this request.
+    pub seq: u64,
+    /// Name of the twin.
+    pub twin: String,
+    /// Version of the twin. If absent, the latest.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub version: Option<u64>,
+    /// Name for the session. If absent, the server chooses one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub session: Option<String>,
+    /// Seed of the first episode.
+    #[serde(default)]
+    pub seed: u64,
+    /// Where to start. If absent, the start of the twin's first trajectory, or the origin if it has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<Start>,
+    /// The cameras. If absent, the twin's rig, or the preset `vehicle6` if it has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rig: Option<RigChoice>,
+    /// Changes of the twin's render profile for this session, for example `{"tau_px": 2.0}`. Fields that
+    /// are absent keep the server's setting, if it has one, or else the twin's.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    pub profile: serde_json::Map<String, serde_json::Value>,
+    /// What each observation holds.
+    #[serde(default)]
+    pub outputs: Outputs,
+    /// How the ego moves. If absent, by teleport.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dynamics: Option<DynamicsChoice>,
+    /// Simulated time of a step, in microseconds. If absent, the server's default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dt_us: Option<i64>,
+    /// How long an answer may take, in milliseconds. If absent, the server's limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deadline_ms: Option<u64>,
+    /// Time between two decisions of the agent, in simulated microseconds: a whole number of steps. Only
+    /// observations at decisions have images. If absent, every observation has images.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub decision_us: Option<i64>,
+    /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's history, and
+    /// its frames are in the first bundle. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warm_up_us: Option<i64>,
+}
+
+impl Open {
+    /// Opens the latest version of a twin, with every default.
+    ///
+    /// ```
+    /// use wildcity_protocol::message::{Encoding, Open, Outputs, Request};
+    ///
+    /// let outputs = Outputs { encoding: Encoding::Png, depth: true, ..Outputs::default() };
+    /// let open = Open { seq: 1, seed: 7, outputs, ..Open::twin("street") };
+    /// let json = serde_json::to_value(Request::Open(Box::new(open)))?;
+    /// assert_eq!(json["type"], "open");
+    /// assert_eq!(json["twin"], "street");
+    /// # Ok::<(), serde_json::Error>(())
+    /// ```
+    pub fn twin(name: impl Into<String>) -> Self {
+        Self {
+            seq: 0,
+            twin: name.into(),
+            version: None,
+            session: None,
+            seed: 0,
+            start: None,
+            rig: None,
+            profile: serde_json::Map::new(),
+            outputs: Outputs::default(),
+            dynamics: None,
+            dt_us: None,
+            deadline_ms: None,
+            decision_us: None,
+            warm_up_us: None,
+        }
+    }
+}
+
+/// Where an episode starts.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum Start {
+    /// At a pose.
+    Pose {
+        /// `world_from_rig`.
+        pose: Pose,
+    },
+    /// At a distance along a recorded trajectory.
+    Station {
+        /// Name of the trajectory.
+        trajectory: String,
+        /// Distance from the start of the trajectory, in metres.
+        #[serde(default)]
+        station_m: f64,
+    },
+}
+
+/// The cameras of a session.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum RigChoice {
+    /// A preset, by name.
+    Preset(String),
+    /// A rig with all its cameras.
+    Full(Rig),
+}
+
+/// How the ego moves.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum DynamicsChoice {
+    /// A motion model that starts at standstill.
+    Model(DynamicsModel),
+    /// A motion model with all its settings.
+    Full(Dynamics),
+}
+
+/// The cameras of a vehicle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Rig {
+    /// Name.
+    pub name: String,
+    /// The cameras, in the order of the images in observations.
+    pub cameras: Vec<RigCamera>,
+}
+
+/// A camera on the vehicle: a pinhole unless it has a lens. All intrinsics are in pixels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct RigCamera {
+    /// Name.
+    pub name: String,
+    /// Image width.
+    pub width: u64,
+    /// Image height.
+    pub height: u64,
+    /// Focal length along x. Answers always have it; requests may omit it for an f-theta lens.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fx: Option<f64>,
+    /// Focal length along y. Answers always have it; requests may omit it for an f-theta lens.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fy: Option<f64>,
+    /// Principal point, x, from the image's left edge.
+    pub cx: f64,
+    /// Principal point, y, from the image's top edge.
+    pub cy: f64,
+    /// The lens model. If absent, a pinhole.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<Lens>,
+    /// The windshield in front of the lens, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub windshield: Option<Windshield>,
+    /// The rolling shutter. If absent, all rows are exposed at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shutter: Option<Shutter>,
+    /// The colour correction. If absent, colours are not changed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure: Option<Exposure>,
+    /// The part of its own car that the camera sees: a PNG with opacity, of the image's size, drawn over
+    /// the image, as `data:image/png;base64,..`. Answers do not repeat it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub overlay: Option<String>,
+    /// `rig_from_camera`: camera axes are x right, y down, z forward.
+    pub camera_to_rig: Pose,
+}
+
+/// What each observation holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(default)]
+pub struct Outputs {
+    /// Names of the cameras to render, in this order. If absent, all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cameras: Option<Vec<String>>,
+    /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of `opened`
+    /// describe the images as sent.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub images: BTreeMap<String, ImagePart>,
+    /// Encoding of colour images.
+    pub encoding: Encoding,
+    /// JPEG quality, 1 to 100. Other encodings ignore it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quality: Option<u8>,
+    /// Whether to add `depth`, f32 `[height, width]`: expected camera z, or distance for wide lenses, in
+    /// metres.
+    pub depth: bool,
+    /// Whether to add `opacity`, f32 `[height, width]`: how valid depth and colour are.
+    pub opacity: bool,
+    /// Whether to add `normals`, f32 `[height, width, 3]`: unit vectors in the camera's axes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub normals: Option<bool>,
+    /// Number of last frames of each camera that an observation holds. If absent, 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames: Option<u64>,
+    /// Whether to add a confidence to each image. If absent, false.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trust: Option<bool>,
+    /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If
+    /// absent, every camera takes a frame with every step.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub period_us: Option<BTreeMap<String, i64>>,
+}
+
+impl Default for Outputs {
+    fn default() -> Self {
+        Self {
+            cameras: None,
+            images: BTreeMap::new(),
+            encoding: Encoding::Jpeg,
+            quality: None,
+            depth: false,
+            opacity: false,
+            normals: None,
+            frames: None,
+            trust: None,
+            period_us: None,
+        }
+    }
+}
+
+/// Crop and size of a camera's image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(default)]
+pub struct ImagePart {
+    /// Left column, top row, width and height of the crop, in pixels of the rig's image. If absent, the
+    /// whole image.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crop: Option<[u64; 4]>,
+    /// Width and height at which the crop is rendered, in pixels. If absent, those of the crop.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub size: Option<[u64; 2]>,
+}
+
+/// Encoding of colour images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Encoding {
+    /// A JPEG file, u8 `[n]`.
+    Jpeg,
+    /// A PNG file, u8 `[n]`.
+    Png,
+    /// Pixels, u8 `[height, width, 3]`.
+    Raw,
+}

@@ -1,0 +1,315 @@
+//! `--config FILE.toml`: the options of `wildcity serve` in a file, and `--print-config`.
+//!
+//! Every option of the command line is a key of the file: `--memory-gib` is `memory_gib`, and the options
+//! under the heading *Limits* are in the table `[limits]`. The file becomes arguments that stand before
+//! those of the command line, where the last one counts: a flag overrides the file, and the file a
+//! default. So each option has one description, one check and one default.
+
+use std::ffi::OsString;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::{Arg, ArgMatches, Args as _, FromArgMatches as _};
+use toml::{Table, Value};
+
+use wildcity_twin::ingest;
+
+use crate::cli::limits;
+
+use super::Serve;
+use super::limit_options::HEADING;
+
+/// Name of the table of the options under [`HEADING`].
+const LIMITS: &str = "limits";
+
+/// Options that are no keys of a configuration file.
+const NOT_KEYS: [&str; 3] = ["config", "print_config", "help"];
+
+/// The options of one run.
+#[derive(Debug)]
+pub(super) struct Resolved {
+    /// The options.
+    pub(super) serve: Serve,
+    matches: ArgMatches,
+}
+
+/// Parses the arguments after `serve`, and the file of `--config` if there is one.
+///
+/// # Errors
+/// The file cannot be read, has an unknown key or a value that the option refuses.
+pub(super) fn resolve(arguments: Vec<OsString>) -> anyhow::Result<Resolved> {
+    let flags = command().try_get_matches_from(&arguments)?;
+    let matches = match flags.get_one::<PathBuf>("config") {
+        Some(path) => {
+            let mut all = read(path).with_context(|| format!("--config {}", path.display()))?;
+            all.extend(arguments);
+            command().try_get_matches_from(all)?
+        }
+        None => flags,
+    };
+    Ok(Resolved { serve: Serve::from_arg_matches(&matches)?, matches })
+}
+
+/// The command with its options alone. An option that is given twice has its last value.
+fn command() -> clap::Command {
+    Serve::augment_args(clap::Command::new("serve")).args_override_self(true).no_binary_name(true)
+}
+
+/// Whether an option is in the table `[limits]`.
+fn is_limit(option: &Arg) -> bool {
+    option.get_help_heading() == Some(HEADING)
+}
+
+/// The key of an option, as `limits.sessions`.
+fn key_of(option: &Arg) -> String {
+    let name = option.get_id().as_str();
+    if is_limit(option) { format!("{LIMITS}.{name}") } else { name.to_owned() }
+}
+
+/// The options that are keys of a configuration file.
+fn keys(command: &clap::Command) -> impl Iterator<Item = &Arg> {
+    let is_key = |option: &&Arg| !NOT_KEYS.contains(&option.get_id().as_str());
+    command.get_arguments().filter(is_key)
+}
+
+/// Reads a configuration file as arguments.
+fn read(path: &Path) -> anyhow::Result<Vec<OsString>> {
+    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES)?;
+    let table: Table = String::from_utf8(text)?.parse()?;
+    let command = command();
+    let mut arguments = Vec::new();
+    for (key, value) in flattened(table)? {
+        let Some(option) = keys(&command).find(|option| key_of(option) == key) else {
+            let nearest = nearest(&key, keys(&command).map(key_of));
+            anyhow::bail!("there is no key {key}; the nearest is {nearest}");
+        };
+        let text = match value {
+            Value::String(text) => text,
+            Value::Integer(number) => number.to_string(),
+            Value::Float(number) => number.to_string(),
+            Value::Boolean(value) => value.to_string(),
+            other => {
+                anyhow::bail!("{key} is of type {}; expected a text or a number", other.type_str())
+            }
+        };
+        let flag = option.get_long().with_context(|| format!("{key} has no flag"))?;
+        let argument = OsString::from(format!("--{flag}={text}"));
+        // Each value is checked by itself, so that the message names the key.
+        if let Err(error) = self::command().try_get_matches_from([&argument]) {
+            let message = error.to_string();
+            let line = message.lines().next().unwrap_or_default();
+            anyhow::bail!("{key}: {}", line.strip_prefix("error: ").unwrap_or(line));
+        }
+        arguments.push(argument);
+    }
+    Ok(arguments)
+}
+
+/// The values of a file by their keys, as `limits.sessions`.
+fn flattened(table: Table) -> anyhow::Result<Vec<(String, Value)>> {
+    let mut values = Vec::new();
+    for (key, value) in table {
+        match value {
+            Value::Table(limits) if key == LIMITS => {
+                values.extend(
+                    limits.into_iter().map(|(key, value)| (format!("{LIMITS}.{key}"), value)),
+                );
+            }
+            _ if key == LIMITS => anyhow::bail!("{LIMITS} is a table: write [{LIMITS}]"),
+            value => values.push((key, value)),
+        }
+    }
+    Ok(values)
+}
+
+/// The key that is most like a wrong one: fewest edits of the name, then the right table.
+fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
+    let name = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
+    let wrong_name = name(wrong);
+    let distance = |key: &String| {
+        let edits = strsim::damerau_levenshtein(&wrong_name, &name(key));
+        let is_other_table = key.contains('.') != wrong.contains('.');
+        (edits, is_other_table)
+    };
+    keys.min_by_key(distance).unwrap_or_default()
+}
+
+impl Resolved {
+    /// Every value that is in effect, with its description: a file that `--config` reads, with the same
+    /// effect.
+    ///
+    /// # Errors
+    /// A default directory is not known, because HOME is not set.
+    pub(super) fn to_toml(&self) -> anyhow::Result<String> {
+        let command = command();
+        let mut text = String::from("# Effective configuration of `wildcity serve`.\n");
+        let is_value = |option: &&Arg| !is_limit(option);
+        for option in keys(&command).filter(is_value) {
+            self.write_value(&mut text, option)?;
+        }
+        let _ = writeln!(text, "\n[{LIMITS}]");
+        for option in keys(&command).filter(|option| is_limit(option)) {
+            self.write_value(&mut text, option)?;
+        }
+        Ok(text)
+    }
+
+    fn write_value(&self, text: &mut String, option: &Arg) -> anyhow::Result<()> {
+        let id = option.get_id().as_str();
+        let help = option.get_long_help().or(option.get_help());
+        let help = help.map(ToString::to_string).unwrap_or_default();
+        // Writing to a String does not fail.
+        let _ = writeln!(text);
+        for line in help.lines().flat_map(|line| wrapped(line, 98)) {
+            let _ = writeln!(text, "{}", format!("# {line}").trim_end());
+        }
+        match self.value(id)? {
+            Some(value) => {
+                let _ = writeln!(text, "{id} = {}", literal(&value));
+            }
+            None => {
+                let _ = writeln!(text, "# {id} is not set.");
+            }
+        }
+        Ok(())
+    }
+
+    /// The text of an option that is in effect: given, or a default.
+    fn value(&self, id: &str) -> anyhow::Result<Option<String>> {
+        let given = self.matches.get_raw(id).and_then(|mut values| values.next_back());
+        let given = given.map(|value| value.to_string_lossy().into_owned());
+        match given {
+            Some(given) => Ok(Some(given)),
+            None => self.serve.default_of(id),
+        }
+    }
+}
+
+/// A text as a value of TOML: a number or a truth value where it reads as one, else a string.
+fn literal(text: &str) -> String {
+    let parsed: Option<Table> = format!("x = {text}").parse().ok();
+    let is_scalar = parsed.is_some_and(|table| {
+        let values: Vec<&Value> = table.values().collect();
+        matches!(values[..], [Value::Integer(_) | Value::Float(_) | Value::Boolean(_)])
+    });
+    if is_scalar {
+        return text.to_owned();
+    }
+    let mut quoted = String::from('"');
+    for c in text.chars() {
+        match c {
+            '"' => quoted.push_str("\\\""),
+            '\\' => quoted.push_str("\\\\"),
+            c if c.is_control() => {
+                let _ = write!(quoted, "\\u{:04X}", u32::from(c));
+            }
+            c => quoted.push(c),
+        }
+    }
+    quoted.push('"');
+    quoted
+}
+
+/// A line broken between words where it would be longer than `width` characters.
+fn wrapped(line: &str, width: usize) -> Vec<String> {
+    let mut lines = vec![String::new()];
+    for word in line.split(' ') {
+        let last = lines.len() - 1;
+        let fits = lines[last].chars().count() + 1 + word.chars().count() <= width;
+        if lines[last].is_empty() {
+            lines[last].push_str(word);
+        } else if fits {
+            lines[last].push(' ');
+            lines[last].push_str(word);
+        } else {
+            lines.push(word.to_owned());
+        }
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Options that name all directories, so that no test depends on HOME.
+    const DIRECTORIES: [&str; 4] =
+        ["--twins=/t", "--episodes=/e", "--uploads=/u", "--cache-dir=/c"];
+
+    fn resolve_with(file: &str, flags: &[&str]) -> anyhow::Result<Resolved> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("serve.toml");
+        std::fs::write(&path, file).unwrap();
+        let config = format!("--config={}", path.display());
+        let arguments = DIRECTORIES.iter().chain(flags).copied().chain([config.as_str()]);
+        resolve(arguments.map(OsString::from).collect())
+    }
+
+    #[test]
+    fn a_flag_overrides_the_file_and_the_file_a_default() {
+        let file = "memory_gib = 2\nthreads = 3\n[limits]\nsessions = 7\nidle_timeout_s = 1.5\n";
+        let resolved = resolve_with(file, &["--threads=5", "--sessions", "9"]).unwrap();
+        let value = |id: &str| resolved.value(id).unwrap().unwrap();
+        assert_eq!(value("memory_gib"), "2", "of the file");
+        assert_eq!(value("threads"), "5", "of the flag");
+        assert_eq!(value("connections"), "1024", "the default");
+        let limits = resolved.serve.limits.limits(None);
+        assert_eq!(limits.sessions, 9);
+        assert_eq!(limits.idle, std::time::Duration::from_millis(1500));
+        assert_eq!(limits.send, wildcity_server::Limits::default().send);
+    }
+
+    #[test]
+    fn without_options_the_limits_are_the_defaults() {
+        let resolved = resolve_with("", &[]).unwrap();
+        assert_eq!(resolved.serve.limits.limits(None), wildcity_server::Limits::default());
+    }
+
+    #[test]
+    fn mistakes_in_the_file_name_the_key() {
+        for (file, message) in [
+            ("memory_gb = 2", "there is no key memory_gb; the nearest is memory_gib"),
+            ("memory-gib = 2", "there is no key memory-gib; the nearest is memory_gib"),
+            ("sessions = 2", "there is no key sessions; the nearest is limits.sessions"),
+            (
+                "[limits]\nsesions = 2",
+                "there is no key limits.sesions; the nearest is limits.sessions",
+            ),
+            ("config = \"x\"", "there is no key config"),
+            ("limits = 3", "limits is a table"),
+            ("[limits]\nsessions = 0", "limits.sessions: invalid value '0'"),
+            ("[limits]\nstep_timeout_s = 61", "limits.step_timeout_s: invalid value '61'"),
+            ("listen = \"here\"", "listen: invalid value 'here'"),
+            ("listen = [1]", "listen is of type array"),
+            ("listen = ", "expected"),
+        ] {
+            let error = format!("{:#}", resolve_with(file, &[]).unwrap_err());
+            assert!(error.contains(message), "{file:?}: {error}");
+            assert!(error.starts_with("--config"), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_is_printed_can_be_fed_back() {
+        let flags = ["--memory-gib=0.1", "--listen=127.0.0.1:0", "--device", "a \"b\" \\ c"];
+        let first = resolve_with("[limits]\nsessions = 7\n", &flags).unwrap().to_toml().unwrap();
+        assert!(first.contains("\n[limits]\n") && first.contains("\nsessions = 7\n"), "{first}");
+        assert!(first.contains("\nmemory_gib = 0.1\n"), "{first}");
+        assert!(first.contains("\n# tokens is not set.\n"), "{first}");
+        let table: Table = first.parse().unwrap();
+        assert_eq!(table["device"].as_str(), Some("a \"b\" \\ c"));
+        let second = resolve_with(&first, &[]).unwrap().to_toml().unwrap();
+        assert_eq!(first, second);
+    }
+
+    #[test]
+    fn every_key_is_described() {
+        let command = command();
+        assert!(keys(&command).count() > 25);
+        for option in keys(&command) {
+            assert!(option.get_help().is_some(), "{} has no description", key_of(option));
+            assert!(option.get_long().is_some(), "{} has no flag", key_of(option));
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! `[limits]`: time-outs, counts and bytes of a server.
+
+use std::time::Duration;
+
+use clap::builder::RangedU64ValueParser;
+
+use wildcity_server::{Limits, SpoolLimits};
+
+use crate::cli::backend_options::{bytes_of_gib, gib};
+
+/// Heading of these options in `--help`; in a configuration file they are the table `[limits]`.
+pub(super) const HEADING: &str = "Limits";
+
+/// Most sessions, connections, pushes or uploads that can be asked for.
+const MAX_COUNT: u64 = 65_535;
+
+/// Longest time-out that can be asked for: 30 days.
+const MAX_TIMEOUT_S: f64 = 30.0 * 24.0 * 3600.0;
+
+fn count() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(1..=MAX_COUNT)
+}
+
+/// Time-outs, counts and bytes of a server.
+#[derive(Clone, Debug, clap::Args)]
+#[command(next_help_heading = HEADING)]
+pub(super) struct LimitOptions {
+    /// Sessions at once: connected, or waiting to be resumed.
+    #[arg(long, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
+    sessions: usize,
+
+    /// WebSocket connections at once; 64 more connections are accepted for HTTP requests alone.
+    #[arg(long, value_name = "N", default_value_t = Limits::default().connections, value_parser = count())]
+    connections: usize,
+
+    /// Pushes that wait or run at once.
+    #[arg(long, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
+    pushes: usize,
+
+    /// Seconds within which a new connection must send its first message.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().hello.as_secs_f64(), value_parser = seconds)]
+    hello_timeout_s: f64,
+
+    /// Seconds that a connection may be silent between requests.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
+    idle_timeout_s: f64,
+
+    /// Seconds within which a client must read an answer; at most 30, since clients give up later.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
+    send_timeout_s: f64,
+
+    /// Seconds for one step, waiting for other sessions included; at most 60, since clients give up later.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
+    step_timeout_s: f64,
+
+    /// Seconds that a session without a connection waits to be resumed.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().resume_grace.as_secs_f64(), value_parser = seconds)]
+    resume_grace_s: f64,
+
+    /// Seconds that running steps may take to finish when the server stops.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
+    drain_timeout_s: f64,
+
+    /// Uploads that are kept at once, finished or not.
+    #[arg(long, value_name = "N", default_value_t = SpoolLimits::default().uploads, value_parser = count())]
+    max_uploads: usize,
+
+    /// Size of the largest upload, in GiB.
+    #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().upload_bytes), value_parser = gib)]
+    upload_gib: f64,
+
+    /// Size of all uploads together, in GiB.
+    #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().bytes), value_parser = gib)]
+    spool_gib: f64,
+
+    /// Seconds that an upload is kept after its last byte.
+    #[arg(long, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
+    upload_age_s: f64,
+}
+
+impl LimitOptions {
+    /// The limits of a server. Its twins may take `resident_bytes` of memory.
+    pub(super) fn limits(&self, resident_bytes: Option<u64>) -> Limits {
+        let seconds = Duration::from_secs_f64;
+        Limits {
+            hello: seconds(self.hello_timeout_s),
+            idle: seconds(self.idle_timeout_s),
+            send: seconds(self.send_timeout_s),
+            step: seconds(self.step_timeout_s),
+            resume_grace: seconds(self.resume_grace_s),
+            drain: seconds(self.drain_timeout_s),
+            connections: self.connections,
+            sessions: self.sessions,
+            pushes: self.pushes,
+            resident_bytes,
+            spool: SpoolLimits {
+                uploads: self.max_uploads,
+                upload_bytes: bytes_of_gib(self.upload_gib),
+                bytes: bytes_of_gib(self.spool_gib),
+                age: seconds(self.upload_age_s),
+            },
+        }
+    }
+}
+
+/// GiB of so many bytes.
+pub(super) fn gib_of(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 30)
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    seconds_up_to(text, MAX_TIMEOUT_S)
+}
+
+fn send_seconds(text: &str) -> Result<f64, String> {
+    seconds_up_to(text, wildcity_protocol::limits::SEND_TIMEOUT.as_secs_f64())
+}
+
+fn step_seconds(text: &str) -> Result<f64, String> {
+    seconds_up_to(text, wildcity_protocol::limits::STEP_TIMEOUT.as_secs_f64())
+}
+
+fn seconds_up_to(text: &str, most: f64) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if seconds >= 0.001 && seconds <= most => Ok(seconds),
+        _ => Err(format!("expected seconds, from 0.001 to {most}")),
+    }
+}

@@ -1,0 +1,187 @@
+//! `wildcity serve`.
+
+mod config_file;
+mod limit_options;
+
+use std::io::{self, IsTerminal, Write};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::Context as _;
+use tracing_subscriber::EnvFilter;
+
+use wildcity_server::Tokens;
+use wildcity_twin::ingest;
+use wildcity_twin::residency::default_memory_bytes;
+
+use limit_options::{LimitOptions, gib_of};
+
+use super::backend_options::{BackendOptions, bytes_of_gib, gib};
+use super::directories::{Episodes, Twins, Uploads};
+use super::profile_options::read_profile;
+
+/// Serve twins to agents over WebSocket.
+///
+/// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
+/// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
+///
+/// Every option can stand in a TOML file as well: --memory-gib is memory_gib there, and the options
+/// under Limits are in the table [limits]. A flag overrides the file, and the file a default.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Serve {
+    /// TOML file of options; `wildcity serve --print-config` prints one.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+
+    /// Print every option that is in effect with its meaning, as a file for --config, and exit.
+    #[arg(long)]
+    print_config: bool,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    episodes: Episodes,
+
+    #[command(flatten)]
+    uploads: Uploads,
+
+    /// JSON file of tokens and what each allows (see below); without it the server only listens on a
+    /// loopback address.
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
+
+    /// Address and port to listen on; port 0 takes a free one. An address that is not loopback needs
+    /// --tokens.
+    #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
+    listen: SocketAddr,
+
+    /// Memory that the Gaussians of all twins may take, in GiB, as 2 or 0.5 [default: three quarters of
+    /// the machine's]. A session is refused if its largest frame does not fit beside those of other
+    /// sessions; the rest of the memory caches what later frames may need.
+    #[arg(long, value_name = "N", value_parser = gib)]
+    memory_gib: Option<f64>,
+
+    /// JSON file of fields of the render profile that every session gets instead of its twin's, as
+    /// `wildcity report` writes it: {"tau_px": 2.0}. A session may ask for others.
+    #[arg(long, value_name = "FILE")]
+    profile: Option<PathBuf>,
+
+    #[command(flatten)]
+    backend: BackendOptions,
+
+    /// What to log, as `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
+    #[arg(long, value_name = "FILTER")]
+    log: Option<String>,
+
+    #[command(flatten)]
+    limits: LimitOptions,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity serve
+  wildcity serve --memory-gib 2
+  wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
+  wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
+  wildcity serve --print-config > serve.toml
+  wildcity serve --config serve.toml --sessions 16
+  curl http://127.0.0.1:8080/v1/twins
+
+Tokens file: role is drive (sessions), push (uploads and pushes) or admin (everything). Give the token
+itself, of at least 16 characters, or hash: blake3: or sha-256: and its hash in hex. twins lists the
+twins that it may use; without the list it may use all.
+  {\"tokens\": [
+    {\"name\": \"fleet\", \"role\": \"drive\", \"token\": \"u3mR8qkV0aXn2wLc\", \"twins\": [\"street\"]},
+    {\"name\": \"trainer\", \"role\": \"push\", \"hash\": \"sha-256:9f86d081884c7d659a2feaa0c55ad015...\"}]}";
+
+impl Serve {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        // The arguments after `wildcity serve` are parsed again, behind those of the file.
+        let resolved = config_file::resolve(std::env::args_os().skip(2).collect())?;
+        if resolved.serve.print_config {
+            write!(io::stdout(), "{}", resolved.to_toml()?)?;
+            return Ok(());
+        }
+        resolved.serve.serve()
+    }
+
+    /// The value of an option that was not given and has no fixed default, as text; none if it has no
+    /// effect.
+    fn default_of(&self, id: &str) -> anyhow::Result<Option<String>> {
+        let text = |path: PathBuf| Some(path.display().to_string());
+        Ok(match id {
+            "twins" => text(self.twins.dir()?),
+            "episodes" => text(self.episodes.dir()?),
+            "uploads" => text(self.uploads.dir()?),
+            "cache_dir" => self.twins.cache().and_then(|cache| text(cache.dir)),
+            "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
+            "log" => Some(self.log_filter()),
+            _ => None,
+        })
+    }
+
+    fn log_filter(&self) -> String {
+        let log = self.log.clone().or_else(|| std::env::var("RUST_LOG").ok());
+        log.unwrap_or_else(|| "info".to_owned())
+    }
+
+    fn serve(self) -> anyhow::Result<()> {
+        let filter = EnvFilter::try_new(self.log_filter())?;
+        tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(io::stderr)
+            .with_ansi(io::stderr().is_terminal())
+            .init();
+        let twins = self.twins.dir()?;
+        anyhow::ensure!(
+            !twins.exists() || twins.is_dir(),
+            "--twins {} is not a directory",
+            twins.display()
+        );
+        if self.twins.catalog()?.twins()?.is_empty() {
+            let dir = twins.display();
+            tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
+        }
+        let tokens = self.tokens.as_deref().map(read_tokens).transpose()?;
+        let config = wildcity_server::Config {
+            listen: self.listen,
+            twins,
+            cache: self.twins.cache(),
+            episodes: self.episodes.dir()?,
+            uploads: self.uploads.dir()?,
+            tokens,
+            backend: Arc::from(self.backend.backend()?),
+            profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
+            limits: self.limits.limits(self.memory_gib.map(bytes_of_gib)),
+        };
+        tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        let served = runtime.block_on(async {
+            // Before the address is printed: the signal may come right after.
+            let stop = wildcity_server::stop_signal()?;
+            let running = wildcity_server::start(config).await?;
+            writeln!(io::stdout(), "listening on {}", running.url())?;
+            stop.await;
+            tracing::info!("stopping");
+            running.stop().await;
+            Ok(())
+        });
+        // A push that still writes is abandoned: a commit that is killed at any point leaves nothing.
+        runtime.shutdown_background();
+        served
+    }
+}
+
+fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
+    let cannot = || format!("--tokens {}", path.display());
+    let text = ingest::read_whole(path, wildcity_server::limits::TOKENS_FILE_BYTES)
+        .with_context(cannot)?;
+    Tokens::parse(&text).with_context(cannot)
+}
+
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an address and a port, as 127.0.0.1:8080".to_owned())
+}

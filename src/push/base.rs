@@ -1,0 +1,59 @@
+//! The version that a push is made from, and conflicts with versions that came after it.
+
+use wildcity_twin::store::{Catalog, StoreError, Version};
+
+use crate::error::PushError;
+use crate::request::{CellSelection, PushRequest};
+
+/// The number of the twin's latest version, if the twin exists. Also refuses a push early if its
+/// cells changed since the base that it names.
+///
+/// # Errors
+/// The base does not exist, or [`StoreError::Overlap`].
+pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64>, PushError> {
+    let versions = match catalog.versions(&request.twin) {
+        Ok(versions) => versions,
+        Err(StoreError::NoTwin { .. }) if request.base.is_none() => return Ok(None),
+        Err(error) => return Err(error.into()),
+    };
+    let latest = versions.last().map(|entry| entry.number);
+    if let (Some(base), Some(latest)) = (request.base, latest) {
+        let diff = catalog.diff(&request.twin, base, latest)?;
+        let changed = diff.cells.iter().map(|difference| difference.cell);
+        let cells: Vec<[i32; 2]> = match &request.cells {
+            CellSelection::These(selected) => {
+                changed.filter(|cell| selected.contains(cell)).collect()
+            }
+            CellSelection::All => changed.collect(),
+            // These cells are known only once the files are read; then the store refuses them.
+            CellSelection::Touched => Vec::new(),
+        };
+        if !cells.is_empty() {
+            let name = request.twin.clone();
+            let settings = Vec::new();
+            return Err(StoreError::Overlap { name, base, latest, cells, settings }.into());
+        }
+    }
+    Ok(latest)
+}
+
+/// The id of a push that names none: a hash of its content and of the latest version, since the same
+/// content on top of another version is another push.
+pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(request.request_hash.as_bytes());
+    hasher.update(&latest.unwrap_or(0).to_le_bytes());
+    hasher.finalize().to_hex()[..32].to_owned()
+}
+
+/// The version that a push is made from; none if it makes a new twin.
+pub(crate) fn find_base(
+    catalog: &Catalog,
+    request: &PushRequest,
+) -> Result<Option<Version>, PushError> {
+    match catalog.version(&request.twin, request.base) {
+        Ok(version) => Ok(Some(version)),
+        Err(StoreError::NoTwin { .. }) if request.base.is_none() => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}

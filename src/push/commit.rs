@@ -1,0 +1,66 @@
+//! Writes the version of a push: all of its cells, or none.
+
+use wildcity_scene::Gaussians;
+use wildcity_twin::store::{
+    Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
+    VersionSettings,
+};
+
+use crate::error::PushError;
+use crate::request::{CellSelection, PushRequest, profile_with};
+use crate::source::provenance;
+use crate::status::Push;
+
+/// The content of a version, apart from what the request says.
+pub(crate) struct NewContent<'a> {
+    pub(crate) gaussians: &'a Gaussians,
+    /// BLAKE3 of each file, in hex.
+    pub(crate) hashes: &'a [String],
+    /// The axes and scale of each file.
+    pub(crate) options: &'a [String],
+}
+
+/// Writes the version. Some cells change the base and keep its settings; all cells replace the twin,
+/// and take the rig, the trajectories and the sky of the base along.
+pub(crate) fn commit(
+    catalog: &Catalog,
+    push: &Push,
+    request: &PushRequest,
+    content: NewContent<'_>,
+    base: Option<&Version>,
+) -> Result<Version, PushError> {
+    let old = base.map(|base| &base.manifest);
+    let record = request.record.or(old.map(|old| old.record)).unwrap_or_default();
+    let storage = StorageOptions { record, levels: request.levels };
+    let mut commit = catalog.begin(&request.twin, CommitKind::Push, storage)?;
+    let only = match &request.cells {
+        CellSelection::These(cells) => Some(cells),
+        CellSelection::Touched | CellSelection::All => None,
+    };
+    let progress = &mut |done: u64, total: u64| push.set_progress(done, total);
+    commit.put(content.gaussians, only, progress)?;
+
+    let mut provenance = provenance(content.hashes, content.options.to_vec(), request.levels);
+    provenance.options.extend(request.note.as_ref().map(|note| format!("note={note}")));
+    let old_profile = old.map(|old| old.profile).unwrap_or_default();
+    let profile = profile_with(old_profile, &request.profile).map_err(StoreError::from)?;
+    let version = match base {
+        Some(base) if request.cells != CellSelection::All => {
+            let profile = (!request.profile.is_empty()).then_some(profile);
+            let change =
+                VersionChange { profile, rig: None, trajectories: None, sky: None, provenance };
+            commit.change(base.number, change)?
+        }
+        _ => {
+            let settings = VersionSettings {
+                profile,
+                rig: old.and_then(|old| old.rig.clone()),
+                trajectories: old.map(|old| old.trajectories.clone()).unwrap_or_default(),
+                sky: old.and_then(|old| old.sky.clone()).map(NewSky::Kept),
+                provenance,
+            };
+            commit.replace(request.base, settings)?
+        }
+    };
+    Ok(version)
+}

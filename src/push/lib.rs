@@ -1,0 +1,39 @@
+//! Pushes: trained scenes become a new version of a twin, all of their cells at once or none.
+//!
+//! ```text
+//! request   what a push asks for, and the checks that need neither files nor twin
+//! base      the version that a push is made from, and conflicts with later versions
+//! queue     the pushes of a server: waiting, running, ended not long ago
+//! status    how far a push is
+//! source    reads scene files and converts them to the twin's axes; `wildcity import` reads so, too
+//! read      joins the files of one push
+//! report    what the files hold, and which cells would change
+//! preview   compares small images before and after
+//! commit    writes the version
+//! publish   the pipeline: read, check, preview, commit, load ahead
+//! ```
+//!
+//! Nothing of a push is visible before its version is committed. This package knows neither HTTP nor
+//! JSON: the server converts requests and answers.
+
+mod base;
+mod commit;
+mod error;
+pub mod limits;
+mod preview;
+mod publish;
+mod queue;
+mod read;
+mod report;
+mod request;
+mod source;
+mod status;
+
+pub use base::{check_base, default_id};
+pub use error::PushError;
+pub use publish::{Viewpoints, publish};
+pub use queue::{Begun, PushQueue};
+pub use report::{CellChange, FileReport, PushReport, Ranges};
+pub use request::{CellSelection, PushRequest, RequestedFile, profile_with};
+pub use source::{SourceAxes, SourceFile, SourceScene, provenance, read_scene};
+pub use status::{Progress, Push, PushedVersion, State, Status};

@@ -1,0 +1,105 @@
+//! How the twin would look: small images of the base and of what it would become, compared.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use wildcity_scene::Gaussians;
+use wildcity_scene::chunk::cell_at;
+use wildcity_session::{ProposedChange, PsnrPreview};
+use wildcity_twin::store::{StoreError, Version};
+
+use crate::error::PushError;
+use crate::limits;
+use crate::report::PushReport;
+use crate::request::{PushRequest, profile_with};
+
+/// What the preview compares: the base with the replaced cells. None if there is no base, or if it
+/// cannot be compared.
+///
+/// # Errors
+/// A comparison was asked for, and the push has too many Gaussians for one; or its profile cannot be
+/// used.
+pub(crate) fn comparison(
+    request: &PushRequest,
+    gaussians: &Arc<Gaussians>,
+    report: &PushReport,
+    base: Option<&Arc<Version>>,
+) -> Result<Option<ProposedChange>, PushError> {
+    let fits = gaussians.len() <= limits::PREVIEW_GAUSSIANS;
+    let is_wanted = request.preview_poses.is_some() || request.min_psnr_db.is_some();
+    if is_wanted && !fits {
+        let most = limits::PREVIEW_GAUSSIANS;
+        let must = format!("set, for {} Gaussians; at most {most} are compared", gaussians.len());
+        return Err(PushError::OutOfRange { field: "golden".to_owned(), must });
+    }
+    let Some(base) = base else { return Ok(None) };
+    if !fits || base.manifest.sh_degree != gaussians.sh_degree {
+        return Ok(None);
+    }
+    let cells: BTreeSet<[i32; 2]> = report.cells.iter().map(|change| change.cell).collect();
+    let profile = profile_with(base.manifest.profile, &request.profile);
+    Ok(Some(ProposedChange {
+        before: base.clone(),
+        gaussians: within(gaussians, &cells, report.left_out),
+        cells,
+        profile: profile.map_err(StoreError::from)?,
+    }))
+}
+
+/// The Gaussians within some cells; no copy is made if none is left out.
+fn within(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64) -> Arc<Gaussians> {
+    if left_out == 0 {
+        return gaussians.clone();
+    }
+    let is_within = |&index: &usize| cells.contains(&cell_at(&gaussians.means_m[index]));
+    Arc::new(gaussians.select((0..gaussians.len()).filter(is_within)))
+}
+
+/// Refuses a push that differs by more than the request allows, and one that was to be compared and
+/// cannot be.
+pub(crate) fn check_psnr(
+    request: &PushRequest,
+    gaussians: &Gaussians,
+    report: &PushReport,
+    base: Option<&Version>,
+) -> Result<(), PushError> {
+    let Some(min_db) = request.min_psnr_db else { return Ok(()) };
+    if report.preview.is_empty() {
+        let why = reason_for_no_preview(request, gaussians, base);
+        let must = format!("{min_db}, but nothing can be compared: {why}");
+        return Err(PushError::OutOfRange { field: "golden.min_psnr_db".to_owned(), must });
+    }
+    let worst = report.preview.iter().enumerate().find(|(_, pose)| pose.psnr_db < min_db);
+    if let Some((index, PsnrPreview { world_from_rig, psnr_db })) = worst {
+        let [x, y, z] = world_from_rig.position_m.to_array();
+        let reason = format!(
+            "pose {index} at ({x:.1}, {y:.1}, {z:.1}) differs from the version before: {psnr_db:.1} dB, \
+             min_psnr_db is {min_db}"
+        );
+        return Err(PushError::Content { reason, cells: Vec::new() });
+    }
+    Ok(())
+}
+
+fn reason_for_no_preview(
+    request: &PushRequest,
+    gaussians: &Gaussians,
+    base: Option<&Version>,
+) -> String {
+    let Some(Version { manifest, .. }) = base else {
+        return "there is no version before it: leave it out".to_owned();
+    };
+    if manifest.sh_degree != gaussians.sh_degree {
+        return format!(
+            "the SH degree is {}, and {} in the version before: leave it out",
+            gaussians.sh_degree, manifest.sh_degree
+        );
+    }
+    match &request.preview_poses {
+        None if manifest.trajectories.is_empty() => {
+            "the twin has no trajectory: name golden.poses".to_owned()
+        }
+        Some(poses) if poses.is_empty() => "golden.poses names none".to_owned(),
+        _ => "a camera of the twin's rig cannot be drawn smaller: leave it out".to_owned(),
+    }
+}

@@ -1,0 +1,188 @@
+//! The pipeline of a push: read, check, preview, commit, load ahead.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use tokio::time::timeout;
+
+use wildcity_scene::Gaussians;
+use wildcity_scene::chunk::cell_at;
+use wildcity_session::{Engine, LatestPin};
+use wildcity_twin::residency::Viewpoint;
+use wildcity_twin::store::{StoreError, Version};
+
+use crate::base::find_base;
+use crate::commit::{NewContent, commit};
+use crate::error::PushError;
+use crate::preview::{check_psnr, comparison};
+use crate::queue::PushQueue;
+use crate::read::{PushedScene, read};
+use crate::report::{CellChanges, PushReport};
+use crate::request::{CellSelection, PushRequest};
+use crate::source::SourceFile;
+use crate::status::{Push, PushedVersion, State};
+
+/// For a twin, the viewpoints of the next frame of each session that drives on it now.
+pub type Viewpoints<'a> = &'a (dyn Fn(&str) -> Vec<Vec<Viewpoint>> + Send + Sync);
+
+/// A scene that was checked against the base.
+struct CheckedScene {
+    gaussians: Arc<Gaussians>,
+    hashes: Vec<String>,
+    options: Vec<String>,
+    report: PushReport,
+}
+
+/// Waits for the push's turn, carries it out, and returns the version that it made. Dropping the future
+/// abandons the push: before the commit nothing of it is visible. The caller ends the push with
+/// [`Push::end`].
+///
+/// # Errors
+/// The content is refused, or the server could not do it; see [`PushError::is_refusal`].
+pub async fn publish(
+    engine: &Arc<Engine>,
+    queue: &PushQueue,
+    push: &Arc<Push>,
+    request: PushRequest,
+    files: Vec<SourceFile>,
+    viewpoints: Viewpoints<'_>,
+) -> Result<PushedVersion, PushError> {
+    let _turn = queue.turn().await?;
+    let request = Arc::new(request);
+
+    push.enter(State::Ingesting);
+    let scene = {
+        let push = push.clone();
+        let request = request.clone();
+        blocking(move || read(&push, &request, &files)).await?
+    };
+
+    push.enter(State::Validating);
+    let base = {
+        let engine = engine.clone();
+        let request = request.clone();
+        blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
+    };
+    let scene = check(engine, push, &request, scene, base.clone()).await?;
+
+    push.enter(State::Committing);
+    let committed = {
+        let engine = engine.clone();
+        let push = push.clone();
+        let request = request.clone();
+        blocking(move || commit_held(&engine, &push, &request, &scene, base.as_deref())).await?
+    };
+    let Committed { version, held } = committed;
+    tracing::info!(twin = request.twin, version = version.number, "pushed");
+
+    push.enter(State::Prefetching);
+    load_ahead(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
+    drop(held);
+    Ok(PushedVersion { number: version.number, hash: version.hash })
+}
+
+/// Finds what would change, and compares how it looks.
+async fn check(
+    engine: &Arc<Engine>,
+    push: &Arc<Push>,
+    request: &Arc<PushRequest>,
+    scene: PushedScene,
+    base: Option<Arc<Version>>,
+) -> Result<CheckedScene, PushError> {
+    let (mut scene, changed) = {
+        let push = push.clone();
+        let request = request.clone();
+        let base = base.clone();
+        blocking(move || {
+            let scene = compare_cells(&push, &request, scene, base.as_deref())?;
+            let changed = comparison(&request, &scene.gaussians, &scene.report, base.as_ref())?;
+            Ok((scene, changed))
+        })
+        .await?
+    };
+    if let Some(changed) = changed {
+        let progress = |done, total| push.set_progress(done, total);
+        let poses = request.preview_poses.clone();
+        scene.report.preview = engine.preview_psnr(changed, poses, &progress).await?;
+        push.set_report(scene.report.clone());
+    }
+    check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;
+    Ok(scene)
+}
+
+/// Finds the cells that the push replaces, and completes the report with them.
+fn compare_cells(
+    push: &Push,
+    request: &PushRequest,
+    scene: PushedScene,
+    base: Option<&Version>,
+) -> Result<CheckedScene, PushError> {
+    let PushedScene { mut gaussians, hashes, options, mut report } = scene;
+    // All cells of a twin have one SH degree. Coefficients of zero raise a lower one.
+    if let Some(base) = base
+        && request.cells != CellSelection::All
+    {
+        gaussians.raise_sh_degree(base.manifest.sh_degree);
+    }
+    let mut counts = BTreeMap::new();
+    for mean_m in &gaussians.means_m {
+        *counts.entry(cell_at(mean_m)).or_insert(0) += 1;
+    }
+    let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts);
+    let changes = changes.inspect_err(|_| push.set_report(report.clone()))?;
+    report.cells = changes.cells;
+    report.left_out = changes.left_out;
+    push.set_report(report.clone());
+    Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
+}
+
+/// A committed version that is not yet opened as the latest.
+struct Committed {
+    version: Version,
+    /// Keeps the version before as the latest until it is dropped.
+    held: Option<LatestPin>,
+}
+
+fn commit_held(
+    engine: &Arc<Engine>,
+    push: &Push,
+    request: &PushRequest,
+    scene: &CheckedScene,
+    base: Option<&Version>,
+) -> Result<Committed, PushError> {
+    // Until the new version is ready, sessions that open the latest get the version that is the latest
+    // now; the preview took its time, so that it may be later than the base.
+    let held = pin_latest(engine, &request.twin)?;
+    let content =
+        NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
+    let version = commit(engine.catalog(), push, request, content, base)?;
+    Ok(Committed { version, held })
+}
+
+/// Keeps the version that is the latest now; none if the twin is new.
+fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
+    let versions = match engine.catalog().versions(twin) {
+        Ok(versions) => versions,
+        Err(StoreError::NoTwin { .. }) => return Ok(None),
+        Err(error) => return Err(error.into()),
+    };
+    Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
+}
+
+/// Loads the version where sessions drive on the twin now, so that those that switch need not wait.
+/// The version is committed and sound: what cannot be loaded now is loaded when it is opened.
+async fn load_ahead(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
+    let prepared = engine.preload(twin, version, frames);
+    match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => tracing::warn!(twin, "not loaded ahead: {error}"),
+        Err(_) => tracing::warn!(twin, "not loaded ahead in time"),
+    }
+}
+
+/// Runs work that may wait for a disk, or takes long, beside the asynchronous tasks.
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, PushError> + Send + 'static,
+) -> Result<T, PushError> {
+    tokio::task::spawn_blocking(work).await.map_err(|_| PushError::Crashed)?
+}

@@ -1,0 +1,211 @@
+//! What the files of a push hold, and what it would change, before anything is committed.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use wildcity_scene::{Gaussians, Manifest};
+use wildcity_session::PsnrPreview;
+use wildcity_twin::ingest::BadGaussian;
+
+use crate::error::PushError;
+use crate::limits;
+use crate::request::CellSelection;
+
+/// What was found in the files of a push.
+#[derive(Clone, Debug, Default)]
+pub struct PushReport {
+    /// Each file that was read.
+    pub files: Vec<FileReport>,
+    /// Gaussians of all files.
+    pub gaussians: u64,
+    /// Gaussians that lie in none of the replaced cells.
+    pub left_out: u64,
+    /// Highest SH degree of the files.
+    pub sh_degree: u8,
+    /// Smallest and largest values; none without Gaussians.
+    pub ranges: Option<Ranges>,
+    /// Cells that are replaced, in order of (y, x).
+    pub cells: Vec<CellChange>,
+    /// How alike the twin looks before and after, at each pose of the preview.
+    pub preview: Vec<PsnrPreview>,
+}
+
+/// A cell that is replaced, and its number of Gaussians before and after.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CellChange {
+    /// Grid cell (x, y).
+    pub cell: [i32; 2],
+    /// Gaussians in the base.
+    pub before: u64,
+    /// Gaussians of the push.
+    pub after: u64,
+}
+
+/// One file of a push.
+#[derive(Clone, Debug)]
+pub struct FileReport {
+    /// Name of the file.
+    pub name: String,
+    /// Gaussians in it.
+    pub gaussians: u64,
+    /// Gaussians with a number outside its bounds.
+    pub bad: u64,
+    /// The first of those.
+    pub first_bad: Vec<BadGaussian>,
+}
+
+/// Smallest and largest values of the numbers of some Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ranges {
+    /// Corners of the axis-aligned box around all centres, in metres in the twin's axes.
+    pub mean_m: [[f64; 3]; 2],
+    /// Standard deviations along the own axes, in metres.
+    pub scale_m: [f64; 2],
+    /// Opacities after the sigmoid, from 0 to 1.
+    pub opacity: [f64; 2],
+    /// Lengths of the quaternions, which are normalised only when they are rendered.
+    pub quat_length: [f64; 2],
+}
+
+impl Ranges {
+    /// The ranges of valid Gaussians; none without Gaussians.
+    pub fn of(gaussians: &Gaussians) -> Option<Self> {
+        if gaussians.is_empty() {
+            return None;
+        }
+        let x_m = range(gaussians.means_m.iter().map(|mean| mean[0]));
+        let y_m = range(gaussians.means_m.iter().map(|mean| mean[1]));
+        let z_m = range(gaussians.means_m.iter().map(|mean| mean[2]));
+        let ln_scales = gaussians.ln_scales.as_flattened();
+        let scales_m = ln_scales.iter().map(|&ln| f64::from(ln).exp());
+        let logits = gaussians.logit_opacities.iter();
+        let opacities = logits.map(|&logit| 1.0 / (1.0 + (-f64::from(logit)).exp()));
+        let quats = gaussians.quats_wxyz.iter();
+        let lengths = quats.map(|q| q.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt());
+        Some(Self {
+            mean_m: [[x_m[0], y_m[0], z_m[0]], [x_m[1], y_m[1], z_m[1]]],
+            scale_m: range(scales_m),
+            opacity: range(opacities),
+            quat_length: range(lengths),
+        })
+    }
+}
+
+/// The smallest and the largest of some values.
+fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
+        [low.min(value), high.max(value)]
+    })
+}
+
+/// The cells that a push replaces.
+#[derive(Debug, PartialEq)]
+pub(crate) struct CellChanges {
+    /// In order of (y, x).
+    pub(crate) cells: Vec<CellChange>,
+    /// Gaussians of the push that lie in none of them.
+    pub(crate) left_out: u64,
+}
+
+impl CellChanges {
+    /// Compares the cells of a base with the number of Gaussians that a push has in each cell.
+    ///
+    /// # Errors
+    /// [`PushError::Content`]: a cell that was named has no Gaussian, or one that was not named would
+    /// lose nearly all of its Gaussians.
+    pub(crate) fn new(
+        selection: &CellSelection,
+        base: Option<&Manifest>,
+        after: &BTreeMap<[i32; 2], u64>,
+    ) -> Result<Self, PushError> {
+        let chunks = base.map_or(&[][..], |base| &base.chunks[..]);
+        let before: BTreeMap<[i32; 2], u64> =
+            chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect();
+        let replaced: BTreeSet<[i32; 2]> = match selection {
+            CellSelection::These(cells) => cells.clone(),
+            CellSelection::Touched => after.keys().copied().collect(),
+            CellSelection::All => before.keys().chain(after.keys()).copied().collect(),
+        };
+        let count = |counts: &BTreeMap<[i32; 2], u64>, cell| counts.get(cell).copied().unwrap_or(0);
+        let mut cells: Vec<CellChange> = replaced
+            .iter()
+            .map(|cell| CellChange {
+                cell: *cell,
+                before: count(&before, cell),
+                after: count(after, cell),
+            })
+            .collect();
+        cells.sort_by_key(|change| (change.cell[1], change.cell[0]));
+        match selection {
+            CellSelection::These(_) => refuse_empty(&cells)?,
+            CellSelection::Touched => refuse_shrunk(&cells)?,
+            CellSelection::All => {}
+        }
+        let kept: u64 = cells.iter().map(|change| change.after).sum();
+        Ok(Self { cells, left_out: after.values().sum::<u64>() - kept })
+    }
+}
+
+/// Refuses named cells without a Gaussian: most likely the axes or the scale of a file are wrong.
+fn refuse_empty(cells: &[CellChange]) -> Result<(), PushError> {
+    let empty: Vec<_> = cells.iter().filter(|change| change.after == 0).collect();
+    let Some(CellChange { cell: [x, y], .. }) = empty.first() else { return Ok(()) };
+    let reason = format!(
+        "{} of the cells named have no Gaussian in the push, as ({x}, {y}): leave them out of cells, \
+         or look at the axes and scale",
+        empty.len()
+    );
+    Err(PushError::Content { reason, cells: empty.iter().map(|change| change.cell).collect() })
+}
+
+/// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`].
+fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
+    let shrinks =
+        |change: &&CellChange| (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64;
+    let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
+    let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() else { return Ok(()) };
+    let reason = format!(
+        "{} cells would lose nearly all of their Gaussians, as ({x}, {y}): {after} Gaussians in place \
+         of {before}. If you mean this, name the cells; if these Gaussians are the margin of a \
+         neighbouring cell, name only the other cells",
+        shrunk.len()
+    );
+    Err(PushError::Content { reason, cells: shrunk.iter().map(|change| change.cell).collect() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_of_two_gaussians() {
+        let gaussians = Gaussians {
+            sh_degree: 0,
+            means_m: vec![[1.0, -2.0, 3.0], [-1.0, 5.0, 0.0]],
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]],
+            ln_scales: vec![[0.0; 3], [0.0, -1.0, 1.0]],
+            logit_opacities: vec![0.0, 100.0],
+            sh: vec![0.0; 6],
+        };
+        let ranges = Ranges::of(&gaussians).unwrap();
+        assert_eq!(ranges.mean_m, [[-1.0, -2.0, 0.0], [1.0, 5.0, 3.0]]);
+        assert_eq!(ranges.scale_m, [f64::exp(-1.0), f64::exp(1.0)]);
+        assert_eq!((ranges.opacity, ranges.quat_length), ([0.5, 1.0], [1.0, 5.0]));
+        assert_eq!(Ranges::of(&Gaussians::default()), None);
+    }
+
+    #[test]
+    fn named_cells_decide_what_is_left_out() {
+        let after = BTreeMap::from([([0, 0], 5), ([1, 0], 7)]);
+        let named = CellSelection::These(BTreeSet::from([[1, 0]]));
+        let changes = CellChanges::new(&named, None, &after).unwrap();
+        assert_eq!(changes.cells, [CellChange { cell: [1, 0], before: 0, after: 7 }]);
+        assert_eq!(changes.left_out, 5);
+        let empty = CellSelection::These(BTreeSet::from([[1, 0], [9, 9]]));
+        match CellChanges::new(&empty, None, &after) {
+            Err(PushError::Content { cells, .. }) => assert_eq!(cells, [[9, 9]]),
+            other => panic!("{other:?}"),
+        }
+        let touched = CellChanges::new(&CellSelection::Touched, None, &after).unwrap();
+        assert_eq!((touched.cells.len(), touched.left_out), (2, 0));
+    }
+}

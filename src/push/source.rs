@@ -1,0 +1,81 @@
+//! Reads one scene file and converts it to the twin's axes.
+
+use std::any::Any;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use wildcity_scene::Gaussians;
+use wildcity_scene::manifest::Provenance;
+use wildcity_twin::ingest::{self, Axes, IngestError, Progress};
+
+/// The axes and unit of a scene file, and how the user wrote them.
+#[derive(Clone, Debug)]
+pub struct SourceAxes {
+    axes: Axes,
+    options: [String; 2],
+}
+
+/// A scene file that waits to be read.
+#[derive(Clone, Debug)]
+pub struct SourceFile {
+    /// Name for messages.
+    pub name: String,
+    /// Path on the local disk.
+    pub path: PathBuf,
+    /// Size of the file, for progress.
+    pub bytes: u64,
+    /// Keeps the file from being removed for as long as it is held.
+    pub guard: Arc<dyn Any + Send + Sync>,
+}
+
+/// The content of a scene file in the axes of the twin.
+#[derive(Clone, Debug)]
+pub struct SourceScene {
+    /// The Gaussians, in metres.
+    pub gaussians: Gaussians,
+    /// BLAKE3 of the bytes that were read, in hex.
+    pub hash: String,
+}
+
+impl SourceAxes {
+    /// Reads axes, as `y-down-z-forward` or nine numbers, and metres per unit of the file.
+    ///
+    /// # Errors
+    /// The axes are not a rotation or reflection, or the scale is not a positive number.
+    pub fn parse(axes: &str, scale: f64) -> Result<Self, IngestError> {
+        let options = [format!("axes={axes}"), format!("scale={scale}")];
+        Ok(Self { axes: axes.parse::<Axes>()?.scaled(scale)?, options })
+    }
+
+    /// The axes and the scale as options, for the provenance of a version.
+    pub fn options(&self) -> &[String; 2] {
+        &self.options
+    }
+}
+
+/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes.
+///
+/// # Errors
+/// As [`ingest::read`].
+pub fn read_scene(
+    path: &Path,
+    axes: &SourceAxes,
+    progress: Progress<'_>,
+) -> Result<SourceScene, IngestError> {
+    let (mut gaussians, hash) = ingest::read_hashed(path, progress)?;
+    axes.axes.apply(&mut gaussians);
+    Ok(SourceScene { gaussians, hash })
+}
+
+/// The provenance of a version made of some files, given their hashes. It has no time and no user, so
+/// that the same content is the same version.
+pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> Provenance {
+    let source = match hashes {
+        [one] => one.clone(),
+        several => blake3::hash(several.join("\n").as_bytes()).to_hex().to_string(),
+    };
+    if !levels {
+        options.push("lod=off".to_owned());
+    }
+    Provenance { options, ..Provenance::of(format!("blake3:{source}")) }
+}

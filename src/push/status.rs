@@ -1,0 +1,140 @@
+//! How far a push is.
+
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+
+use crate::error::PushError;
+use crate::report::PushReport;
+
+/// The stage of a push.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// Waiting for earlier pushes.
+    Queued,
+    /// Its files are read.
+    Ingesting,
+    /// Its content is compared with the twin.
+    Validating,
+    /// The version is written.
+    Committing,
+    /// The version is loaded into memory for the sessions that may switch to it.
+    Prefetching,
+    /// The version is the latest.
+    Ready,
+    /// The content cannot be accepted.
+    Refused,
+    /// The server could not carry it out.
+    Failed,
+}
+
+/// Work done within a state. The unit is bytes while files are read, else poses or Gaussians.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Work done.
+    pub done: u64,
+    /// All work of the state; 0 if it is not known.
+    pub total: u64,
+}
+
+/// The version that a push made.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PushedVersion {
+    /// Number of the version.
+    pub number: u64,
+    /// BLAKE3 of its manifest, in hex.
+    pub hash: String,
+}
+
+/// Everything that a client may know of a push.
+#[derive(Clone, Debug)]
+pub struct Status {
+    /// The stage.
+    pub state: State,
+    /// Progress within the stage.
+    pub progress: Progress,
+    /// The version, once it is ready.
+    pub version: Option<PushedVersion>,
+    /// What was found in the files, as far as it is known.
+    pub report: Option<Arc<PushReport>>,
+    /// Why it was refused or failed.
+    pub error: Option<Arc<PushError>>,
+}
+
+/// One push.
+pub struct Push {
+    request_hash: blake3::Hash,
+    /// Counts the pushes of a queue: the oldest is forgotten first.
+    number: u64,
+    status: Mutex<Status>,
+}
+
+impl Push {
+    pub(crate) fn new(request_hash: blake3::Hash, number: u64) -> Self {
+        let status = Status {
+            state: State::Queued,
+            progress: Progress::default(),
+            version: None,
+            report: None,
+            error: None,
+        };
+        Self { request_hash, number, status: Mutex::new(status) }
+    }
+
+    pub(crate) fn request_hash(&self) -> blake3::Hash {
+        self.request_hash
+    }
+
+    pub(crate) fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// A copy of the status at this moment.
+    pub fn status(&self) -> Status {
+        self.status.lock().clone()
+    }
+
+    /// Whether the push waits or runs.
+    pub fn is_open(&self) -> bool {
+        match self.status.lock().state {
+            State::Queued
+            | State::Ingesting
+            | State::Validating
+            | State::Committing
+            | State::Prefetching => true,
+            State::Ready | State::Refused | State::Failed => false,
+        }
+    }
+
+    /// Ends the push. An error that is a refusal gives [`State::Refused`], any other [`State::Failed`].
+    /// Returns the state.
+    pub fn end(&self, result: Result<PushedVersion, PushError>) -> State {
+        let mut status = self.status.lock();
+        match result {
+            Ok(version) => {
+                status.state = State::Ready;
+                status.version = Some(version);
+            }
+            Err(error) => {
+                status.state = if error.is_refusal() { State::Refused } else { State::Failed };
+                status.error = Some(Arc::new(error));
+            }
+        }
+        status.state
+    }
+
+    /// Enters a state, at its beginning.
+    pub(crate) fn enter(&self, state: State) {
+        let mut status = self.status.lock();
+        status.state = state;
+        status.progress = Progress::default();
+    }
+
+    pub(crate) fn set_progress(&self, done: u64, total: u64) {
+        self.status.lock().progress = Progress { done, total };
+    }
+
+    pub(crate) fn set_report(&self, report: PushReport) {
+        self.status.lock().report = Some(Arc::new(report));
+    }
+}

@@ -1,0 +1,32 @@
+//! The outputs of the stages in their plain form, for another backend to continue from or compare with.
+
+use super::Scratch;
+use crate::layout::Cutoffs;
+use crate::stage::{Stage, StageOutputs, TileLists};
+
+/// Copies the outputs of the stages up to and including `last`. Splats are numbered without the gaps at the
+/// ends of pages.
+pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> StageOutputs {
+    let Scratch { projected, sorted, bins } = scratch;
+    let mut outputs = StageOutputs::default();
+    // The number of the splat at each place.
+    let mut index_of_place = vec![0; projected.places()];
+    for unit in projected.units() {
+        for (place, splat) in projected.unit(unit) {
+            index_of_place[place as usize] = outputs.splats.len() as u32;
+            outputs.splats.push(*splat);
+            outputs.keys.push(cutoffs.sort_key(unit.view, splat.depth_m));
+        }
+    }
+    let index = |place: u32| index_of_place[place as usize];
+    if last >= Stage::Sort {
+        outputs.order = Some(sorted.places().map(index).collect());
+    }
+    if last >= Stage::Bin {
+        outputs.tiles = Some(TileLists {
+            ranges: bins.starts().windows(2).map(|tile| [tile[0], tile[1]]).collect(),
+            instances: bins.places().map(index).collect(),
+        });
+    }
+    outputs
+}

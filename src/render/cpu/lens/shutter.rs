@@ -1,0 +1,133 @@
+//! Rolling shutters, 16 points at a time: [`crate::View::project_beyond`] as seen from the end of the
+//! exposure.
+//!
+//! Everything is relative to the camera's frame at the end of the exposure, so that f32 holds only the small
+//! motion during one exposure. "Remaining" is the fraction of the exposure that is still to come when a row
+//! is exposed: 1 for the first row, 0 for the last.
+
+use fearless_simd::{f32x16, mask32x16, prelude::*};
+
+use crate::cpu::lanes::Vec3x16;
+use crate::cpu::math::sin;
+use crate::view::ShutterMotion;
+
+/// A shutter that rolls while the camera moves, for many points.
+#[derive(Clone, Debug)]
+pub(in crate::cpu) struct SimdShutter {
+    remaining: [f32; 3],
+    translation_world_m: [f32; 3],
+    translation_m: [f32; 3],
+    axis: [f32; 3],
+    rotation_rad: f32,
+}
+
+impl SimdShutter {
+    /// Rounds of the search for the row that sees a point. Points that need more are left to the f64 path.
+    pub(super) const ROUNDS: u32 = 16;
+
+    /// The search ends when the fraction changes by at most this: 1e-6 of 1 m of motion.
+    const CONVERGED: f32 = 1e-6;
+
+    /// The largest rotation during one exposure, in radians, for which [`sin`] is accurate.
+    const MAX_ROTATION_RAD: f64 = 1.5;
+
+    /// `None` if the camera rotates by more than [`Self::MAX_ROTATION_RAD`] during the exposure.
+    pub(super) fn new(motion: &ShutterMotion) -> Option<Self> {
+        let ShutterMotion { remaining, translation_world_m, translation_m, axis, rotation_rad } =
+            *motion;
+        (rotation_rad <= Self::MAX_ROTATION_RAD).then(|| Self {
+            remaining: remaining.map(|value| value as f32),
+            translation_world_m: translation_world_m.as_vec3().to_array(),
+            translation_m: translation_m.as_vec3().to_array(),
+            axis: axis.as_vec3().to_array(),
+            rotation_rad: rotation_rad as f32,
+        })
+    }
+
+    /// The remaining fraction when places of the image, in pixels, are exposed.
+    #[inline(always)]
+    pub(super) fn remaining_at<S: Simd>(
+        &self,
+        simd: S,
+        x_px: f32x16<S>,
+        y_px: f32x16<S>,
+    ) -> f32x16<S> {
+        let [a, b, c] = self.remaining.map(|value| f32x16::splat(simd, value));
+        let remaining = x_px.mul_add(a, y_px.mul_add(b, c));
+        remaining.max(f32x16::splat(simd, 0.0)).min(f32x16::splat(simd, 1.0))
+    }
+
+    /// Whether two fractions are the same moment.
+    #[inline(always)]
+    pub(super) fn converged<S: Simd>(simd: S, one: f32x16<S>, other: f32x16<S>) -> mask32x16<S> {
+        (one - other).abs().simd_le(f32x16::splat(simd, Self::CONVERGED))
+    }
+
+    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in
+    /// metres.
+    #[inline(always)]
+    pub(super) fn from_end_frame<S: Simd>(
+        &self,
+        simd: S,
+        at_end_m: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        let moved_m = Vec3x16::splat(simd, self.translation_m).mul_add(remaining, at_end_m);
+        moved_m.plus(self.rotation_change(simd, moved_m, remaining))
+    }
+
+    /// By how many metres the camera-space z of points is larger while a fraction remains than at the end.
+    #[inline(always)]
+    pub(in crate::cpu) fn z_change<S: Simd>(
+        &self,
+        simd: S,
+        at_end_m: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> f32x16<S> {
+        let translation_m = self.translation(simd, remaining);
+        translation_m.z + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
+    }
+
+    /// How far the camera's centre has yet to move, in metres, in its frame at the end of the exposure.
+    #[inline(always)]
+    pub(in crate::cpu) fn translation<S: Simd>(&self, simd: S, remaining: f32x16<S>) -> Vec3x16<S> {
+        Vec3x16::splat(simd, self.translation_m).scale(remaining)
+    }
+
+    /// The same in world axes.
+    #[inline(always)]
+    pub(in crate::cpu) fn translation_world<S: Simd>(
+        &self,
+        simd: S,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        Vec3x16::splat(simd, self.translation_world_m).scale(remaining)
+    }
+
+    /// Directions in the camera's frame while a fraction remains, in its frame at the end.
+    #[inline(always)]
+    pub(super) fn direction_to_end_frame<S: Simd>(
+        &self,
+        simd: S,
+        direction: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        let backward = f32x16::splat(simd, 0.0) - remaining;
+        direction.plus(self.rotation_change(simd, direction, backward))
+    }
+
+    /// By how much rotation changes a vector, from the frame at the end to the frame while a fraction
+    /// remains; with a negative fraction, the other way.
+    ///
+    /// Rodrigues' formula without the vector itself: `sin θ (k × v) + (1 - cos θ) k × (k × v)`, with
+    /// `1 - cos θ = 2 sin²(θ/2)`, which does not cancel for small angles.
+    #[inline(always)]
+    fn rotation_change<S: Simd>(&self, simd: S, v: Vec3x16<S>, remaining: f32x16<S>) -> Vec3x16<S> {
+        let axis = Vec3x16::splat(simd, self.axis);
+        let angle_rad = remaining * f32x16::splat(simd, self.rotation_rad);
+        let sine = sin(simd, angle_rad);
+        let half = sin(simd, angle_rad * f32x16::splat(simd, 0.5));
+        let across = axis.cross(v);
+        across.scale(sine).plus(axis.cross(across).scale((half + half) * half))
+    }
+}

@@ -1,0 +1,55 @@
+//! The axes of Gaussians, and coordinates of their centres in f64: what both projections begin with.
+
+use fearless_simd::{f32x16, f64x8, prelude::*};
+
+use crate::cpu::lanes::Vec3x16;
+use wildcity_scene::chunk::{Lanes, column};
+
+/// Sixteen f64: lanes 0 to 7, then lanes 8 to 15.
+pub(super) type F64x16<S> = (f64x8<S>, f64x8<S>);
+
+/// One coordinate of 16 points in another frame, in metres: `row · (x, y, z, 1)`, in f64.
+#[inline(always)]
+pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4]) -> F64x16<S> {
+    let [rx, ry, rz, translation_m] = row.map(|value| f64x8::splat(simd, value));
+    let x = points.x.widen();
+    let y = points.y.widen();
+    let z = points.z.widen();
+    let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, translation_m)));
+    let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, translation_m)));
+    (low, high)
+}
+
+/// Columns of the rotation matrices of a block's unit quaternions: each Gaussian's own axes, in the world.
+///
+/// Of a unit quaternion (w, x, y, z) the matrix is
+///
+/// ```text
+/// 1 - 2(yy + zz)   2(xy - wz)       2(xz + wy)
+/// 2(xy + wz)       1 - 2(xx + zz)   2(yz - wx)
+/// 2(xz - wy)       2(yz + wx)       1 - 2(xx + yy)
+/// ```
+#[inline(always)]
+pub(super) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+    let one = f32x16::splat(simd, 1.0);
+    let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
+    // Below each product holds the factor 2 of the matrix.
+    let x2 = x + x;
+    let y2 = y + y;
+    let z2 = z + z;
+    let xx = x * x2;
+    let yy = y * y2;
+    let zz = z * z2;
+    let xy = x * y2;
+    let xz = x * z2;
+    let yz = y * z2;
+    let wx = w * x2;
+    let wy = w * y2;
+    let wz = w * z2;
+    [
+        Vec3x16 { x: one - yy - zz, y: xy + wz, z: xz - wy },
+        Vec3x16 { x: xy - wz, y: one - xx - zz, z: yz + wx },
+        Vec3x16 { x: xz + wy, y: yz - wx, z: one - xx - yy },
+    ]
+}

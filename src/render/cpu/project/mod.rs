@@ -1,0 +1,253 @@
+//! Stage project: 3D Gaussians become 2D splats on the images of all views, 16 Gaussians at a time.
+//!
+//! The method is EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian splatting (Kerbl et al. 2023). A
+//! static pinhole camera has its projection linearised at each centre ([`pinhole`]). Every other camera (lens
+//! distortion, windshield, rolling shutter while it moves) has six points of each Gaussian projected
+//! ([`unscented`]). Both produce the same kind of splat ([`splat_block`]).
+//!
+//! # Layout
+//!
+//! Work is cut into units of one view and 16 clusters of one chunk. Threads compute units in any order, and
+//! their results are stored in order of (view, global id), so the output does not depend on the schedule.
+//!
+//! **Splats stay where they were projected.** They lie in pages of 256 splats that one frame leaves to the
+//! next. Sort moves 8-byte keys and bin writes 4-byte places; neither moves a splat. Copying the splats into
+//! depth order was no faster to read, and it doubled the memory of a frame.
+//!
+//! **Every function that a hot loop calls is `#[inline(always)]`.** `fearless_simd` dispatches to an
+//! instruction set at run time, on stable Rust. A closure or an iterator adapter that remains a call of its
+//! own is compiled without that instruction set. Removing such calls made this stage four times as fast.
+
+mod axes;
+mod color;
+mod pinhole;
+mod splat_block;
+mod unscented;
+
+use std::ops::Range;
+
+use fearless_simd::{Level, dispatch, prelude::*};
+use parking_lot::Mutex;
+use rayon::prelude::*;
+
+use self::unscented::UnscentedChunkView;
+use super::lens::LensProjection;
+use crate::Frame;
+use crate::layout::{ChunkView, Cutoffs, Frustum, Splat};
+use crate::unscented::UnscentedView;
+use wildcity_scene::Chunk;
+use wildcity_scene::chunk::{CLUSTER, Cluster, LANES};
+
+/// Clusters of a unit: 4,096 Gaussians take about 100 µs, long enough to outweigh scheduling them.
+const UNIT_CLUSTERS: usize = 16;
+
+/// Splats of a page.
+const PAGE: usize = 1 << PAGE_BITS;
+const PAGE_BITS: u32 = 8;
+
+/// 12 KiB of splats. The units of a frame change as the ego moves; pages pass from one unit to another, so
+/// memory follows the largest frame and not the sum of each unit's largest size.
+type Page = Box<[Splat; PAGE]>;
+
+/// All splats of a frame.
+#[derive(Debug, Default)]
+pub(super) struct Projected {
+    /// Pages in order of (view, global id); the last page of each unit may be partly filled.
+    pages: Vec<Page>,
+    units: Vec<Unit>,
+    /// Pages of earlier frames that this frame has not used.
+    free: Mutex<Vec<Page>>,
+}
+
+/// The splats of one view and at most 4,096 Gaussians.
+#[derive(Debug)]
+pub(super) struct Unit {
+    /// Index of the view.
+    pub(super) view: usize,
+    /// Number of splats.
+    pub(super) len: usize,
+    /// Index of its first page.
+    first_page: usize,
+}
+
+/// A view that is not a static pinhole.
+struct NonPinholeView<'a> {
+    unscented: UnscentedView<'a>,
+    /// The lens for 16 points at a time; `None` where only the f64 path describes it.
+    lens: Option<LensProjection>,
+}
+
+/// What one thread computes at a time: becomes one [`Unit`].
+struct Job<'a> {
+    view: usize,
+    chunk: &'a Chunk,
+    clusters: Range<usize>,
+    projection: ChunkProjection<'a>,
+}
+
+/// How one view projects the Gaussians of one chunk.
+#[derive(Clone, Copy)]
+#[allow(clippy::large_enum_variant, reason = "nearly all are the large one")]
+enum ChunkProjection<'a> {
+    /// A static pinhole camera: linearised at each centre.
+    Pinhole { chunk_view: ChunkView, frustum: Frustum },
+    /// A lens, a windshield, or a rolling shutter: the unscented transform.
+    Unscented(UnscentedChunkView<'a>),
+}
+
+impl Projected {
+    /// Projects every Gaussian of the scene into every view.
+    pub(super) fn project(&mut self, level: Level, frame: &Frame<'_>, cutoffs: &Cutoffs) {
+        let Self { pages, units, free } = self;
+        free.get_mut().append(pages);
+
+        // Prepare what is the same for all chunks of a view, then one job per visible unit.
+        let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
+            frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
+        let jobs = jobs(frame, &non_pinhole);
+
+        // In parallel: each job fills pages of its own.
+        let filled: Vec<(usize, Vec<Page>)> = jobs
+            .par_iter()
+            .map_init(Vec::new, |splats, job| {
+                splats.clear();
+                dispatch!(level, simd => project_unit(simd, job, cutoffs, splats));
+                (splats.len(), copy_to_pages(splats, free))
+            })
+            .collect();
+
+        // In the order of the jobs: list the pages.
+        units.clear();
+        for (job, (len, mut filled)) in jobs.iter().zip(filled) {
+            units.push(Unit { view: job.view, len, first_page: pages.len() });
+            pages.append(&mut filled);
+        }
+    }
+
+    /// Number of splats.
+    pub(super) fn len(&self) -> usize {
+        self.units.iter().map(|unit| unit.len).sum()
+    }
+
+    /// Number of places for splats; the last ones of each unit may be empty.
+    pub(super) fn places(&self) -> usize {
+        self.pages.len() * PAGE
+    }
+
+    /// The units in order of (view, global id).
+    pub(super) fn units(&self) -> &[Unit] {
+        &self.units
+    }
+
+    /// Places and splats of one unit, in order of global ids.
+    pub(super) fn unit(&self, unit: &Unit) -> impl Iterator<Item = (u32, &Splat)> {
+        let first = (unit.first_page << PAGE_BITS) as u32;
+        let pages = &self.pages[unit.first_page..];
+        (first..).zip(pages.iter().flat_map(|page| page.iter()).take(unit.len))
+    }
+
+    /// The splat at a place: the high bits are the page, the low 8 bits the splat of the page.
+    #[inline(always)]
+    pub(super) fn splat(&self, place: u32) -> &Splat {
+        &self.pages[(place >> PAGE_BITS) as usize][place as usize % PAGE]
+    }
+}
+
+impl<'a> NonPinholeView<'a> {
+    /// `None` for a static pinhole.
+    fn new(view: &'a crate::View, frame: &Frame<'_>) -> Option<Self> {
+        let unscented = UnscentedView::new(view, frame.profile)?;
+        Some(Self { unscented, lens: LensProjection::new(view) })
+    }
+}
+
+impl ChunkProjection<'_> {
+    /// Whether a Gaussian of the cluster can touch the image; `true` when in doubt.
+    #[inline(always)]
+    fn may_see(&self, chunk: &Chunk, cluster: &Cluster) -> bool {
+        let Cluster { min_m, max_m, sigma_m, .. } = *cluster;
+        match self {
+            Self::Pinhole { frustum, .. } => frustum.may_see(min_m, max_m, sigma_m),
+            Self::Unscented(view) => view.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
+        }
+    }
+}
+
+/// Copies splats to free pages, and to new ones when no free page is left.
+fn copy_to_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
+    let wanted = splats.len().div_ceil(PAGE);
+    let mut pages = {
+        let mut free = free.lock();
+        let kept = free.len().saturating_sub(wanted);
+        free.split_off(kept)
+    };
+    pages.resize_with(wanted, || Box::new([Splat::default(); PAGE]));
+    for (page, splats) in pages.iter_mut().zip(splats.chunks(PAGE)) {
+        page[..splats.len()].copy_from_slice(splats);
+    }
+    pages
+}
+
+/// All jobs of a frame, in order of (view, global id). A unit that a view cannot see has no job; it costs one
+/// visibility test per cluster.
+fn jobs<'a>(frame: &Frame<'a>, non_pinhole: &'a [Option<NonPinholeView<'a>>]) -> Vec<Job<'a>> {
+    let mut jobs = Vec::new();
+    for (index, (view, non_pinhole)) in frame.views.iter().zip(non_pinhole).enumerate() {
+        for chunk in &frame.scene.chunks {
+            let projection = match non_pinhole {
+                Some(NonPinholeView { unscented, lens }) => ChunkProjection::Unscented(
+                    UnscentedChunkView::new(view, chunk, unscented, lens.as_ref()),
+                ),
+                None => ChunkProjection::Pinhole {
+                    chunk_view: ChunkView::new(view, chunk),
+                    frustum: Frustum::new(view, chunk, frame.profile),
+                },
+            };
+            add_jobs(index, projection, chunk, &mut jobs);
+        }
+    }
+    jobs
+}
+
+/// Adds the jobs of one view and one chunk.
+fn add_jobs<'a>(
+    view: usize,
+    projection: ChunkProjection<'a>,
+    chunk: &'a Chunk,
+    jobs: &mut Vec<Job<'a>>,
+) {
+    let visible = |clusters: &Range<usize>| {
+        let mut clusters = chunk.clusters()[clusters.clone()].iter();
+        clusters.any(|cluster| projection.may_see(chunk, cluster))
+    };
+    let count = chunk.clusters().len();
+    let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
+    jobs.extend(ranges.filter(visible).map(|clusters| Job { view, chunk, clusters, projection }));
+}
+
+/// Projects the visible clusters of a job, one block of 16 Gaussians after the other.
+#[inline(always)]
+fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut Vec<Splat>) {
+    let blocks = job.chunk.len().div_ceil(LANES);
+    for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
+        if !job.projection.may_see(job.chunk, cluster) {
+            continue;
+        }
+        let first = k * CLUSTER / LANES;
+        for block in first..(first + CLUSTER / LANES).min(blocks) {
+            let columns = job.chunk.lane_group(block);
+            let degree = job.chunk.sh_degree();
+            let projected = match &job.projection {
+                ChunkProjection::Pinhole { chunk_view, .. } => {
+                    pinhole::project_block(simd, columns, degree, chunk_view, cutoffs)
+                }
+                ChunkProjection::Unscented(view) => {
+                    unscented::project_block(simd, columns, degree, view, cutoffs)
+                }
+            };
+            if let Some(projected) = projected {
+                projected.append_visible(splats);
+            }
+        }
+    }
+}

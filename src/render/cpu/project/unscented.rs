@@ -1,0 +1,375 @@
+//! Projection by every camera that is not a static pinhole: six points of each Gaussian
+//! ([`crate::unscented`] explains the method).
+//!
+//! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32. Those with a
+//! point beyond the lens' field, or with a point for which the search found no row, are projected one by one
+//! in f64 by [`UnscentedView`].
+
+use fearless_simd::{f32x16, mask32x16, prelude::*};
+use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
+
+use super::axes::{F64x16, rotation_columns, transform_row};
+use super::color::color;
+use super::splat_block::{Ellipse, LOG2_UNIT, Moments, ProjectedBlock, SplatBlock};
+use crate::View;
+use crate::constants::EXTENT_SLACK_PX;
+use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lens::{ExposedPixels, LensPixels, LensProjection};
+use crate::layout::Cutoffs;
+use crate::unscented::{CullBound, Footprint, UnscentedView};
+use wildcity_scene::Chunk;
+use wildcity_scene::chunk::{LANES, Lanes, column};
+use wildcity_scene::geometry::camera::WIDEST_RAD;
+
+/// One chunk in a view that is not a static pinhole.
+#[derive(Clone, Copy)]
+pub(super) struct UnscentedChunkView<'a> {
+    unscented: &'a UnscentedView<'a>,
+    /// `None` where only the f64 path describes the camera.
+    lens: Option<&'a LensProjection>,
+    /// The chunk's origin in the world.
+    origin_m: DVec3,
+    /// Rows that take a point `(x, y, z, 1)` of the chunk to the camera's frame at the end of the exposure,
+    /// in metres.
+    camera_from_chunk: [[f64; 4]; 3],
+    /// The camera's centre relative to the chunk's origin, in world axes, in metres.
+    camera_m: [f32; 3],
+    size_px: [f32; 2],
+    /// Whether depth is the distance from the camera, and not z.
+    depth_is_distance: bool,
+}
+
+impl<'a> UnscentedChunkView<'a> {
+    /// Positions are subtracted in f64, so that a twin far from its origin loses no precision.
+    pub(super) fn new(
+        view: &View,
+        chunk: &Chunk,
+        unscented: &'a UnscentedView<'a>,
+        lens: Option<&'a LensProjection>,
+    ) -> Self {
+        let origin_m = chunk.origin_m();
+        let camera_from_world = view.world_from_camera.inverse();
+        let camera_m = view.world_from_camera.position_m - origin_m;
+        let rows = camera_from_world.rotation_matrix().transpose();
+        let translation_m = camera_from_world.rotation * -camera_m;
+        let row = |axis: usize| rows.col(axis).extend(translation_m[axis]).to_array();
+        Self {
+            unscented,
+            lens,
+            origin_m,
+            camera_from_chunk: [0, 1, 2].map(row),
+            camera_m: camera_m.as_vec3().to_array(),
+            size_px: view.camera.size_px().as_vec2().to_array(),
+            depth_is_distance: view.camera.depth_is_distance(),
+        }
+    }
+
+    /// Whether a Gaussian with its centre in a box, relative to `origin_m`, can touch the image.
+    #[inline(always)]
+    pub(super) fn may_see(&self, origin_m: DVec3, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
+        self.unscented.may_see(origin_m, min_m, max_m, sigma_m)
+    }
+}
+
+/// Projects one block of 16 Gaussians, or returns `None` if none of them can be seen.
+#[inline(always)]
+pub(super) fn project_block<S: Simd>(
+    simd: S,
+    columns: &[Lanes],
+    sh_degree: u8,
+    view: &UnscentedChunkView<'_>,
+    cutoffs: &Cutoffs,
+) -> Option<SplatBlock> {
+    // What the lens describes, 16 at a time.
+    let mut toward_m = [[0.0_f32; LANES]; 3];
+    let (mut splats, remaining) = match view.lens {
+        Some(lens) => project_lanes(simd, columns, view, lens, cutoffs, &mut toward_m),
+        None => (SplatBlock::default(), (1 << LANES) - 1),
+    };
+    // The rest, one by one in f64.
+    for lane in (0..LANES).filter(|lane| remaining >> lane & 1 == 1) {
+        if let Some(from_camera_m) = project_one(columns, lane, view, cutoffs, &mut splats) {
+            splats.visible |= 1 << lane;
+            for (to, from) in toward_m.iter_mut().zip(from_camera_m.to_array()) {
+                to[lane] = from as f32;
+            }
+        }
+    }
+    if splats.visible == 0 {
+        return None;
+    }
+    let [x, y, z] = toward_m.each_ref().map(|axis| f32x16::load_array_ref(simd, axis));
+    splats.set_colors(color(simd, columns, sh_degree, Vec3x16 { x, y, z }));
+    Some(splats)
+}
+
+/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
+/// and a bit for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera to the
+/// centres, in world axes.
+#[inline(always)]
+fn project_lanes<S: Simd>(
+    simd: S,
+    columns: &[Lanes],
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    cutoffs: &Cutoffs,
+    toward_m: &mut [[f32; LANES]; 3],
+) -> (SplatBlock, u64) {
+    let splat = |value: f32| f32x16::splat(simd, value);
+
+    // Centres in the camera's frame at the end of the exposure, in f64 for depth and in f32 for the rest.
+    let mean = Vec3x16::load(simd, columns, column::MEAN);
+    let [right, down, forward] = view.camera_from_chunk;
+    let x = transform_row(simd, mean, right);
+    let y = transform_row(simd, mean, down);
+    let z = transform_row(simd, mean, forward);
+    let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
+    let at_end_m = [x, y, z];
+
+    // Cull what is too faint, and what surely misses the image.
+    let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
+    let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
+        & !surely_unseen(simd, center, x.max(y).max(z), view.unscented.cull_bound());
+    if in_range.all_false() {
+        return (SplatBlock::default(), 0);
+    }
+
+    // When each centre is exposed, and where the camera is then.
+    let ExposedPixels { pixels: center_px, remaining } = lens.project(simd, center, splat(0.0));
+    let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
+    if let Some(shutter) = lens.shutter() {
+        toward = toward.plus(shutter.translation_world(simd, remaining));
+    }
+    *toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
+
+    // Near and far. While the shutter rolls the depth is known only where the row was found; the f64 path
+    // decides for the others.
+    let depth_m = depth(simd, at_end_m, view, lens, center, remaining);
+    let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
+    let is_depth = match lens.shutter() {
+        None => splat(0.0).simd_ge(splat(0.0)),
+        Some(_) => center_px.margin.simd_ge(splat(0.0)),
+    };
+    let in_range = in_range & (in_depth | !is_depth);
+    if in_range.all_false() {
+        return (SplatBlock::default(), 0);
+    }
+
+    // The six points: ±√3 standard deviations along each own axis.
+    let axes = rotation_columns(simd, columns);
+    let [right, down, forward] =
+        view.camera_from_chunk.map(|[x, y, z, _]| [x as f32, y as f32, z as f32]);
+    let right = Vec3x16::splat(simd, right);
+    let down = Vec3x16::splat(simd, down);
+    let forward = Vec3x16::splat(simd, forward);
+    let mut margin = center_px.margin;
+    let mut pairs = [[splat(0.0); 4]; 3];
+    let mut mean_x = splat(0.0);
+    let mut mean_y = splat(0.0);
+    for axis in 0..3 {
+        let distance = [x, y, z][axis] * splat(3.0_f32.sqrt());
+        let offset = axes[axis].scale(distance);
+        let offset = Vec3x16 { x: right.dot(offset), y: down.dot(offset), z: forward.dot(offset) };
+        let plus = center.plus(offset);
+        let minus = center.minus(offset);
+        // Each search begins with the moment at which the centre is exposed.
+        let LensPixels { x_px: ax, y_px: ay, margin: a } =
+            lens.project(simd, plus, remaining).pixels;
+        let LensPixels { x_px: bx, y_px: by, margin: b } =
+            lens.project(simd, minus, remaining).pixels;
+        margin = margin.min(a).min(b);
+        pairs[axis] = [ax, ay, bx, by];
+        mean_x = mean_x + (ax + bx);
+        mean_y = mean_y + (ay + by);
+    }
+    let sixth = splat(1.0 / 6.0);
+    let mean_x = mean_x * sixth;
+    let mean_y = mean_y * sixth;
+
+    // The 2 x 6 root of the covariance, as in `UnscentedView::project`: half differences of each pair, and
+    // distances of each pair's middle from the mean.
+    let half = splat(0.5 / 3.0_f32.sqrt());
+    let mut root = [[splat(0.0); 2]; 6];
+    for (axis, [ax, ay, bx, by]) in pairs.into_iter().enumerate() {
+        root[axis] = [(ax - bx) * half, (ay - by) * half];
+        root[3 + axis] =
+            [(ax - mean_x + (bx - mean_x)) * half, (ay - mean_y + (by - mean_y)) * half];
+    }
+
+    // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
+    let [mut xx, mut yy, mut xy, mut det] = [splat(0.0); 4];
+    for (i, [x, y]) in root.into_iter().enumerate() {
+        xx = x.mul_add(x, xx);
+        yy = y.mul_add(y, yy);
+        xy = x.mul_add(y, xy);
+        for [other_x, other_y] in &root[..i] {
+            let minor = x * *other_y - y * *other_x;
+            det = minor.mul_add(minor, det);
+        }
+    }
+    let moments = Moments { xx, yy, xy, det };
+    let ellipse = Ellipse::from_moments(moments, splat(cutoffs.blur_px2), splat(LOG2_UNIT));
+
+    let inside = in_range & margin.simd_ge(splat(0.0));
+    let projected =
+        ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
+    let splats = projected.clip(simd, view.size_px, cutoffs);
+    (splats, in_range.to_bitmask() & !inside.to_bitmask())
+}
+
+/// Which Gaussians surely miss the image: the test of [`CullBound`] in f32, with bounds for the angles that
+/// are loose by what the approximations here are off.
+#[inline(always)]
+fn surely_unseen<S: Simd>(
+    simd: S,
+    center_m: Vec3x16<S>,
+    sigma_m: f32x16<S>,
+    bound: &CullBound,
+) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
+    let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
+
+    // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
+    // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
+    let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
+    let steep = t.simd_gt(splat(1.0));
+    let low = steep.select(splat(1.0) / t, t);
+    let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+    let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+
+    // Below s = 1/2, asin s is at most s π/3.
+    let third_turn = splat(std::f64::consts::FRAC_PI_3);
+    let translation = splat(bound.translation_m) / distance_m;
+    let slack_rad = translation.mul_add(third_turn, splat(0.01 + bound.rotation_rad));
+    let least_rad = half + half - slack_rad;
+    let most_rad = half + half + slack_rad;
+    let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
+    let spread_rad = share.mul_add(third_turn, splat(bound.windshield_rad));
+
+    // Out: the distance from the image is more than any splat reaches, and no point comes near the axis'
+    // other end, where the lens is not continued.
+    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
+    let out_px =
+        (least_rad - splat(bound.windshield_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
+    let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
+    // Close to the camera the bounds above do not hold, and nothing is decided.
+    let far = translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5));
+    far & (out | least_rad.simd_gt(splat(bound.max_center_rad)))
+}
+
+#[inline(always)]
+fn add<S: Simd>((low, high): F64x16<S>, more: f32x16<S>) -> F64x16<S> {
+    let more = more.widen();
+    (low + more.0, high + more.1)
+}
+
+/// Depth of centres, in metres: computed in f64 and rounded to f32 once, since splats are blended in order of
+/// it.
+///
+/// `at_end_m` and `center` are the same centres, in the camera's frame at the end of the exposure. A centre
+/// that is seen while a fraction of the exposure remains has the depth of the moment: it is farther by what
+/// the camera has yet to move.
+#[inline(always)]
+fn depth<S: Simd>(
+    simd: S,
+    at_end_m: [F64x16<S>; 3],
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    center: Vec3x16<S>,
+    remaining: f32x16<S>,
+) -> f32x16<S> {
+    let [mut x, mut y, mut z] = at_end_m;
+    if !view.depth_is_distance {
+        if let Some(shutter) = lens.shutter() {
+            z = add(z, shutter.z_change(simd, center, remaining));
+        }
+        return z.0.narrow(z.1);
+    }
+    // A distance does not depend on rotation.
+    if let Some(shutter) = lens.shutter() {
+        let translation_m = shutter.translation(simd, remaining);
+        x = add(x, translation_m.x);
+        y = add(y, translation_m.y);
+        z = add(z, translation_m.z);
+    }
+    let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
+    let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
+    low.narrow(high)
+}
+
+/// Projects one Gaussian in f64 into its lane of `to`, and returns the vector from the camera to its centre,
+/// in world axes, in metres; `None` if it cannot be seen.
+#[inline(always)]
+fn project_one(
+    columns: &[Lanes],
+    lane: usize,
+    view: &UnscentedChunkView<'_>,
+    cutoffs: &Cutoffs,
+    to: &mut SplatBlock,
+) -> Option<DVec3> {
+    // Read the Gaussian.
+    let value = |column: usize| f64::from(columns[column].0[lane]);
+    let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
+    let log2_cut = f64::from(cutoffs.log2_alpha_cut);
+    let mut log2_opacity = value(column::LOG2_OPACITY);
+    let opaque = log2_opacity >= log2_cut;
+    if !opaque {
+        return None;
+    }
+    let q = column::QUAT;
+    let rotation = DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q));
+    let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(vector(column::SCALE));
+    let mean_m = view.origin_m + vector(column::MEAN);
+    let Footprint { mean_px, root_px, depth_m, camera_m } =
+        view.unscented.project(mean_m, axes_m)?;
+
+    // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
+    let blur = f64::from(cutoffs.blur_px2);
+    let mut xx = 0.0;
+    let mut yy = 0.0;
+    let mut xy = 0.0;
+    let mut det_before = 0.0;
+    for (i, column_px) in root_px.iter().enumerate() {
+        xx += column_px.x * column_px.x;
+        yy += column_px.y * column_px.y;
+        xy += column_px.x * column_px.y;
+        for other_px in &root_px[..i] {
+            let minor = column_px.perp_dot(*other_px);
+            det_before += minor * minor;
+        }
+    }
+    let det = det_before + blur * (xx + yy + blur);
+    if cutoffs.antialiased {
+        log2_opacity += 0.5 * (det_before / det).max(0.005 * 0.005).log2();
+    }
+
+    // The box where alpha reaches the cut, against the image's pixel centres.
+    let power = log2_opacity - log2_cut;
+    let unit = f64::from(LOG2_UNIT);
+    let sigma_x = (xx + blur).sqrt();
+    let sigma_y = (yy + blur).sqrt();
+    let extent_px =
+        power.max(0.0).sqrt() / unit * DVec2::new(sigma_x, sigma_y) + f64::from(EXTENT_SLACK_PX);
+    let on_image = power >= 0.0
+        && (mean_px + extent_px).cmpge(DVec2::splat(0.5)).all()
+        && (mean_px - extent_px).cmple(view.unscented.size_px() - 0.5).all();
+    if !on_image {
+        return None;
+    }
+
+    // The factor of the inverse, as in `Ellipse::from_moments`.
+    let l2 = unit / sigma_y;
+    let root_det = det.sqrt();
+    to.mean_x[lane] = mean_px.x as f32;
+    to.mean_y[lane] = mean_px.y as f32;
+    to.l0[lane] = (unit * sigma_y / root_det) as f32;
+    to.l1[lane] = (-(xy * l2) / root_det) as f32;
+    to.l2[lane] = l2 as f32;
+    to.log2_opacity[lane] = log2_opacity as f32;
+    to.depth_m[lane] = depth_m as f32;
+    to.extent_x[lane] = extent_px.x as f32;
+    to.extent_y[lane] = extent_px.y as f32;
+    Some(mean_m - camera_m)
+}

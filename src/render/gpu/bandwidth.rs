@@ -1,0 +1,117 @@
+//! Bandwidth model: the fewest bytes that each stage must move, computed from the counts of a frame. It is
+//! the memory side of the stage's roofline.
+
+use super::layout::{
+    Counters, DIGITS, Frame as GpuFrame, GEOMETRY_WORDS, RASTER_BATCH, SOA_BLOCK, SORT_BLOCK,
+};
+use super::resolve::Planes;
+use super::sort::DIGIT_BITS;
+use crate::Frame;
+use crate::constants::{DEPTH_BITS, TILE_PX};
+use wildcity_scene::chunk::CLUSTER;
+use wildcity_scene::sh;
+
+/// Counts of a frame.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FrameCounts {
+    /// SH degree of the scene.
+    pub sh_degree: u8,
+    /// Number of views.
+    pub views: u32,
+    /// Pixels of all views.
+    pub pixels: u64,
+    /// 32-bit values per pixel that were requested.
+    pub planes: u64,
+    /// Tiles of all views.
+    pub tiles: u64,
+    /// Macro tiles of all views.
+    pub macro_tiles: u64,
+    /// (Cluster, view) pairs that the host did not cull.
+    pub cluster_views: u64,
+    /// Visible (Gaussian, view) pairs.
+    pub splats: u64,
+    /// (Splat, macro tile) pairs.
+    pub touches: u64,
+    /// (Splat, tile) pairs.
+    pub instances: u64,
+    /// Batches of [`RASTER_BATCH`] splats that tiles blended.
+    pub batches: u64,
+}
+
+impl FrameCounts {
+    /// The counts of a frame of which nothing is drawn yet.
+    pub(super) fn new(frame: &Frame<'_>, planes: Planes, gpu_frame: &GpuFrame) -> Self {
+        Self {
+            sh_degree: frame.scene.sh_degree(),
+            views: gpu_frame.views,
+            pixels: frame.views.iter().map(|view| view.camera.pixels() as u64).sum(),
+            planes: planes.tile_bytes() / u64::from(4 * TILE_PX * TILE_PX),
+            tiles: gpu_frame.tiles.into(),
+            macro_tiles: gpu_frame.macro_tiles.into(),
+            ..Self::default()
+        }
+    }
+
+    /// Adds the counts of a region.
+    pub(super) fn add(&mut self, cluster_views: u32, counters: &Counters) {
+        self.cluster_views += u64::from(cluster_views);
+        self.splats += u64::from(counters.splats);
+        self.touches += u64::from(counters.touches);
+        self.instances += u64::from(counters.instances);
+        self.batches += u64::from(counters.batches);
+    }
+
+    /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every array
+    /// exactly once, and nothing stays in a cache from one kernel to the next.
+    ///
+    /// | stage | per | bytes |
+    /// |---|---|---|
+    /// | project | cluster view | header, geometry of 256 Gaussians (36 B each), a visibility bit per Gaussian written and read, cluster view, count, prefix sum |
+    /// | | visible pair | geometry and colour; shape 32, colour 16, key and index 8 |
+    /// | sort | visible pair, pass of 8 bits | histogram 4, key and value read and written 16, counters 5/4 |
+    /// | bin | visible pair | key, index, and shape twice (40 each), offset and its prefix sum 20 |
+    /// | | touch | macro tile, splat, mask 12 |
+    /// | tile sort | touch, pass of 8 bits | histogram 4, key and two values read and written 24, counters 5/4 |
+    /// | expand | touch | macro tile 4, mask 8, splat 4 |
+    /// | | instance | splat 4 |
+    /// | | tile | offset and its prefix sum 20, range 8 |
+    /// | | macro tile | range 8, written once and read twice |
+    /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
+    /// | | instance, tile, pixel | splat 4; range 8; 4 for each requested value |
+    pub fn stage_bytes(&self) -> [(&'static str, u64); 6] {
+        let Self { cluster_views, splats, touches, instances, tiles, macro_tiles, .. } = *self;
+        let cluster = CLUSTER as u64;
+        let geometry = 4 * u64::from(GEOMETRY_WORDS);
+        let color = 4 * (3 * sh::coefficients(self.sh_degree) as u64).div_ceil(2);
+        let header = 4 * u64::from(SOA_BLOCK);
+        // A counter is written by the histogram, read by the prefix sum's first pass, read and written by
+        // its last pass, and read by the scatter.
+        let counters = |keys: u64| keys.div_ceil(SORT_BLOCK.into()) * u64::from(DIGITS) * 4 * 5;
+        let sorted = |keys: u64, bits: u32, values: u64| {
+            let pass = keys * (4 + 2 * 4 * (1 + values)) + counters(keys);
+            u64::from(bits.div_ceil(DIGIT_BITS)) * pass
+        };
+        let scanned = 4 + 12 + 4;
+        let bits = |number: u64| u64::BITS - number.leading_zeros();
+        let depth_bits = DEPTH_BITS + bits(u64::from(self.views.max(1) - 1));
+        [
+            (
+                "project",
+                cluster_views * (header + cluster * geometry + 2 * cluster / 8 + 2 * 8 + scanned)
+                    + splats * (geometry + color + 32 + 16 + 8),
+            ),
+            ("sort", sorted(splats, depth_bits, 1)),
+            ("bin", splats * (2 * 40 + scanned) + touches * 12),
+            ("tile sort", sorted(touches, bits(macro_tiles), 2)),
+            ("expand", touches * 16 + instances * 4 + tiles * (scanned + 8) + macro_tiles * 24),
+            ("rasterize", splats * 48 + instances * 4 + tiles * 8 + self.pixels * 4 * self.planes),
+        ]
+    }
+
+    /// Fewest multiply-adds, or instructions of the same cost, of stage rasterize: five for each splat of
+    /// a batch and pixel of the tile, for `d`, `u` (two), the exponent, and its comparison. Pixels that a
+    /// splat touches take ten more, and pixels that have stopped take none; neither is counted.
+    pub fn rasterize_operations(&self) -> u64 {
+        5 * self.batches * u64::from(RASTER_BATCH) * u64::from(TILE_PX * TILE_PX)
+    }
+}

@@ -1,0 +1,134 @@
+//! Recording the stages of a region, and timing them.
+
+use std::time::Duration;
+
+use wgpu::SubmissionIndex;
+
+use super::{Chain, CurrentFrame, Source, add_time};
+use crate::FrameStats;
+use crate::constants::DEPTH_BITS;
+use crate::gpu::kernel::{Recorder, TIMESTAMP_BYTES};
+use crate::gpu::layout::{Counters, Frame as GpuFrame};
+use crate::gpu::plan::{Counts, job};
+use crate::gpu::project::ProjectInputs;
+use crate::gpu::rasterize::{RasterizeInputs, TileOutput};
+use crate::gpu::read_back::TIMESTAMP_OFFSET;
+use crate::gpu::sort::{Columns, SortJobs};
+use crate::stage::Stage;
+
+impl Chain {
+    /// Records and submits all stages of a region that must still run. Returns the names of the stages in
+    /// order, and the submission.
+    pub(super) fn submit(
+        &mut self,
+        source: Source<'_>,
+        current: &CurrentFrame,
+        output: &TileOutput,
+    ) -> (Vec<&'static str>, SubmissionIndex) {
+        let mut recorder = Recorder::new(&self.device, self.queries.clone());
+        self.record(&mut recorder, source, &current.parameters, Stage::Bin);
+        let Self { device, plan, splats, bin, lenses, timestamps, .. } = self;
+
+        let mut pass = recorder.stage("rasterize");
+        let inputs = RasterizeInputs { plan, splats, bin, lenses };
+        self.rasterize.run(device, &mut pass, inputs, output);
+        drop(pass);
+
+        // Everything that the host reads.
+        let read_back = &current.read_back;
+        let timestamps = timestamps.buffer();
+        let head = read_back.head.buffer();
+        let stages = recorder.finish_stages(timestamps);
+        let encoder = &mut recorder.encoder;
+        encoder.copy_buffer_to_buffer(plan.counters(), 0, head, 0, size_of::<Counters>() as u64);
+        encoder.copy_buffer_to_buffer(timestamps, 0, head, TIMESTAMP_OFFSET, TIMESTAMP_BYTES);
+        self.rasterize.copy(encoder, &read_back.pages, output);
+        let submission = device.queue.submit([recorder.encoder.finish()]);
+        (stages, submission)
+    }
+
+    /// Records the stages up to and including `last` that must still run. Returns which of the buffers of
+    /// the sort of splats are in order.
+    pub(super) fn record(
+        &mut self,
+        recorder: &mut Recorder,
+        source: Source<'_>,
+        parameters: &GpuFrame,
+        last: Stage,
+    ) -> usize {
+        let must_run = |stage| stage <= last && source.needs(stage);
+        let counts = match source {
+            Source::Gaussians(work) => {
+                Counts { cluster_views: work.cluster_views(), ..Counts::default() }
+            }
+            Source::Stages(outputs) => self.fill(outputs),
+        };
+        let Self { device, mirror, plan, scan, splats, lenses, .. } = self;
+        plan.start(device, parameters, &counts);
+
+        if let Source::Gaussians(work) = source {
+            let mut pass = recorder.stage("project");
+            let inputs = ProjectInputs { plan, scan, mirror, lenses };
+            self.project.run(device, &mut pass, work, inputs, splats);
+        }
+
+        let mut sorted = 0;
+        if must_run(Stage::Sort) {
+            let mut pass = recorder.stage("sort");
+            let jobs = SortJobs {
+                keys: plan.job(job::SPLATS_SORT),
+                counters: plan.job(job::SPLATS_DIGITS),
+            };
+            let depth_bits = DEPTH_BITS + bits(parameters.views - 1);
+            let data = Columns { keys: &splats.keys, values: &splats.indices, masks: None };
+            sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+        }
+
+        if must_run(Stage::Bin) {
+            recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
+            let mut pass = recorder.stage("bin");
+            self.bin.list_touches(device, &mut pass, plan, scan, splats, sorted);
+            drop(pass);
+
+            let mut pass = recorder.stage("tile sort");
+            let jobs = SortJobs {
+                keys: plan.job(job::TOUCHES_SORT),
+                counters: plan.job(job::TOUCHES_DIGITS),
+            };
+            // Touches of no tile have the number after the last macro tile.
+            let macro_tile_bits = bits(parameters.macro_tiles);
+            let data = self.bin.touches();
+            let touches = self.sort.run(device, &mut pass, scan, jobs, data, macro_tile_bits);
+            drop(pass);
+
+            let mut pass = recorder.stage("expand");
+            let macro_tiles = parameters.macro_tiles;
+            self.bin.list_instances(device, &mut pass, plan, scan, macro_tiles, touches);
+        }
+        sorted
+    }
+
+    /// Adds the time of each stage by the device's clock. If it has none, adds the time of the whole
+    /// submission as "device".
+    pub(super) fn add_stage_times(
+        &self,
+        stats: &mut FrameStats,
+        stages: &[&'static str],
+        timestamps: &[u64],
+        whole: Duration,
+    ) {
+        let Some(tick_ns) = self.device.tick_ns() else {
+            add_time(stats, "device", whole);
+            return;
+        };
+        for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
+            let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
+            add_time(stats, stage, Duration::from_nanos(ns as u64));
+        }
+    }
+}
+
+/// Number of significant bits of a number.
+fn bits(number: u32) -> u32 {
+    u32::BITS - number.leading_zeros()
+}

@@ -1,0 +1,69 @@
+//! A fair queue: callers are served in the order in which they called. A mutex alone does not
+//! guarantee any order.
+
+use parking_lot::{Condvar, Mutex};
+
+/// A queue of callers, each with a ticket number.
+#[derive(Debug, Default)]
+pub(super) struct TicketQueue {
+    counts: Mutex<Counts>,
+    advanced: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Counts {
+    /// Tickets given out.
+    issued: u64,
+    /// Tickets whose turn has ended: the number of the ticket that is served now.
+    served: u64,
+}
+
+/// The right to be served. It passes to the next caller when this is dropped.
+#[derive(Debug)]
+pub(super) struct Ticket<'a>(&'a TicketQueue);
+
+impl TicketQueue {
+    /// Blocks until all earlier callers have dropped their tickets.
+    pub(super) fn wait(&self) -> Ticket<'_> {
+        let mut counts = self.counts.lock();
+        let own = counts.issued;
+        counts.issued += 1;
+        self.advanced.wait_while(&mut counts, |counts| counts.served != own);
+        Ticket(self)
+    }
+}
+
+impl Drop for Ticket<'_> {
+    fn drop(&mut self) {
+        self.0.counts.lock().served += 1;
+        self.0.advanced.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn callers_are_served_in_the_order_of_their_calls() {
+        let queue = TicketQueue::default();
+        let served = Mutex::new(Vec::new());
+        let first = queue.wait();
+        std::thread::scope(|scope| {
+            for caller in 1..=20 {
+                let queue = &queue;
+                let served = &served;
+                scope.spawn(move || {
+                    let _ticket = queue.wait();
+                    served.lock().push(caller);
+                });
+                while queue.counts.lock().issued <= caller {
+                    std::thread::yield_now();
+                }
+            }
+            assert_eq!(*served.lock(), [0; 0], "a caller was served before the first one had left");
+            drop(first);
+        });
+        assert!(served.into_inner().into_iter().eq(1..=20));
+    }
+}

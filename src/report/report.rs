@@ -1,0 +1,121 @@
+//! All measurements of one twin.
+
+use serde::Serialize;
+
+use super::confidence::Confidence;
+use super::feature_costs::FeatureCounts;
+use super::measurement::Measurement;
+use super::recommend::{Goal, Recommendation, pareto_front};
+use super::sample_points::{OFFSETS_M, Sampling};
+use super::settings::Skipped;
+use wildcity_scene::RenderProfile;
+use wildcity_stress::table::{Column, Table};
+
+/// All measurements of one twin. JSON and CSV write numbers that are infinite or NaN as the words `inf`,
+/// `-inf` and `NaN`: a setting that is exact has a PSNR of `inf`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// The twin, and how it is rendered.
+    pub subject: Subject,
+    /// The backends; [`super::setting::Setting::backend`] is an index into them.
+    pub backends: Vec<Column>,
+    /// How many sample points there are, and how much is compared at each.
+    pub sampling: Sampling,
+    /// Names of the sample points.
+    #[serde(rename = "places")]
+    pub sample_points: Vec<String>,
+    /// Time that a step of the reference would take, in milliseconds.
+    pub reference_ms: f64,
+    /// Measurements of all settings; the twin as it is served is the first.
+    pub settings: Vec<Measurement>,
+    /// Settings that were not compared, with the reasons.
+    #[serde(rename = "left_out")]
+    pub skipped: Vec<Skipped>,
+    /// Time that a step of the reference would take with a ray for every pixel, in milliseconds. None if
+    /// every camera is a pinhole at rest.
+    pub exact_rays_ms: Option<f64>,
+    /// Trust in the images over the distance from the recorded drive. Empty without a drive.
+    #[serde(rename = "believed")]
+    pub confidence: Vec<Confidence>,
+    /// What the user asked for, if anything.
+    #[serde(rename = "wanted")]
+    pub goal: Option<Goal>,
+    /// The setting that reaches the goal.
+    pub recommendation: Option<Recommendation>,
+    /// Why no setting is recommended although there is a goal.
+    #[serde(rename = "unmet")]
+    pub unmet_reason: Option<String>,
+    /// Results of extreme scenes on every backend.
+    pub stress: Table,
+    /// Memory and GPU work of one step, with each feature and without.
+    #[serde(rename = "needed")]
+    pub feature_costs: Vec<FeatureCounts>,
+}
+
+/// The twin of a report, and how it is rendered.
+#[derive(Clone, Debug, Serialize)]
+pub struct Subject {
+    /// Name of the twin.
+    pub twin: String,
+    /// Number of its version.
+    pub version: u64,
+    /// Hash of the version.
+    pub version_hash: String,
+    /// Gaussians at full detail.
+    pub gaussians: u64,
+    /// Degree of their spherical harmonics.
+    pub sh_degree: u8,
+    /// Record format in which they are stored.
+    pub record: &'static str,
+    /// The twin's render profile.
+    pub profile: RenderProfile,
+    /// Cameras of a step.
+    pub cameras: usize,
+    /// How often a step was timed at each sample point.
+    pub repeat: u32,
+}
+
+impl Report {
+    /// The settings as CSV: a header, and one line per setting, with decimal points and no quotes except
+    /// around names. A cell is empty where there is no value: dB beside a drive if none was recorded, and
+    /// bytes of a device if the backend has none.
+    pub fn csv(&self) -> String {
+        let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
+        let mut csv = format!(
+            "setting,family,backend,step_ms,p95_ms,psnr_db,least_db,{by_offset},ssim,max,p99_9,depth_l1_m,\
+             gaussians,scene_bytes,device_bytes,stored_bytes_each,sent_bytes,on_front\n"
+        );
+        for (measurement, is_on_front) in self.settings.iter().zip(pareto_front(&self.settings)) {
+            csv.push_str(&self.csv_line(measurement, is_on_front));
+        }
+        csv
+    }
+
+    fn csv_line(&self, measurement: &Measurement, is_on_front: bool) -> String {
+        let errors = &measurement.errors;
+        let cost = &measurement.cost;
+        let backend = self.backends[measurement.setting.backend].backend;
+        let psnr_at = |offset: usize| {
+            measurement.psnr_db_by_offset.get(offset).map_or(String::new(), f64::to_string)
+        };
+        format!(
+            "\"{}\",{},{backend},{:.3},{:.3},{},{},{},{},{},{},{},{},{},{},{},{},{is_on_front}\n",
+            measurement.setting.name,
+            measurement.setting.family.name(),
+            cost.step_ms,
+            measurement.p95_ms(),
+            errors.psnr_db,
+            measurement.min_db(),
+            [0, 1, 2, 3].map(psnr_at).join(","),
+            errors.ssim,
+            errors.max,
+            errors.p99_9,
+            errors.depth_l1_m,
+            cost.gaussians,
+            cost.scene_bytes,
+            cost.device_bytes.map_or(String::new(), |bytes| bytes.to_string()),
+            cost.stored_bytes_per_gaussian,
+            cost.sent_bytes
+        )
+    }
+}

@@ -1,0 +1,17 @@
+//! Work that blocks, beside the asynchronous tasks.
+
+use crate::fault::Fault;
+
+/// Runs work that may wait for a disk, and returns its result.
+pub(crate) async fn blocking<T, F>(
+    work: impl FnOnce() -> Result<T, F> + Send + 'static,
+) -> Result<T, Fault>
+where
+    T: Send + 'static,
+    F: Into<Fault> + Send + 'static,
+{
+    let joined = tokio::task::spawn_blocking(work).await;
+    let done = joined
+        .map_err(|_| Fault::Internal("a task crashed; the server's log says where".to_owned()))?;
+    done.map_err(Into::into)
+}

@@ -1,0 +1,126 @@
+//! What a server is made of, and its limits.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use wildcity_render::Backend;
+use wildcity_scene::ProfileOverrides;
+use wildcity_twin::store::DiskCacheSettings;
+
+use crate::auth::Tokens;
+use crate::limits;
+
+/// What a server is made of.
+#[derive(Clone)]
+pub struct Config {
+    /// Address to listen on; port 0 takes a free one. It must be a loopback address if there are no
+    /// tokens.
+    pub listen: SocketAddr,
+    /// Directory of twins, or their URL.
+    pub twins: PathBuf,
+    /// Where parts of twins at a URL are kept on disk.
+    pub cache: Option<DiskCacheSettings>,
+    /// Directory where episodes are recorded.
+    pub episodes: PathBuf,
+    /// Directory where uploads are kept until they are pushed. One server uses it at a time.
+    pub uploads: PathBuf,
+    /// The tokens of clients; without tokens every client may do everything.
+    pub tokens: Option<Tokens>,
+    /// The renderer.
+    pub backend: Arc<dyn Backend>,
+    /// Changes of the render profile of every twin; a session may change more.
+    pub profile: ProfileOverrides,
+    /// Time-outs, counts and bytes.
+    pub limits: Limits,
+}
+
+/// Time-outs, counts and bytes of a server. The constants in [`crate::limits`] and in the packages of
+/// the protocol, the session and the push are the defaults.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Time-out for the first message of a connection.
+    pub hello: Duration,
+    /// Time-out for the next request.
+    pub idle: Duration,
+    /// Time-out for a client to read an answer.
+    pub send: Duration,
+    /// Time-out for one step, waiting for other sessions included.
+    pub step: Duration,
+    /// How long a session without a connection waits to be resumed.
+    pub resume_grace: Duration,
+    /// Time-out for running steps when the server stops.
+    pub drain: Duration,
+    /// WebSocket connections at once.
+    pub connections: usize,
+    /// Sessions at once.
+    pub sessions: usize,
+    /// Pushes that wait or run at once.
+    pub pushes: usize,
+    /// Bytes of memory that all twins in use may take; three quarters of the machine's memory if there
+    /// is no value.
+    pub resident_bytes: Option<u64>,
+    /// Limits of uploads.
+    pub spool: SpoolLimits,
+}
+
+/// Limits of uploads. The constants in [`crate::limits`] are the defaults.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SpoolLimits {
+    /// Uploads at once, finished or not.
+    pub uploads: usize,
+    /// Bytes of the largest upload.
+    pub upload_bytes: u64,
+    /// Bytes of all uploads, as announced.
+    pub bytes: u64,
+    /// How long an upload is kept after its last byte.
+    pub age: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            hello: wildcity_protocol::limits::HELLO_TIMEOUT,
+            idle: limits::IDLE_TIMEOUT,
+            send: wildcity_protocol::limits::SEND_TIMEOUT,
+            step: wildcity_protocol::limits::STEP_TIMEOUT,
+            resume_grace: limits::RESUME_GRACE,
+            drain: limits::DRAIN_TIMEOUT,
+            connections: limits::CONNECTIONS,
+            sessions: wildcity_session::limits::SESSIONS,
+            pushes: wildcity_push::limits::OPEN_PUSHES,
+            resident_bytes: None,
+            spool: SpoolLimits::default(),
+        }
+    }
+}
+
+impl Default for SpoolLimits {
+    fn default() -> Self {
+        Self {
+            uploads: limits::UPLOADS,
+            upload_bytes: limits::UPLOAD_BYTES,
+            bytes: limits::SPOOL_BYTES,
+            age: limits::UPLOAD_AGE,
+        }
+    }
+}
+
+impl std::fmt::Debug for Config {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
+            self;
+        f.debug_struct("Config")
+            .field("listen", listen)
+            .field("twins", twins)
+            .field("cache", cache)
+            .field("episodes", episodes)
+            .field("uploads", uploads)
+            .field("tokens", &tokens.is_some())
+            .field("backend", &backend.name())
+            .field("profile", profile)
+            .field("limits", limits)
+            .finish()
+    }
+}

@@ -1,0 +1,28 @@
+//! Names and poses in fields of requests.
+
+use wildcity_protocol::message;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::is_name;
+
+use crate::fault::Fault;
+
+/// A name, or a fault that names the field.
+pub(super) fn name_of(field: &str, name: String) -> Result<String, Fault> {
+    if is_name(&name) { Ok(name) } else { Err(Fault::InvalidName { field: field.into(), name }) }
+}
+
+/// A pose, or a fault that names the field.
+pub(super) fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> {
+    Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
+}
+
+/// The poses of a list. One more than `limit` is read, from which the receiver sees that there are too
+/// many; the rest of a long list is not.
+pub(super) fn poses_of(
+    field: &str,
+    poses: &[message::Pose],
+    limit: usize,
+) -> Result<Vec<Pose>, Fault> {
+    let poses = poses.iter().take(limit + 1).enumerate();
+    poses.map(|(index, pose)| pose_of(&format!("{field}[{index}]"), pose)).collect()
+}

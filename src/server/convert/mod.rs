@@ -1,0 +1,31 @@
+//! Conversion between the wire and the session: no other module of the server names the protocol's types.
+//!
+//! ```text
+//! request      text frames to commands
+//! rig          rigs of requests
+//! non_finite   NaN and infinity in requests, which JSON cannot express
+//! answer       answers other than observations
+//! observation  observations
+//! camera       lenses, windshields, shutters and exposures, both ways
+//! http         bodies of HTTP, both ways
+//! fault        the wire code and the HTTP status of each fault
+//! ```
+
+mod answer;
+mod camera;
+mod fault;
+mod field;
+mod http;
+mod non_finite;
+mod observation;
+mod request;
+mod rig;
+
+pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
+pub(crate) use fault::{WireCode, code, http_status, refusal_body, refused};
+pub(crate) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
+pub(crate) use observation::observation;
+pub(crate) use request::{Command, Parsed, parse};
+
+/// The WebSocket subprotocol.
+pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;

@@ -1,0 +1,68 @@
+//! A deadline that moves on with every sign of progress.
+
+use std::pin::pin;
+use std::time::Duration;
+
+use parking_lot::Mutex;
+use tokio::time::{Instant, timeout};
+
+/// The time by which an HTTP connection must make progress with a request or its answer, or be closed.
+/// A connection that becomes a WebSocket leaves this deadline behind.
+pub(crate) struct IdleDeadline {
+    deadline: Mutex<Instant>,
+    period: Duration,
+}
+
+impl IdleDeadline {
+    /// A deadline one period from now.
+    pub(crate) fn new(period: Duration) -> Self {
+        Self { deadline: Mutex::new(Instant::now() + period), period }
+    }
+
+    /// Moves the deadline to one period from now: the request makes progress.
+    pub(crate) fn extend(&self) {
+        *self.deadline.lock() = Instant::now() + self.period;
+    }
+
+    /// Runs work of the server that the client waits for. The deadline does not pass meanwhile, since
+    /// the time is not the client's fault.
+    pub(crate) async fn extend_during<T>(&self, work: impl Future<Output = T>) -> T {
+        let mut work = pin!(work);
+        loop {
+            self.extend();
+            if let Ok(done) = timeout(self.period / 2, &mut work).await {
+                self.extend();
+                return done;
+            }
+        }
+    }
+
+    /// Returns when the deadline has passed.
+    pub(crate) async fn passed(&self) {
+        loop {
+            let deadline = *self.deadline.lock();
+            if deadline <= Instant::now() {
+                return;
+            }
+            tokio::time::sleep_until(deadline).await;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_client_is_not_cut_off_while_it_waits_for_the_server() {
+        let deadline = IdleDeadline::new(Duration::from_millis(400));
+        tokio::select! {
+            biased;
+            () = deadline.passed() => panic!("cut off while the server worked"),
+            () = deadline.extend_during(tokio::time::sleep(Duration::from_millis(1200))) => {}
+        }
+        // The client's own silence still ends the connection.
+        let silent = timeout(Duration::from_secs(10), deadline.passed());
+        silent.await.expect("the deadline passes");
+    }
+}

@@ -1,0 +1,52 @@
+//! Metrics over HTTP.
+
+use std::sync::Arc;
+
+use axum::Extension;
+use axum::extract::{Request, State};
+use axum::http::header;
+use axum::middleware::Next;
+use axum::response::{IntoResponse as _, Response};
+
+use crate::auth::{Grant, Role};
+use crate::convert::WireCode;
+use crate::fault::Fault;
+use crate::metrics::GaugeValues;
+use crate::state::ServerState;
+
+use super::refusal::HttpResult;
+
+/// `GET /metrics`, in OpenMetrics' text format.
+pub(super) async fn show(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> HttpResult {
+    grant.require(Role::Admin)?;
+    let free_connections = state.websocket_permits.available_permits();
+    let spooled = state.spool.as_ref().map(|spool| spool.usage()).unwrap_or_default();
+    let gauges = GaugeValues {
+        sessions: state.sessions.count(),
+        connections: state.limits.connections - free_connections,
+        frames_queued: state.engine.queued_frames(),
+        uploads: spooled.uploads,
+        spool_bytes: spooled.bytes,
+        pushes_open: state.pushes.open_count(),
+    };
+    let text = state.metrics.text(gauges);
+    let text = text.map_err(|error| Fault::Internal(error.to_string()))?;
+    let content_type = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+    Ok(([(header::CONTENT_TYPE, content_type)], text).into_response())
+}
+
+/// Counts the requests that HTTP routes refuse.
+pub(super) async fn count_refusals(
+    State(state): State<Arc<ServerState>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let response = next.run(request).await;
+    if let Some(code) = response.extensions().get::<WireCode>() {
+        state.metrics.refused(&code.0);
+    }
+    response
+}

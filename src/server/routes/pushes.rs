@@ -1,0 +1,117 @@
+//! Pushes over HTTP: requests are carried to the package `wildcity-push`, and its status is answered.
+
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::{Path, State as Shared};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use axum::{Extension, Json};
+
+use wildcity_push::{Begun, Push, PushError, PushRequest, SourceFile, State};
+
+use crate::auth::{Grant, Role};
+use crate::blocking::blocking;
+use crate::convert;
+use crate::fault::Fault;
+use crate::state::ServerState;
+
+use super::refusal::HttpResult;
+
+/// `POST /v1/twins/{twin}/pushes`: answers 202 and carries the push out. A known push is answered with
+/// its status.
+pub(super) async fn begin(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(twin): Path<String>,
+    body: Bytes,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&twin)?;
+    let request = convert::new_push(twin, &body)?;
+    let latest = {
+        let catalog = state.engine.catalog().clone();
+        let request = request.clone();
+        blocking(move || wildcity_push::check_base(&catalog, &request)).await?
+    };
+    let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
+    let twin = request.twin.clone();
+    let push = match state.pushes.begin(&request, &id, || find_uploads(&state, &request))? {
+        Begun::Known(push) => push,
+        Begun::New { push, files } => {
+            tokio::spawn(run(state.clone(), push.clone(), request, files));
+            push
+        }
+    };
+    Ok(answer(StatusCode::ACCEPTED, &id, &twin, &push))
+}
+
+/// `GET /v1/twins/{twin}/pushes/{id}`: the status of a push.
+pub(super) async fn show(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path((twin, id)): Path<(String, String)>,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&twin)?;
+    let push = state.pushes.get(&twin, &id).map_err(Fault::from)?;
+    Ok(answer(StatusCode::OK, &id, &twin, &push))
+}
+
+/// Carries out a push, and ends it.
+async fn run(
+    state: Arc<ServerState>,
+    push: Arc<Push>,
+    request: PushRequest,
+    files: Vec<SourceFile>,
+) {
+    let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
+    let published =
+        wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
+    let result = tokio::select! {
+        result = published => result,
+        () = state.stopped() => Err(PushError::ShuttingDown),
+    };
+    let reason = result.as_ref().err().map(ToString::to_string);
+    let ended = push.end(result);
+    if let Some(reason) = reason {
+        tracing::warn!(state = ?ended, "a push ended: {reason}");
+    }
+    let outcome = match ended {
+        State::Ready => "ready",
+        State::Refused => "refused",
+        _ => "failed",
+    };
+    state.metrics.push_ended(outcome);
+}
+
+/// The finished uploads of a push. An upload is not removed while its file is held.
+fn find_uploads(state: &ServerState, request: &PushRequest) -> Result<Vec<SourceFile>, Fault> {
+    let spool = state.spool()?;
+    let mut files = Vec::with_capacity(request.files.len());
+    for (index, file) in request.files.iter().enumerate() {
+        let upload = spool.get(&file.upload)?;
+        let size = upload.announced().size;
+        if !upload.is_complete() {
+            let held = upload.offset();
+            let must = format!("an upload with {held} of {size} bytes: finish it first");
+            return Err(Fault::OutOfRange { field: format!("files[{index}].upload"), must });
+        }
+        files.push(SourceFile {
+            name: upload.announced().name.clone(),
+            path: upload.path(),
+            bytes: size,
+            guard: upload,
+        });
+    }
+    Ok(files)
+}
+
+fn answer(status: StatusCode, id: &str, twin: &str, push: &Push) -> Response {
+    let body = Json(convert::push(id, twin, &push.status()));
+    let mut response = (status, body).into_response();
+    if let Ok(location) = HeaderValue::from_str(&format!("/v1/twins/{twin}/pushes/{id}")) {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    response
+}

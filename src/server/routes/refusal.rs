@@ -1,0 +1,36 @@
+//! Faults as HTTP answers.
+
+use axum::Json;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+
+use crate::convert;
+use crate::fault::Fault;
+
+/// The result of a route.
+pub(crate) type HttpResult = Result<Response, Refusal>;
+
+/// A fault that becomes an HTTP answer.
+#[derive(Debug)]
+pub(crate) struct Refusal(Fault);
+
+impl<F: Into<Fault>> From<F> for Refusal {
+    fn from(fault: F) -> Self {
+        Self(fault.into())
+    }
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        let status = convert::http_status(&self.0);
+        tracing::debug!(%status, "refused: {}", self.0);
+        let mut response = (status, Json(convert::refusal_body(&self.0))).into_response();
+        if status == StatusCode::UNAUTHORIZED {
+            let bearer = HeaderValue::from_static("Bearer realm=\"wildcity\"");
+            response.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
+        }
+        // The middleware that counts refusals reads the code here, not in the body.
+        response.extensions_mut().insert(convert::code(&self.0));
+        response
+    }
+}

@@ -1,0 +1,87 @@
+//! Twins and their versions over HTTP.
+
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::{Path, State};
+use axum::response::IntoResponse as _;
+use axum::{Extension, Json};
+
+use wildcity_twin::store::StoreError;
+
+use crate::auth::{Grant, Role};
+use crate::blocking::blocking;
+use crate::convert;
+use crate::fault::Fault;
+use crate::state::ServerState;
+
+use super::refusal::HttpResult;
+
+/// `GET /v1/twins`: the latest version of every twin that the token may use.
+pub(super) async fn list(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> HttpResult {
+    let mut twins = state.engine.twins().await?;
+    twins.retain(|twin| grant.allows_twin(&twin.name));
+    Ok(Json(convert::twins(&twins)).into_response())
+}
+
+/// `GET /v1/twins/{twin}`: the latest version of one twin.
+pub(super) async fn show(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    grant.require_twin(&name)?;
+    let twins = state.engine.twins().await?;
+    match twins.iter().find(|twin| twin.name == name) {
+        Some(twin) => Ok(Json(convert::twin(twin)).into_response()),
+        None => {
+            // SessionOptions it gives the reason why it is not listed.
+            let catalog = state.engine.catalog().clone();
+            blocking(move || catalog.version(&name, None)).await?;
+            let reason = "the twin was made while it was looked for; ask again";
+            Err(Fault::Internal(reason.to_owned()).into())
+        }
+    }
+}
+
+/// `GET /v1/twins/{twin}/versions`: all versions, the latest last.
+pub(super) async fn versions(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    grant.require_twin(&name)?;
+    let engine = state.engine.clone();
+    let listed = blocking(move || {
+        let versions = engine.catalog().versions(&name)?;
+        // Read after the log: a push holds the latest version before it commits the next.
+        let held = engine.pinned_latest(&name);
+        Ok::<_, StoreError>((versions, held))
+    });
+    let (versions, held) = listed.await?;
+    Ok(Json(convert::versions(&versions, held)).into_response())
+}
+
+/// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.
+pub(super) async fn rollback(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> HttpResult {
+    grant.require(Role::Admin)?;
+    grant.require_twin(&name)?;
+    let number = convert::rollback(&body)?;
+    let engine = state.engine.clone();
+    let version = blocking(move || {
+        let version = engine.catalog().rollback(&name, number)?;
+        // A push that is being made ready must not keep the rollback from being the latest.
+        engine.move_latest_pin(&name, version.number);
+        tracing::info!(twin = name, version = version.number, "rolled back to {number}");
+        Ok::<_, StoreError>(version)
+    });
+    Ok(Json(convert::version(&version.await?)).into_response())
+}

@@ -1,0 +1,99 @@
+//! The upgrade from HTTP to WebSocket.
+
+use std::sync::Arc;
+
+use axum::Extension;
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::IntoResponse as _;
+use hyper::upgrade::Upgraded;
+use hyper_util::rt::TokioIo;
+use tokio::net::TcpStream;
+use tokio::sync::OwnedSemaphorePermit;
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+
+use crate::auth::{Grant, Role};
+use crate::connection;
+use crate::convert;
+use crate::fault::Fault;
+use crate::socket::Socket;
+use crate::state::ServerState;
+
+use super::refusal::HttpResult;
+
+/// `GET /v1/session`: checks the handshake (RFC 6455, section 4.2) and hands the socket over to a
+/// [`connection`].
+pub(super) async fn upgrade(
+    State(state): State<Arc<ServerState>>,
+    Extension(http_permit): Extension<Arc<OwnedSemaphorePermit>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    mut request: Request,
+) -> HttpResult {
+    let accept = match check_handshake(request.headers()) {
+        Ok(key) => derive_accept_key(key),
+        Err((status, message)) => return Ok((status, format!("{message}\n")).into_response()),
+    };
+    grant.require(Role::Drive)?;
+    let Ok(websocket_permit) = state.websocket_permits.clone().try_acquire_owned() else {
+        let limit = state.limits.connections;
+        return Err(Fault::Busy { what: "connections", limit }.into());
+    };
+    let upgrade = hyper::upgrade::on(&mut request);
+    tokio::spawn(async move {
+        // Both permits are held until the connection ends.
+        let _http_permit = http_permit;
+        let _websocket_permit = websocket_permit;
+        match upgrade.await.map(into_tcp) {
+            Ok(Ok((stream, read_ahead))) => {
+                let socket = Socket::new(stream, read_ahead, state.limits.send).await;
+                connection::serve(state, socket, grant).await;
+            }
+            Ok(Err(_)) => tracing::error!("a WebSocket upgrade did not give back its socket"),
+            Err(error) => tracing::debug!("a client left during its upgrade: {error}"),
+        }
+    });
+    let headers = [
+        (header::CONNECTION, "Upgrade"),
+        (header::UPGRADE, "websocket"),
+        (header::SEC_WEBSOCKET_ACCEPT, &accept),
+        (header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL),
+    ];
+    Ok((StatusCode::SWITCHING_PROTOCOLS, headers).into_response())
+}
+
+/// The socket under an upgraded connection, and the bytes that were already read from it.
+fn into_tcp(upgraded: Upgraded) -> Result<(TcpStream, Vec<u8>), Upgraded> {
+    let parts = upgraded.downcast::<TokioIo<TcpStream>>()?;
+    Ok((parts.io.into_inner(), parts.read_buf.into()))
+}
+
+/// The client's key, if the headers are those of a WebSocket handshake.
+fn check_handshake(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
+    let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
+        let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
+        values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))
+    };
+    let has = |name, wanted: &str| any(name, &|value| value.eq_ignore_ascii_case(wanted));
+    let bad = |message: &str| Err((StatusCode::BAD_REQUEST, message.to_owned()));
+    if !has(header::CONNECTION, "upgrade") || !has(header::UPGRADE, "websocket") {
+        let message = "this address speaks WebSocket: send an upgrade".to_owned();
+        return Err((StatusCode::UPGRADE_REQUIRED, message));
+    }
+    if !has(header::SEC_WEBSOCKET_VERSION, "13") {
+        return bad("Sec-WebSocket-Version must be 13");
+    }
+    // Unlike the values above, names of subprotocols are case-sensitive.
+    if !any(header::SEC_WEBSOCKET_PROTOCOL, &|offered| offered == convert::SUBPROTOCOL) {
+        return bad("offer the subprotocol wildcity.v1 in Sec-WebSocket-Protocol");
+    }
+    match headers.get(header::SEC_WEBSOCKET_KEY) {
+        Some(key) if is_key(key.as_bytes()) => Ok(key.as_bytes()),
+        _ => bad("Sec-WebSocket-Key must be 16 bytes in base64"),
+    }
+}
+
+/// Whether a text is base64 of 16 bytes: 22 digits, and padding.
+fn is_key(text: &[u8]) -> bool {
+    let is_digit = |b: &u8| b.is_ascii_alphanumeric() || b"+/".contains(b);
+    matches!(text.strip_suffix(b"=="), Some(digits) if digits.len() == 22 && digits.iter().all(is_digit))
+}

@@ -1,0 +1,88 @@
+//! Digests of uploads.
+
+use std::fs::File;
+use std::io;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+
+/// A digest, written as `blake3:` or `sha-256:` and 64 lower-case hex digits.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub(crate) struct Digest {
+    algorithm: Algorithm,
+    hash: [u8; 32],
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Algorithm {
+    Blake3,
+    Sha256,
+}
+
+impl Digest {
+    /// The id of an upload with this digest, which is also a file name.
+    pub(super) fn id(&self) -> String {
+        String::from(self.clone()).replace(':', "-")
+    }
+
+    /// The digest of an id.
+    pub(super) fn of_id(id: &str) -> Option<Self> {
+        let (algorithm, hex) = id.rsplit_once('-')?;
+        format!("{algorithm}:{hex}").try_into().ok()
+    }
+
+    /// The digest of a file, with the algorithm of this one.
+    pub(super) fn of_same_kind(&self, path: &Path) -> io::Result<Self> {
+        let mut file = File::open(path)?;
+        let hash = match self.algorithm {
+            Algorithm::Blake3 => {
+                let mut hasher = blake3::Hasher::new();
+                io::copy(&mut file, &mut hasher)?;
+                *hasher.finalize().as_bytes()
+            }
+            Algorithm::Sha256 => {
+                let mut hasher = Sha256::new();
+                io::copy(&mut file, &mut hasher)?;
+                hasher.finalize().into()
+            }
+        };
+        Ok(Self { algorithm: self.algorithm, hash })
+    }
+}
+
+impl TryFrom<String> for Digest {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let parsed = text.split_once(':').and_then(|(algorithm, hex)| {
+            let algorithm = [Algorithm::Blake3, Algorithm::Sha256]
+                .into_iter()
+                .find(|known| known.name() == algorithm)?;
+            let is_lower_case = hex.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+            let hash = blake3::Hash::from_hex(hex).ok().filter(|_| is_lower_case)?;
+            Some(Self { algorithm, hash: *hash.as_bytes() })
+        });
+        parsed.ok_or_else(|| {
+            format!(
+                "{text:?} is no digest: expected blake3: or sha-256: and 64 lower-case hex digits"
+            )
+        })
+    }
+}
+
+impl From<Digest> for String {
+    fn from(Digest { algorithm, hash }: Digest) -> Self {
+        format!("{}:{}", algorithm.name(), blake3::Hash::from_bytes(hash).to_hex())
+    }
+}
+
+impl Algorithm {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Blake3 => "blake3",
+            Self::Sha256 => "sha-256",
+        }
+    }
+}

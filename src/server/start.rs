@@ -1,0 +1,106 @@
+//! Starts a server.
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use tokio::net::TcpListener;
+use tokio::sync::{Semaphore, watch};
+
+use wildcity_push::PushQueue;
+use wildcity_session::{Engine, EngineSettings, SessionError};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, StoreError};
+
+use crate::config::Config;
+use crate::metrics::Metrics;
+use crate::sessions::SessionRegistry;
+use crate::shutdown::Running;
+use crate::spool::Spool;
+use crate::state::ServerState;
+
+/// Why a server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// Every machine of the network could drive, and read the twins.
+    #[error(
+        "{address} is not a loopback address, and without tokens only 127.0.0.1 and [::1] are \
+         safe: give --tokens FILE, or reach them from elsewhere through an SSH tunnel"
+    )]
+    PublicAddress {
+        /// The refused address.
+        address: SocketAddr,
+    },
+    /// The address cannot be used.
+    #[error("cannot listen on {address}: {cause}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// The directory for episodes cannot be made.
+    #[error("cannot record episodes in {}: {cause}", path.display())]
+    Episodes {
+        /// The directory.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// The directory of twins cannot be read.
+    #[error(transparent)]
+    Twins(#[from] StoreError),
+    /// The renderer cannot be started.
+    #[error(transparent)]
+    Engine(#[from] SessionError),
+}
+
+/// Starts a server within the running tokio runtime and returns once it listens.
+///
+/// # Errors
+/// The address is not a loopback address and there are no tokens, or the address or a directory cannot
+/// be used. A directory for uploads that cannot be used is only logged: the server starts and refuses
+/// uploads.
+pub async fn start(config: Config) -> Result<Running, ServerError> {
+    let Config { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
+        config;
+    if tokens.is_none() && !listen.ip().is_loopback() {
+        return Err(ServerError::PublicAddress { address: listen });
+    }
+
+    // The engine: twins, renderer, recordings.
+    std::fs::create_dir_all(&episodes)
+        .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
+    let catalog = Catalog::open_cached(&twins, cache.as_ref())?;
+    let cache = Cache::limited(catalog, limits.resident_bytes);
+    let engine =
+        Engine::start(EngineSettings { cache, episodes, backend, step_timeout: limits.step })?;
+
+    // The socket.
+    let listen_error = |cause| ServerError::Listen { address: listen, cause };
+    let listener = TcpListener::bind(listen).await.map_err(listen_error)?;
+    let address = listener.local_addr().map_err(listen_error)?;
+
+    // Uploads. Agents can drive without them.
+    let spool = Spool::open(&uploads, limits.spool).map(Arc::new).map_err(|error| {
+        let reason = format!("{}: {error}", uploads.display());
+        tracing::warn!("uploads are refused: {reason}");
+        reason
+    });
+
+    let (stop, stopping) = watch::channel(false);
+    let state = Arc::new(ServerState {
+        metrics: Metrics::new(engine.clone()),
+        engine,
+        sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
+        websocket_permits: Arc::new(Semaphore::new(limits.connections)),
+        stopping,
+        limits,
+        profile,
+        tokens,
+        spool,
+        pushes: PushQueue::new(limits.pushes),
+    });
+    Ok(Running::new(state, listener, address, stop))
+}

@@ -1,0 +1,50 @@
+//! What all connections of a server share.
+
+use std::sync::Arc;
+
+use tokio::sync::{Semaphore, watch};
+
+use wildcity_push::PushQueue;
+use wildcity_scene::ProfileOverrides;
+use wildcity_session::Engine;
+
+use crate::auth::Tokens;
+use crate::config::Limits;
+use crate::fault::Fault;
+use crate::metrics::Metrics;
+use crate::sessions::SessionRegistry;
+use crate::spool::Spool;
+
+/// What all connections of a server share.
+pub(crate) struct ServerState {
+    pub(crate) engine: Arc<Engine>,
+    pub(crate) sessions: Arc<SessionRegistry>,
+    /// One permit per WebSocket connection.
+    pub(crate) websocket_permits: Arc<Semaphore>,
+    /// Becomes true when the server stops.
+    pub(crate) stopping: watch::Receiver<bool>,
+    pub(crate) limits: Limits,
+    /// Changes of the render profile of every twin.
+    pub(crate) profile: ProfileOverrides,
+    pub(crate) tokens: Option<Tokens>,
+    /// The spool, or why there is none.
+    pub(crate) spool: Result<Arc<Spool>, String>,
+    pub(crate) pushes: PushQueue,
+    pub(crate) metrics: Metrics,
+}
+
+impl ServerState {
+    /// The spool of uploads.
+    ///
+    /// # Errors
+    /// [`Fault::NoUploads`].
+    pub(crate) fn spool(&self) -> Result<&Arc<Spool>, Fault> {
+        self.spool.as_ref().map_err(|reason| Fault::NoUploads { reason: reason.clone() })
+    }
+
+    /// Returns when the server stops.
+    pub(crate) async fn stopped(&self) {
+        // An error means that the sender was dropped, which stops the server as well.
+        let _ = self.stopping.clone().wait_for(|&stop| stop).await;
+    }
+}

@@ -1,0 +1,130 @@
+//! Why a file was refused.
+
+use std::io;
+
+use crate::limits;
+use wildcity_scene::sky::SkyError;
+use wildcity_scene::validate::BadGaussians;
+
+use super::file::FileError;
+use super::unpack_budget::limit_bytes;
+
+/// Why a file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum IngestError {
+    /// It cannot be read, or is not a regular file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// It has none of the known formats.
+    #[error(
+        "the file starts with {start:?}, which is none of the formats that can be read: PLY, safetensors, SPZ, \
+         SOG, KHR_gaussian_splatting, NuRec, \
+         .ksplat, .splat; convert it to one of them, or copy it again"
+    )]
+    UnknownFormat {
+        /// Its first bytes, as text.
+        start: String,
+    },
+    /// A file that the given one names.
+    #[error("part {name:?}: {cause}")]
+    Part {
+        /// The name in the file that refers to it.
+        name: String,
+        /// Why it cannot be read.
+        cause: FileError,
+    },
+    /// A header cannot be parsed, or is not that of a Gaussian scene.
+    #[error("{format} header, {place}: {reason}")]
+    Header {
+        /// The format.
+        format: &'static str,
+        /// Where in the header, such as `line 3` or `tensor means`.
+        place: String,
+        /// What is wrong, and what must hold instead.
+        reason: String,
+    },
+    /// The header implies another file size.
+    #[error(
+        "{format} body: the header promises {promised} bytes ({content}), the file holds {held}; \
+         it is {}: write or copy it again",
+        if held < promised { "truncated" } else { "oversized" }
+    )]
+    Size {
+        /// The format.
+        format: &'static str,
+        /// Bytes that must follow the header.
+        promised: u128,
+        /// Bytes that follow it.
+        held: u128,
+        /// The counts and sizes that `promised` was computed from.
+        content: String,
+    },
+    /// The body contradicts its header or itself.
+    #[error("{format} body, {place}: {reason}")]
+    Body {
+        /// The format.
+        format: &'static str,
+        /// Where in the body, such as `positions` or `means_l.webp`.
+        place: String,
+        /// What is wrong, and what must hold instead.
+        reason: String,
+    },
+    /// Compressed data expands to more than any scene does.
+    #[error(
+        "{format}, {place}: {packed} bytes unpack to {unpacked}; for a scene at most {} are expected: \
+         convert it to PLY, if it is one",
+        limit_bytes(*packed)
+    )]
+    DecompressionBomb {
+        /// The format.
+        format: &'static str,
+        /// Where in the file.
+        place: String,
+        /// Compressed bytes.
+        packed: u64,
+        /// Bytes that they would unpack to.
+        unpacked: u128,
+    },
+    /// More Gaussians than a twin can hold.
+    #[error(
+        "{count} Gaussians; at most {} fit one import: split the scene",
+        limits::IMPORT_GAUSSIANS
+    )]
+    TooMany {
+        /// Number of Gaussians.
+        count: u64,
+    },
+    /// Gaussians that no renderer can draw.
+    #[error("{0}")]
+    Values(#[from] BadGaussians),
+    /// A sky that cannot be drawn.
+    #[error("sky: {0}")]
+    Sky(#[from] SkyError),
+    /// `--axes` or `--scale` cannot be used.
+    #[error("{option} {given:?}: {reason}")]
+    InvalidAxes {
+        /// The option.
+        option: &'static str,
+        /// What was given.
+        given: String,
+        /// What is wrong, and what must hold instead.
+        reason: String,
+    },
+}
+
+impl From<io::Error> for IngestError {
+    fn from(error: io::Error) -> Self {
+        Self::File(error.into())
+    }
+}
+
+/// Checks that a twin can hold this many Gaussians.
+///
+/// # Errors
+/// [`IngestError::TooMany`].
+pub(super) fn check_count(count: u64) -> Result<usize, IngestError> {
+    match usize::try_from(count) {
+        Ok(fits) if count <= limits::IMPORT_GAUSSIANS => Ok(fits),
+        _ => Err(IngestError::TooMany { count }),
+    }
+}

@@ -1,0 +1,257 @@
+//! Covers a triangle with flat Gaussians.
+//!
+//! A triangle is cut into k² similar ones, each about as large as its share of the whole surface.
+//! Each part becomes a Gaussian with the mean and covariance of a uniform triangle, widened so that
+//! neighbours leave no gaps.
+
+use glam::{DMat2, DMat3, DQuat, DVec2, DVec3, DVec4};
+use image::RgbaImage;
+
+use crate::ingest::activation;
+use wildcity_scene::Gaussians;
+
+/// Ratio of a Gaussian's standard deviation to that of its triangle. Triangles of a regular mesh
+/// with edges of length L have 0.20 L, and their centres are 0.58 L apart: a standard deviation of
+/// 0.6 of that distance leaves no gaps.
+const WIDER: f64 = 1.7;
+/// Longest edge of a triangle that becomes one Gaussian, in edges of a square with the area of a
+/// share. The Gaussian of a longer, narrow triangle would reach beyond its ends.
+pub(super) const LONGEST: f64 = 4.0;
+/// The most halvings of one triangle. Every second one halves its length, so a rail of 4 m becomes
+/// pieces of 6 cm.
+const HALVINGS: u32 = 12;
+/// Ratio of thickness to length.
+const FLATNESS: f64 = 0.02;
+/// Opacity of an opaque material.
+const OPACITY: f64 = 0.97;
+
+/// A triangle of the scene.
+#[derive(Clone)]
+pub(super) struct Triangle {
+    pub(super) corners_m: [DVec3; 3],
+    /// Linear red, green, blue, and opacity at the corners, before the texture's.
+    pub(super) colors: [DVec4; 3],
+    pub(super) uv: [DVec2; 3],
+    pub(super) material: Material,
+}
+
+/// What all corners share.
+#[derive(Clone)]
+pub(super) struct Material {
+    pub(super) texture: Option<Texture>,
+    /// Opacity below which a point is invisible.
+    pub(super) cutoff: f64,
+}
+
+pub(super) type Texture = std::sync::Arc<RgbaImage>;
+
+impl Triangle {
+    pub(super) fn area_m2(&self) -> f64 {
+        let [a, b, c] = self.corners_m;
+        let area_m2 = 0.5 * (b - a).cross(c - a).length();
+        if area_m2.is_finite() { area_m2 } else { 0.0 }
+    }
+
+    /// Cuts the triangle across its longest edge, again and again, until that edge is short, or not
+    /// much longer than the triangle is wide.
+    pub(super) fn halved(self, longest_m: f64) -> Vec<Self> {
+        let mut whole = vec![(self, 0)];
+        let mut parts = Vec::new();
+        while let Some((triangle, halvings)) = whole.pop() {
+            let edge_m = |k: usize| triangle.corners_m[k].distance(triangle.corners_m[(k + 1) % 3]);
+            let k = (0..3).max_by(|&a, &b| edge_m(a).total_cmp(&edge_m(b))).unwrap_or(0);
+            let width_m = 2.0 * triangle.area_m2() / edge_m(k);
+            // Says what must hold, so that NaN is not long.
+            let is_long = edge_m(k) > longest_m && edge_m(k) > LONGEST * width_m;
+            if !is_long || halvings == HALVINGS {
+                parts.push(triangle);
+                continue;
+            }
+            for replaced in [k, (k + 1) % 3] {
+                let mut half = triangle.clone();
+                let other = if replaced == k { (k + 1) % 3 } else { k };
+                half.corners_m[replaced] =
+                    0.5 * (triangle.corners_m[replaced] + triangle.corners_m[other]);
+                half.colors[replaced] = 0.5 * (triangle.colors[replaced] + triangle.colors[other]);
+                half.uv[replaced] = 0.5 * (triangle.uv[replaced] + triangle.uv[other]);
+                whole.push((half, halvings + 1));
+            }
+        }
+        parts
+    }
+
+    /// Number of parts that each edge is cut into; 0 for a triangle without area.
+    pub(super) fn cuts(&self, share_m2: f64) -> u32 {
+        // A triangle is at most the whole surface, so this is at most the square root of
+        // MESH_GAUSSIANS.
+        (self.area_m2() / share_m2).sqrt().ceil() as u32
+    }
+
+    /// Appends the Gaussians of all parts, without invisible ones.
+    pub(super) fn cover(&self, cuts: u32, all: &mut Gaussians) {
+        let Some((quat_wxyz, scales_m)) = self.shape(cuts) else { return };
+        let ln_scales = scales_m.map(activation::ln_scale);
+        for i in 0..cuts {
+            for j in 0..cuts - i {
+                let centre = |third: f64| [f64::from(i) + third, f64::from(j) + third];
+                let upright = Some(centre(1.0 / 3.0));
+                let turned = (j + 1 < cuts - i).then(|| centre(2.0 / 3.0));
+                for [u, v] in upright.into_iter().chain(turned) {
+                    let [u, v] = [u, v].map(|share| share / f64::from(cuts));
+                    let (rgb, opacity) = self.color([1.0 - u - v, u, v]);
+                    if opacity <= 0.0 {
+                        continue;
+                    }
+                    let [a, b, c] = self.corners_m;
+                    all.means_m.push((a + u * (b - a) + v * (c - a)).to_array());
+                    all.quats_wxyz.push(quat_wxyz);
+                    all.ln_scales.push(ln_scales);
+                    all.logit_opacities.push(activation::logit(OPACITY * opacity));
+                    all.sh.extend(rgb.map(activation::dc));
+                }
+            }
+        }
+    }
+
+    /// Rotation (w, x, y, z) and standard deviations, in metres, of each part. A uniform triangle
+    /// has the covariance Σ (corner - centre)(corner - centre)ᵀ / 12, the same for upright and
+    /// inverted parts.
+    fn shape(&self, cuts: u32) -> Option<([f32; 4], [f64; 3])> {
+        let [a, b, c] = self.corners_m;
+        let normal = (b - a).cross(c - a).try_normalize()?;
+        let across = (b - a).try_normalize()?;
+        let up = normal.cross(across);
+        let centre_m = (a + b + c) / 3.0;
+        let mut covariance = DMat2::ZERO;
+        for corner_m in self.corners_m {
+            let d = DVec2::new(across.dot(corner_m - centre_m), up.dot(corner_m - centre_m));
+            covariance += DMat2::from_cols(d * d.x, d * d.y);
+        }
+        covariance *= (WIDER / f64::from(cuts)).powi(2) / 12.0;
+        // The eigenvectors and eigenvalues of a symmetric 2 x 2 matrix: the angle of the major axis
+        // is atan2(2 xy, xx - yy) / 2, the variances are (xx + yy) / 2 ± √((xx - yy)² / 4 + xy²).
+        let [xx, xy, yy] = [covariance.x_axis.x, covariance.x_axis.y, covariance.y_axis.y];
+        let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
+        let spread = (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
+        let middle = 0.5 * (xx + yy);
+        let [long_m, short_m] = [middle + spread, (middle - spread).max(0.0)].map(f64::sqrt);
+        let long = angle.cos() * across + angle.sin() * up;
+        let axes = DMat3::from_cols(long, normal.cross(long), normal);
+        let DQuat { x, y, z, w } = DQuat::from_mat3(&axes).normalize();
+        Some(([w, x, y, z].map(|q| q as f32), [long_m, short_m, FLATNESS * long_m]))
+    }
+
+    /// Display colour and opacity, 0 to 1, at a point given by its barycentric coordinates.
+    fn color(&self, shares: [f64; 3]) -> ([f64; 3], f64) {
+        let at = |values: [DVec4; 3]| (0..3).map(|k| shares[k] * values[k]).sum::<DVec4>();
+        let mut color = at(self.colors);
+        if let Some(image) = &self.material.texture {
+            let uv = (0..3).map(|k| shares[k] * self.uv[k]).sum::<DVec2>();
+            let place = |share: f64, size: u32| {
+                // Repeated, which is glTF's default.
+                ((share.rem_euclid(1.0) * f64::from(size)) as u32).min(size - 1)
+            };
+            let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));
+            let [red, green, blue, alpha] = texel.0.map(|value| f64::from(value) / 255.0);
+            let [red, green, blue] = [red, green, blue].map(linear_from_display);
+            color *= DVec4::new(red, green, blue, alpha);
+        }
+        let opacity = if color.w >= self.material.cutoff { color.w.clamp(0.0, 1.0) } else { 0.0 };
+        ([color.x, color.y, color.z].map(display_from_linear), opacity)
+    }
+}
+
+/// The sRGB transfer function of IEC 61966-2-1, decoded.
+fn linear_from_display(value: f64) -> f64 {
+    if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+}
+
+/// The sRGB transfer function of IEC 61966-2-1, encoded.
+fn display_from_linear(value: f64) -> f64 {
+    let value = value.clamp(0.0, 1.0);
+    if value <= 0.003_130_8 { 12.92 * value } else { 1.055 * value.powf(1.0 / 2.4) - 0.055 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn triangle(corners_m: [[f64; 3]; 3]) -> Triangle {
+        Triangle {
+            corners_m: corners_m.map(DVec3::from_array),
+            colors: [DVec4::new(1.0, 0.0, 0.0, 1.0), DVec4::Y, DVec4::Z].map(|c| c.with_w(1.0)),
+            uv: [DVec2::ZERO; 3],
+            material: Material { texture: None, cutoff: 0.0 },
+        }
+    }
+
+    /// The parts together have the triangle's own mean, and its covariance: that of their centres
+    /// and their own, which is widened.
+    #[test]
+    fn the_parts_have_the_moments_of_the_whole() {
+        let whole = triangle([[1.0, 2.0, 3.0], [4.0, 2.5, 2.0], [0.0, 5.0, 7.0]]);
+        let [a, b, c] = whole.corners_m;
+        let centre_m = (a + b + c) / 3.0;
+        let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        let exact = whole.corners_m.map(|m| outer(m - centre_m)).into_iter().sum::<DMat3>() / 12.0;
+        for cuts in [1, 2, 7] {
+            let mut parts = Gaussians::with_capacity(0, 0);
+            whole.cover(cuts, &mut parts);
+            assert_eq!(parts.len(), (cuts * cuts) as usize);
+            let share = 1.0 / parts.len() as f64;
+            let mean_m: DVec3 =
+                parts.means_m.iter().map(|&mean_m| share * DVec3::from_array(mean_m)).sum();
+            assert!((mean_m - centre_m).length() < 1e-12, "{mean_m}");
+            let mut covariance = DMat3::ZERO;
+            for i in 0..parts.len() {
+                let [w, x, y, z] = parts.quats_wxyz[i].map(f64::from);
+                let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
+                // Flat parts: the third axis is what was added.
+                let [long, short, _] = parts.ln_scales[i].map(|ln| f64::from(ln).exp() / WIDER);
+                let half = axes * DMat3::from_diagonal(DVec3::new(long, short, 0.0));
+                let d = DVec3::from_array(parts.means_m[i]) - centre_m;
+                covariance += (outer(d) + half * half.transpose()) * share;
+            }
+            let off = (covariance - exact).to_cols_array().map(f64::abs);
+            assert!(off.iter().all(|&off| off < 1e-6), "{cuts}: {off:?}");
+        }
+    }
+
+    #[test]
+    fn a_rail_is_halved_until_its_parts_are_short() {
+        let rail = triangle([[0.0; 3], [5.0, 0.0, 0.0], [5.0, 0.01, 0.0]]);
+        let area_m2 = rail.area_m2();
+        let parts = rail.halved(0.1);
+        // Of its two long edges one is halved first, and then both halves' edges in turn.
+        assert!((100..=1 << HALVINGS).contains(&parts.len()), "{}", parts.len());
+        let sum_m2: f64 = parts.iter().map(Triangle::area_m2).sum();
+        assert!((sum_m2 / area_m2 - 1.0).abs() < 1e-12);
+        let longest_m = parts.iter().flat_map(|part| {
+            let [a, b, c] = part.corners_m;
+            [a.distance(b), b.distance(c), c.distance(a)]
+        });
+        let longest_m = longest_m.fold(0.0, f64::max);
+        assert!(longest_m <= 0.1, "{longest_m}");
+        // However long, and however thin; and what is not thin stays whole.
+        let line = triangle([[0.0; 3], [1e9, 0.0, 0.0], [2e9, 0.0, 0.0]]);
+        assert_eq!(line.halved(1e-3).len(), 1 << HALVINGS);
+        assert_eq!(triangle([[0.0; 3], [9.0, 0.0, 0.0], [0.0, 9.0, 0.0]]).halved(0.1).len(), 1);
+    }
+
+    #[test]
+    fn colour_runs_between_the_corners_and_what_is_cut_off_is_not_there() {
+        let mut whole = triangle([[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+        let ([red, green, blue], opacity) = whole.color([0.5, 0.5, 0.0]);
+        assert_eq!((red, blue, opacity), (green, 0.0, 1.0));
+        assert!((red - 0.7354).abs() < 1e-4, "half the light, displayed: {red}");
+        whole.material = Material { texture: None, cutoff: 2.0 };
+        let mut parts = Gaussians::with_capacity(0, 0);
+        whole.cover(3, &mut parts);
+        assert_eq!(parts.len(), 0);
+        // Nothing is made of a line.
+        let line = triangle([[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
+        assert_eq!(line.cuts(1e-3), 0);
+        line.cover(1, &mut parts);
+        assert_eq!(parts.len(), 0);
+    }
+}

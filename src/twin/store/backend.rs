@@ -1,0 +1,161 @@
+//! What the store needs of a directory or an object store.
+
+use std::collections::BTreeSet;
+use std::fmt::Debug;
+use std::io::{self, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use super::StoreError;
+use super::layout::{object_key, record_key};
+
+/// A directory or an object store with twins. Callers have checked all names of twins and all
+/// hashes.
+pub(super) trait ObjectBackend: Debug + Send + Sync {
+    /// The directory, or the URL.
+    fn root(&self) -> &Path;
+
+    /// Names of the twins that have a version, sorted.
+    fn twin_names(&self) -> Result<Vec<String>, StoreError>;
+
+    /// Version numbers in a twin's log, ascending; none for an unknown twin.
+    fn version_numbers(&self, name: &str) -> Result<Vec<u64>, StoreError>;
+
+    /// Reads one log record, up to the largest size of a record.
+    fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError>;
+
+    /// Reads an object and compares it with its hash.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] for another hash, and for an object longer than `limit_bytes`.
+    fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError>;
+
+    /// Reads an object of any size, compares it with its hash, and returns its first bytes, at most
+    /// `most_bytes`.
+    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError>;
+
+    /// Reads a range of an object and compares it with a hash of that range.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if the object ends before the range does; nothing is allocated for
+    /// it then.
+    fn read_range(
+        &self,
+        name: &str,
+        object: &str,
+        bytes: Range<u64>,
+        hash: &[u8; 32],
+    ) -> Result<Vec<u8>, StoreError>;
+
+    /// Reads an object to its end without keeping it. Returns its size in bytes.
+    fn read_and_discard(&self, name: &str, hash: &str) -> Result<u64, StoreError>;
+
+    /// Checks that an object exists and has the right size, without reading its content.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if it is shorter or longer.
+    fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError>;
+
+    /// Begins a commit.
+    fn begin_staging(&self, name: &str, commit: &str) -> Result<Box<dyn Staging>, StoreError>;
+
+    /// Names of the twins with a commit that has begun and not ended: it runs, or it was killed.
+    fn unfinished_commits(&self) -> Result<Vec<String>, StoreError>;
+
+    /// Removes what killed commits of a twin left: their staging, and objects that they placed and
+    /// that `named` does not contain. Running commits are not affected.
+    fn remove_abandoned(
+        &self,
+        name: &str,
+        named: &dyn Fn() -> Option<BTreeSet<String>>,
+    ) -> Result<(), StoreError>;
+
+    /// All objects of a twin, in order of their hashes.
+    fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
+
+    /// Removes the objects that `which` returns. Where the backend has locks, publishing is locked
+    /// from before `which` is called.
+    fn remove_objects(
+        &self,
+        name: &str,
+        which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
+    ) -> Result<(), StoreError>;
+
+    /// File names in a folder of a twin's side files. A side file is small and not part of any
+    /// version: a lease, or the state of garbage collection.
+    fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;
+
+    /// Reads a side file of at most [`limits::SIDE_FILE_BYTES`](crate::limits::SIDE_FILE_BYTES);
+    /// `None` if it does not exist.
+    fn read_side_file(&self, name: &str, file: &str) -> Result<Option<Vec<u8>>, StoreError>;
+
+    /// Writes a side file, in place of an older one of that name.
+    ///
+    /// # Errors
+    /// [`StoreError::SideFileSize`] for one too large to be read again.
+    fn write_side_file(&self, name: &str, file: &str, bytes: &[u8]) -> Result<(), StoreError>;
+
+    /// Removes a side file, if it exists.
+    fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError>;
+
+    /// Path or URL of one log record.
+    fn record_path(&self, name: &str, number: u64) -> PathBuf {
+        self.root().join(record_key(name, number))
+    }
+
+    /// Path or URL of an object.
+    fn object_path(&self, name: &str, hash: &str) -> PathBuf {
+        self.root().join(object_key(name, hash))
+    }
+}
+
+/// Writes the content of an object.
+pub(super) type WriteObject<'a> = Box<dyn FnOnce(&mut dyn Write) -> io::Result<()> + 'a>;
+
+/// Objects of a commit in preparation, which no reader sees yet. Dropping it before it is published
+/// removes them where the backend can.
+pub(super) trait Staging: Debug + Send {
+    /// Writes one object, and names it by its hash.
+    fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError>;
+
+    /// Waits until no other commit publishes a version of this twin, and keeps others from
+    /// publishing until this is dropped. Does nothing where the backend has no locks.
+    fn lock_publishing(&mut self) -> Result<(), StoreError>;
+
+    /// Makes objects visible, and then the log record. The caller has called
+    /// [`Staging::lock_publishing`].
+    ///
+    /// # Errors
+    /// [`StoreError::Conflict`] if the number is taken. Nothing is visible then, unless the error
+    /// is [`StoreError::NotSynced`].
+    fn publish(
+        &mut self,
+        hashes: &BTreeSet<&str>,
+        number: u64,
+        record: &[u8],
+    ) -> Result<(), StoreError>;
+
+    /// Puts objects in the place of those of an existing version, which repairs damaged and missing
+    /// ones, and makes its record durable. The caller has called [`Staging::lock_publishing`].
+    fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError>;
+
+    /// Where its objects lie, for messages.
+    fn dir(&self) -> &Path;
+}
+
+/// An object in a listing.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ListedObject {
+    pub(super) hash: String,
+    pub(super) bytes: u64,
+    /// When it was last written, in microseconds since 1970.
+    pub(super) written_us: i64,
+}
+
+/// An object that was written.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct StoredObject {
+    /// Its BLAKE3, 64 lower-case hex digits.
+    pub(super) hash: String,
+    pub(super) bytes: u64,
+}

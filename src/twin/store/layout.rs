@@ -1,0 +1,66 @@
+//! Where the parts of a twin lie below the root of a directory or an object store, and what their
+//! names may be.
+
+use std::path::PathBuf;
+
+use crate::limits;
+
+use super::StoreError;
+
+/// Path of a log record below the root. The number has ten digits, so that names sort as numbers
+/// do.
+pub(super) fn record_key(name: &str, number: u64) -> String {
+    format!("{name}/log/{number:010}")
+}
+
+/// Path of an object below the root.
+pub(super) fn object_key(name: &str, hash: &str) -> String {
+    format!("{name}/objects/{}/{hash}", &hash[..2])
+}
+
+/// The version numbers among the file names of a log, ascending.
+pub(super) fn log_numbers(names: impl IntoIterator<Item = String>) -> Vec<u64> {
+    let number = |entry: String| {
+        let number: u64 = entry.parse().ok()?;
+        // "1" and "+1" parse as numbers, too, but no commit wrote them.
+        (format!("{number:010}") == entry).then_some(number)
+    };
+    let mut numbers: Vec<u64> = names.into_iter().filter_map(number).collect();
+    numbers.sort_unstable();
+    numbers
+}
+
+/// Whether a text is 64 lower-case hex digits, and so may become a file name.
+pub(super) fn is_hash(text: &str) -> bool {
+    text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
+}
+
+/// Checks that a side file is small enough to be read again.
+///
+/// # Errors
+/// [`StoreError::SideFileSize`].
+pub(super) fn check_side_file(path: PathBuf, bytes: &[u8]) -> Result<(), StoreError> {
+    let bytes = bytes.len() as u64;
+    let limit = limits::SIDE_FILE_BYTES;
+    if bytes > limit { Err(StoreError::SideFileSize { path, bytes, limit }) } else { Ok(()) }
+}
+
+/// Checks that bytes have a hash.
+///
+/// # Errors
+/// Says which hash they have instead.
+pub(super) fn check_hash(bytes: &[u8], hash: &str) -> Result<(), String> {
+    let found = blake3::hash(bytes).to_hex();
+    if found.as_str() == hash { Ok(()) } else { Err(format!("its bytes hash to {found}")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_names_that_a_commit_writes_are_versions() {
+        let names = ["0000000002", "10000000000", "1", "+1", "+000000003", "00000000004", "x"];
+        assert_eq!(log_numbers(names.map(str::to_owned)), [2, 10_000_000_000]);
+    }
+}

@@ -1,0 +1,76 @@
+//! What a version consists of beside its cells.
+
+use std::collections::BTreeSet;
+
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{RenderProfile, Rig, Trajectory};
+
+use super::StoreError;
+use super::sky::NewSky;
+
+/// What a version consists of beside its cells.
+#[derive(Clone, Debug)]
+pub struct VersionSettings {
+    /// How it must be rendered.
+    pub profile: RenderProfile,
+    /// The rig of the vehicle that recorded it.
+    pub rig: Option<Rig>,
+    /// Recorded drives.
+    pub trajectories: Vec<Trajectory>,
+    /// The sky behind the Gaussians.
+    pub sky: Option<NewSky>,
+    /// Where it comes from.
+    pub provenance: Provenance,
+}
+
+/// What a change replaces of a version beside cells. A field that is `None` keeps the base's value.
+#[derive(Clone, Debug)]
+pub struct VersionChange {
+    /// How it must be rendered.
+    pub profile: Option<RenderProfile>,
+    /// The rig of the vehicle that recorded it.
+    pub rig: Option<Rig>,
+    /// All recorded drives.
+    pub trajectories: Option<Vec<Trajectory>>,
+    /// The sky behind the Gaussians; `Some(None)` removes it.
+    pub sky: Option<Option<NewSky>>,
+    /// Where the new version comes from.
+    pub provenance: Provenance,
+}
+
+impl VersionSettings {
+    /// # Errors
+    /// Names what cannot be used.
+    pub(super) fn check(&self) -> Result<(), StoreError> {
+        check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)?;
+        self.sky.as_ref().map_or(Ok(()), |sky| sky.check(&self.profile))
+    }
+}
+
+impl VersionChange {
+    /// Checks everything but the sky, which needs the profile of the base.
+    ///
+    /// # Errors
+    /// Names what cannot be used.
+    pub(super) fn check(&self) -> Result<(), StoreError> {
+        let trajectories = self.trajectories.as_deref().unwrap_or_default();
+        check(self.profile.as_ref(), self.rig.as_ref(), trajectories)
+    }
+}
+
+fn check(
+    profile: Option<&RenderProfile>,
+    rig: Option<&Rig>,
+    trajectories: &[Trajectory],
+) -> Result<(), StoreError> {
+    profile.map_or(Ok(()), RenderProfile::check)?;
+    rig.map_or(Ok(()), Rig::check)?;
+    let mut names = BTreeSet::new();
+    for trajectory in trajectories {
+        trajectory.check()?;
+        if !names.insert(&*trajectory.name) {
+            return Err(StoreError::DuplicateTrajectory { name: trajectory.name.clone() });
+        }
+    }
+    Ok(())
+}
