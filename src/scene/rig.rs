@@ -113,7 +113,9 @@ pub enum RigError {
         limit: usize,
     },
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
-    #[error("{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with .")]
+    #[error(
+        "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+    )]
     Name {
         /// The refused name.
         name: String,

@@ -398,7 +398,8 @@ impl Camera {
         for (field, value, derived) in [("fx", self.pinhole.fx, x), ("fy", self.pinhole.fy, y)] {
             let agrees = (value - derived).abs() <= 1e-6 * derived;
             if !agrees {
-                let must = "an f-theta lens takes its focal lengths from its polynomial: omit fx and fy";
+                let must =
+                    "an f-theta lens takes its focal lengths from its polynomial: omit fx and fy";
                 return Err(CameraError::Intrinsic { field, value, must });
             }
         }
