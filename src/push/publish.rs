@@ -136,7 +136,7 @@ fn compare_cells(
     Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
 }
 
-/// A committed version that nobody gets as the latest yet.
+/// A committed version that is not yet opened as the latest.
 struct Committed {
     version: Version,
     /// Keeps the version before as the latest until it is dropped.

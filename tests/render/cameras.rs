@@ -13,17 +13,18 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{agree, cpu, max_difference, psnr, render, render_one, try_render};
 use crate::lenses::{
-    driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of, street_scene,
+    check_against_exact_rays, check_projections, lenses, rolling_view, scaled_and_cropped,
+    sideways_rolling_view, street_scene,
 };
 
 #[test]
 fn known_points_land_where_the_model_says() {
     for (name, camera) in lenses() {
-        for (camera, least) in sizes_of(&camera).into_iter().zip([20, 20, 5]) {
-            let points = lands(&cpu(), name, camera, 0.3);
+        for (camera, least) in scaled_and_cropped(&camera).into_iter().zip([20, 20, 5]) {
+            let points = check_projections(&cpu(), name, camera, 0.3);
             assert!(points >= least, "{name}: {points} points");
         }
-        lands(&Reference, name, camera.scaled(64, 40).unwrap(), 0.3);
+        check_projections(&Reference, name, camera.scaled(64, 40).unwrap(), 0.3);
     }
 }
 
@@ -34,7 +35,7 @@ fn exact() -> RenderProfile {
 
 #[test]
 fn every_lens_draws_what_each_pixels_ray_meets() {
-    meets_what_each_pixels_ray_meets(&Reference);
+    check_against_exact_rays(&Reference);
 }
 
 #[test]
@@ -223,7 +224,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
             ShutterDirection::LeftToRight,
             ShutterDirection::RightToLeft,
         ] {
-            let view = driven(camera, pose, direction);
+            let view = rolling_view(camera, pose, direction);
             let image = render_one(&cpu(), &street, &profile, view);
             let across =
                 matches!(direction, ShutterDirection::LeftToRight | ShutterDirection::RightToLeft);
@@ -271,13 +272,13 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
 fn the_cpu_backend_rolls_as_it_is_defined() {
     let (street, pose) = street_scene();
     for camera in [lenses()[0].1, lenses()[2].1] {
-        let view = driven(camera, pose, ShutterDirection::TopToBottom);
+        let view = rolling_view(camera, pose, ShutterDirection::TopToBottom);
         let truth = render_one(&Reference, &street, &RenderProfile::default(), view);
         let image = render_one(&cpu(), &street, &RenderProfile::default(), view);
         agree(&image, &truth).unwrap();
     }
     // The ray of a point's image leads from the camera's pose at that moment to the point.
-    let view = driven(lenses()[0].1, Pose::IDENTITY, ShutterDirection::BottomToTop);
+    let view = rolling_view(lenses()[0].1, Pose::IDENTITY, ShutterDirection::BottomToTop);
     let point_m = DVec3::new(0.4, -0.3, 2.0);
     let at_px = view.project_world(point_m).unwrap();
     let pose = view.world_from_camera_at(at_px);
@@ -288,7 +289,7 @@ fn the_cpu_backend_rolls_as_it_is_defined() {
 
 #[test]
 fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
-    let view = passing();
+    let view = sideways_rolling_view();
     for step in 0..200 {
         let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
         let landed = view.project_extrapolated(point_m, 1.0);
