@@ -1,8 +1,10 @@
-//! The ground under the ego, as far as recorded drives tell of it.
+//! The ground under the ego, derived from recorded drives.
 //!
-//! A rig's origin is on the ground under its rear axle and its z axis stands on it, so every keyframe is
-//! a piece of ground: a plane through its origin across its z axis. That needs nothing but the manifest
-//! and holds for any twin with a drive; the Gaussians themselves have no ground, only what lies on it.
+//! A rig's origin is on the ground under its rear axle, and its z axis is normal to the ground. So every
+//! keyframe of a recorded drive defines a ground plane: through its origin, perpendicular to its z axis. This
+//! needs only the manifest and works for every twin with a drive. The Gaussians represent surfaces, most of
+//! which are not ground, and classifying them would be a guess. In a twin without a drive there is no ground,
+//! and a car stays in its own plane.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -10,30 +12,30 @@ use crate::limits;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 
-/// What drives tell of the ground.
+/// The ground defined by recorded drives.
 #[derive(Clone, Copy, Debug)]
 pub struct Ground<'a> {
     drives: &'a [Trajectory],
 }
 
-/// A plane through a point.
+/// A plane through a point, with unit normal `up`.
 struct Plane {
     point_m: DVec3,
     up: DVec3,
 }
 
 impl<'a> Ground<'a> {
-    /// Of recorded drives.
+    /// The ground of some recorded drives.
     pub fn from_drives(drives: &'a [Trajectory]) -> Self {
         Self { drives }
     }
 
-    /// A pose (`world_from_rig`) set on the ground: straight down or up onto it, level with it, heading
-    /// as it did. A pose that no drive comes within [`limits::GROUND_NEAR_M`] of stays as it is.
+    /// Places a pose (`world_from_rig`) on the ground: moves it vertically onto the ground plane and tilts it to
+    /// the plane's normal, keeping its heading. A pose farther than [`limits::GROUND_NEAR_M`] from every drive
+    /// is returned unchanged.
     ///
-    /// The nearest drive counts, in space and not in the plane: a bridge is not the street below it.
-    /// Between keyframes the plane is between theirs. Every keyframe is looked at: 170,000 take a
-    /// millisecond.
+    /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are distinguished.
+    /// Between keyframes it is interpolated. Every keyframe is tested: 170,000 take a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
         match self.under(world_from_rig.position_m) {
             Some(plane) => plane.place(world_from_rig),
@@ -67,7 +69,7 @@ impl<'a> Ground<'a> {
 impl Plane {
     fn place(&self, world_from_rig: Pose) -> Pose {
         let Self { point_m, up } = *self;
-        // A drive on its side, or upside down, is no ground.
+        // A drive that is tilted by more than 45 degrees does not define a ground.
         if up.z < limits::GROUND_UP {
             return world_from_rig;
         }
@@ -75,7 +77,7 @@ impl Plane {
         let aside_m = position_m - point_m;
         position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
         let forward = world_from_rig.rotation * DVec3::X;
-        // Heading straight up there is none; the rig stays as it is.
+        // A rig that points along the normal has no heading; it is returned unchanged.
         let Some(forward) = forward.reject_from_normalized(up).try_normalize() else {
             return world_from_rig;
         };
@@ -89,7 +91,7 @@ mod tests {
     use super::*;
     use wildcity_scene::trajectory::Keyframe;
 
-    /// Uphill along x by a tenth, above a level street along y.
+    /// A bridge uphill along x with a slope of 0.1, above a level street along y.
     fn drives() -> Vec<Trajectory> {
         let drive = |name: &str, pose: &dyn Fn(i64) -> Pose| {
             let keyframe = |i| Keyframe { time_us: i, world_from_rig: pose(i) };
@@ -119,7 +121,7 @@ mod tests {
         assert!((up - wanted).length() < 1e-12, "{up}");
         let forward = settled.rotation * DVec3::X;
         assert!((forward.y.atan2(forward.x) - 0.3).abs() < 0.01, "{forward}");
-        // Settled again it stays: what a step leaves is what the next begins with.
+        // Placing is idempotent: each step starts from the result of the previous one.
         let again = Ground::from_drives(&drives).place(settled);
         assert!((again.position_m - settled.position_m).length() < 1e-12);
     }
@@ -135,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn far_from_every_drive_nothing_is_known() {
+    fn a_pose_far_from_every_drive_is_unchanged() {
         let drives = drives();
         let far = Pose { position_m: DVec3::new(0.0, 500.0, 3.0), ..Pose::IDENTITY };
         assert_eq!(Ground::from_drives(&drives).place(far), far);

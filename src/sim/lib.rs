@@ -1,6 +1,7 @@
-//! What moves in a city twin: the ego, by what its agent wants and what a car can do.
+//! Motion in a city twin: the dynamics of the ego vehicle under an agent's commands, and the ground it stands
+//! on.
 //!
-//! Pure: the same state, the same command, the same bytes.
+//! Everything here is pure: the same state and the same command give the same bytes.
 
 pub mod ego;
 pub mod ground;

@@ -1,8 +1,8 @@
-//! Sideways while speed changes. There is no closed form then: the state is a polynomial that satisfies
-//! `|v| dz/dt = G(v) z + v steer δ` at five points of a piece (Radau IIA, order 9, Hairer and Wanner,
-//! "Solving Ordinary Differential Equations II", IV.5). The equation is linear, so one solution of ten
-//! linear equations gives it; the last point is the piece's end, so stiffness damps instead of exciting,
-//! and nothing is divided by v.
+//! Lateral dynamics while speed changes. There is no closed form, so the state is approximated by a polynomial
+//! that satisfies `|v| dz/dt = G(v) z + v steer δ` at five nodes of an interval (Radau IIA, order 9: Hairer and
+//! Wanner, "Solving Ordinary Differential Equations II", IV.5). The equation is linear, so one system of ten
+//! linear equations gives the solution. The last node is the end of the interval, so the method is L-stable:
+//! stiff transients are damped. Nothing is divided by v.
 
 use std::sync::LazyLock;
 
@@ -10,10 +10,10 @@ use glam::DVec2;
 
 use super::vehicle::LateralDynamics;
 
-/// Points of a piece.
+/// Number of nodes of an interval.
 pub(super) const POINTS: usize = 5;
 
-/// Where they lie in it: the zeros of Radau's right polynomial of degree 5.
+/// The nodes on [0, 1]: the zeros of the right Radau polynomial of degree 5.
 pub(super) const NODES: [f64; POINTS] = [
     0.057_104_196_114_517_68,
     0.276_843_013_638_123_8,
@@ -22,10 +22,10 @@ pub(super) const NODES: [f64; POINTS] = [
     1.0,
 ];
 
-/// Integrals from the piece's start to each point, as weights of the values at the points. The last row
-/// is the quadrature over the piece: exact for polynomials of degree 8.
+/// Weights of the integrals from the start of the interval to each node. The last row is the quadrature over
+/// the interval, exact for polynomials of degree 8.
 pub(super) static INTEGRALS: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
-    // What is right for every power: sum_j a_ij c_j^k = c_i^(k + 1) / (k + 1).
+    // Exact for every power: sum_j a_ij c_j^k = c_i^(k + 1) / (k + 1).
     let powers: [[f64; POINTS]; POINTS] =
         std::array::from_fn(|k| NODES.map(|node| node.powi(k as i32)));
     NODES.map(|node| {
@@ -34,9 +34,9 @@ pub(super) static INTEGRALS: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|
     })
 });
 
-/// Derivatives at the points, as weights of the change since the piece's start at each.
+/// Weights of the derivative at each node, applied to the changes since the start of the interval.
 static DERIVATIVES: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
-    // What is right for every power: sum_j d_ij c_j^(k + 1) = (k + 1) c_i^k.
+    // Exact for every power: sum_j d_ij c_j^(k + 1) = (k + 1) c_i^k.
     let powers: [[f64; POINTS]; POINTS] =
         std::array::from_fn(|k| NODES.map(|node| node.powi(k as i32 + 1)));
     NODES.map(|node| {
@@ -45,8 +45,8 @@ static DERIVATIVES: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
     })
 });
 
-/// Lateral velocity (m/s) and yaw rate (rad/s) at the points of a piece that begins with `sideways` and
-/// lasts `piece_s`, by the speeds (m/s, of one sign) and steering angles (rad) there.
+/// Lateral velocity (m/s) and yaw rate (rad/s) at the nodes of an interval of `piece_s` seconds that starts with
+/// `sideways`, given the speeds (m/s, of one sign) and steering angles (rad) at the nodes.
 pub(super) fn solve(
     tyres: &LateralDynamics,
     piece_s: f64,
@@ -59,7 +59,8 @@ pub(super) fn solve(
     let mut right = [0.0; 2 * POINTS];
     // The unknowns are the changes since the start: |v| D y - G y = G z + v steer δ.
     for point in 0..POINTS {
-        let (speed, angle) = (speeds_m_s[point], angles_rad[point]);
+        let speed = speeds_m_s[point];
+        let angle = angles_rad[point];
         let matrix = tyres.matrix(speed);
         let pull = matrix * sideways + tyres.steer * (speed * angle);
         let rate = speed.abs() / piece_s;
@@ -70,13 +71,14 @@ pub(super) fn solve(
         for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
             rows[2 * point + row][2 * point + column] -= matrix.col(column)[row];
         }
-        (right[2 * point], right[2 * point + 1]) = (pull.x, pull.y);
+        right[2 * point] = pull.x;
+        right[2 * point + 1] = pull.y;
     }
     let changes = solved(rows, right);
     std::array::from_fn(|point| sideways + DVec2::new(changes[2 * point], changes[2 * point + 1]))
 }
 
-/// The solution of linear equations, by Gauss with the largest pivot of each column.
+/// Solves a system of linear equations by Gaussian elimination with partial pivoting.
 fn solved<const N: usize>(mut rows: [[f64; N]; N], mut right: [f64; N]) -> [f64; N] {
     for column in 0..N {
         let larger =

@@ -1,15 +1,15 @@
-//! Sideways at constant speed, in closed form: at any speed and for any time.
+//! Lateral dynamics at constant speed in closed form, for any speed and any time.
 
 use glam::{DMat2, DVec2};
 
 use super::vehicle::LateralDynamics;
 
-/// What turns the wheel: the steering angle follows what it is told, `dδ/dt = (told - δ) / lag`.
+/// The steering actuator: the angle follows its setpoint with a first-order lag, `dδ/dt = (target - δ) / lag`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Steering {
-    /// The angle of the front wheels, in radians, to the left.
+    /// Angle of the front wheels, in radians, positive to the left.
     pub(super) angle_rad: f64,
-    /// What it is told to be.
+    /// Setpoint of the angle, in radians.
     pub(super) target_rad: f64,
     /// Its lag, in seconds.
     pub(super) lag_s: f64,
@@ -17,11 +17,12 @@ pub(super) struct Steering {
 
 /// The solution of `|v| dz/dt = G z + v steer δ(t)` for a speed v, from a state z.
 ///
-/// δ is `told + (δ - told) e^(-t / lag)`, so a particular solution is `c + d e^(-t / lag)` with
-/// `G c = -v steer told` and `(G + |v| / lag) d = -v steer (δ - told)`; what remains decays as the
-/// matrix exponential of `G t / |v|`. All is finite as v goes to 0, where z is 0 at once: the car rolls
-/// as it is steered. `G + |v| / lag` is regular wherever no eigenvalue is that of the lag, -10 1/s: they
-/// are below -14 at up to 10 m/s backwards, and forwards below -23 or complex.
+/// The steering angle is `target + (δ - target) e^(-t / lag)`, so a particular solution is `c + d e^(-t / lag)`
+/// with `G c = -v steer target` and `(G + |v| / lag) d = -v steer (δ - target)`. The remainder decays as the
+/// matrix exponential of `G t / |v|`. Everything stays finite as v goes to 0, where z becomes 0 at once: the car
+/// rolls in the direction of its wheels. `G + |v| / lag` is regular unless an eigenvalue equals the rate of the
+/// lag, -10 1/s: the eigenvalues are below -14 1/s at up to 10 m/s backwards, and forwards below -23 1/s or
+/// complex.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ConstantSpeed {
     speed_m_s: f64,
@@ -33,7 +34,7 @@ pub(super) struct ConstantSpeed {
 }
 
 impl Steering {
-    /// The angle after a time in seconds.
+    /// The angle after a time in seconds, in radians.
     pub(super) fn after(&self, time_s: f64) -> f64 {
         self.target_rad + (self.angle_rad - self.target_rad) * (-time_s / self.lag_s).exp()
     }
@@ -55,18 +56,18 @@ impl ConstantSpeed {
         Self { speed_m_s, lag_s, matrix, settled, lagging, fading }
     }
 
-    /// Lateral velocity (m/s) and yaw rate (rad/s) after a time in seconds, and by how much the car has
-    /// turned until then, in radians.
+    /// Lateral velocity (m/s) and yaw rate (rad/s) after a time in seconds, and the change of heading until
+    /// then, in radians.
     pub(super) fn after(&self, time_s: f64) -> (DVec2, f64) {
         let lag = (-time_s / self.lag_s).exp();
         let stretch_s2_m = time_s / self.speed_m_s.abs();
-        // At a crawl the slowest eigenvalue of G is -178 m/s²: e^-1780 is less than an f64 can be.
+        // At very low speed the slowest eigenvalue of G is -178 m/s²: e^-1780 underflows f64.
         let faded = if stretch_s2_m < 10.0 {
             exponential(self.matrix * stretch_s2_m) * self.fading
         } else {
             DVec2::ZERO
         };
-        // Of G t / |v| the integral of the exponential is |v| G^-1 (e^(G t / |v|) - 1).
+        // The integral of e^(G t / |v|) is |v| G^-1 (e^(G t / |v|) - 1).
         let turned = self.settled * time_s
             + self.lagging * (self.lag_s * (1.0 - lag))
             + self.matrix.inverse() * (faded - self.fading) * self.speed_m_s.abs();
@@ -75,8 +76,8 @@ impl ConstantSpeed {
 }
 
 /// The exponential of a matrix: `e^μ (cosh ν + sinh ν / ν (M - μ))`, where μ is half its trace and
-/// `(M - μ)² = ν²`. With ν² below 0 these are cosine and sine; none of it overflows where the real parts
-/// of the eigenvalues `μ ± ν` are not positive.
+/// `(M - μ)² = ν²` (Cayley-Hamilton). For negative ν² the hyperbolic functions become cosine and sine. Nothing
+/// overflows if the real parts of the eigenvalues `μ ± ν` are not positive.
 fn exponential(matrix: DMat2) -> DMat2 {
     let mean = 0.5 * (matrix.x_axis.x + matrix.y_axis.y);
     let rest = matrix - DMat2::from_diagonal(DVec2::splat(mean));

@@ -1,4 +1,4 @@
-//! The kinematic model over a step: an arc, exactly.
+//! One step of the kinematic model: an exact circular arc.
 
 use glam::DVec2;
 
@@ -7,8 +7,8 @@ use super::single_track::SingleTrackState;
 use super::speed::Drive;
 use super::vehicle::Vehicle;
 
-/// The car after a step in seconds of constant acceleration and curvature, which it has at once, its speed
-/// within bounds that 0 lies in (m/s). It rolls without slipping.
+/// The state after a step of constant acceleration and curvature, which apply without lag. The speed stays
+/// within `bounds_m_s`, which must contain 0. The car rolls without slip.
 pub(super) fn rolled(
     from: &SingleTrackState,
     car: &Vehicle,
@@ -17,7 +17,7 @@ pub(super) fn rolled(
     bounds_m_s: [f64; 2],
 ) -> SingleTrackState {
     let Action { acceleration_m_s2, curvature_1_m } = action;
-    // A drive that gives what it is told has no lag, whatever the number.
+    // A drive that already delivers its setpoint is not affected by the lag.
     let drive = Drive {
         speed_m_s: from.speed_m_s,
         acceleration_m_s2,
@@ -44,12 +44,13 @@ pub(super) fn rolled(
     }
 }
 
-/// The way along an arc, in the frame of its start (metres along x forward and y left), and by how much
-/// it turns, in radians: `(sin(κ s) / κ, (1 - cos(κ s)) / κ)`, which has no 0 / 0 as written here.
+/// Displacement along an arc in the frame of its start (metres, x forward and y left), and the change of
+/// heading, in radians: `(sin(κ s) / κ, (1 - cos(κ s)) / κ)`, computed as a chord at half the angle, which
+/// avoids 0 / 0.
 pub(super) fn arc(length_m: f64, curvature_1_m: f64) -> (DVec2, f64) {
     let half = 0.5 * length_m * curvature_1_m;
     let chord_m = if half.abs() < 1e-4 {
-        // sin h / h = 1 - h²/6, up to 1e-18.
+        // sin h / h = 1 - h²/6 with an error below 1e-18.
         length_m * (1.0 - half * half / 6.0)
     } else {
         length_m * half.sin() / half

@@ -1,4 +1,4 @@
-//! A trajectory that an agent wants to drive: where it wants to be, and when.
+//! A trajectory that an agent sends to be followed: timed poses, and the reference that the tracker derives.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -8,48 +8,49 @@ use wildcity_scene::geometry::Pose;
 
 use super::EgoError;
 
-/// Where to be at a time.
+/// A pose at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TimedPose {
     /// Time since the step's start, in microseconds.
     pub time_us: i64,
-    /// `rig(start)_from_rig`: the pose in the frame of the rig as it is when the step starts.
+    /// `rig(start)_from_rig`: the pose in the frame of the rig at the start of the step.
     pub start_from_rig: Pose,
 }
 
-/// 1 to [`limits::PATH_POSES`] poses in order of time; it begins where the rig is, at time 0.
+/// 1 to [`limits::PATH_POSES`] poses in order of time. The trajectory starts at time 0 at the pose of the rig.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Path {
     poses: Vec<TimedPose>,
 }
 
-/// What the path wants at a time, in the plane of the rig as it is when the step starts.
+/// The reference at a time, in the plane of the rig at the start of the step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ReferenceState {
-    /// Where, in metres.
+    /// Position, in metres.
     pub(super) position_m: DVec2,
     /// Heading, in radians.
     pub(super) yaw_rad: f64,
     /// Speed along the heading, in m/s; below 0 backwards.
     pub(super) speed_m_s: f64,
-    /// How speed changes, in m/s².
+    /// Acceleration along the heading, in m/s².
     pub(super) acceleration_m_s2: f64,
     /// Yaw rate, in rad/s.
     pub(super) yaw_rate_rad_s: f64,
 }
 
-/// The path's poses in the plane, with the speeds that they imply.
+/// The poses of a path projected to the plane, with speeds, accelerations and yaw rates from finite differences.
 #[derive(Debug)]
 pub(super) struct ReferenceTrajectory {
+    /// Times in seconds, and the reference then.
     knots: Vec<(f64, ReferenceState)>,
 }
 
 impl Path {
-    /// A path from outside.
+    /// A path from untrusted input.
     ///
     /// # Errors
-    /// There are no poses or too many, or their times do not rise from above 0 to at most
+    /// There are no poses or too many, or their times do not increase strictly from above 0 to at most
     /// [`limits::PATH_US`].
     pub fn checked(poses: Vec<TimedPose>) -> Result<Self, EgoError> {
         if !(1..=limits::PATH_POSES).contains(&poses.len()) {
@@ -67,17 +68,17 @@ impl Path {
         Ok(Self { poses })
     }
 
-    /// Its poses.
+    /// The poses.
     pub fn poses(&self) -> &[TimedPose] {
         &self.poses
     }
 
-    /// When it ends, in microseconds.
+    /// Time of the last pose, in microseconds.
     pub fn end_us(&self) -> i64 {
         self.poses.last().map_or(0, |pose| pose.time_us)
     }
 
-    /// `rig(start)_from_rig` at a time within the path: linear between its poses.
+    /// `rig(start)_from_rig` at a time within the path, interpolated between its poses.
     pub(super) fn at(&self, time_us: i64) -> Pose {
         let mut before = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
         for pose in &self.poses {
@@ -93,8 +94,8 @@ impl Path {
         before.start_from_rig
     }
 
-    /// What it wants in the plane, by its own poses: where the rig is counts only beside a single one. Else
-    /// a rig that is behind would find a path that begins fast and brakes.
+    /// The reference in the plane, from the path's own poses. The rig's present pose is added only if the path
+    /// has a single pose. Otherwise a rig that lags behind would get a reference that starts fast and brakes.
     pub(super) fn reference(&self) -> ReferenceTrajectory {
         let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
         let start = (self.poses.len() == 1).then_some(start);
@@ -108,7 +109,7 @@ impl Path {
             })
             .collect();
         let last = places.len() - 1;
-        // Differences across each pose; at the ends those of the first and the last stretch.
+        // Central differences at each pose; one-sided at the ends.
         let moved = |k: usize| {
             let (from, to) = (places[k.saturating_sub(1)], places[(k + 1).min(last)]);
             let (way_m, seconds) = (to.1 - from.1, to.0 - from.0);
@@ -137,8 +138,8 @@ impl Path {
 }
 
 impl ReferenceTrajectory {
-    /// What is wanted at a time in seconds: before the first pose as it would have come there, after the
-    /// last what is wanted there.
+    /// The reference at a time in seconds: interpolated; before the first pose extrapolated backwards; after the
+    /// last pose that of the last.
     pub(super) fn at(&self, time_s: f64) -> ReferenceState {
         let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
         let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };
@@ -158,7 +159,7 @@ impl ReferenceTrajectory {
 }
 
 impl ReferenceState {
-    /// The same some seconds earlier, at constant acceleration and yaw rate.
+    /// Extrapolates this state to some seconds earlier, with constant acceleration and yaw rate.
     fn before(&self, seconds: f64) -> Self {
         let speed_m_s = self.speed_m_s - seconds * self.acceleration_m_s2;
         let yaw_rad = self.yaw_rad - seconds * self.yaw_rate_rad_s;
@@ -168,7 +169,7 @@ impl ReferenceState {
     }
 }
 
-/// An angle from -π to π, in radians.
+/// The angle wrapped to -π to π, in radians.
 pub(super) fn wrapped(angle_rad: f64) -> f64 {
     let turns = (angle_rad / std::f64::consts::TAU).round();
     angle_rad - turns * std::f64::consts::TAU

@@ -1,4 +1,4 @@
-//! The dynamic single track over a step: speed, steering, sliding and turning, and where that leads.
+//! One step of the linear single-track model: speed, steering, lateral velocity, yaw rate, and the pose.
 
 use glam::DVec2;
 
@@ -7,12 +7,12 @@ use super::constant_speed::{ConstantSpeed, Steering};
 use super::speed::{Drive, Phase};
 use super::vehicle::{LateralDynamics, Vehicle};
 
-/// A car in the plane.
+/// The state of a car in the plane.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SingleTrackState {
-    /// Where the middle of the rear axle is, in metres.
+    /// Position of the middle of the rear axle, in metres.
     pub position_m: DVec2,
-    /// Where the car heads, in radians from the x axis, to the left.
+    /// Heading, in radians from the x axis, positive to the left.
     pub yaw_rad: f64,
     /// Speed along the car, in m/s; below 0 backwards.
     pub speed_m_s: f64,
@@ -22,11 +22,11 @@ pub struct SingleTrackState {
     pub yaw_rate_rad_s: f64,
     /// Angle of the front wheels, in radians, to the left.
     pub steering_rad: f64,
-    /// What the drive gives, in m/s².
+    /// Acceleration that the drive delivers, in m/s².
     pub acceleration_m_s2: f64,
 }
 
-/// What steering and drive are told, constant over a step.
+/// Setpoints of steering and drive, constant over a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Setpoint {
     /// Acceleration along the car, in m/s².
@@ -35,35 +35,44 @@ pub struct Setpoint {
     pub steering_rad: f64,
 }
 
-/// How much longer a piece is than the one before it: what decays at a rate λ has fallen to `e^(-2 x)` of
-/// itself when a piece is x / λ long, and five points leave at most 7e-9 of that (x = 5).
+/// Ratio of the lengths of consecutive intervals. A transient that decays at a rate λ has fallen to `e^(-2 x)` of
+/// its initial value when an interval is x / λ long, and collocation at five points leaves an error of at most
+/// 7e-9 of that (at x = 5).
 const GROWTH: f64 = 1.5;
 
-/// Longest piece, as a part of the lag: what lags is then a polynomial up to 1e-15 of itself.
+/// Largest length of an interval, as a fraction of the lag: the exponential of the lag is then a polynomial
+/// with a relative error of 1e-15.
 const LONGEST_LAGS: f64 = 0.25;
 
-/// Below this speed, in m/s, pieces get no shorter. What slides there after a change of steering is
-/// `v² δ' / 178²` or 3e-9 m/s at most, for 6 µs.
+/// Below this speed, in m/s, intervals get no shorter. The lateral velocity after a change of steering is at
+/// most `v² δ' / 178²`, 3e-9 m/s, for 6 µs.
 const CRAWL_M_S: f64 = 1e-3;
 
 impl SingleTrackState {
-    /// The car after a step in seconds, its speed within bounds that 0 lies in (m/s).
+    /// The state after a step of `step_s` seconds. The speed stays within `bounds_m_s` (smallest and largest,
+    /// in m/s), which must contain 0.
     ///
-    /// Exact at constant speed. While speed changes, sliding and turning are collocated in pieces, with
-    /// an error below 1e-9 (m, rad, m/s) of a step of 0.1 s at every speed; so is, in either case, the
-    /// integral of the way, whose rule is exact to degree 8.
+    /// Exact at constant speed. While speed changes, lateral velocity and yaw rate are collocated in intervals,
+    /// with an error below 1e-9 (m, rad, m/s) for a step of 0.1 s at every speed. The pose is integrated in both
+    /// cases by the quadrature of the same nodes, which is exact to degree 8 and has the same error.
     #[must_use]
-    pub fn after(&self, car: &Vehicle, told: Setpoint, step_s: f64, bounds_m_s: [f64; 2]) -> Self {
+    pub fn after(
+        &self,
+        car: &Vehicle,
+        setpoint: Setpoint,
+        step_s: f64,
+        bounds_m_s: [f64; 2],
+    ) -> Self {
         let tyres = car.tyres();
         let drive = Drive {
             speed_m_s: self.speed_m_s,
             acceleration_m_s2: self.acceleration_m_s2,
-            target_m_s2: told.acceleration_m_s2,
+            target_m_s2: setpoint.acceleration_m_s2,
             lag_s: car.lag_s,
         };
         let steering = Steering {
             angle_rad: self.steering_rad,
-            target_rad: told.steering_rad,
+            target_rad: setpoint.steering_rad,
             lag_s: car.lag_s,
         };
         let (phases, acceleration_m_s2) = drive.phases(step_s, bounds_m_s);
@@ -89,7 +98,7 @@ impl SingleTrackState {
         let (mut begun_s, mut piece_s) = (0.0, (1.0 / fastest_1_s).min(longest_s));
         while begun_s < phase.duration_s {
             let left_s = phase.duration_s - begun_s;
-            // A last piece that is a mere rest of rounding would be as good as none.
+            // Extend the last interval instead of adding one that only covers a rounding error.
             let last = left_s <= 1.01 * piece_s;
             let end_s = if last { phase.duration_s } else { begun_s + piece_s };
             let angle_rad = steering.after(begun_s);
@@ -102,13 +111,14 @@ impl SingleTrackState {
         }
         self.speed_m_s = phase.end_m_s;
         if self.speed_m_s == 0.0 {
-            // What G z = 0 says.
-            (self.lateral_m_s, self.yaw_rate_rad_s) = (0.0, 0.0);
+            // At v = 0 the equation is G z = 0.
+            self.lateral_m_s = 0.0;
+            self.yaw_rate_rad_s = 0.0;
         }
         self
     }
 
-    /// Drives a piece of which the points are known.
+    /// Integrates the pose over an interval whose nodes are known.
     fn drive(&mut self, car: &Vehicle, points: &[Point; POINTS], length_s: f64) {
         let mut way_m = DVec2::ZERO;
         for (point, weight) in points.iter().zip(INTEGRALS[POINTS - 1]) {
@@ -119,19 +129,23 @@ impl SingleTrackState {
         let end = points[POINTS - 1];
         self.position_m += length_s * way_m;
         self.yaw_rad += end.turned_rad;
-        (self.lateral_m_s, self.yaw_rate_rad_s) = (end.sideways.x, end.sideways.y);
+        self.lateral_m_s = end.sideways.x;
+        self.yaw_rate_rad_s = end.sideways.y;
     }
 }
 
-/// A part of a phase.
+/// One integration interval of a phase.
 struct Piece {
+    /// Start within the phase, in seconds.
     begun_s: f64,
     length_s: f64,
+    /// Steering at the start of the interval.
     steering: Steering,
+    /// Lateral velocity (m/s) and yaw rate (rad/s) at the start of the interval.
     sideways: DVec2,
 }
 
-/// What is known of a moment of a piece.
+/// The state at a node of an interval.
 #[derive(Clone, Copy)]
 struct Point {
     speed_m_s: f64,

@@ -1,56 +1,57 @@
-//! Speed over a step: what is told to the drive comes with a lag, and speed stays within bounds.
+//! Speed over a step: the drive follows its setpoint with a lag, and speed stays within bounds.
 
-/// A stretch of a step in which speed is constant, or moves without a bound and without changing sign.
+/// A part of a step in which speed is constant, or changes without reaching a bound or changing sign.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Phase {
-    /// How long it lasts, in seconds; above zero.
+    /// Duration, in seconds; above zero.
     pub(super) duration_s: f64,
-    /// Whether speed is constant: at a bound, or because nothing pushes.
+    /// Whether speed is constant: at a bound, or without acceleration.
     pub(super) held: bool,
-    /// Speed and drive at its start.
+    /// Speed and drive at the start.
     pub(super) drive: Drive,
-    /// Speed at its end, in m/s: exactly the bound, or 0, where it ends there.
+    /// Speed at the end, in m/s: exactly the bound or 0 if the phase ends there.
     pub(super) end_m_s: f64,
 }
 
-/// Speed and its drive: the acceleration `a` follows what it is told, `da/dt = (told - a) / lag`.
+/// Speed and drive: the acceleration `a` follows its setpoint with a first-order lag,
+/// `da/dt = (target - a) / lag`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Drive {
     /// Speed, in m/s; below 0 backwards.
     pub(super) speed_m_s: f64,
-    /// What the drive gives, in m/s²; at a bound of speed more than happens.
+    /// Acceleration that the drive delivers, in m/s²; at a bound of speed the actual acceleration is 0.
     pub(super) acceleration_m_s2: f64,
-    /// What it is told to give, in m/s².
+    /// Setpoint of the acceleration, in m/s².
     pub(super) target_m_s2: f64,
     /// Its lag, in seconds.
     pub(super) lag_s: f64,
 }
 
 impl Drive {
-    /// Speed after a time in seconds, if no bound holds it.
+    /// Speed after a time in seconds, without bounds, in m/s.
     pub(super) fn speed_after(&self, time_s: f64) -> f64 {
-        // The integral of a(t) = told + (a - told) e^(-t / lag).
+        // The integral of a(t) = target + (a - target) e^(-t / lag).
         let lagging = self.lag_s * -(-time_s / self.lag_s).exp_m1();
         self.speed_m_s
             + self.target_m_s2 * time_s
             + (self.acceleration_m_s2 - self.target_m_s2) * lagging
     }
 
-    /// What the drive gives after a time in seconds, in m/s².
+    /// Acceleration that the drive delivers after a time in seconds, in m/s².
     pub(super) fn acceleration_after(&self, time_s: f64) -> f64 {
         let lacking = self.acceleration_m_s2 - self.target_m_s2;
         self.target_m_s2 + lacking * (-time_s / self.lag_s).exp()
     }
 
-    /// Cuts a step into phases; also what the drive gives at its end. `bounds_m_s` hold the speed, 0 lies
-    /// within or on them. At most one change of the acceleration's sign, two bounds and a standstill lie
-    /// in a step: six phases.
+    /// Divides a step into phases; also returns the drive's acceleration at its end. `bounds_m_s` are the
+    /// smallest and largest speed and contain 0. A step has at most one change of the acceleration's sign, two
+    /// bounds and a standstill: six phases.
     pub(super) fn phases(mut self, step_s: f64, bounds_m_s: [f64; 2]) -> (Vec<Phase>, f64) {
         let mut phases = Vec::new();
         let mut left_s = step_s;
         while left_s > 0.0 {
             let turns_s = self.turns_after().unwrap_or(f64::INFINITY);
-            // At rest it begins as it is told.
+            // Without acceleration, the setpoint decides the direction of the change.
             let pushes = match self.acceleration_m_s2 {
                 0.0 => self.target_m_s2,
                 given => given,
@@ -73,16 +74,16 @@ impl Drive {
         (phases, self.acceleration_m_s2)
     }
 
-    /// When the drive changes from braking to pushing or back, in seconds, if it does.
+    /// Time until the acceleration changes its sign, in seconds, if it does.
     fn turns_after(&self) -> Option<f64> {
-        // told + (a - told) e^(-t / lag) = 0.
+        // Solve target + (a - target) e^(-t / lag) = 0.
         let opposed = self.acceleration_m_s2 * self.target_m_s2 < 0.0;
         let ratio = (self.target_m_s2 - self.acceleration_m_s2) / self.target_m_s2;
         opposed.then(|| self.lag_s * ratio.ln()).filter(|time_s| *time_s > 0.0)
     }
 
-    /// How long speed, which only rises or only falls for `most_s`, moves without reaching a bound or 0;
-    /// and where it is then.
+    /// Time until speed, which is monotone for `most_s`, reaches a bound or 0, at most `most_s`; and the speed
+    /// then.
     fn free(&self, most_s: f64, bounds_m_s: [f64; 2]) -> (f64, f64) {
         let end_m_s = self.speed_after(most_s);
         let [low, high] = bounds_m_s;
@@ -97,8 +98,9 @@ impl Drive {
         let reached = [low, 0.0, high].into_iter().filter(between);
         let first = if rises { reached.reduce(f64::min) } else { reached.reduce(f64::max) };
         let Some(target_m_s) = first else { return (most_s, end_m_s) };
-        // Halving 64 times leaves no f64 between; Newton's method would need care where a = 0.
-        let (mut before_s, mut after_s) = (0.0, most_s);
+        // 64 bisections leave no f64 between the bounds; Newton's method would need care where a = 0.
+        let mut before_s = 0.0;
+        let mut after_s = most_s;
         for _ in 0..64 {
             let middle_s = 0.5 * (before_s + after_s);
             if (self.speed_after(middle_s) < target_m_s) == rises {

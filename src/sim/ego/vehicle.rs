@@ -1,11 +1,11 @@
-//! The numbers of a car.
+//! Parameters of the single-track model.
 
 use glam::{DMat2, DVec2};
 
-/// A single track: both wheels of an axle are one, in the middle.
+/// Parameters of the single-track model, in which both wheels of an axle are merged into one in its middle.
 ///
-/// The default's numbers are those of the vehicle model of NVIDIA's AlpaSim (a Ford Fusion), which gives
-/// the stiffness of one wheel and doubles it for the axle; so do we.
+/// The defaults are those of the vehicle model of NVIDIA's AlpaSim (a Ford Fusion). As there, stiffness is given
+/// per wheel and doubled for the axle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vehicle {
     /// Mass, in kg.
@@ -20,16 +20,17 @@ pub struct Vehicle {
     pub front_wheel_n_rad: f64,
     /// Cornering stiffness of one rear wheel, in N/rad.
     pub rear_wheel_n_rad: f64,
-    /// Time in which steering and drive come within 1/e of what they are told, in seconds.
+    /// Time constant of the lag of steering and drive, in seconds.
     pub lag_s: f64,
 }
 
-/// How a vehicle moves sideways at speed v, forwards or backwards, with z the lateral velocity of its
-/// centre of gravity (m/s, to the left) and its yaw rate (rad/s, to the left):
+/// The lateral dynamics at speed v, forwards or backwards. The state z is the lateral velocity of the centre of
+/// gravity (m/s, positive to the left) and the yaw rate (rad/s, positive to the left):
 /// `|v| dz/dt = (grip + v |v| turning) z + v steer δ`.
 ///
-/// It is Newton's law for linear tyres, whose force is stiffness times slip, `(u - v δ) / |v|` for a
-/// wheel with the lateral velocity u, times |v|: so nothing is divided by v, and at v = 0 it says z = 0.
+/// These are Newton's equations with linear tyres (Rajamani, "Vehicle Dynamics and Control", 2.3), multiplied by
+/// |v|. The lateral force of a tyre is its stiffness times its slip angle, `(u - v δ) / |v|` for a wheel with
+/// lateral velocity u. After the multiplication nothing is divided by v, and v = 0 gives z = 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct LateralDynamics {
     grip: DMat2,
@@ -37,7 +38,7 @@ pub(super) struct LateralDynamics {
 }
 
 impl Vehicle {
-    /// What every ego drives.
+    /// The parameters of every ego.
     pub const DEFAULT: Self = Self {
         mass_kg: 2014.4,
         inertia_kg_m2: 3414.2,
@@ -48,22 +49,27 @@ impl Vehicle {
         lag_s: 0.1,
     };
 
-    /// The steering angle, in radians, with which the car comes to drive a curvature, in 1/m, at a speed.
+    /// The steering angle, in radians, that gives a curvature (1/m) in steady state at a speed (m/s).
     ///
-    /// In a steady turn the tyres slip: `δ = κ (L + K v²)`, `K = m (l_r C_r - l_f C_f) / (2 L C_f C_r)`,
-    /// by setting dz/dt = 0. K is 0.0035 s²/m here: the car understeers.
+    /// Setting dz/dt = 0 gives `δ = κ (L + K v²)` with the understeer gradient
+    /// `K = m (l_r C_r - l_f C_f) / (2 L C_f C_r)` (Rajamani, 3.1.3). K is 0.0035 s²/m for the default vehicle: it
+    /// understeers.
     pub fn steering_rad(&self, curvature_1_m: f64, speed_m_s: f64) -> f64 {
         let Self { mass_kg, rear_to_cg_m, wheelbase_m, .. } = *self;
-        let (front, rear) = (self.front_wheel_n_rad, self.rear_wheel_n_rad);
+        let front = self.front_wheel_n_rad;
+        let rear = self.rear_wheel_n_rad;
         let moment = rear_to_cg_m * rear - (wheelbase_m - rear_to_cg_m) * front;
         let understeer_s2_m = mass_kg * moment / (2.0 * wheelbase_m * front * rear);
         curvature_1_m * (wheelbase_m + understeer_s2_m * speed_m_s * speed_m_s.abs())
     }
 
     pub(super) fn tyres(&self) -> LateralDynamics {
-        let (front, rear) = (2.0 * self.front_wheel_n_rad, 2.0 * self.rear_wheel_n_rad);
-        let (rear_m, front_m) = (self.rear_to_cg_m, self.wheelbase_m - self.rear_to_cg_m);
-        let (mass, inertia) = (self.mass_kg, self.inertia_kg_m2);
+        let front = 2.0 * self.front_wheel_n_rad;
+        let rear = 2.0 * self.rear_wheel_n_rad;
+        let rear_m = self.rear_to_cg_m;
+        let front_m = self.wheelbase_m - self.rear_to_cg_m;
+        let mass = self.mass_kg;
+        let inertia = self.inertia_kg_m2;
         let moment = front_m * front - rear_m * rear;
         let turn = front_m * front_m * front + rear_m * rear_m * rear;
         LateralDynamics {
@@ -77,16 +83,16 @@ impl Vehicle {
 }
 
 impl LateralDynamics {
-    /// The matrix of `|v| dz/dt = G z + v steer δ`, in m/s².
+    /// The matrix G of `|v| dz/dt = G z + v steer δ`, in m/s².
     pub(super) fn matrix(&self, speed_m_s: f64) -> DMat2 {
         let mut matrix = self.grip;
         matrix.y_axis.x -= speed_m_s * speed_m_s.abs();
         matrix
     }
 
-    /// The fastest decay at low speed, times speed, in m/s²: 438 of the default car.
+    /// The rate of the fastest decay at low speed times the speed, in m/s²: 438 for the default vehicle.
     pub(super) fn stiffness_m_s2(&self) -> f64 {
-        // The larger eigenvalue of a matrix whose eigenvalues are real and negative.
+        // The larger magnitude of the two eigenvalues, which are real and negative.
         let half = 0.5 * (self.grip.x_axis.x + self.grip.y_axis.y);
         -half + (half * half - self.grip.determinant()).max(0.0).sqrt()
     }
