@@ -1,24 +1,24 @@
-//! Merging Gaussians by their moments, and what that costs.
+//! Merging two Gaussians by moment matching, and the cost of a merge.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// A Gaussian with the moments that merging needs.
+/// A Gaussian with its moments.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Node {
-    /// Centre, in metres.
+    /// Mean, in metres.
     pub(super) mean_m: DVec3,
     /// Covariance, in m².
     pub(super) cov_m2: DMat3,
-    /// Standard deviations along the own axes, in metres.
+    /// Standard deviations along the principal axes, in metres.
     pub(super) scale_m: DVec3,
-    /// The own axes, as columns.
+    /// Principal axes, as columns.
     pub(super) axes: DMat3,
     /// Opacity times [`area_m2`].
     pub(super) weight: f64,
 }
 
-/// The measure of how much a Gaussian covers: proportional to the mean of its three projections
-/// along its own axes. Two flat neighbours merge into a flat one of their areas' sum, if they touch.
+/// A measure of the area that a Gaussian covers: proportional to the mean area of its projections along its three
+/// principal axes. Two flat neighbours that touch merge into a flat Gaussian with the sum of their areas.
 pub(super) fn area_m2(scale_m: DVec3) -> f64 {
     let DVec3 { x, y, z } = scale_m;
     x * y + y * z + z * x
@@ -39,23 +39,23 @@ impl Node {
         self.scale_m.max_element()
     }
 
-    /// Opacity of the peak; above 1 where much lay on top of each other.
+    /// Opacity of the peak; above 1 where several Gaussians overlapped.
     pub(super) fn opacity(&self) -> f64 {
         self.weight / area_m2(self.scale_m)
     }
 
-    /// The own axes as a unit quaternion (w, x, y, z).
+    /// The principal axes as a unit quaternion (w, x, y, z).
     pub(super) fn quat_wxyz(&self) -> [f64; 4] {
         let q = DQuat::from_mat3(&self.axes).normalize();
         [q.w, q.x, q.y, q.z]
     }
 }
 
-/// The first two moments of two Gaussians by weight; `scale_m` and `axes` are still to be found by
-/// [`Node::diagonalise`].
+/// The merge of two Gaussians: the first two moments of their weighted mixture. `scale_m` and `axes` are invalid
+/// until [`Node::diagonalise`] is called.
 pub(super) fn joined(a: &Node, b: &Node) -> Node {
     let weight = a.weight + b.weight;
-    // Two that cannot be seen are equally important.
+    // Two invisible Gaussians get equal shares.
     let share = if weight > 0.0 { b.weight / weight } else { 0.5 };
     let offset = b.mean_m - a.mean_m;
     let mean_m = a.mean_m + share * offset;
@@ -66,7 +66,7 @@ pub(super) fn joined(a: &Node, b: &Node) -> Node {
 }
 
 impl Node {
-    /// Finds the own axes and the standard deviations along them.
+    /// Computes principal axes and standard deviations from the covariance.
     pub(super) fn diagonalise(&mut self) {
         let (squares, axes) = eigen(self.cov_m2);
         self.scale_m = squares.max(DVec3::ZERO).map(f64::sqrt);
@@ -74,12 +74,11 @@ impl Node {
     }
 }
 
-/// How different two Gaussians look from their merger: the squared L2 norm of the difference of the
-/// fields, divided by that of what was there, 0 to about 1.
+/// The cost of a merge: the squared L2 norm of the difference between the fields before and after, relative to that
+/// of the field before; 0 to about 1.
 ///
-/// A field is `weight x normal density x (1, colour)`, seen through a blur of `blur_m2`, so that
-/// what a pixel cannot resolve does not count. `∫ N(a, A) N(b, B) = N(a - b; 0, A + B)`: six
-/// closed-form terms, of which four remain since the merger's weight is the sum.
+/// A field is `weight x normal density x (1, colour)`, blurred with variance `blur_m2` so that details that a pixel
+/// cannot resolve do not count. With `∫ N(a, A) N(b, B) = N(a - b; 0, A + B)` all six terms have a closed form.
 pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_m2: f64) -> f64 {
     let share = if merged.weight > 0.0 { b.weight / merged.weight } else { 0.5 };
     let colour = colours[0].lerp(colours[1], share);
@@ -98,7 +97,7 @@ pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_
 fn overlap(a: &Node, b: &Node, blur_m2: f64) -> f64 {
     let sum = a.cov_m2 + b.cov_m2 + DMat3::from_diagonal(DVec3::splat(2.0 * blur_m2));
     let offset = b.mean_m - a.mean_m;
-    // Cofactors: the rows of the inverse times the determinant.
+    // Solve by Cramer's rule: the cofactor rows are the inverse times the determinant.
     let [x, y, z] = [sum.x_axis, sum.y_axis, sum.z_axis];
     let (yz, zx, xy) = (y.cross(z), z.cross(x), x.cross(y));
     let determinant = x.dot(yz);
@@ -110,8 +109,8 @@ fn outer(v: DVec3) -> DMat3 {
     DMat3::from_cols(v * v.x, v * v.y, v * v.z)
 }
 
-/// Eigenvalues and a right-handed set of eigenvectors of a symmetric matrix, by Jacobi's rotations:
-/// each makes one entry zero, and five rounds leave nothing of f64's.
+/// Eigenvalues and a right-handed set of eigenvectors of a symmetric matrix, by Jacobi rotations. Each rotation makes
+/// one off-diagonal entry zero; five rounds reach the accuracy of f64.
 fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
     let mut vectors = DMat3::IDENTITY;
     for _ in 0..8 {

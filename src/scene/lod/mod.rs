@@ -14,34 +14,35 @@ use super::sh;
 
 use merge::{Node, cost, joined};
 
-/// One level of detail of one block.
+/// One level of detail of a block.
 #[derive(Clone, Debug)]
 pub struct Level {
-    /// How far anything of level 0 was moved or cut short, at most, in metres; 0 for level 0.
+    /// Upper bound, in metres, of how far a Gaussian of level 0 was moved plus 3 times the standard deviation that
+    /// it lost; 0 for level 0.
     pub error_m: f32,
-    /// Its Gaussians.
+    /// The Gaussians.
     pub chunk: Chunk,
 }
 
-/// The finest limit, in metres: a pixel of 1 mm is one of 1800 px focal length at 1.8 m.
+/// The finest limit, in metres: about the size of a pixel at 1.8 m with a focal length of 1800 px.
 const FINEST_LIMIT_M: f64 = 1.0 / 1024.0;
-/// The coarsest limit, in metres: a pixel at 29 km.
+/// The coarsest limit, in metres: the size of such a pixel at 29 km.
 const COARSEST_LIMIT_M: f64 = 16.0;
-/// A level is kept if it has at most so much of the Gaussians of the one kept before: all levels
-/// above 0 together take at most 0.65 / 0.35 = 1.9 times level 0, and half of that is usual.
+/// A level is kept if it has at most this share of the Gaussians of the previously kept level. So all levels
+/// above 0 together have at most 0.65 / 0.35 = 1.9 times as many as level 0; half of that is usual.
 const KEPT_SHARE: f64 = 0.65;
-/// Nothing is merged below so many: a block is one chunk of the renderer, and one group of lanes.
+/// Merging stops at this number: a block is one chunk with at least one lane group.
 const FEWEST: usize = 16;
-/// Gaussians in Morton order that are paired among themselves.
+/// Number of consecutive Gaussians in Morton order among which pairs are formed.
 const GROUP: usize = 64;
-/// How far along the order a partner is looked for.
+/// A partner is searched among this many successors in the order.
 const PARTNERS: usize = 16;
-/// Rounds of pairing under one limit, at most: each at most halves a block.
+/// Largest number of pairing rounds per limit; each round at most halves a block.
 const ROUNDS: usize = 8;
-/// A merger that changes the fields by more than this share is not made. On the demo street, 0.02
-/// draws as many Gaussians at any tau as 0.2, with 1 dB less noise.
+/// Largest accepted cost of a merge, as a share of the fields' norm. On the demo street, 0.02 draws as many
+/// Gaussians at any tau as 0.2, with 1 dB less noise.
 const MOST_COST: f64 = 0.02;
-/// Variance that the renderer adds on the screen, in px²: what it hides costs nothing.
+/// Variance that the renderer adds on the screen, in px²: differences that this blur hides have no cost.
 const BLUR_PX2: f64 = 0.3;
 
 /// The levels above 0 of a block, coarser and coarser; none if merging does not pay.
@@ -63,22 +64,22 @@ pub fn levels(block: &Chunk) -> Vec<Level> {
     kept
 }
 
-/// A block on its way to coarser levels.
+/// The state of merging a block into coarser levels.
 struct Merging {
     nodes: Vec<Node>,
-    /// Largest error of what a node stands for, in metres.
+    /// Largest error over the Gaussians of level 0 that each node represents, in metres.
     errors_m: Vec<f64>,
-    /// `[node, coefficient, channel]`.
+    /// SH coefficients, `[node, coefficient, channel]`.
     sh: Vec<f32>,
-    /// Floats of one node's colour.
+    /// Number of floats of one node in `sh`.
     stride: usize,
-    /// Centre and largest standard deviation of every Gaussian of level 0, in metres.
+    /// Mean and largest standard deviation of every Gaussian of level 0 (a leaf), in metres.
     leaves: Vec<(DVec3, f64)>,
-    /// The node that stands for each of them.
+    /// The node that represents each leaf.
     node_of_leaf: Vec<u32>,
 }
 
-/// A pair that may be merged.
+/// A candidate pair for merging.
 struct Pair {
     cost: f64,
     first: usize,
@@ -109,11 +110,11 @@ impl Merging {
         merging
     }
 
-    /// Merges until nothing more can be merged without an error above the limit.
+    /// Merges pairs until none is left whose error stays within the limit, or the rounds are used up.
     fn merge_within(&mut self, limit_m: f64) {
         for round in 0..ROUNDS {
             let before = self.nodes.len();
-            // Every other round pairs across the borders of the groups before.
+            // Every other round shifts the groups by half, so that pairs cross the borders of the round before.
             let first = if round % 2 == 0 { GROUP } else { GROUP / 2 };
             let mut partner = vec![None; before];
             let mut start = 0;
@@ -126,18 +127,18 @@ impl Merging {
                 break;
             }
             self.join(&partner);
-            // A round that joins less than every fiftieth is the last.
+            // Stop when a round merges fewer than one in fifty.
             if self.nodes.len() * 50 > before * 49 || self.nodes.len() <= FEWEST {
                 break;
             }
         }
     }
 
-    /// Chooses disjoint pairs of a group, the cheapest first.
+    /// Chooses disjoint pairs within a group greedily, the cheapest first.
     fn pair(&self, group: std::ops::Range<usize>, limit_m: f64, partner: &mut [Option<u32>]) {
         let mut pairs = Vec::new();
-        // Most pairs are too far apart, whatever their errors: a root less for each of those. The
-        // margin keeps what `price` may accept, however the roots are rounded.
+        // Most pairs are too far apart for any merge; comparing squares saves a square root for each. The margin
+        // keeps every pair that `price` may accept in spite of rounding.
         let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
         let nodes = &self.nodes[group.clone()];
         for (place, from) in nodes.iter().enumerate() {
@@ -165,17 +166,18 @@ impl Merging {
         }
     }
 
-    /// What merging two nodes costs; none if it may not be done.
+    /// The cost of merging two nodes; `None` if the error would exceed the limit or the cost is too high.
     fn price(&self, first: usize, second: usize, limit_m: f64) -> Option<f64> {
         let (a, b) = (&self.nodes[first], &self.nodes[second]);
         let (error_a, error_b) = (self.errors_m[first], self.errors_m[second]);
-        // One of the two moves at least half the way.
+        // Quick rejection: one of the two nodes moves by at least half their distance.
         let distance_m = a.mean_m.distance(b.mean_m);
         if 0.5 * distance_m + error_a.min(error_b) > limit_m {
             return None;
         }
         let merged = joined(a, b);
-        // The merger reaches at least as far along the longest axis of either.
+        // A lower bound of the merged node's largest standard deviation: that along the longest axis of the
+        // larger node.
         let larger = if a.sigma_m() >= b.sigma_m() { a } else { b };
         let axis = longest_axis(larger);
         let sigma_m = axis.dot(merged.cov_m2 * axis).max(0.0).sqrt();
@@ -193,14 +195,14 @@ impl Merging {
         (cost <= MOST_COST).then_some(cost)
     }
 
-    /// Linear colour without the part that depends on the direction.
+    /// Colour of the DC coefficients, without the part that depends on the direction.
     fn colour(&self, node: usize) -> DVec3 {
         let dc = &self.sh[node * self.stride..node * self.stride + 3];
         let colour = |channel: usize| (f64::from(dc[channel]) * sh::C0 + 0.5).max(0.0);
         DVec3::new(colour(0), colour(1), colour(2))
     }
 
-    /// Merges every node that has a partner with it, in place of the first of the two.
+    /// Merges every node with its partner, compacting all arrays in place.
     fn join(&mut self, partner: &[Option<u32>]) {
         let count = self.nodes.len();
         let mut place = vec![u32::MAX; count];
@@ -226,7 +228,7 @@ impl Merging {
                     self.sh[node * self.stride + k] = mixed as f32;
                 }
             }
-            // Never further back than where it was read: the second of a pair comes later.
+            // `end` never exceeds `node`, so no unread entry is overwritten: the second of a pair comes later.
             self.nodes[end] = joint;
             self.sh.copy_within(node * self.stride..(node + 1) * self.stride, end * self.stride);
             self.errors_m[end] = if partner[node].is_some() { 0.0 } else { self.errors_m[node] };
@@ -249,7 +251,7 @@ impl Merging {
         }
     }
 
-    /// The largest error of all nodes, rounded up.
+    /// The largest error of all nodes, rounded up to f32.
     fn error_m(&self) -> f32 {
         let largest = self.errors_m.iter().fold(0.0_f64, |all, &error| all.max(error));
         (largest as f32).next_up()

@@ -1,4 +1,4 @@
-//! What a record makes of a scene, and how many bytes it takes.
+//! Encoding a scene in a record format and decoding it again, to measure size and loss.
 
 use std::sync::Arc;
 
@@ -6,18 +6,18 @@ use crate::chunk::{LANES, Lanes, columns};
 use crate::record::{Clamped, PART_GAUSSIANS};
 use crate::{Chunk, RecordFormat, Scene};
 
-/// A scene as it comes out of a record.
+/// The result of [`round_trip`].
 #[derive(Clone, Debug)]
 pub struct RoundTrip {
-    /// The scene.
+    /// The decoded scene.
     pub scene: Scene,
-    /// Bytes of all parts, as coded.
+    /// Size of all encoded parts before compression, in bytes.
     pub coded_bytes: u64,
-    /// Values that did not fit, and were clamped.
+    /// Number of values that were out of range and clamped.
     pub clamped: u64,
 }
 
-/// Codes every chunk of a scene in parts, and decodes them again.
+/// Encodes every chunk of a scene in parts and decodes them again.
 pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
     let empty = Scene { chunks: Vec::new(), sky: scene.sky.clone() };
     let mut all = RoundTrip { scene: empty, coded_bytes: 0, clamped: 0 };
@@ -34,9 +34,14 @@ pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
                 .expect("a part has the size that its record just gave it");
         }
         all.clamped += clamped.worst().map_or(0, |(_, count)| count);
-        let (cell, origin_m, degree) = (chunk.cell(), chunk.origin_m(), chunk.sh_degree());
-        let again = Chunk::from_lanes(cell, origin_m, degree, chunk.len(), lanes);
-        all.scene.chunks.push(Arc::new(again));
+        let decoded = Chunk::from_lanes(
+            chunk.cell(),
+            chunk.origin_m(),
+            chunk.sh_degree(),
+            chunk.len(),
+            lanes,
+        );
+        all.scene.chunks.push(Arc::new(decoded));
     }
     all
 }
