@@ -5,10 +5,9 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use wildcity_scene::manifest::Provenance;
+use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, RenderProfile};
-use wildcity_twin::ingest::{self, Axes};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
@@ -118,7 +117,7 @@ impl Import {
         if !is_name(&self.twin) {
             return Err(StoreError::Name { name: self.twin }.into());
         }
-        let axes = self.axes.parse::<Axes>()?.scaled(self.scale)?;
+        let axes = SourceAxes::parse(&self.axes, self.scale)?;
         let profile = self.profile.load()?.apply(RenderProfile::default())?;
         let sky = self.sky.read(&self.axes)?;
         let rig = self.rig.as_deref().map(read_rig).transpose()?;
@@ -128,9 +127,8 @@ impl Import {
         // 2. The scene.
         let cannot = || format!("cannot import {}", self.source.display());
         let bar = progress::bytes("reading");
-        let read = ingest::read_hashed(&self.source, &mut progress::show(&bar));
-        let (mut gaussians, source) = read.with_context(cannot)?;
-        axes.apply(&mut gaussians);
+        let read = read_scene(&self.source, &axes, &mut progress::show(&bar));
+        let SourceScene { gaussians, hash } = read.with_context(cannot)?;
         bar.finish_and_clear();
         if gaussians.is_empty() {
             let source = self.source.display();
@@ -141,10 +139,7 @@ impl Import {
         }
 
         // 3. The twin.
-        let mut options = vec![format!("axes={}", self.axes), format!("scale={}", self.scale)];
-        if self.no_lod {
-            options.push("lod=off".to_owned());
-        }
+        let levels = !self.no_lod;
         let bar = progress::count("writing");
         let new = NewVersion {
             name: &self.twin,
@@ -153,8 +148,8 @@ impl Import {
             rig,
             trajectories,
             sky: sky.map(NewSky::Put),
-            provenance: Provenance { options, ..Provenance::of(format!("blake3:{source}")) },
-            storage: StorageOptions { record: self.record, levels: !self.no_lod },
+            provenance: provenance(&[hash], axes.options().to_vec(), levels),
+            storage: StorageOptions { record: self.record, levels },
         };
         let version = catalog.commit(new, &mut progress::show(&bar));
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.

@@ -105,3 +105,64 @@ pub fn main() -> ExitCode {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// The commands without subcommands, each with the words that select it.
+    fn leaves_of(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
+        let path = format!("{path}{} ", command.get_name());
+        let mut leaves: Vec<_> =
+            command.get_subcommands().flat_map(|sub| leaves_of(sub, &path)).collect();
+        if leaves.is_empty() {
+            leaves.push((path.trim_end().to_owned(), command.clone()));
+        }
+        leaves
+    }
+
+    fn all_leaves() -> Vec<(String, clap::Command)> {
+        leaves_of(&Arguments::command(), "")
+    }
+
+    #[test]
+    fn every_command_and_option_is_explained_and_has_an_example() {
+        let leaves = all_leaves();
+        assert!(leaves.len() > 25, "{} commands", leaves.len());
+        for (path, command) in leaves {
+            let after = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
+            assert!(command.get_about().is_some(), "{path} has no description");
+            assert!(after.contains(&path) && after.contains("Example"), "{path} has no example");
+            for argument in command.get_arguments() {
+                assert!(argument.get_help().is_some(), "{path}: {} has no help", argument.get_id());
+            }
+        }
+    }
+
+    #[test]
+    fn profile_is_a_file_and_set_is_a_field_on_every_command() {
+        let mut counts = [0; 2];
+        for (path, command) in all_leaves() {
+            for argument in command.get_arguments() {
+                let names = argument.get_value_names().unwrap_or_default();
+                let names: Vec<&str> = names.iter().map(|name| name.as_str()).collect();
+                let expected = match argument.get_long() {
+                    Some("profile") => (0, ["FILE"]),
+                    Some("set") => (1, ["FIELD=VALUE"]),
+                    _ => continue,
+                };
+                counts[expected.0] += 1;
+                assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
+            }
+        }
+        // serve, import, render, bench step, bisect; and push instead of serve.
+        assert_eq!(counts, [5, 5]);
+    }
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        Arguments::command().debug_assert();
+    }
+}

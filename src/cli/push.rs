@@ -16,17 +16,17 @@ use super::progress;
 
 /// Push trained scenes to a server, as a new version of a twin.
 ///
-/// The files become one. They replace the 64 m cells that their Gaussians lie in, all at once; sessions
-/// that run keep what they see until they ask for the new version. What was cut off goes on where it
-/// stopped: run the same again.
+/// The files become one scene. It replaces the 64 m cells that its Gaussians lie in, all at once.
+/// Running sessions keep their version until they switch to the new one. To continue an upload after a
+/// lost connection, run the same command again.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// The scene files, one file each, of the formats that `wildcity import` reads.
+    /// Scene files of the formats that `wildcity import` reads; each scene in one file.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
-    /// Name of the twin; a new one is made.
+    /// Name of the twin; a twin that does not exist is made.
     #[arg(long, value_name = "NAME")]
     twin: String,
 
@@ -41,21 +41,21 @@ pub(super) struct Push {
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
 
-    /// `all`, or the cells to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j)
-    /// m. What lies elsewhere is left out [default: those that the Gaussians lie in]
+    /// `all`, or a cell to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j) m.
+    /// Gaussians in other cells are left out [default: the cells that the Gaussians lie in]
     #[arg(long, value_name = "CELL", allow_hyphen_values = true)]
     cells: Vec<String>,
 
-    /// The version that the scenes were trained from: cells that changed since are not overwritten
+    /// The version that the scenes were trained from; cells that changed since are not overwritten
     /// [default: the latest]
     #[arg(long, value_name = "VERSION")]
     base: Option<u64>,
 
-    /// In how many bits Gaussians are stored, if not as the rest of the twin.
+    /// Record format of the stored Gaussians, as in `wildcity import` [default: as in the twin]
     #[arg(long)]
     record: Option<String>,
 
-    /// Makes no levels of detail.
+    /// Make no levels of detail.
     #[arg(long)]
     no_lod: bool,
 
@@ -63,16 +63,17 @@ pub(super) struct Push {
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 
-    /// What this version is, for people.
+    /// Description of this version.
     #[arg(long)]
     note: Option<String>,
 
-    /// Refuses the push if a view along the twin's trajectory differs by more, in dB.
+    /// Refuse the push if an image along the twin's trajectory has a lower PSNR than this against the
+    /// version before, in dB.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
 }
 
-/// `--server` and its token, for every command that talks to one.
+/// `--server` and its token, for every command that connects to a server.
 #[derive(Debug, clap::Args)]
 pub(super) struct Server {
     /// The server, as http://HOST:PORT.
@@ -96,7 +97,7 @@ impl Push {
             [] => None,
             [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
             cells => Some(CellSelection::Listed(
-                cells.iter().map(|c| cell(c)).collect::<Result<_, _>>()?,
+                cells.iter().map(|text| parse_cell(text)).collect::<Result<_, _>>()?,
             )),
         };
         let client = self.server.client()?;
@@ -104,7 +105,7 @@ impl Push {
         let pushed = runtime.block_on(self.push(&client, cells))?;
         let mut out = io::stdout().lock();
         if let Some(report) = &pushed.report {
-            show(&mut out, report)?;
+            print_report(&mut out, report)?;
         }
         match (pushed.state, pushed.version, pushed.error) {
             (PushState::Ready, Some(version), _) => {
@@ -114,7 +115,7 @@ impl Push {
             }
             (state, _, error) => {
                 let why = error.map_or_else(String::new, |error| error.message);
-                anyhow::bail!("the push was {}: {why}", word(state))
+                anyhow::bail!("the push was {}: {why}", state_name(state))
             }
         }
     }
@@ -130,11 +131,10 @@ impl Push {
             let upload = client.upload(path, &mut progress::show(&bar)).await;
             let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
             bar.finish_and_clear();
-            let (axes, scale) = (self.axes.clone(), self.scale);
-            files.push(PushFile { upload: upload.id, axes, scale });
+            files.push(PushFile { upload: upload.id, axes: self.axes.clone(), scale: self.scale });
         }
         let asked = NewPush {
-            // One for this run: if the answer is lost, the same is asked and not another.
+            // One id for this run: if an answer is lost, the client asks for the same push again.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
             files,
             base: self.base,
@@ -147,19 +147,19 @@ impl Push {
         };
         let begun = client.push(&self.twin, &asked).await?;
         let bar = progress::state();
-        let seen = &mut |push: &Pushed| {
-            bar.set_message(word(push.state));
+        let on_status = &mut |push: &Pushed| {
+            bar.set_message(state_name(push.state));
             bar.set_length(push.progress.total);
             bar.set_position(push.progress.done);
         };
-        let ended = client.wait_for_push(begun, seen).await?;
+        let ended = client.wait_for_push(begun, on_status).await?;
         bar.finish_and_clear();
         Ok(ended)
     }
 }
 
 impl Server {
-    /// A client of it, with the token.
+    /// A client of the server, with the token.
     pub(super) fn client(&self) -> anyhow::Result<HttpClient> {
         let token = match &self.token_file {
             Some(path) => Some(read_token(path)?),
@@ -176,19 +176,20 @@ fn read_token(path: &Path) -> anyhow::Result<String> {
     Ok(String::from_utf8(text).with_context(cannot)?.trim().to_owned())
 }
 
-fn cell(text: &str) -> anyhow::Result<[i32; 2]> {
+/// A cell, as `3,-1`.
+fn parse_cell(text: &str) -> anyhow::Result<[i32; 2]> {
     let parsed = text
         .split_once(',')
         .and_then(|(x, y)| Some([x.trim().parse().ok()?, y.trim().parse().ok()?]));
     parsed.with_context(|| format!("--cells {text:?} is neither all nor a cell, as 3,-1"))
 }
 
-fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
+fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
     for file in &report.files {
         writeln!(out, "file        {}: {} Gaussians", file.name, file.gaussians)?;
         for bad in &file.first_bad {
-            let (index, field) = (bad.index, &bad.field);
-            writeln!(out, "bad         Gaussian {index}: {field} is {}; {}", bad.value, bad.must)?;
+            let wildcity_protocol::http::BadGaussian { index, field, value, must } = bad;
+            writeln!(out, "bad         Gaussian {index}: {field} is {value}; {must}")?;
         }
         let unnamed = file.bad - file.first_bad.len() as u64;
         if unnamed > 0 {
@@ -202,10 +203,8 @@ fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         writeln!(out, "scales      {thin:.2e} to {wide:.2e} m")?;
     }
     if !report.cells.is_empty() {
-        let count = |of: fn(&wildcity_client::CellReport) -> u64| -> u64 {
-            report.cells.iter().map(of).sum()
-        };
-        let (before, after) = (count(|cell| cell.before), count(|cell| cell.after));
+        let before: u64 = report.cells.iter().map(|cell| cell.before).sum();
+        let after: u64 = report.cells.iter().map(|cell| cell.after).sum();
         let cells = report.cells.len();
         writeln!(out, "cells       {cells}: {before} Gaussians before, {after} after")?;
     }
@@ -214,13 +213,13 @@ fn show(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
     }
     for preview in &report.previews {
         let [x, y, z] = preview.pose.xyz;
-        let alike = preview.psnr_db.map_or("equal".to_owned(), |db| format!("{db:.1} dB"));
-        writeln!(out, "view        from ({x:.1}, {y:.1}, {z:.1}): {alike}")?;
+        let psnr = preview.psnr_db.map_or("equal".to_owned(), |db| format!("{db:.1} dB"));
+        writeln!(out, "view        from ({x:.1}, {y:.1}, {z:.1}): {psnr}")?;
     }
     Ok(())
 }
 
-fn word(state: PushState) -> &'static str {
+fn state_name(state: PushState) -> &'static str {
     match state {
         PushState::Queued => "queued",
         PushState::Ingesting => "ingesting",

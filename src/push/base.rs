@@ -5,8 +5,8 @@ use wildcity_twin::store::{Catalog, StoreError, Version};
 use crate::error::PushError;
 use crate::request::{CellSelection, PushRequest};
 
-/// The number of the twin's latest version, if the twin exists. Also refuses a push early whose cells
-/// changed since the base that it names.
+/// The number of the twin's latest version, if the twin exists. Also refuses a push early if its
+/// cells changed since the base that it names.
 ///
 /// # Errors
 /// The base does not exist, or [`StoreError::Overlap`].

@@ -4,7 +4,7 @@
 /// of its files.
 pub const OPEN_PUSHES: usize = 16;
 
-/// Pushes whose status is kept after their end: a report of 100,000 cells takes 3 MB, and most
+/// Ended pushes that keep their status: a report of 100,000 cells takes 3 MB, and most
 /// reports have a hundred cells.
 pub const REMEMBERED_PUSHES: usize = 64;
 

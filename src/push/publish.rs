@@ -136,7 +136,7 @@ fn compare_cells(
     Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
 }
 
-/// A committed version that nobody gets as the latest yet.
+/// A committed version that is not yet opened as the latest.
 struct Committed {
     version: Version,
     /// Keeps the version before as the latest until it is dropped.
@@ -172,8 +172,8 @@ fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, Pus
 /// Loads the version where sessions drive on the twin now, so that those that switch need not wait.
 /// The version is committed and sound: what cannot be loaded now is loaded when it is opened.
 async fn load_ahead(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
-    let prepared = engine.prepare(twin, version, frames);
-    match timeout(wildcity_session::limits::PREFETCH_TIMEOUT, prepared).await {
+    let prepared = engine.preload(twin, version, frames);
+    match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}
         Ok(Err(error)) => tracing::warn!(twin, "not loaded ahead: {error}"),
         Err(_) => tracing::warn!(twin, "not loaded ahead in time"),

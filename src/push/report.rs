@@ -67,7 +67,7 @@ pub struct Ranges {
 }
 
 impl Ranges {
-    /// The ranges of Gaussians whose numbers are within their bounds; none without Gaussians.
+    /// The ranges of valid Gaussians; none without Gaussians.
     pub fn of(gaussians: &Gaussians) -> Option<Self> {
         if gaussians.is_empty() {
             return None;

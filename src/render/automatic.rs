@@ -20,8 +20,8 @@ pub struct Selection {
     pub reason: String,
 }
 
-/// Chooses the fastest hardware device if it passes the self-test, or else the cpu backend. Software devices are
-/// correct but slow, and are never chosen. `limits` apply to a device.
+/// Chooses the fastest hardware device if it passes the self-test, or else the cpu backend. Software devices
+/// are correct but slow, and are never chosen. `limits` apply to a device.
 ///
 /// # Errors
 /// As [`Cpu::new`].
@@ -80,12 +80,12 @@ pub fn self_test(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, Self
     if db >= MIN_PSNR_DB { Ok(db) } else { Err(SelfTestError::Inaccurate { db }) }
 }
 
-/// Gaussians of the test scene. Its two views have about 46,000 splats, which are twelve blocks of the sort, whose
-/// 3,072 counters are two blocks of the scan: every kernel runs with more than one workgroup.
+/// Gaussians of the test scene. Its two views have about 46,000 splats, which are twelve blocks of the sort.
+/// Their 3,072 counters are two blocks of the scan. So every kernel runs with more than one workgroup.
 const TEST_GAUSSIANS: usize = 30_000;
 
-/// Gaussians of all sizes, 1 to 60 m ahead, with colours of SH degree 1. Every 256th is large and faint (fog), and
-/// covers more macro tiles than one thread lists.
+/// Gaussians of all sizes, 1 to 60 m ahead, with colours of SH degree 1. Every 256th is large and faint
+/// (fog), and covers more macro tiles than one thread lists.
 fn test_scene() -> Scene {
     let mut gaussians = Gaussians::with_capacity(1, TEST_GAUSSIANS);
     for i in 0..TEST_GAUSSIANS {

@@ -1,7 +1,8 @@
 //! The cpu backend up to a stage and the gpu backend from there, to find the gpu stage that is wrong.
 //!
-//! The stages exchange [`StageOutputs`](crate::stage::StageOutputs). [`bisect`] draws a frame with every stage in
-//! turn as the last one on the cpu: the first gpu stage with which the image is still wrong is the faulty one.
+//! The stages exchange [`StageOutputs`](crate::stage::StageOutputs). [`bisect`] draws a frame with every
+//! stage in turn as the last one on the cpu: the first gpu stage with which the image is still wrong is the
+//! faulty one.
 
 use super::compare::psnr::{MIN_PSNR_DB, psnr_db, psnr_db_u8};
 use super::cpu::Cpu;
@@ -64,13 +65,13 @@ fn render_split(
     Ok(stats)
 }
 
-/// How close the images of the gpu backend are to those of the cpu backend, by the number of stages that run on the
-/// cpu.
+/// How close the images of the gpu backend are to those of the cpu backend, by the number of stages that run
+/// on the cpu.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
-    /// The last stage on the cpu, if any, and the PSNR of all views in dB: the lesser of that of linear colour and
-    /// opacity and that of the 8-bit colour. Infinite if no value differs, NaN if the gpu failed with
-    /// [`RenderError::TooMany`].
+    /// The last stage on the cpu, if any, and the PSNR of all views in dB: the lesser of that of linear
+    /// colour and opacity and that of the 8-bit colour. Infinite if no value differs, NaN if the gpu failed
+    /// with [`RenderError::TooMany`].
     pub psnr_db: Vec<(Option<Stage>, f64)>,
 }
 
@@ -105,8 +106,8 @@ pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, Rend
 impl Bisection {
     /// The name of the gpu stage that is wrong; `None` if every image is right.
     ///
-    /// Of the images that are wrong it takes the one with the most stages on the cpu: the first stage that the gpu
-    /// ran for it is the faulty one.
+    /// Of the images that are wrong it takes the one with the most stages on the cpu: the first stage that
+    /// the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
         let right = self.psnr_db.iter().rev().take_while(is_right).count();

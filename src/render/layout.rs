@@ -1,7 +1,7 @@
 //! Inputs of the fast backends: the scene and views in f64 become camera-relative f32.
 //!
-//! A position is subtracted from the camera's in f64, once per chunk and frame, and only the difference is rounded
-//! to f32: a twin 4,500 km from its origin loses nothing.
+//! A position is subtracted from the camera's in f64, once per chunk and frame, and only the difference is
+//! rounded to f32: a twin 4,500 km from its origin loses nothing.
 
 use glam::{DVec3, Vec3};
 
@@ -67,8 +67,8 @@ impl Cutoffs {
 
     /// The sort key of a splat: `view (4 bits) | depth (28 bits)`, from the nearest.
     ///
-    /// The bits of positive f32 rise with their values, so their difference from the bits of near is an exact order;
-    /// 28 bits reach 2^32 times near.
+    /// The bits of positive f32 rise with their values, so their difference from the bits of near is an exact
+    /// order; 28 bits reach 2^32 times near.
     #[inline(always)]
     pub fn sort_key(&self, view: usize, depth_m: f32) -> u32 {
         let depth = depth_m.to_bits() - self.near_m.to_bits();
@@ -88,8 +88,8 @@ pub struct ChunkView {
     pub rotation: [[f32; 3]; 3],
     /// The chunk's origin in camera space, in metres.
     pub translation_m: [f32; 3],
-    /// The camera's forward axis in the world, and the camera-space z of the chunk's origin in metres. In f64, so that
-    /// surfels of one plane are not ordered by rounding errors.
+    /// The camera's forward axis in the world, and the camera-space z of the chunk's origin in metres. In
+    /// f64, so that surfels of one plane are not ordered by rounding errors.
     pub forward: [f64; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
@@ -137,11 +137,12 @@ impl ChunkView {
 
 /// Half-spaces in which every Gaussian misses the image, to cull whole clusters of 256 at once.
 ///
-/// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat can be wider than
-/// the ellipsoid's outline, and culling must not change a pixel. A splat misses the left edge when `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s`
-/// is its largest standard deviation, `t` its clamped slope and `k` the extent in standard
-/// deviations: `√cov_xx` is at most `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx` the condition is linear in the
-/// centre: `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are alike. Near and far have no width,
+/// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat can be
+/// wider than the ellipsoid's outline, and culling must not change a pixel. A splat misses the left edge when
+/// `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s` is its largest standard deviation, `t` its
+/// clamped slope and `k` the extent in standard deviations: `√cov_xx` is at most
+/// `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx` the condition is linear in the centre:
+/// `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are alike. Near and far have no width,
 /// since only centres are compared with them.
 #[derive(Clone, Copy, Debug)]
 pub struct Frustum {
@@ -191,9 +192,9 @@ impl Frustum {
         Self { planes: camera_planes.map(plane) }
     }
 
-    /// Whether a Gaussian with its centre in a box, relative to the chunk's origin, and standard deviations up to
-    /// `sigma_m` can touch the image; `true` when in doubt. The test allows for rounding errors of 1e-5 of the terms'
-    /// size.
+    /// Whether a Gaussian with its centre in a box, relative to the chunk's origin, and standard deviations
+    /// up to `sigma_m` can touch the image; `true` when in doubt. The test allows for rounding errors of 1e-5
+    /// of the terms' size.
     pub fn may_see(&self, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
         let center = 0.5 * (min_m + max_m);
         let half = 0.5 * (max_m - min_m);

@@ -6,11 +6,12 @@
 //! | [`cpu`] | f32, SIMD, all cores | the default without a GPU |
 //! | [`gpu`] | f32, WGSL compute shaders, one per stage | the fastest |
 //!
-//! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu backend. Two
-//! combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first stages on the cpu and the rest on
-//! the gpu. [`compare`] measures how far images differ.
+//! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu backend.
+//! Two combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first stages on the cpu
+//! and the rest on the gpu. [`compare`] measures how far images differ.
 //!
-//! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number of threads.
+//! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number
+//! of threads.
 
 pub mod automatic;
 pub mod compare;
@@ -52,22 +53,22 @@ pub struct Frame<'a> {
 /// Most views of one frame: the cameras of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
-/// Buffers for the images of one view, row by row from the top; an image that is `None` is not computed. Pixels outside
-/// of the lens' field are 0 in all of them.
+/// Buffers for the images of one view, row by row from the top; an image that is `None` is not computed.
+/// Pixels outside of the lens' field are 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the background;
-    /// and the opacity of the Gaussians alone.
+    /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the
+    /// background; and the opacity of the Gaussians alone.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same colours, clamped to [0, 1] and rounded to 8 bits.
     pub rgb8: Option<&'a mut [u8]>,
-    /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that may see 90° and more)
-    /// in metres, 0 where opacity is 0.
+    /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that may see 90°
+    /// and more) in metres, 0 where opacity is 0.
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, which tells how valid the depth is.
     pub opacity: Option<&'a mut [f32]>,
-    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are in the
-    /// camera's axes and point towards the camera; 0 where there is no depth.
+    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
+    /// in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
@@ -97,8 +98,8 @@ impl Target<'_> {
     }
 }
 
-/// Called once per view from a worker thread, with the view's index, as soon as its pixels are final: one image can be
-/// encoded while others are still drawn.
+/// Called once per view from a worker thread, with the view's index, as soon as its pixels are final: one
+/// image can be encoded while others are still drawn.
 pub type OnViewDone<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
 
 /// Time and work of a frame.
@@ -207,7 +208,8 @@ pub trait Backend: Send + Sync {
     /// The name, as in `--backend` and in observations.
     fn name(&self) -> &'static str;
 
-    /// What the last bit of a pixel depends on beside the backend: the instruction set or the device. May be empty.
+    /// What the last bit of a pixel depends on beside the backend: the instruction set or the device. May be
+    /// empty.
     fn detail(&self) -> String {
         String::new()
     }
@@ -217,8 +219,8 @@ pub trait Backend: Send + Sync {
         1
     }
 
-    /// Number of frames that it processes at once: so many concurrent callers of [`Backend::render`] are faster than
-    /// one, and more are not. It is 1 for a backend that uses the whole machine for one frame.
+    /// Number of frames that it processes at once: so many concurrent callers of [`Backend::render`] are
+    /// faster than one, and more are not. It is 1 for a backend that uses the whole machine for one frame.
     fn frames_in_flight(&self) -> usize {
         1
     }
@@ -236,8 +238,8 @@ pub trait Backend: Send + Sync {
 }
 
 impl Frame<'_> {
-    /// The background, and the matrix `sky_from_world` that takes directions to its axes: the sky, or the profile's
-    /// background as a sky of one colour; `None` if that is black.
+    /// The background, and the matrix `sky_from_world` that takes directions to its axes: the sky, or the
+    /// profile's background as a sky of one colour; `None` if that is black.
     ///
     /// # Errors
     /// [`RenderError::Sky`].
@@ -255,7 +257,7 @@ impl Frame<'_> {
     /// Checks the number of views, and that each target fits its view.
     ///
     /// # Errors
-    /// Names the first view whose target does not fit.
+    /// Names the first view with a target that does not fit.
     pub fn check(&self, targets: &[Target<'_>]) -> Result<(), RenderError> {
         self.check_views()?;
         let count = self.views.len();

@@ -1,9 +1,10 @@
-//! The outputs of the stages project, sort and bin, in one plain form that every tiled backend can give and take.
+//! The outputs of the stages project, sort and bin, in one plain form that every tiled backend can give and
+//! take.
 //!
 //! The cpu backend gives them after any stage, and the gpu backend continues from them
-//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`). Tests compare single
-//! stages on the same buffers: each of 32 mutations of the shaders must fail the stages that share the mutated shader,
-//! and no other. (The idea is Vello's "CPU up to a stage".)
+//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`). Tests
+//! compare single stages on the same buffers: each of 32 mutations of the shaders must fail the stages that
+//! share the mutated shader, and no other. (The idea is Vello's "CPU up to a stage".)
 
 use super::layout::Splat;
 
@@ -32,8 +33,8 @@ impl Stage {
     }
 }
 
-/// The outputs of a frame's stages up to one of them. The output of sort requires that of project, and that of bin
-/// requires both.
+/// The outputs of a frame's stages up to one of them. The output of sort requires that of project, and that
+/// of bin requires both.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StageOutputs {
     /// Of project: all views' splats, in order of (view, global id).
@@ -56,7 +57,7 @@ pub struct TileLists {
 }
 
 impl StageOutputs {
-    /// The last stage whose output is there.
+    /// The last stage with an output here.
     pub fn last_stage(&self) -> Stage {
         match (&self.order, &self.tiles) {
             (_, Some(_)) => Stage::Bin,

@@ -11,7 +11,7 @@
 //! centre a weight of -99.
 //!
 //! **Limits.** Six points give the first two moments of a Gaussian that the camera maps almost linearly. A
-//! Gaussian whose standard deviation along the view is an eighth of its distance comes out 2 % too small
+//! Gaussian with a standard deviation along the view of an eighth of its distance comes out 2 % too small
 //! (stress case T22), a quarter 9 %.
 //!
 //! **Lenses are extrapolated beyond their field,** for the shape of Gaussians that reach into it: points may
@@ -186,7 +186,7 @@ impl<'a> UnscentedView<'a> {
         self.view.camera.size_px()
     }
 
-    /// Whether a Gaussian whose centre lies within a ball, in the camera's frame at the end of the exposure,
+    /// Whether a Gaussian with its centre in a ball, in the camera's frame at the end of the exposure,
     /// can touch the image: the test of [`CullBound`].
     #[inline(always)]
     fn may_touch(&self, center_m: DVec3, radius_m: f64, sigma_m: f64) -> bool {

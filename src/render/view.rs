@@ -28,12 +28,12 @@ pub struct RollingShutter {
 }
 
 /// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses little:
-/// what remains of the exposure, and of the camera's motion, while a place of the image is exposed. The motion is
-/// that of [`Pose::interpolate`].
+/// what remains of the exposure, and of the camera's motion, while a place of the image is exposed. The
+/// motion is that of [`Pose::interpolate`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShutterMotion {
-    /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure remains, clamped
-    /// to 0 to 1.
+    /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure remains,
+    /// clamped to 0 to 1.
     pub(super) remaining: [f64; 3],
     /// The camera's translation during the whole exposure, in metres, in world axes.
     pub(super) translation_world_m: DVec3,
@@ -75,8 +75,8 @@ impl View {
         Self::of_moving_rig(cameras, world_from_rig, &|_| world_from_rig)
     }
 
-    /// The cameras of a rig with the pose `world_from_rig` now, and the pose `world_from_rig_before(age_us)` that
-    /// many microseconds ago, which cameras with a rolling shutter need.
+    /// The cameras of a rig with the pose `world_from_rig` now, and the pose `world_from_rig_before(age_us)`
+    /// that many microseconds ago, which cameras with a rolling shutter need.
     pub fn of_moving_rig(
         cameras: &[RigCamera],
         world_from_rig: Pose,
@@ -147,12 +147,13 @@ impl View {
 
     /// The image of a point of the world, with the lens extrapolated beyond its field.
     ///
-    /// With a rolling shutter, the row decides when a point is exposed, that decides the camera's pose, and the
-    /// pose decides the row. A fixed-point iteration finds the moment, beginning with `first_guess`. Each round
-    /// multiplies the error by what the image moves per row: a tenth for an object that passes close by. Where
-    /// an object passes so close that a round leaves more than half of the error, the interval between a moment
-    /// that is too early and one that is too late is halved instead. An object that moves over the image as fast
-    /// as the rows are read may have several solutions; it is found on one of them, or beside the image.
+    /// With a rolling shutter, the row decides when a point is exposed, that decides the camera's pose, and
+    /// the pose decides the row. A fixed-point iteration finds the moment, beginning with `first_guess`. Each
+    /// round multiplies the error by what the image moves per row: a tenth for an object that passes close
+    /// by. Where an object passes so close that a round leaves more than half of the error, the interval
+    /// between a moment that is too early and one that is too late is halved instead. An object that moves
+    /// over the image as fast as the rows are read may have several solutions; it is found on one of them, or
+    /// beside the image.
     #[inline(always)]
     pub fn project_extrapolated(&self, world_m: DVec3, first_guess: f64) -> ProjectedPoint {
         let project_at = |fraction: f64, world_from_camera: Pose| {
@@ -195,8 +196,8 @@ impl View {
             self.rolling_shutter.as_ref()?;
         let last = &self.world_from_camera;
         let Camera { width_px, height_px, .. } = self.camera;
-        // Slope and offset of the remaining fraction along an axis: 1 at the middle of the first row or column, 0
-        // at the middle of the last; a single row is the last one.
+        // Slope and offset of the remaining fraction along an axis: 1 at the middle of the first row or
+        // column, 0 at the middle of the last; a single row is the last one.
         let along = |size_px: u32| {
             let last_px = f64::from(size_px) - 1.0;
             if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::ReportError;
+use super::error::ReportError;
 use super::sample_points::{OFFSETS_M, SamplePoint, scaled};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::CameraError;

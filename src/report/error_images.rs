@@ -1,6 +1,6 @@
 //! A rendered window, the reference, and a map of the error between them, as PNG files.
 
-use super::ReportError;
+use super::error::ReportError;
 use wildcity_render::compare::errors::Image;
 
 /// The window in which a setting has its largest error.

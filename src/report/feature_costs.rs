@@ -9,7 +9,7 @@ use std::sync::Arc;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
-use super::ReportError;
+use super::error::ReportError;
 use super::measure::sky_bytes;
 use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;

@@ -11,12 +11,13 @@ use std::time::Instant;
 
 use image::ImageReader;
 
+use super::error::ReportError;
+use super::error_images::ErrorImages;
 use super::measurement::{Cost, Measurement, SampleResult};
 use super::sample_points::{OFFSETS_M, SamplePoint};
 use super::setting::Setting;
 use super::statistics::{min, quantile};
 use super::timing::{Step, StepTimes, encode};
-use super::{ErrorImages, ReportError};
 use wildcity_render::compare::errors::{ErrorAccumulator, Image, ImageErrors};
 use wildcity_render::compare::images::{RenderedImage, render_images};
 use wildcity_render::gpu::Gpu;

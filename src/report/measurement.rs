@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::ErrorImages;
+use super::error_images::ErrorImages;
 use super::setting::{Family, Setting};
 use super::statistics::{min, quantile};
 use wildcity_render::compare::errors::ImageErrors;

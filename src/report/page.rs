@@ -3,12 +3,14 @@
 use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
+use super::error::ReportError;
 use super::error_images::{ErrorImages, HEAT_RGB, HEAT_STEPS};
 use super::measurement::Measurement;
 use super::recommend::{Goal, Recommendation, pareto_front};
+use super::report::Report;
 use super::sample_points::OFFSETS_M;
 use super::setting::Family;
-use super::{Report, ReportError, feature_costs, plots};
+use super::{feature_costs, plots};
 use wildcity_stress::Verdict;
 
 const STYLE: &str = "\

@@ -3,8 +3,8 @@
 use plotters::coord::ranged1d::{Ranged, ValueFormatter};
 use plotters::prelude::*;
 
-use super::ReportError;
 use super::confidence::Confidence;
+use super::error::ReportError;
 use super::measurement::Measurement;
 use super::recommend::pareto_front;
 use super::sample_points::OFFSETS_M;

@@ -12,7 +12,7 @@
 
 use serde::Serialize;
 
-use super::ReportError;
+use super::error::ReportError;
 use super::measurement::{Measurement, SampleResult};
 use super::setting::{Family, ImageEncoding};
 use super::statistics::min;

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use parking_lot::Mutex;
 
-use super::ReportError;
+use super::error::ReportError;
 use super::setting::ImageEncoding;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene};

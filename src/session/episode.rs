@@ -1,16 +1,20 @@
 //! One episode: where the ego is, when, and how it got there. Pure: no clock, no I/O.
+//!
+//! A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
+//! new one before it replaces the old, so that a step which fails on the way has not happened.
 
 use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::trajectory::Keyframe;
 use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
+use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
 
 /// How far back the history reaches: 15 steps of 0.1 s before now.
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
@@ -24,12 +28,12 @@ pub struct Episode {
     distance_m: f64,
     ego: Ego,
     terminated: bool,
-    /// World-from-rig by time in microseconds, rising; the last is now. Never empty, and no longer
-    /// than the history needs, or the frames before the first step.
-    track: VecDeque<(i64, Pose)>,
-    /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
+    /// Past poses by rising time since the episode's start; the last is now. Never empty. Reaches as far
+    /// back as the history, or as the frames of the warm-up before the first step.
+    track: VecDeque<Keyframe>,
+    /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     begin_us: i64,
-    /// Of the observations that said how far they may be believed, the least mean of one's images.
+    /// The least mean trust of an observation, of those that came with a trust.
     least_trust: Option<f64>,
 }
 
@@ -37,12 +41,12 @@ pub struct Episode {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The agent closed it, or ended it.
+    /// The agent closed the session or terminated the episode.
     Completed,
-    /// The same, and on its way the images could not be believed: it left what was recorded
-    /// (`limits::OFF_MODEL_TRUST`). Told only where observations say their trust.
+    /// The same, but the ego left what was recorded: the trust of an observation fell below
+    /// [`limits::OFF_MODEL_TRUST`]. Only where observations come with a trust.
     OffModel,
-    /// The agent broke the protocol beyond repair.
+    /// The agent broke the protocol, and the connection was closed.
     AgentError,
     /// The agent was silent for too long.
     AgentTimeout,
@@ -64,34 +68,34 @@ pub struct EpisodeSummary {
     pub time_us: i64,
     /// Distance driven, in metres: the sum of the straight lines between poses.
     pub distance_m: f64,
-    /// Trust of the observation that is believed least, the mean of its images; absent where none was said.
+    /// The least mean trust of an observation's images, 0 to 1; absent if no observation had a trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_trust: Option<f64>,
 }
 
-/// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last is the identity.
+/// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last pose is the identity.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EgoHistory {
     /// Positions `[16, 3]`, in metres.
     pub xyz_m: [[f32; 3]; HISTORY_POSES],
     /// Rotation matrices `[16, 3, 3]`, row by row.
     pub rotation: [[[f32; 3]; 3]; HISTORY_POSES],
-    /// How many, from the end, were driven, in the warm-up too; the earlier ones repeat the first.
+    /// How many poses, counted from the end, were driven, warm-up included. The earlier ones repeat the
+    /// first of these.
     pub count: usize,
 }
 
 impl Episode {
-    /// An episode of an ego at its start, at time zero. `dt_us` is above zero.
+    /// An episode with the ego at its start, at time zero. `dt_us` is above zero.
     pub fn new(seed: u64, ego: Ego, dt_us: i64) -> Self {
-        Self::warmed_up(seed, ego, &[], dt_us)
+        Self::with_warm_up(seed, ego, &[], dt_us)
     }
 
-    /// The same behind a warm-up: where the rig was (`world_from_rig`) by time in microseconds, rising
-    /// and below 0.
-    pub(crate) fn warmed_up(seed: u64, ego: Ego, warm_up: &[(i64, Pose)], dt_us: i64) -> Self {
-        let now = (0, ego.world_from_rig());
-        let track: VecDeque<_> = warm_up.iter().copied().chain([now]).collect();
-        let begin_us = track[0].0;
+    /// The same with a warm-up before the start: past poses at rising times below 0.
+    pub(crate) fn with_warm_up(seed: u64, ego: Ego, warm_up: &[Keyframe], dt_us: i64) -> Self {
+        let start = Keyframe { time_us: 0, world_from_rig: ego.world_from_rig() };
+        let track: VecDeque<Keyframe> = warm_up.iter().copied().chain([start]).collect();
+        let begin_us = track[0].time_us;
         Self {
             seed,
             dt_us,
@@ -105,12 +109,11 @@ impl Episode {
         }
     }
 
-    /// The episode after one more step. `self` stays as it is, so that a step whose rendering fails has
-    /// not happened.
+    /// The episode after one more step.
     ///
     /// # Errors
-    /// [`SessionError::EpisodeOver`] after the last step, [`SessionError::Ego`] if the ego cannot do
-    /// what it is told.
+    /// [`SessionError::EpisodeOver`] after the last step, [`SessionError::Ego`] if the ego cannot execute
+    /// the command.
     pub fn stepped(
         &self,
         command: &Command,
@@ -128,34 +131,37 @@ impl Episode {
         next.step += 1;
         next.distance_m += moved_m.length();
         next.terminated = terminate;
-        next.track.push_back((time_us, world_from_rig));
-        // One pose at or before the history's begin must stay, to interpolate from. The first step may
-        // still draw frames of the warm-up.
+        next.track.push_back(Keyframe { time_us, world_from_rig });
+        // Keep one pose at or before the history's first, to interpolate from. The first step may still
+        // render frames of the warm-up, so it keeps all of that.
         let reach_us = HISTORY_US.max(self.dt_us - self.begin_us);
-        while next.track.len() > 2 && next.track[1].0 <= time_us - reach_us {
+        while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }
         Ok(next)
     }
 
-    /// Some of a rig's cameras, by their indices, where the rig stands somewhere. If it `moves`, as the ego
-    /// has just moved: so a rolling shutter sees from any place what it would see if the ego had come
-    /// there as it came to where it is. At the start of an episode it stands, and in a warm-up.
+    /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
+    ///
+    /// With `in_motion`, a rolling shutter sees the ego's last motion, transferred to that pose: as if the
+    /// ego had come there the way it came to where it is. Otherwise the rig stands while the image is
+    /// exposed, as it does in a warm-up and at the start of an episode.
     pub(crate) fn views(
         &self,
-        (cameras, which): (&[RigCamera], &[usize]),
+        cameras: &[RigCamera],
+        selected: &[usize],
         world_from_rig: Pose,
-        moves: bool,
+        in_motion: bool,
     ) -> Vec<View> {
         let now = self.world_from_rig();
         let all = View::of_moving_rig(cameras, world_from_rig, &|age_us| {
-            if !moves {
+            if !in_motion {
                 return world_from_rig;
             }
-            let then = self.at((self.time_us() - age_us).max(0));
+            let then = self.pose_at((self.time_us() - age_us).max(0));
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         });
-        which.iter().map(|&camera| all[camera]).collect()
+        selected.iter().map(|&camera| all[camera]).collect()
     }
 
     /// Seed of the episode.
@@ -170,7 +176,7 @@ impl Episode {
 
     /// Simulated time since the start, in microseconds.
     pub fn time_us(&self) -> i64 {
-        self.track[self.track.len() - 1].0
+        self.track[self.track.len() - 1].time_us
     }
 
     /// Where the ego is.
@@ -178,55 +184,65 @@ impl Episode {
         self.ego.world_from_rig()
     }
 
-    /// When what is known of it begins, in microseconds: 0, or the begin of its warm-up.
+    /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     pub(crate) fn begin_us(&self) -> i64 {
         self.begin_us
     }
 
-    /// How the ego stands and moves.
+    /// Pose, velocity and the rest of the ego's state.
     pub fn ego(&self) -> &Ego {
         &self.ego
     }
 
-    /// Whether it has ended.
+    /// Whether the agent has ended it.
     pub fn terminated(&self) -> bool {
         self.terminated
     }
 
-    /// How it went so far. An episode that the agent ended stays completed, whatever came after.
+    /// The summary so far. An episode that its agent terminated counts as completed, whatever `outcome`
+    /// the connection came to later.
     pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
-        let outcome = match (self.terminated, outcome) {
-            (true, _) | (_, Outcome::Completed) => match self.least_trust {
-                Some(trust) if trust < limits::OFF_MODEL_TRUST => Outcome::OffModel,
-                _ => Outcome::Completed,
-            },
-            (false, outcome) => outcome,
+        let completed = self.terminated || outcome == Outcome::Completed;
+        let off_model = self.least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        let outcome = match (completed, off_model) {
+            (true, true) => Outcome::OffModel,
+            (true, false) => Outcome::Completed,
+            (false, _) => outcome,
         };
-        let (steps, time_us, distance_m) = (self.step, self.time_us(), self.distance_m);
-        EpisodeSummary { outcome, steps, time_us, distance_m, least_trust: self.least_trust }
+        EpisodeSummary {
+            outcome,
+            steps: self.step,
+            time_us: self.time_us(),
+            distance_m: self.distance_m,
+            least_trust: self.least_trust,
+        }
     }
 
-    /// Remembers how far the images of an observation may be believed, 0 to 1 each; nothing if there are
-    /// none.
-    pub(crate) fn judged(&mut self, trusts: impl Iterator<Item = f64>) {
-        let (sum, count) =
-            trusts.fold((0.0, 0.0), |(sum, count), trust| (sum + trust, count + 1.0));
+    /// Takes the trusts of an observation's images, 0 to 1 each, into account; there may be none.
+    pub(crate) fn add_trusts(&mut self, trusts: impl Iterator<Item = f64>) {
+        let mut sum = 0.0;
+        let mut count = 0.0;
+        for trust in trusts {
+            sum += trust;
+            count += 1.0;
+        }
         if count > 0.0 {
             let mean = sum / count;
             self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
         }
     }
 
-    /// What the ego remembers now.
+    /// The ego history now.
     pub fn history(&self) -> EgoHistory {
         let rig_from_world = self.world_from_rig().inverse();
         let mut xyz_m = [[0.0; 3]; HISTORY_POSES];
         let mut rotation = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]; HISTORY_POSES];
-        // The last stays the identity: the product would be so only up to rounding.
+        // The last pose stays the exact identity; `rig_from_world * world_from_rig` would be rounded.
         for k in 0..HISTORY_POSES - 1 {
             let age_us = (HISTORY_POSES - 1 - k) as i64 * HISTORY_STEP_US;
-            let rig_from_past = rig_from_world * self.at(self.time_us() - age_us);
+            let rig_from_past = rig_from_world * self.pose_at(self.time_us() - age_us);
             xyz_m[k] = rig_from_past.position_m.as_vec3().to_array();
+            // Transposed, since glam's arrays go column by column.
             rotation[k] = rig_from_past.rotation_matrix().transpose().as_mat3().to_cols_array_2d();
         }
         let steps_back = (self.time_us() - self.begin_us) / HISTORY_STEP_US;
@@ -234,18 +250,19 @@ impl Episode {
         EgoHistory { xyz_m, rotation, count }
     }
 
-    /// `world_from_rig` at a time, between the poses of the track.
-    pub(crate) fn at(&self, time_us: i64) -> Pose {
-        let after = self.track.partition_point(|&(t, _)| t < time_us);
-        let Some(&(after_us, to)) = self.track.get(after) else { return self.world_from_rig() };
+    /// `world_from_rig` at a time since the episode's start: interpolated, and constant beyond both ends
+    /// of the track.
+    pub(crate) fn pose_at(&self, time_us: i64) -> Pose {
+        let after = self.track.partition_point(|key| key.time_us < time_us);
+        let Some(to) = self.track.get(after) else { return self.world_from_rig() };
         match after.checked_sub(1) {
-            None => to,
-            // Not even rounded.
-            Some(_) if after_us == time_us => to,
+            None => to.world_from_rig,
+            // Exact: interpolation could round.
+            Some(_) if to.time_us == time_us => to.world_from_rig,
             Some(before) => {
-                let (before_us, from) = self.track[before];
-                let t = (time_us - before_us) as f64 / (after_us - before_us) as f64;
-                from.interpolate(&to, t)
+                let from = &self.track[before];
+                let t = (time_us - from.time_us) as f64 / (to.time_us - from.time_us) as f64;
+                from.world_from_rig.interpolate(&to.world_from_rig, t)
             }
         }
     }
@@ -318,7 +335,7 @@ mod tests {
     #[test]
     fn rolling_shutters_see_from_where_the_ego_was() {
         let views = |episode: &Episode, camera: &RigCamera, x_m: f64| {
-            episode.views((std::slice::from_ref(camera), &[0]), at(x_m, 0.0), true)
+            episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), true)
         };
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
         let mut camera = RigCamera::new("front", Camera::from_pinhole(8, 6, pinhole), at(1.5, 0.2));
@@ -342,16 +359,18 @@ mod tests {
     #[test]
     fn the_history_reaches_into_the_warm_up() {
         // Ten metres a second for half a second, and on from there.
-        let warm_up: Vec<_> = (-5..0).map(|k| (k * 100_000, at(k as f64, 0.0))).collect();
+        let warm_up: Vec<_> = (-5..0)
+            .map(|k| Keyframe { time_us: k * 100_000, world_from_rig: at(k as f64, 0.0) })
+            .collect();
         let ego = Ego::new(Dynamics::default(), at(0.0, 0.0));
-        let start = Episode::warmed_up(1, ego, &warm_up, 100_000);
+        let start = Episode::with_warm_up(1, ego, &warm_up, 100_000);
         assert_eq!((start.step(), start.time_us(), start.history().count), (0, 0, 6));
         let xs_m = |episode: &Episode| episode.history().xyz_m.map(|p| p[0]);
         assert_eq!(xs_m(&start)[8..], [-5.0, -5.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
         let next = moved(&start, at(1.0, 0.0), false).unwrap();
         assert_eq!(xs_m(&next)[8..], [-6.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
         assert_eq!((next.history().count, next.summary(Outcome::Completed).distance_m), (7, 1.0));
-        assert_eq!(next.at(-500_000), at(-5.0, 0.0), "still there for the first step's frames");
+        assert_eq!(next.pose_at(-500_000), at(-5.0, 0.0), "kept for the first step's frames");
     }
 
     #[test]

@@ -8,114 +8,114 @@ use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-use crate::record::format::RecordError;
+use crate::record::error::RecordError;
 
-/// Why a request was refused. The session is then as it was before.
+/// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
-    /// The twin cannot be had.
+    /// The twin does not exist or cannot be read.
     #[error(transparent)]
     Twin(#[from] StoreError),
-    /// What is to be drawn does not fit into memory, or could not be loaded.
+    /// What a frame needs does not fit into memory, or could not be loaded.
     #[error(transparent)]
     Residency(ResidencyError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The presets there are.
+        /// The names of the presets.
         known: Vec<&'static str>,
     },
     /// The rig has no camera of this name.
     #[error("the rig has no camera {name:?}; it has {}", known.join(", "))]
     UnknownCamera {
-        /// Where it was asked for, as it is called on the wire.
+        /// The field of the request that names it, as on the wire.
         field: String,
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The cameras there are.
+        /// The names of the rig's cameras.
         known: Vec<String>,
     },
-    /// A recorded drive of the twin cannot be driven along.
+    /// A recorded drive of the twin is no route.
     #[error(transparent)]
     Route(#[from] RouteError),
-    /// A camera was asked for twice.
-    #[error("camera {name:?} is asked for twice; name each camera once")]
+    /// A camera was requested twice.
+    #[error("camera {name:?} is requested twice; name each camera once")]
     CameraTwice {
-        /// Which name of `outputs.cameras`.
+        /// Index of the second request in `outputs.cameras`.
         index: usize,
         /// The name.
         name: String,
     },
     /// The twin has no trajectory of this name.
-    #[error("the twin has no trajectory {name:?}; it has {}", listed(known))]
+    #[error("the twin has no trajectory {name:?}; it has {}", joined_or_none(known))]
     UnknownTrajectory {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The trajectories there are.
+        /// The names of the twin's trajectories.
         known: Vec<String>,
     },
     /// A number or count is outside its limits.
     #[error("{field} is {must}")]
     OutOfRange {
-        /// The field, as it is called on the wire.
+        /// The field of the request, as on the wire.
         field: &'static str,
-        /// What it is, and what is accepted.
+        /// The value, and what is accepted.
         must: String,
     },
-    /// The profile that is asked for cannot be had.
+    /// The requested profile is invalid.
     #[error(transparent)]
     Profile(#[from] ProfileError),
-    /// The twin's sky is too sharp for the profile's `sky_error`.
+    /// The profile's `sky_error` is below what the twin's sky can be baked to.
     #[error("profile: {0}")]
     Sky(SkyError),
     /// The images of one answer have too many pixels.
-    #[error("the answer has {pixels} pixels; at most {limit} fit: ask for fewer or smaller images")]
+    #[error("the answer has {pixels} pixels; at most {limit} fit: request fewer or smaller images")]
     AnswerTooLarge {
-        /// All images together.
+        /// Pixels of all images together.
         pixels: u64,
-        /// What fits.
+        /// The most that fit.
         limit: u64,
     },
-    /// The ego does not do as it is told.
+    /// The ego cannot execute the command.
     #[error(transparent)]
     Ego(#[from] EgoError),
-    /// The episode was ended by its agent.
+    /// The agent has ended the episode.
     #[error("the episode ended with step {steps}; send reset")]
     EpisodeOver {
-        /// Steps done.
+        /// Steps of the episode.
         steps: u64,
     },
-    /// Too much waits for the renderer, or too many answers are kept.
+    /// The render queue is full, or the budget for answers is used up.
     #[error("the server is busy: {what}; try again later")]
     Busy {
-        /// What there is too much of.
+        /// What is used up.
         what: &'static str,
     },
-    /// The deadline passed while the frame was queued or drawn.
+    /// The deadline passed while the frame was queued or rendered.
     #[error("the frame was not ready within the deadline; nothing changed")]
     DeadlineExceeded,
     /// The backend refused the frame.
     #[error(transparent)]
     Render(#[from] RenderError),
     /// An image could not be encoded.
-    #[error("camera {camera:?} was not encoded: {reason}")]
+    #[error("the image of camera {camera:?} could not be encoded: {reason}")]
     Encode {
-        /// The camera.
+        /// Name of the camera.
         camera: String,
         /// What the encoder says.
         reason: String,
     },
-    /// The episode's file could not be written. The step was not taken: what is answered is on
+    /// The episode's file could not be written, so that the request had no effect: every answer is on
     /// record.
     #[error(transparent)]
     Record(#[from] RecordError),
-    /// A defect of the program.
-    #[error("the renderer crashed; the server's log says where")]
+    /// A bug of the program: a worker thread panicked.
+    #[error("a worker thread of the server crashed; see the server's log")]
     Crashed,
-    /// The render thread could not be started.
-    #[error("cannot start the render thread: {reason}")]
+    /// A render thread could not be started.
+    #[error("cannot start a render thread: {reason}")]
     Thread {
         /// What the operating system says.
         reason: String,
@@ -131,6 +131,6 @@ impl From<ResidencyError> for SessionError {
     }
 }
 
-fn listed(names: &[String]) -> String {
+fn joined_or_none(names: &[String]) -> String {
     if names.is_empty() { "none".to_owned() } else { names.join(", ") }
 }

@@ -1,9 +1,22 @@
-//! Episodes: reset, step, observe, record, replay.
+//! Sessions of agents on city twins: open, reset, step, observe, record, replay.
 //!
-//! An [`Engine`] is what all sessions share; a [`Session`] is one agent's use of it. A request
-//! renders, is recorded, and only then changes the session: whatever fails on the way, nothing has
-//! happened, and the request can be sent again.
+//! An [`Engine`] is shared by all sessions; a [`Session`] belongs to one agent. A request renders, is
+//! recorded, and only then changes the session: if anything fails on the way, nothing has happened, and the
+//! client can repeat the request.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `session` | a session: opening it, answering its requests |
+//! | `options`, `start` | what a client requests when it opens a session; where episodes start |
+//! | `episode` | where the ego is, when, and how it got there |
+//! | `engine` | the twins in memory, the render queue, the budget for answers |
+//! | `observe` | which images are rendered, and how they become one message |
+//! | `record` | episodes' files, and their replay |
+//! | `prefetch` | what is loaded ahead of the ego |
+//! | `golden` | the preview of a push |
+//! | [`limits`] | limits and defaults |
 
+mod blocking;
 mod engine;
 mod episode;
 mod error;
@@ -14,27 +27,31 @@ mod options;
 mod prefetch;
 mod record;
 mod session;
+mod start;
+mod viewpoint;
 
+pub use engine::render_queue::Scratch;
 pub use engine::twin_summaries::{TrajectorySummary, TwinSummary};
 pub use engine::{Engine, EngineSettings, LatestPin};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use golden::{ProposedChange, PsnrPreview};
 pub use observe::buffer::ObservationBuffer;
-pub use observe::builder::{HEADER_PREFIX_BYTES, viewpoints};
 pub use observe::encode::{Encoding, jpeg, png};
+pub use observe::layout::HEADER_PREFIX_BYTES;
 pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
 pub use record::ego_replay::DivergedStep;
+pub use record::error::RecordError;
 pub use record::format::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordError, RecordedCommand, RecordedOutputs,
-    RecordedVersion,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOutputs, RecordedVersion,
 };
-pub use record::replay::{
-    ImageDifference, ProvenanceChange, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil,
-    ReplayedImage,
+pub use record::recorded_episode::RecordedEpisode;
+pub use record::replay_report::{
+    ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
 pub use session::Session;
+pub use viewpoint::viewpoints;

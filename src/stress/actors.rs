@@ -33,8 +33,8 @@ fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
         let image = run.render_and_compare(what, &turned, &profile, moved)?;
         let off = max_difference(&still.rgba, &image.rgba);
-        // A device quantizes each of 16 coefficients in steps of 1/32,767 of the largest one of its cluster of 256, which
-        // is below 5e-4 in sum. The other backends keep f32.
+        // A device quantizes each of 16 coefficients in steps of 1/32,767 of the largest one of its cluster
+        // of 256, which is below 5e-4 in sum. The other backends keep f32.
         run.check_at_most(format!("{what}: off by"), off.into(), 5e-4);
     }
     Ok(())

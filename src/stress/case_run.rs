@@ -160,8 +160,9 @@ impl<'a> CaseRun<'a> {
         Ok(render_images(&Reference, scene, profile, &[view])?.remove(0))
     }
 
-    /// The backend's images of one view, after checks that every value is finite and that the reference backend's images
-    /// agree. The reference backend is not compared with itself; its images must satisfy what a case states in numbers.
+    /// The backend's images of one view, after checks that every value is finite and that the reference
+    /// backend's images agree. The reference backend is not compared with itself; its images must satisfy
+    /// what a case states in numbers.
     pub(super) fn render_and_compare(
         &mut self,
         what: impl Into<String>,
@@ -207,7 +208,8 @@ impl Check {
         }
     }
 
-    /// The share of its bound that the value takes: 1 is all of it. In dB the error counts: 20 dB are a factor of ten.
+    /// The share of its bound that the value takes: 1 is all of it. In dB the error counts: 20 dB are a
+    /// factor of ten.
     pub fn bound_usage(&self) -> f64 {
         match self.bound {
             Bound::AtMost(0.0) => self.measured,

@@ -45,8 +45,9 @@ fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (point_px, point_px2) = sampled(&camera, &gaussian);
 
     run.check_at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
-    // The image of a splat ends where alpha is below the cut, at r² = 2 ln(opacity / cut) in standard deviations. A 2D
-    // Gaussian truncated at r has 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. The renderer's blur adds to it.
+    // The image of a splat ends where alpha is below the cut, at r² = 2 ln(opacity / cut) in standard
+    // deviations. A 2D Gaussian truncated at r has 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. The
+    // renderer's blur adds to it.
     let left = profile.alpha_cut / gaussian.opacity;
     let share = 1.0 + left.ln() * left / (1.0 - left);
     let size_px2 = point_px2[0] + point_px2[1];
@@ -140,8 +141,8 @@ fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let within =
         run.render_and_compare("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
     run.check("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
-    // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball beyond the field may reach
-    // over the edge of the field, which is at 0.68, by as much as the blur.
+    // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball beyond the
+    // field may reach over the edge of the field, which is at 0.68, by as much as the blur.
     let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
     let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
     let image = run.render_and_compare(
@@ -217,9 +218,9 @@ fn balls() -> Scene {
 mod tests {
     use super::*;
 
-    /// The scaled unscented transform (Wan and van der Merwe 2000) with kappa 0: of six points at `alpha √3` standard
-    /// deviations, and of the centre. Returns the weight of the centre, and mean and covariance on the image. With alpha 1
-    /// and beta 0 the centre has no weight, as in the renderer.
+    /// The scaled unscented transform (Wan and van der Merwe 2000) with kappa 0: of six points at `alpha √3`
+    /// standard deviations, and of the centre. Returns the weight of the centre, and mean and covariance on
+    /// the image. With alpha 1 and beta 0 the centre has no weight, as in the renderer.
     fn unscented(
         camera: &Camera,
         gaussian: &GaussianSpec,
@@ -246,7 +247,8 @@ mod tests {
         (w0, mean_px, px2)
     }
 
-    /// How far a rule's mean and covariance are from those of 20,000 points: in pixels, and as a share of the size.
+    /// How far a rule's mean and covariance are from those of 20,000 points: in pixels, and as a share of the
+    /// size.
     fn off(mean_m: DVec3, [alpha, beta]: [f64; 2]) -> (f64, f64) {
         let (camera, gaussian) = fisheye_and_gaussian();
         let gaussian = GaussianSpec { mean_m, ..gaussian };
@@ -257,9 +259,9 @@ mod tests {
         (mean_px.distance(point_px), spreads.fold(0.0, f64::max))
     }
 
-    /// gsplat's weights (alpha 0.1, beta 2, and so -99 at the centre) keep T22, too, and are closer than six points without
-    /// a centre. But they follow the lens only near the centre: for a Gaussian as wide as it is far, 135° off the axis, they
-    /// are off by 2,000 px, and six points by 150 px.
+    /// gsplat's weights (alpha 0.1, beta 2, and so -99 at the centre) keep T22, too, and are closer than six
+    /// points without a centre. But they follow the lens only near the centre: for a Gaussian as wide as it
+    /// is far, 135° off the axis, they are off by 2,000 px, and six points by 150 px.
     #[test]
     fn a_weight_of_minus_99_fails_far_off_the_axis() {
         let (camera, gaussian) = fisheye_and_gaussian();

@@ -1,6 +1,6 @@
-//! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that every backend must
-//! keep. `wildcity stress` runs them and prints the table, and tests run them: a driver that is wrong on one machine is
-//! found on that machine.
+//! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that every
+//! backend must keep. `wildcity stress` runs them and prints the table, and tests run them: a driver that is
+//! wrong on one machine is found on that machine.
 //!
 //! ```text
 //! shapes     needles, dust, walls, Gaussians beside the view        T1 T2 T3 T13 T26
@@ -12,19 +12,20 @@
 //! actors     colours that rotate with an actor                      T25
 //! ```
 //!
-//! The reference backend is not compared with itself: its images must be finite, and keep what a case states in numbers.
+//! The reference backend is not compared with itself: its images must be finite, and keep what a case states
+//! in numbers.
 //!
 //! # How to add a case
 //!
-//! 1. Write a constant `TN: Case` and a function `tN(run: &mut CaseRun<'_>)` in the file of its family. The function
-//!    builds a scene ([`GaussianSpec`](wildcity_render::compare::gaussians::GaussianSpec) is the short form), renders it
-//!    with `run.render_and_compare`, which also checks that every value is finite and that the reference backend agrees,
-//!    and states further bounds with `run.check_at_most`, `run.check_at_least_db` and `run.check`. Each check's text must
-//!    say what was measured and where.
-//! 2. Add it to [`CASES`], in order of numbers. A case that takes gigabytes or minutes is a `CaseBody::Heavy`, which
-//!    runs only with `--heavy`.
-//! 3. Add a mutation to `tests/stress/mutations.rs` for every check: a faulty backend with which the check must fail. A
-//!    test fails for a check without one, since a bound that no fault exceeds proves nothing.
+//! 1. Write a constant `TN: Case` and a function `tN(run: &mut CaseRun<'_>)` in the file of its family. The
+//!    function builds a scene ([`GaussianSpec`](wildcity_render::compare::gaussians::GaussianSpec) is the
+//!    short form), renders it with `run.render_and_compare`, which also checks that every value is finite and
+//!    that the reference backend agrees, and states further bounds with `run.check_at_most`,
+//!    `run.check_at_least_db` and `run.check`. Each check's text must say what was measured and where.
+//! 2. Add it to [`CASES`], in order of numbers. A case that takes gigabytes or minutes is a
+//!    `CaseBody::Heavy`, which runs only with `--heavy`.
+//! 3. Add a mutation to `tests/stress/mutations.rs` for every check: a faulty backend with which the check
+//!    must fail. A test fails for a check without one, since a bound that no fault exceeds proves nothing.
 
 mod actors;
 mod case_run;
@@ -111,8 +112,8 @@ pub struct Outcome {
     /// What was rendered instead, if it is less than what the case states.
     #[serde(rename = "only")]
     pub reduced_to: Option<String>,
-    /// The first check that failed; or else the check closest to its bound, the limit of the device, or why the case was not
-    /// run.
+    /// The first check that failed; or else the check closest to its bound, the limit of the device, or why
+    /// the case was not run.
     #[serde(rename = "told")]
     pub detail: String,
     /// The share of its bound that this check's value takes: 1 is all of it; 0 for a check without a size.

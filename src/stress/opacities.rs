@@ -68,15 +68,16 @@ fn t12(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for (what, invalid) in invalidated(&more) {
         let scene = Scene::from_gaussians(&invalid);
         let image = run.render_and_compare(what.clone(), &scene, &profile, view)?;
-        // With one Gaussian more, the others move by one index, and may be in the next cluster, whose colours are quantized
-        // in other steps on a device: 1.5 / 32,767 of each coefficient.
+        // With one Gaussian more, the others move by one index, and may be in the next cluster, where colours
+        // are quantized in other steps on a device: 1.5 / 32,767 of each coefficient.
         let off = max_difference(&image.rgba, &right.rgba);
         run.check_at_most(format!("{what}: neighbours off by"), off.into(), 1e-4);
     }
     Ok(())
 }
 
-/// The same Gaussians, of SH degree 1, with one more before them: nearly opaque, with a standard deviation of 14 cm.
+/// The same Gaussians, of SH degree 1, with one more before them: nearly opaque, with a standard deviation of
+/// 14 cm.
 fn with_one_more(good: &Gaussians, mean_m: [f64; 3]) -> Gaussians {
     let mut more = good.clone();
     more.means_m.insert(0, mean_m);
@@ -119,15 +120,15 @@ fn invalidated(more: &Gaussians) -> Vec<(String, Gaussians)> {
 
 pub(super) const T19: Case = Case {
     number: "T19",
-    what: "layers whose transmittance lands on the stop, and layers at the cap; 10,000 of them",
+    what: "layers with a transmittance exactly at the stop, and layers at the cap; 10,000 of them",
     bound: "agrees with f64; the layer that would reach the stop is left out; within 1e-6",
     body: CaseBody::Light(t19),
 };
 
 fn t19(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // Layers of alpha 0.9 at the centre: the transmittance becomes 0.1, 0.01, 0.001 and then 1e-4. The fourth layer would
-    // reach the stop, and is left out; ten thousand more layers change nothing. Layers of opacity 1 are capped at 0.99:
-    // 0.01, then 1e-4, off by no more than the rounding of the cap to f32, 2e-6 of it.
+    // Layers of alpha 0.9 at the centre: the transmittance becomes 0.1, 0.01, 0.001 and then 1e-4. The fourth
+    // layer would reach the stop, and is left out; ten thousand more layers change nothing. Layers of opacity
+    // 1 are capped at 0.99: 0.01, then 1e-4, off by no more than the rounding of the cap to f32, 2e-6 of it.
     let layer = |i: i32| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),
@@ -152,8 +153,8 @@ fn t19(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let off = (1.0 - f64::from(image.opacity[4 * 9 + 4]) - left).abs();
         run.check_at_most(format!("{what}: transmittance off by"), off, 1e-6);
     }
-    // A pixel that has stopped stays stopped, although thin layers that follow would not reach the stop; its neighbours
-    // continue.
+    // A pixel that has stopped stays stopped, although thin layers that follow would not reach the stop; its
+    // neighbours continue.
     let dot = |i| GaussianSpec { sigma_m: DVec3::splat(0.015), ..layer(i) };
     let thin = |i| GaussianSpec { opacity: 0.1, ..layer(10 + i) };
     let layers = scene_of(&(0..4).map(dot).chain((0..50).map(thin)).collect::<Vec<_>>());
@@ -174,7 +175,8 @@ pub(super) const T28: Case = Case {
 fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let fog = (0..70_000).map(|i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
-        // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops before the last layer.
+        // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops before the
+        // last layer.
         sigma_m: DVec3::splat(100.0),
         opacity: 1.05 / 255.0,
         ..GaussianSpec::default()

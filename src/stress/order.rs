@@ -48,8 +48,8 @@ pub(super) const T8: Case = Case {
 };
 
 fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // Half-way through the rotation the depth order of the two centres changes, and the image jumps ("pops"), since whole
-    // Gaussians are sorted. The jump must be as large as that of the reference backend.
+    // Half-way through the rotation the depth order of the two centres changes, and the image jumps ("pops"),
+    // since whole Gaussians are sorted. The jump must be as large as that of the reference backend.
     let bar = |angle: f64, x: f64, rgb| GaussianSpec {
         mean_m: DVec3::new(x, 0.0, 5.0),
         rotation: DQuat::from_rotation_y(angle),
@@ -171,7 +171,8 @@ fn t27(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// A low-discrepancy sequence in [0, 1)⁶: multiples of powers of the root of x⁷ = x + 1, modulo 1 (Roberts 2018).
+/// A low-discrepancy sequence in [0, 1)⁶: multiples of powers of the root of x⁷ = x + 1, modulo 1 (Roberts
+/// 2018).
 pub(super) fn low_discrepancy(i: usize) -> [f64; 6] {
     [1, 2, 3, 4, 5, 6].map(|power| (0.5 + (i + 1) as f64 * 1.112_775_684_f64.powi(-power)).fract())
 }

@@ -1,4 +1,5 @@
-//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far from the origin.
+//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far from the
+//! origin.
 
 use glam::DVec3;
 
@@ -150,8 +151,8 @@ fn encoded_street(run: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), Ren
             off_m = off_m.max((chunk.value(index, column) - again.value(index, column)).abs());
         }
     }
-    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The bound is half a step of
-    // 128 m / 2^23 = 2^-16 m.
+    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The bound is
+    // half a step of 128 m / 2^23 = 2^-16 m.
     run.check_at_most("centres off by m", off_m.into(), 0.5 * 128.0 / f64::from(1 << 23));
     let mut view = street_view([200, 120]);
     view.world_from_camera.position_m += away;

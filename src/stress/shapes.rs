@@ -154,8 +154,8 @@ pub(super) const T26: Case = Case {
 };
 
 fn t26(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal length of 1,000 px: xx²
-    // is 1e37.
+    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal length of
+    // 1,000 px: xx² is 1e37.
     for angle in [0.0, 0.4, 0.8, 1.3] {
         let needle = scene_of(&[GaussianSpec {
             mean_m: DVec3::new(0.0, 0.0, 0.0101),

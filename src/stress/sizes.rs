@@ -18,8 +18,8 @@ pub(super) const T14: Case = Case {
 };
 
 fn t14(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // At a distance of 5 m and with a focal length of 160 px, a centre at a multiple of 0.5 m lies on the edge of a tile of
-    // 16 px. With a sigma of 16 px / √(2 ln(255 · 0.9)) the splat reaches the next edge.
+    // At a distance of 5 m and with a focal length of 160 px, a centre at a multiple of 0.5 m lies on the
+    // edge of a tile of 16 px. With a sigma of 16 px / √(2 ln(255 · 0.9)) the splat reaches the next edge.
     let exact_m = 16.0 * 5.0 / 160.0 / (2.0 * (255.0_f64 * 0.9).ln()).sqrt();
     let splats = (0..800_i32).map(|i| {
         let ulps = f64::from(i % 41 - 20) * f64::from(f32::EPSILON);
@@ -143,8 +143,9 @@ fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let margin_px = 32;
     let [right, bottom] = [0, 1].map(|axis| size_px[axis] - part_px[axis]);
     for at in [[0, 0], [right / 2 + 3, bottom / 2 + 5], [right, bottom]] {
-        // The slope clamp depends on an image's own edges (gsplat's rule), so that a part draws splats that are centred
-        // beyond its edges differently. The part is rendered with a margin, which is not compared.
+        // The slope clamp depends on an image's own edges (gsplat's rule), so that a part draws splats that
+        // are centred beyond its edges differently. The part is rendered with a margin, which is not
+        // compared.
         let padded_at = at.map(|px| px as i32 - margin_px as i32);
         let padded = crop_view(whole, padded_at, part_px.map(|px| px + 2 * margin_px));
         let truth = run.render_reference(&balls, &profile, padded)?;

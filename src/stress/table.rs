@@ -41,8 +41,8 @@ pub struct Row {
 /// A backend to run cases on, or its name and why it is not available.
 pub type Candidate = Result<Box<dyn Backend>, (&'static str, String)>;
 
-/// Runs cases on backends; heavy cases only if `heavy`. Before each run it calls `progress` with the number of finished
-/// runs and the number of the next case.
+/// Runs cases on backends; heavy cases only if `heavy`. Before each run it calls `progress` with the number
+/// of finished runs and the number of the next case.
 pub fn run(
     cases: &[&Case],
     backends: &[Candidate],
@@ -85,8 +85,8 @@ impl Table {
 }
 
 impl Row {
-    /// The outcome to print: the first that missed its bound, or else the one closest to its bound, or else one that was
-    /// not run.
+    /// The outcome to print: the first that missed its bound, or else the one closest to its bound, or else
+    /// one that was not run.
     pub fn tightest(&self) -> Option<&Outcome> {
         let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
         let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);

@@ -1,5 +1,11 @@
-//! City twins on disk and in memory: files of outside formats in, sections of a versioned store
-//! out.
+//! City twins on disk and in memory.
+//!
+//! ```text
+//! ingest     reads scenes, skies, and camera lists from the formats of other programs
+//! store      immutable, content-addressed versions in a directory or an object store
+//! residency  which sections of a version are in memory, and which are loaded next
+//! limits     limits and defaults, with the arithmetic behind each
+//! ```
 
 pub mod ingest;
 pub mod limits;

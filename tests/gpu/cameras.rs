@@ -13,7 +13,10 @@ use wildcity_scene::{RenderProfile, Rig, Scene};
 
 use crate::gpu::{gpu, gpu_with};
 use crate::images::{agree, cpu, psnr, render, render_one, try_render, view_along};
-use crate::lenses::{driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of};
+use crate::lenses::{
+    check_against_exact_rays, check_projections, lenses, rolling_view, scaled_and_cropped,
+    sideways_rolling_view,
+};
 use crate::streets::{demo_street, street};
 
 /// Along a street, as [`crate::streets::street_views`] are.
@@ -35,10 +38,10 @@ pub(crate) fn lens_views() -> Vec<View> {
     let pose = straight().world_from_camera;
     let still = lenses.iter().map(|(_, camera)| View::new(*camera, pose));
     let rolling_shutter = [
-        driven(straight().camera, pose, ShutterDirection::TopToBottom),
-        driven(camera("opencv"), pose, ShutterDirection::BottomToTop),
-        driven(behind, pose, ShutterDirection::LeftToRight),
-        driven(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
+        rolling_view(straight().camera, pose, ShutterDirection::TopToBottom),
+        rolling_view(camera("opencv"), pose, ShutterDirection::BottomToTop),
+        rolling_view(behind, pose, ShutterDirection::LeftToRight),
+        rolling_view(camera("f-theta by pixels"), pose, ShutterDirection::RightToLeft),
     ];
     still.chain(rolling_shutter).collect()
 }
@@ -98,15 +101,15 @@ fn the_demo_street_through_lenses_and_shutters() {
 
 #[test]
 fn every_lens_draws_what_each_pixels_ray_meets() {
-    meets_what_each_pixels_ray_meets(&gpu());
+    check_against_exact_rays(&gpu());
 }
 
 #[test]
 fn known_points_land_where_the_model_says() {
     let gpu = gpu();
     for (name, camera) in lenses() {
-        for camera in sizes_of(&camera) {
-            let points = lands(&gpu, name, camera, 0.6);
+        for camera in scaled_and_cropped(&camera) {
+            let points = check_projections(&gpu, name, camera, 0.6);
             assert!(points >= 2, "{name}: {points} points");
         }
     }
@@ -121,8 +124,8 @@ fn gaussians_that_pass_close_are_drawn_as_by_the_cpu() {
     };
     let balls = scene_of(&[0, 1, 2, 3, 4].map(ball));
     let profile = RenderProfile::default();
-    let truth = render_one(&cpu(), &balls, &profile, passing());
-    agree(&render_one(&*gpu(), &balls, &profile, passing()), &truth).unwrap();
+    let truth = render_one(&cpu(), &balls, &profile, sideways_rolling_view());
+    agree(&render_one(&*gpu(), &balls, &profile, sideways_rolling_view()), &truth).unwrap();
 }
 
 /// The f-theta cameras of a real car, at full size and at the input size of a driving model.

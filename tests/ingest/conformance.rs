@@ -295,7 +295,8 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
         let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
         q.map(|q| q / length)
     };
-    let (p, q) = (unit(a.quats_wxyz[i]), unit(b.quats_wxyz[j]));
+    let p = unit(a.quats_wxyz[i]);
+    let q = unit(b.quats_wxyz[j]);
     // An ellipsoid is the same after half a turn around one of its own axes, and as -q.
     let [w, x, y, z] = q;
     let turned = [[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]];

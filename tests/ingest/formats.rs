@@ -33,14 +33,16 @@ fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &st
     };
     for i in 0..read.len() {
         for axis in 0..3 {
-            let (a, b) = (read.means_m[i][axis], written.means_m[i][axis]);
+            let a = read.means_m[i][axis];
+            let b = written.means_m[i][axis];
             assert!((a - b).abs() <= within.mean_m, "{name}: position is {a}, not {b}");
         }
         let unit = |q: [f32; 4]| {
             let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
             q.map(|q| q / length)
         };
-        let (p, q) = (unit(read.quats_wxyz[i]), unit(written.quats_wxyz[i]));
+        let p = unit(read.quats_wxyz[i]);
+        let q = unit(written.quats_wxyz[i]);
         let same_side = p.iter().zip(q).map(|(p, q)| p * q).sum::<f32>() > 0.0;
         near(&p, &q.map(|q| if same_side { q } else { -q }), within.quat, "rotation");
         near(&read.ln_scales[i], &written.ln_scales[i], within.ln_scale, "ln scale");
@@ -212,7 +214,8 @@ fn streamed_sog_gives_its_finest_level_and_its_environment() {
         });
         read_files(&part.collect()).unwrap().0
     };
-    let (fine, sky) = (sog_in("0/"), sog_in("sky/"));
+    let fine = sog_in("0/");
+    let sky = sog_in("sky/");
     assert_eq!(all.means_m[..40], fine.means_m[..40]);
     assert_eq!(all.sh[..40 * 27], fine.sh[..40 * 27]);
     assert_eq!(all.means_m[40..], sky.means_m[..]);

@@ -1,11 +1,11 @@
 //! Arbitrary and nearly valid bytes never cause a panic or an absurd allocation.
 //!
-//! [`every_parser_survives_what_chance_makes`] is the fuzz target of every parser: it damages the
+//! [`every_parser_survives_random_damage`] is the fuzz target of every parser: it damages the
 //! corpus, one small scene per format and a mesh, beneath checksums. It runs for a second by
 //! default; to run it for a night:
 //!
 //! ```text
-//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release --test ingest chance
+//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release -p wildcity-twin --test ingest random_damage
 //! ```
 //!
 //! A failure prints seed, round, format and the damaged file's bytes in hex.
@@ -125,7 +125,7 @@ fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
 }
 
 #[test]
-fn every_parser_survives_what_chance_makes() {
+fn every_parser_survives_random_damage() {
     let seed = setting("WILDCITY_FUZZ_SEED", 1);
     let end = Instant::now() + Duration::from_secs(setting("WILDCITY_FUZZ_SECONDS", 1));
     let mut random = Random(seed);

@@ -223,7 +223,7 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
     let text = image("quats.webp", &[[0, 0, 0, 251]; 6]);
     assert!(text.starts_with("SOG body, quats.webp: Gaussian 0: alpha is 251"), "{text}");
     let text = refusal_of(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
-    assert!(text.starts_with("SOG body, quats.webp: is no sound WebP image: "), "{text}");
+    assert!(text.starts_with("SOG body, quats.webp: is a damaged WebP image: "), "{text}");
 
     let files = streamed();
     let meta = |from: &str, to: &str| refusal_of(&files, "lod-meta.json", &text_change(from, to));

@@ -91,7 +91,8 @@ fn is_alike(a: &Gaussians, i: usize, b: &Gaussians, j: usize) -> bool {
         let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
         q.map(|q| q / length)
     };
-    let (p, q) = (unit(a.quats_wxyz[i]), unit(b.quats_wxyz[j]));
+    let p = unit(a.quats_wxyz[i]);
+    let q = unit(b.quats_wxyz[j]);
     let dot: f32 = p.iter().zip(q).map(|(p, q)| p * q).sum();
     let sigmoid = |logit: f32| 1.0 / (1.0 + (-logit).exp());
     let apart = |axis: usize| (a.means_m[i][axis] - b.means_m[j][axis]).abs();
@@ -122,7 +123,8 @@ fn a_sog_of_the_first_version_is_read() {
     let Some(logo) = read("scenes/playcanvas-logo/meta.json") else { return };
     assert_eq!((logo.len(), logo.sh_degree), (307_128, 0));
     // What meta.json says, of logarithms: exp(0.93) - 1 = 1.535, and so on.
-    let (low, high) = ([-1.535, -2.782, -0.577], [1.535, 0.296, 0.577]);
+    let low = [-1.535, -2.782, -0.577];
+    let high = [1.535, 0.296, 0.577];
     assert!(is_within(&logo, low, high));
     // The extremes occur, so the range is used fully.
     let most = |axis: usize| logo.means_m.iter().map(|m| m[axis]).fold(f64::MIN, f64::max);
@@ -135,7 +137,8 @@ fn a_sog_of_the_first_version_is_read() {
 fn a_streamed_sog_is_read_in_full_detail() {
     let Some(playbot) = read("scenes/playbot/lod-meta.json") else { return };
     assert_eq!((playbot.len(), playbot.sh_degree), (500_000, 2));
-    let (low, high) = ([-1.033496, -1.083135, -1.039343], [1.03509, 0.05205518, 1.042389]);
+    let low = [-1.033496, -1.083135, -1.039343];
+    let high = [1.03509, 0.05205518, 1.042389];
     assert!(is_within(&playbot, low, high));
     // The finest level alone, in one file, is the same.
     let finest = read("scenes/playbot/0_0/meta.json").unwrap();

@@ -85,10 +85,12 @@ fn every_level_keeps_its_error_bound() {
     for block in blocks(&scene).iter().filter(|block| block.len() > 500).step_by(9) {
         let leaves = moments(block);
         let whole: f64 = leaves.iter().map(|leaf| leaf.2).sum();
-        let (mut error_m, mut count) = (0.0, block.len());
+        let mut error_m = 0.0;
+        let mut count = block.len();
         for level in lod::levels(block) {
             assert!(level.error_m >= error_m && level.chunk.len() < count);
-            (error_m, count) = (level.error_m, level.chunk.len());
+            error_m = level.error_m;
+            count = level.chunk.len();
             let nodes = moments(&level.chunk);
             // Opacity times area is conserved.
             let now: f64 = nodes.iter().map(|node| node.2).sum();

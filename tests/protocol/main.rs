@@ -6,6 +6,7 @@
 
 mod client;
 mod damaged;
+mod dependencies;
 mod fake_server;
 mod frames;
 mod messages;

@@ -1,4 +1,4 @@
-//! Bodies that want to do harm get an error of their own, and the server serves on.
+//! Malicious bodies: each gets its own error, and the server keeps serving.
 
 use serde_json::json;
 
@@ -67,7 +67,7 @@ async fn hostile_bodies() {
     for name in ["..", "a/b", "", "a".repeat(300).as_str(), "\n"] {
         let body = json!({ "name": name, "size": 1, "digest": format!("blake3:{:064}", 0) });
         let reply = post(&server, "/v1/uploads", &body).await;
-        // A name is only shown, never a path: what could be one by itself is refused.
+        // A name is only shown and never used as a path; names with a separator are refused all the same.
         assert!(reply.status == 400 || name == "..", "{name:?}: {reply:?}");
     }
     for digest in ["", "blake3:", "md5:00", &format!("blake3:{}", "G".repeat(64)), "blake3-/../x"] {

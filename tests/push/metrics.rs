@@ -1,4 +1,4 @@
-//! `/metrics` counts what happened, each server for itself.
+//! `/metrics` counts the events of one server.
 
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -17,8 +17,9 @@ pub(crate) async fn scrape(server: &TestServer) -> String {
 }
 
 #[tokio::test]
-async fn what_happened_is_counted() {
-    let (server, idle) = (TestServer::start().await, TestServer::start().await);
+async fn events_are_counted() {
+    let server = TestServer::start().await;
+    let idle = TestServer::start().await;
     let mut driver = server.driver("a").await;
     for x in 1..=3 {
         driver.step(f64::from(x)).await;

@@ -1,5 +1,5 @@
-//! Pushes: atomic, over all their cells; refused with everything that is wrong; the same again is the
-//! same.
+//! Pushes: all of their cells change at once; a refusal lists everything that is wrong; the same push again
+//! has the same result.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -69,7 +69,7 @@ async fn the_same_push_again_is_the_same_answer() {
     assert_eq!(first, again);
     let other = push(&server, &gaussians, |_| {}).await;
     assert_eq!(other.version, Some(2), "the same content as the latest version's is that version");
-    // After a rollback, the same content is wanted again.
+    // After a rollback, the same content makes a new version.
     post(&server, "/v1/twins/test/rollback", &json!({ "version": 1 })).await;
     assert_eq!(push(&server, &gaussians, |_| {}).await.version, Some(4));
     let taken = json!({ "id": "one", "files": [{ "upload": "blake3-0" }], "note": "another" });
@@ -101,9 +101,9 @@ async fn every_bad_gaussian_is_named() {
     server.still_serves().await;
 }
 
-/// A few Gaussians that stray into a neighbour's cell must not wipe it.
+/// A few Gaussians in a neighbouring cell must not replace all of its Gaussians.
 #[tokio::test]
-async fn a_margin_does_not_wipe_the_neighbour() {
+async fn a_margin_does_not_replace_the_neighbouring_cell() {
     let server = TestServer::start().await;
     let mut gaussians = in_cell([0, 0], 40, 1);
     for mean in gaussians.means_m.iter_mut().take(3) {
@@ -118,7 +118,7 @@ async fn a_margin_does_not_wipe_the_neighbour() {
     assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
     assert_eq!(pushed.report.unwrap().left_out, 3);
     assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 37 + 32);
-    // Named, it is meant.
+    // A cell that is named is replaced.
     let pushed = push(&server, &gaussians, |push| push.cells = named(&[[0, 0], [1, 0]])).await;
     assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
     assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 40);
@@ -127,15 +127,15 @@ async fn a_margin_does_not_wipe_the_neighbour() {
 }
 
 #[tokio::test]
-async fn what_others_changed_is_not_overwritten() {
+async fn cells_that_changed_since_the_base_are_not_overwritten() {
     let server = TestServer::start().await;
     let changed = push(&server, &in_cell([0, 0], 40, 1), |push| push.base = Some(1)).await;
     assert_eq!(changed.version, Some(2), "{changed:?}");
-    // Other cells go on top.
+    // Other cells are added on top.
     let apart = push(&server, &in_cell([1, 0], 50, 2), |push| push.base = Some(1)).await;
     assert_eq!(apart.version, Some(3), "{apart:?}");
     assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 90);
-    // The same cell does not: known at once where cells are named, else once the files are read.
+    // The same cell is refused: at once if it is named, otherwise when the files are read.
     let late = push(&server, &in_cell([0, 0], 60, 3), |push| push.base = Some(1)).await;
     let error = late.error.unwrap();
     assert_eq!((late.state, error.code), (PushState::Refused, Code::Conflict));
@@ -172,7 +172,7 @@ async fn views_before_and_after_are_compared() {
     assert!(golden.iter().all(|golden| golden.psnr_db.is_some_and(|db| db < 90.0)), "{golden:?}");
     let pushed = push(&server, &gaussians, |push| push.preview.min_psnr_db = Some(1.0)).await;
     assert_eq!(pushed.version, Some(2), "{pushed:?}");
-    // The same again looks the same, within what the record rounds.
+    // The same content looks the same, up to the rounding of its record format.
     let again = push(&server, &gaussians, |push| {
         push.preview.min_psnr_db = Some(40.0);
         push.note = Some("once more".to_owned());
@@ -181,9 +181,9 @@ async fn views_before_and_after_are_compared() {
     assert_eq!(again.state, PushState::Ready, "{again:?}");
 }
 
-/// Whoever asks for a likeness does not get a version that was compared with nothing.
+/// A push with `min_psnr_db` is refused if there is nothing to compare it with.
 #[tokio::test]
-async fn a_likeness_that_cannot_be_seen_is_refused() {
+async fn a_psnr_that_cannot_be_measured_is_refused() {
     let server = TestServer::start().await;
     let alike = |push: &mut NewPush| push.preview.min_psnr_db = Some(1.0);
     let refused = |pushed: &Push, why: &str| {
@@ -218,7 +218,7 @@ async fn a_likeness_that_cannot_be_seen_is_refused() {
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
 }
 
-/// A session's frame that crashes the renderer, or a comparison that does, ends that alone.
+/// A crash of the renderer fails the frame or the preview that caused it, and nothing else.
 #[tokio::test]
 async fn a_crash_while_comparing_fails_the_push_and_nothing_else() {
     let server = TestServer::start().await;
@@ -226,7 +226,7 @@ async fn a_crash_while_comparing_fails_the_push_and_nothing_else() {
     let failed = push(&server, &in_cell([0, 0], 40, 1), |push| push.id = Some("p".into())).await;
     assert_eq!((failed.state, failed.version), (PushState::Failed, None), "{failed:?}");
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
-    // What failed is tried again.
+    // A failed push can be sent again.
     let again = push(&server, &in_cell([0, 0], 40, 1), |push| push.id = Some("p".into())).await;
     assert_eq!((again.state, again.version), (PushState::Ready, Some(2)), "{again:?}");
     server.still_serves().await;

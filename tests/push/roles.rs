@@ -1,4 +1,4 @@
-//! Who may do what.
+//! What each role may do.
 
 use serde_json::json;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
@@ -42,7 +42,7 @@ async fn ask(server: &TestServer, request: &str, token: Option<&str>, body: &str
 }
 
 #[tokio::test]
-async fn every_route_asks_for_its_role() {
+async fn every_route_needs_its_role() {
     let server = guarded().await;
     let upload = json!({ "name": "x", "size": 1, "digest": format!("blake3:{:064}", 0) });
     let upload = upload.to_string();
@@ -61,8 +61,8 @@ async fn every_route_asks_for_its_role() {
         ("GET /v1/sessions", "", &[ADMIN]),
         ("GET /metrics", "", &[ADMIN]),
     ] {
-        for nobody in [None, Some("driver-driver-drive"), Some("")] {
-            let refused = ask(&server, request, nobody, body).await;
+        for unknown in [None, Some("driver-driver-drive"), Some("")] {
+            let refused = ask(&server, request, unknown, body).await;
             refused.refused(401, "unauthorized");
             assert!(refused.header("www-authenticate").is_some(), "{refused:?}");
         }
@@ -78,7 +78,7 @@ async fn every_route_asks_for_its_role() {
 }
 
 #[tokio::test]
-async fn a_token_reaches_its_twins_alone() {
+async fn a_token_may_only_use_its_twins() {
     let server = guarded().await;
     let listed = ask(&server, "GET /v1/twins", Some(ELSEWHERE), "").await;
     assert_eq!(listed.body, json!({ "twins": [] }));
@@ -109,7 +109,7 @@ async fn upgrade(server: &TestServer, token: Option<&str>) -> Result<crate::supp
 }
 
 #[tokio::test]
-async fn sessions_ask_for_drive_and_belong_to_their_token() {
+async fn sessions_need_the_role_drive_and_belong_to_their_token() {
     let server = guarded().await;
     assert_eq!(upgrade(&server, None).await.err(), Some(401));
     assert_eq!(upgrade(&server, Some("rubbish")).await.err(), Some(401));
@@ -158,7 +158,7 @@ async fn the_client_sends_its_token() {
 }
 
 #[tokio::test]
-async fn pages_from_elsewhere_may_not_push() {
+async fn web_pages_from_elsewhere_may_not_push() {
     let server = TestServer::start().await;
     let body = r#"{"version": 1}"#;
     let request = "POST /v1/twins/test/rollback HTTP/1.1\r\nOrigin: https://example.org";

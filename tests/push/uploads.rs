@@ -1,4 +1,4 @@
-//! Uploads: resumed, checked, bounded; and nothing is left of what is refused.
+//! Uploads: resumed, checked, limited; no file is left of an upload that is refused.
 
 use std::time::Duration;
 
@@ -59,7 +59,7 @@ async fn an_upload_that_is_cut_goes_on_where_it_stopped() {
     assert_eq!(begun.status, 201, "{begun:?}");
     let path = begun.header("location").unwrap().to_owned();
     assert_eq!(begun.header("upload-offset"), Some("0"));
-    // Half of what is announced, and then the line is cut.
+    // Half of the announced bytes, and then the connection is cut.
     let mut stream = TcpStream::connect(server.address()).await.unwrap();
     let head = format!(
         "PATCH {path} HTTP/1.1\r\nHost: localhost\r\nUpload-Offset: 0\r\nContent-Length: {}\r\n\r\n",
@@ -82,7 +82,7 @@ async fn an_upload_that_is_cut_goes_on_where_it_stopped() {
 }
 
 #[tokio::test]
-async fn half_an_upload_survives_a_restart_and_rubbish_does_not() {
+async fn an_incomplete_upload_survives_a_restart_and_stray_files_do_not() {
     let server = TestServer::start().await;
     let content = content(100_000);
     let path = begin(&server, &content).await.header("location").unwrap().to_owned();
@@ -101,7 +101,7 @@ async fn half_an_upload_survives_a_restart_and_rubbish_does_not() {
     let end = append(&server, &path, 60_000, "", &content[60_000..]).await;
     assert_eq!(end.body["complete"], true, "{end:?}");
     assert!(orphans.iter().all(|orphan| !twins.join(".uploads").join(orphan).exists()));
-    assert!(twins.join(".uploads").join(other).exists(), "what is not ours stays");
+    assert!(twins.join(".uploads").join(other).exists(), "a file of another name stays");
     drop(kept);
 }
 
@@ -118,15 +118,16 @@ async fn two_servers_do_not_share_a_spool() {
 }
 
 #[tokio::test]
-async fn what_is_not_what_was_promised_is_refused_and_forgotten() {
+async fn an_upload_that_does_not_match_its_announcement_is_removed() {
     let server = TestServer::start().await;
-    let (good, bad) = (content(5000), [&content(4999)[..], b"!"].concat());
+    let good = content(5000);
+    let bad = [&content(4999)[..], b"!"].concat();
     let path = begin(&server, &good).await.header("location").unwrap().to_owned();
     append(&server, &path, 0, "", &bad).await.refused(422, "upload_digest");
     get(&server, &path).await.refused(404, "unknown_upload");
     assert_eq!(spooled(&server), Vec::<String>::new());
 
-    // Without a byte it is checked at once.
+    // An upload of no bytes is checked at once.
     let digest = format!("blake3:{:064}", 0);
     let empty = json!({ "name": "empty.ply", "size": 0, "digest": digest });
     for _ in 0..2 {
@@ -138,7 +139,7 @@ async fn what_is_not_what_was_promised_is_refused_and_forgotten() {
     append(&server, &path, 1, "", &good[1..]).await.refused(409, "upload_offset");
     let at = append(&server, &path, 1, "", &good[1..]).await.body["offset"].clone();
     assert_eq!(at, 0, "a wrong offset is told the right one");
-    // Too long by its header, and by what comes.
+    // Too long by its Content-Length, and by the bytes that come.
     append(&server, &path, 0, "", &[&good[..], b"x"].concat()).await.refused(422, "upload_digest");
     let chunked = "PATCH {path} HTTP/1.1\r\nUpload-Offset: 0\r\nTransfer-Encoding: chunked";
     let body = [format!("{:x}\r\n", good.len() + 1).as_bytes(), &good, b"x\r\n0\r\n\r\n"].concat();
@@ -198,7 +199,7 @@ async fn the_spool_has_its_limits() {
 }
 
 #[tokio::test]
-async fn what_nobody_comes_back_for_is_thrown_away() {
+async fn an_upload_that_is_too_old_is_removed() {
     let spool = SpoolLimits { age: Duration::from_millis(50), ..SpoolLimits::default() };
     let server = TestServer::with(Limits { spool, ..Limits::default() }).await;
     begin(&server, b"left alone").await;
@@ -207,10 +208,10 @@ async fn what_nobody_comes_back_for_is_thrown_away() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, gone).await.expect("it is thrown away");
+    tokio::time::timeout(PATIENCE, gone).await.expect("it is removed");
 }
 
-/// The client comes back on another connection while the server still waits on the old one.
+/// The client reconnects while the server still waits for bytes on the old connection.
 #[tokio::test]
 async fn a_new_connection_takes_the_upload_over() {
     let server = TestServer::start().await;
@@ -223,7 +224,7 @@ async fn a_new_connection_takes_the_upload_over() {
     );
     stalled.write_all(head.as_bytes()).await.unwrap();
     stalled.write_all(&content[..1_100_000]).await.unwrap();
-    // What fills a write is on disk; the rest of it is only in memory.
+    // The first MiB is written to disk; the rest is only in memory.
     let reached = async {
         loop {
             let offset = get(&server, &path).await.body["offset"].as_u64().unwrap();

@@ -1,9 +1,10 @@
-//! Sessions and versions: each keeps its own until its agent asks for another.
+//! Sessions and versions: each session keeps its version until its agent switches.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use serde_json::json;
 use wildcity_client::PushState;
@@ -13,11 +14,11 @@ use wildcity_session::{
     SessionOptions,
 };
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::Catalog;
+use wildcity_twin::store::{Catalog, Retention};
 
-use crate::http::{get, in_cell, push};
+use crate::http::{get, in_cell, post, push};
 use crate::metrics::scrape;
-use crate::support::{Agent, PATIENCE, Seen, TestServer, pose, refused};
+use crate::support::{Agent, PATIENCE, Seen, TestServer, commit_twin_of, pose, refused};
 
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;
@@ -53,8 +54,8 @@ async fn driver(server: &TestServer, name: &str) -> Agent {
 #[tokio::test]
 async fn agents_drive_while_versions_are_pushed() {
     let server = Arc::new(rendering(None).await);
-    let (mut pinned, mut switching) =
-        (driver(&server, "pinned").await, driver(&server, "switching").await);
+    let mut pinned = driver(&server, "pinned").await;
+    let mut switching = driver(&server, "switching").await;
     let over = Arc::new(AtomicBool::new(false));
     let pushing = async {
         for number in 0..VERSIONS {
@@ -65,7 +66,8 @@ async fn agents_drive_while_versions_are_pushed() {
     };
     let places = |step: usize| (step % 5) as f64;
     let staying = async {
-        let (mut sights, mut step) = (Vec::new(), 0);
+        let mut sights = Vec::new();
+        let mut step = 0;
         while !over.load(Ordering::SeqCst) {
             sights.push(sight(&pinned.step(places(step)).await));
             step += 1;
@@ -73,7 +75,9 @@ async fn agents_drive_while_versions_are_pushed() {
         sights
     };
     let following = async {
-        let (mut sights, mut step, mut version) = (Vec::new(), 0, 1);
+        let mut sights = Vec::new();
+        let mut step = 0;
+        let mut version = 1;
         while !over.load(Ordering::SeqCst) {
             if step % 3 == 2 {
                 let switched = switching.ask(json!({ "type": "switch_version" })).await;
@@ -94,7 +98,7 @@ async fn agents_drive_while_versions_are_pushed() {
     let versions: std::collections::BTreeSet<_> = sights.iter().map(|sight| sight.0).collect();
     assert!(versions.len() > 3, "only {versions:?} were seen");
 
-    // Every observation is the picture of its version, whole: as another server draws it.
+    // Every observation shows one version alone: as a fresh server draws it.
     sights.extend(pinned_sights);
     let mut seen: BTreeMap<(u64, u64), String> = BTreeMap::new();
     for (version, x_m, hash) in sights {
@@ -139,7 +143,7 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     let closed = agent.ask(json!({ "type": "close" })).await;
     assert_eq!(closed["summary"]["steps"], 5, "{closed}");
 
-    // What was recorded follows.
+    // The recording has the switches as well.
     let recording = RecordedEpisode::read(&server.recorded()[0]).unwrap();
     let switches: Vec<_> = recording.versions.iter().map(|(at, v)| (*at, v.version)).collect();
     assert_eq!(switches, [(2, 2), (4, 1)]);
@@ -157,7 +161,7 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     assert_eq!(difference.line, 4);
 }
 
-/// While a new version is made ready, who opens the latest gets the one before.
+/// While a new version is made ready, sessions that open the latest get the version before it.
 #[tokio::test]
 async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     let server = TestServer::start().await;
@@ -188,9 +192,9 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     assert_eq!((latest().await, listed().await), (2, 2), "nothing is held");
 }
 
-/// The same over the wire, of a push that takes its time to make its version ready.
+/// The same over the wire, during a push that takes a while to make its version ready.
 #[tokio::test]
-async fn what_is_not_ready_is_not_the_latest() {
+async fn a_version_that_is_not_ready_is_not_the_latest() {
     let server = rendering(None).await;
     let mut agent = driver(&server, "a").await;
     agent.step(1.0).await;
@@ -230,7 +234,7 @@ async fn what_is_not_ready_is_not_the_latest() {
     assert!(versions.as_array().unwrap().iter().all(|version| version["ready"] == true));
 }
 
-/// What a session needs of a new version is in memory when the push is ready.
+/// When a push is ready, the parts of its version that sessions need are in memory.
 #[tokio::test]
 async fn a_ready_version_does_not_keep_its_sessions_waiting() {
     let server = rendering(None).await;
@@ -255,4 +259,19 @@ async fn without_a_session_there_is_nothing_to_switch() {
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
     refused(&agent.ask(json!({ "type": "switch_version" })).await, "session_state");
+}
+
+/// A version that garbage collection removed is gone for HTTP as well, and no fault of the server.
+#[tokio::test]
+async fn a_rollback_to_a_collected_version_is_refused() {
+    let server = TestServer::start().await;
+    commit_twin_of(server.twins.path(), 1.0);
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let retention = Retention { versions: 1, grace: Duration::ZERO };
+    // The first run notes the garbage, the second one removes it.
+    for _ in 0..2 {
+        assert_eq!(catalog.collect("test", retention, false).unwrap().kept, [2]);
+    }
+    let body = json!({ "version": 1 });
+    post(&server, "/v1/twins/test/rollback", &body).await.refused(404, "unknown_version");
 }

@@ -1,4 +1,4 @@
-//! Exposure and overlays: what they do to colours, and that they do nothing else.
+//! Exposure and overlays: they change colours as specified, and nothing else.
 
 use std::sync::Arc;
 
@@ -44,7 +44,7 @@ fn an_exposure_follows_the_sky_and_precedes_the_overlay() {
             changed += usize::from(seen[0] != plain[0]);
         }
         assert!(changed > image.opacity.len() / 2, "{changed}");
-        // 8 bit are made of the same colours.
+        // The 8-bit image has the same colours.
         for (byte, linear) in image.rgb8.chunks(3).zip(image.rgba.chunks(4)) {
             for c in 0..3 {
                 let wanted = 255.0 * linear[c].clamp(0.0, 1.0);
@@ -91,7 +91,7 @@ fn what_cannot_be_is_refused() {
         let error = Appearance { exposure: Some(exposure), overlay: None }.check([1, 1]);
         assert!(matches!(error, Err(AppearanceError::Exposure { field: "offset", .. })));
     }
-    // A backend does not trust whoever did not check.
+    // A backend checks the overlay itself, whether the caller did or not.
     let scene = Scene::default();
     let views = street_views();
     let frame = Frame { scene: &scene, profile: &RenderProfile::DEFAULT, views: &views[2..] };

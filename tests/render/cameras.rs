@@ -1,5 +1,5 @@
-//! What lenses and rolling shutters make of a scene: against the analytic projection, against every
-//! pixel's own ray, and against the same scene row by row.
+//! Images by lenses and rolling shutters, compared with the analytic projection, with exact rays, and with
+//! the same scene rendered row by row.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -13,28 +13,29 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{agree, cpu, max_difference, psnr, render, render_one, try_render};
 use crate::lenses::{
-    driven, lands, lenses, meets_what_each_pixels_ray_meets, passing, sizes_of, street_scene,
+    check_against_exact_rays, check_projections, lenses, rolling_view, scaled_and_cropped,
+    sideways_rolling_view, street_scene,
 };
 
 #[test]
 fn known_points_land_where_the_model_says() {
     for (name, camera) in lenses() {
-        for (camera, least) in sizes_of(&camera).into_iter().zip([20, 20, 5]) {
-            let points = lands(&cpu(), name, camera, 0.3);
+        for (camera, least) in scaled_and_cropped(&camera).into_iter().zip([20, 20, 5]) {
+            let points = check_projections(&cpu(), name, camera, 0.3);
             assert!(points >= least, "{name}: {points} points");
         }
-        lands(&Reference, name, camera.scaled(64, 40).unwrap(), 0.3);
+        check_projections(&Reference, name, camera.scaled(64, 40).unwrap(), 0.3);
     }
 }
 
-/// The profile of every pixel's own ray.
+/// The profile with exact rays.
 fn exact() -> RenderProfile {
     RenderProfile { rays: Rays::Exact, ..RenderProfile::default() }
 }
 
 #[test]
 fn every_lens_draws_what_each_pixels_ray_meets() {
-    meets_what_each_pixels_ray_meets(&Reference);
+    check_against_exact_rays(&Reference);
 }
 
 #[test]
@@ -48,7 +49,7 @@ fn the_cpu_backend_draws_lenses_as_they_are_defined() {
         let image = render_one(&cpu(), &street, &profile, view);
         agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
-    // With all that a profile may ask for.
+    // With other settings of the profile.
     for setting in ["antialiased=true", "near=3", "far=30", "blur=0.1"] {
         let mut profile = RenderProfile::default();
         profile.set(setting).unwrap();
@@ -69,12 +70,13 @@ fn zero_distortion_draws_the_bytes_of_a_pinhole() {
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &street, &profile, View::new(ideal, pose));
     assert!(render_one(&cpu(), &street, &profile, same) == image);
-    // A shutter that rolls while nothing moves is told apart only by how the shape is computed.
+    // With a rolling shutter at rest the image differs only by the unscented transform, which replaces
+    // linearisation.
     let unmoved = View { rolling_shutter: Some(still), ..same };
     let db = psnr(&render_one(&cpu(), &street, &profile, unmoved).rgba, &image.rgba);
     eprintln!("a pinhole by six points: {db:.1} dB of a pinhole");
     assert!(db > 40.0, "{db:.1} dB");
-    // And a hardly bent one draws hardly another image.
+    // A tiny distortion hardly changes the image.
     let hardly = Lens::opencv(OpenCv::new([1e-9, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]));
     let hardly = View::new(Camera { lens: hardly, ..ideal }, pose);
     let off = max_difference(
@@ -84,8 +86,8 @@ fn zero_distortion_draws_the_bytes_of_a_pinhole() {
     assert!(off < 2.0 / 255.0, "off by {off}");
 }
 
-/// A fisheye of 220° whose image circle lies within the image.
-fn beyond_half() -> Camera {
+/// A fisheye of 220° with its image circle within the image.
+fn fisheye_220() -> Camera {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
     Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) }
@@ -93,9 +95,9 @@ fn beyond_half() -> Camera {
 
 #[test]
 fn t23_beyond_180_degrees_and_never_around() {
-    let camera = beyond_half();
+    let camera = fisheye_220();
     assert_eq!(camera.check(), Ok(()));
-    // A ball straight behind, and one at 100° to the right, beyond a pinhole's world.
+    // A ball exactly behind, and one at 100° to the right, where no pinhole sees.
     let behind = GaussianSpec { mean_m: DVec3::new(0.0, 0.0, -3.0), ..GaussianSpec::default() };
     let (sin, cos) = 100_f64.to_radians().sin_cos();
     let right = GaussianSpec { mean_m: 3.0 * DVec3::new(sin, 0.0, cos), ..GaussianSpec::default() };
@@ -108,7 +110,7 @@ fn t23_beyond_180_degrees_and_never_around() {
         let at_px = camera.project(right.mean_m).unwrap();
         let found_px = centroid(&image.opacity, [120, 100], at_px, f64::INFINITY).unwrap();
         assert!(found_px.distance(at_px) < 0.3);
-        // A wall all around: what the lens does not see stays empty, to the pixel.
+        // A wall all around: exactly the pixels within the lens' field are covered.
         let wall = GaussianSpec {
             sigma_m: DVec3::splat(50.0),
             mean_m: DVec3::Z,
@@ -125,7 +127,7 @@ fn t23_beyond_180_degrees_and_never_around() {
             }
         }
     }
-    // All around, against every pixel's ray.
+    // A street all around, against exact rays.
     let (street, pose) = street_scene();
     let view = View { world_from_camera: pose, ..view };
     let truth = render_one(&Reference, &street, &exact(), view);
@@ -222,11 +224,11 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
             ShutterDirection::LeftToRight,
             ShutterDirection::RightToLeft,
         ] {
-            let view = driven(camera, pose, direction);
+            let view = rolling_view(camera, pose, direction);
             let image = render_one(&cpu(), &street, &profile, view);
             let across =
                 matches!(direction, ShutterDirection::LeftToRight | ShutterDirection::RightToLeft);
-            // Each row alone, from where the camera then stands, with every pixel's own ray.
+            // Each row alone, with exact rays, from the camera's pose when the row is exposed.
             let rows: u32 = if across { 160 } else { 100 };
             let mut truth = vec![0.0_f32; 4 * 160 * 100];
             for row in (0..rows).step_by(7) {
@@ -270,13 +272,13 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
 fn the_cpu_backend_rolls_as_it_is_defined() {
     let (street, pose) = street_scene();
     for camera in [lenses()[0].1, lenses()[2].1] {
-        let view = driven(camera, pose, ShutterDirection::TopToBottom);
+        let view = rolling_view(camera, pose, ShutterDirection::TopToBottom);
         let truth = render_one(&Reference, &street, &RenderProfile::default(), view);
         let image = render_one(&cpu(), &street, &RenderProfile::default(), view);
         agree(&image, &truth).unwrap();
     }
-    // A point is seen by the row that it lands on, from where the camera stands then.
-    let view = driven(lenses()[0].1, Pose::IDENTITY, ShutterDirection::BottomToTop);
+    // The ray of a point's image leads from the camera's pose at that moment to the point.
+    let view = rolling_view(lenses()[0].1, Pose::IDENTITY, ShutterDirection::BottomToTop);
     let point_m = DVec3::new(0.4, -0.3, 2.0);
     let at_px = view.project_world(point_m).unwrap();
     let pose = view.world_from_camera_at(at_px);
@@ -287,7 +289,7 @@ fn the_cpu_backend_rolls_as_it_is_defined() {
 
 #[test]
 fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
-    let view = passing();
+    let view = sideways_rolling_view();
     for step in 0..200 {
         let point_m = DVec3::new(0.02 * f64::from(step) - 2.0, 0.1, 1.5);
         let landed = view.project_extrapolated(point_m, 1.0);
@@ -309,14 +311,14 @@ fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
 
 #[test]
 fn t22_six_points_scatter_as_a_million() {
-    // A wide disc at an angle, through the fisheye: mean and covariance on the image, by drawing.
+    // An inclined wide disc through the fisheye: mean and covariance on the image, by sampling points.
     let camera = lenses()[1].1;
     let view = View::new(camera, Pose::IDENTITY);
-    let bent = UnscentedView::new(&view, &RenderProfile::default()).unwrap();
+    let unscented = UnscentedView::new(&view, &RenderProfile::default()).unwrap();
     let mean_m = DVec3::new(0.6, 0.3, 1.5);
     let axes_m = DMat3::from_quat(DQuat::from_rotation_y(0.7))
         * DMat3::from_diagonal(DVec3::new(0.2, 0.3, 0.01));
-    let footprint = bent.project(mean_m, axes_m).unwrap();
+    let footprint = unscented.project(mean_m, axes_m).unwrap();
     let covariance = |columns: &[DVec2]| {
         let sum = |f: fn(&DVec2) -> f64| columns.iter().map(f).sum::<f64>();
         [sum(|c| c.x * c.x), sum(|c| c.x * c.y), sum(|c| c.y * c.y)]
@@ -380,7 +382,7 @@ fn lenses_and_pinholes_share_a_frame() {
     let (street, pose) = street_scene();
     let ideal = Camera::from_pinhole(90, 70, Pinhole { fx: 60.0, fy: 60.0, cx: 45.0, cy: 35.0 });
     let views: Vec<View> =
-        [lenses()[2].1, ideal, beyond_half()].map(|c| View::new(c, pose)).to_vec();
+        [lenses()[2].1, ideal, fisheye_220()].map(|c| View::new(c, pose)).to_vec();
     let backend = cpu();
     let profile = RenderProfile::default();
     let together = render(&backend, &street, &profile, &views);

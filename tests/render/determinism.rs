@@ -1,4 +1,4 @@
-//! The same input, the same bytes.
+//! The same input gives the same bytes: at any number of threads, in any order of views, after any other frame.
 
 use std::sync::Mutex;
 

@@ -1,4 +1,5 @@
-//! Camera models on their own: there and back, by formulas written another way, and what is refused.
+//! Camera models alone: projection and its inverse, comparison with formulas written independently, and
+//! rejected coefficients.
 
 use glam::{DVec2, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -17,7 +18,7 @@ use crate::lenses::{lenses, street_scene};
 use crate::scene_files::Random;
 
 #[test]
-fn every_pixel_comes_back_to_where_it_was() {
+fn projection_inverts_unprojection_at_every_pixel() {
     for (name, camera) in lenses() {
         assert_eq!(camera.check(), Ok(()), "{name}");
         let mut seen = 0;
@@ -41,7 +42,7 @@ fn every_pixel_comes_back_to_where_it_was() {
 }
 
 #[test]
-fn each_model_is_its_formula() {
+fn each_model_matches_its_formula() {
     let point = DVec3::new(0.7, -0.4, 2.0);
     for (name, camera) in lenses() {
         let Pinhole { fx, fy, cx, cy } = camera.pinhole;
@@ -102,7 +103,7 @@ fn each_model_is_its_formula() {
 }
 
 #[test]
-fn a_windshield_turns_rays_as_its_polynomials_say_and_back() {
+fn a_windshield_refracts_by_its_polynomials_and_back() {
     let camera = lenses()[4].1;
     let windshield = camera.windshield.unwrap();
     let point = DVec3::new(0.7, -0.4, 2.0).normalize();
@@ -120,7 +121,7 @@ fn a_windshield_turns_rays_as_its_polynomials_say_and_back() {
     assert!(off_px < 1e-9, "{off_px:e} px");
     assert!(camera.project(point).unwrap().distance(without.project(point).unwrap()) > 0.1);
 
-    // The same polynomials the other way undo what these do.
+    // The same polynomials in the other direction undo the refraction.
     let backward = Windshield::new(
         WindshieldReference::Backward,
         *windshield.horizontal(),
@@ -149,7 +150,7 @@ fn another_size_or_a_part_shows_the_same_directions() {
 }
 
 #[test]
-fn zero_distortion_is_a_pinhole_by_another_name() {
+fn zero_distortion_is_a_pinhole() {
     assert_eq!(Lens::opencv(OpenCv::new([0.0; 6], [0.0; 2], [0.0; 4])), Lens::Pinhole);
 }
 
@@ -157,7 +158,8 @@ fn zero_distortion_is_a_pinhole_by_another_name() {
 fn a_lens_ends_before_it_folds_back() {
     let wide = Pinhole { fx: 40.0, fy: 40.0, cx: 80.0, cy: 50.0 };
     let ideal = Camera::from_pinhole(160, 100, wide);
-    // θ - θ³/6 turns at √2 rad; x (1 - 0.3 r²) at r = 1.05, and is 0.8 at 0.82.
+    // θ - θ³/6 begins to fall at √2 rad. x (1 - 0.3 r²) begins to fall at r = 1.05; its field ends at 0.82,
+    // where the factor is 0.8.
     let fisheye = Fisheye::new([-1.0 / 6.0, 0.0, 0.0, 0.0], None);
     let fisheye = Camera { lens: Lens::Fisheye(fisheye), ..ideal };
     assert!((fisheye.limit_rad() - 1.4).abs() < 1e-12, "{}", fisheye.limit_rad());
@@ -241,7 +243,7 @@ fn distorted([width, height]: [u32; 2], f: f64, lens: OpenCv) -> Camera {
     Camera { lens: Lens::opencv(lens), ..Camera::from_pinhole(width, height, pinhole) }
 }
 
-/// A direction, by how far off the axis and along it, and its azimuth.
+/// A direction, by its components across and along the axis, and its azimuth.
 fn ray([off_axis, along]: [f64; 2], azimuth_rad: f64) -> DVec3 {
     DVec3::new(off_axis * azimuth_rad.cos(), off_axis * azimuth_rad.sin(), along)
 }
@@ -269,14 +271,14 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
         accepted += 1;
         let mut before: Option<(DVec3, DVec2)> = None;
         for i in 0..100 {
-            // To the very limit, close to it, and anywhere.
+            // At the limit, close to it, and anywhere within it.
             let share = [1.0 - 1e-9, 1.0 - 1e-3 * within(1.0).abs(), within(1.0).abs()][i % 3];
             let slope = ray([share * limit, 1.0], within(3.2));
             let at_px = camera.project(slope).unwrap();
             let back = camera.unproject(at_px).unwrap_or_else(|| panic!("{lens:?} lost {slope}"));
             let off = back.distance(slope.normalize());
             assert!(off < 1e-9, "{lens:?}: {slope} came back off by {off:e}");
-            // Of two directions the one farther along their difference lands farther along it.
+            // Of two directions, the one farther along their difference has its image farther along it.
             if let Some((other, other_px)) = before {
                 let apart = (slope - other).truncate();
                 assert!(apart.dot(at_px - other_px) > 0.0, "{lens:?} mirrors {slope}, {other}");
@@ -293,7 +295,7 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
     assert!(accepted > 500, "{accepted} of 600");
 }
 
-/// Against every pixel's own ray, on both backends.
+/// The lower PSNR of the two backends against exact rays.
 fn least_db(camera: Camera) -> f64 {
     assert_eq!(camera.check(), Ok(()));
     let (street, pose) = street_scene();
@@ -309,13 +311,13 @@ fn least_db(camera: Camera) -> f64 {
 }
 
 #[test]
-fn a_pole_beyond_the_image_tears_nothing_over_it() {
+fn a_pole_beyond_the_image_does_not_disturb_it() {
     // 1 + k4 r² + k5 r⁴ + k6 r⁶ is 0 at 1.22; the image's corner is at 0.83.
     let pole = OpenCv::new([-4.9, 17.6, -9.5, -5.0, 17.7, -9.9], [0.0; 2], [0.0; 4]);
     let db = least_db(distorted([160, 90], 110.0, pole));
     eprintln!("a pole beyond the image: {db:.1} dB against every pixel's ray");
     assert!(db >= 45.0, "{db:.1} dB");
-    // As of an Azure Kinect: what is no pole keeps its field.
+    // Coefficients like those of an Azure Kinect: without a pole the lens keeps its field.
     let k = [0.462, -2.41, 1.42, 0.341, -2.24, 1.35];
     let kinect = OpenCv::new(k, [5e-4, -2e-4], [0.0; 4]);
     assert!(kinect.limit_slope() > 7.9, "{}", kinect.limit_slope());
@@ -353,7 +355,7 @@ fn tangential_distortion_mirrors_nothing_into_the_image() {
 }
 
 #[test]
-fn a_lens_shows_all_of_its_field() {
+fn an_image_covers_all_of_the_field() {
     for (f, k) in [(100.0, [0.75, -0.27, -0.096]), (40.0, [0.2, 0.05, -0.01])] {
         let lens = OpenCv::new([k[0], k[1], k[2], 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
         let camera = distorted([300, 300], f, lens);
@@ -379,8 +381,8 @@ fn a_lens_shows_all_of_its_field() {
     }
 }
 
-/// A fisheye behind a windshield, which sees so far off its axis.
-fn behind(windshield: Windshield, max_angle_rad: f64) -> Camera {
+/// A fisheye behind a windshield, with a largest angle off its axis.
+fn behind_windshield(windshield: Windshield, max_angle_rad: f64) -> Camera {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(max_angle_rad)));
     let pinhole = Pinhole { fx: 55.0, fy: 55.0, cx: 100.0, cy: 100.0 };
     Camera { lens, windshield: Some(windshield), ..Camera::from_pinhole(200, 200, pinhole) }
@@ -391,18 +393,18 @@ fn a_windshield_that_folds_where_it_fades_is_refused() {
     let straight = Bivariate::new("vertical", &[0.0, 0.0, 1.0]).unwrap();
     let turned = Bivariate::new("horizontal", &[0.15, 1.0, 0.0]).unwrap();
     let windshield = Windshield::new(WindshieldReference::Forward, turned, straight);
-    let refused = behind(windshield, 1.7).check().unwrap_err();
+    let refused = behind_windshield(windshield, 1.7).check().unwrap_err();
     assert_eq!(refused.field(), "windshield");
     assert!(refused.to_string().contains("87 degrees"), "{refused}");
-    // Before a lens that sees less of what it turns, it may stay.
-    assert_eq!(behind(windshield, 0.9).check(), Ok(()));
+    // In front of a lens with a smaller field the same windshield is accepted.
+    assert_eq!(behind_windshield(windshield, 0.9).check(), Ok(()));
     for name in Rig::preset_names() {
         assert_eq!(Rig::preset(name).unwrap().check(), Ok(()), "{name}");
     }
 }
 
 #[test]
-fn windshields_neither_fold_nor_lose_what_is_behind_them() {
+fn windshields_neither_fold_nor_lose_rays() {
     let mut random = Random(9);
     let mut within = |most: f64| most * (2.0 * random.unit() - 1.0);
     let mut accepted = 0;
@@ -416,7 +418,7 @@ fn windshields_neither_fold_nor_lose_what_is_behind_them() {
             Bivariate::new("windshield", &c).unwrap()
         });
         let way = [WindshieldReference::Forward, WindshieldReference::Backward][set / 16 % 2];
-        let camera = behind(Windshield::new(way, h, v), limit_rad);
+        let camera = behind_windshield(Windshield::new(way, h, v), limit_rad);
         if camera.check().is_err() {
             continue;
         }

@@ -1,4 +1,4 @@
-//! Normals: of surfaces whose normal is known, through every lens, and where surfaces end.
+//! Normals of surfaces with a known normal, through every lens, and at the edges of surfaces.
 
 use glam::{DQuat, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
@@ -48,7 +48,7 @@ fn wall(through_m: DVec3, facing: DVec3, side_m: f64) -> Vec<GaussianSpec> {
     places.map(disc).collect()
 }
 
-/// Angles between what was drawn and a direction, in degrees, of what is covered well; sorted.
+/// Angles between the normals of well covered pixels and a direction, in degrees, sorted.
 fn off_deg(drawn: &Drawn, facing: DVec3) -> Vec<f64> {
     let covered = drawn.normals.chunks(3).zip(&drawn.opacity).filter(|(_, o)| **o > 0.98);
     let angle = |(n, _): (&[f32], _)| {
@@ -62,7 +62,7 @@ fn off_deg(drawn: &Drawn, facing: DVec3) -> Vec<f64> {
 }
 
 #[test]
-fn a_wall_faces_where_it_does() {
+fn normals_of_a_wall_match() {
     let facing = DVec3::new(0.4, -0.3, -1.0).normalize();
     let scene = scene_of(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
@@ -91,12 +91,12 @@ fn a_wall_faces_where_it_does() {
 
 #[test]
 fn an_edge_belongs_to_neither_side() {
-    // A board 2 m away before a wall 4 m away: between them is one step, and no slope.
+    // A board 2 m away in front of a wall 4 m away: the edge between them must not give slanted normals.
     let board = wall(DVec3::new(-1.0, 0.0, 2.0), DVec3::NEG_Z, 2.0);
     let behind = wall(DVec3::new(0.0, 0.0, 4.0), DVec3::NEG_Z, 12.0);
     let scene = scene_of(&[board, behind].concat());
     let drawn = draw(&cpu(), &scene, forward_view([160, 100], 90.0));
-    // The board's last discs fade out over some pixels, whose depth is between the two and has a slope.
+    // At the board's edge discs fade out over some pixels, and their blended depth does have a slope.
     let mut on_one = 0;
     let mut slopes = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
@@ -110,7 +110,7 @@ fn an_edge_belongs_to_neither_side() {
 }
 
 #[test]
-fn where_nothing_is_nothing_faces() {
+fn pixels_without_depth_have_no_normal() {
     let ball = scene_of(&[GaussianSpec::default()]);
     let drawn = draw(&cpu(), &ball, forward_view([40, 30], 30.0));
     let mut covered = 0;

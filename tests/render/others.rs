@@ -1,4 +1,4 @@
-//! Against images that other renderers made of the same Gaussians.
+//! Comparison with images of the same Gaussians by other renderers.
 
 use wildcity_render::Backend;
 use wildcity_render::reference::Reference;
@@ -16,7 +16,7 @@ fn gsplat_is_met() {
     };
     assert!(off(&Reference, &truth.profile) <= 1e-5);
     assert!(off(&cpu(), &truth.profile) <= 1e-4);
-    // Another profile is another image: the comparison can fail.
+    // With another profile the comparison fails.
     for setting in ["blur=0.2", "antialiased=true", "alpha_cut=0.02", "alpha_cap=0.5"] {
         let mut other = truth.profile;
         other.set(setting).unwrap();

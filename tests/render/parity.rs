@@ -1,4 +1,4 @@
-//! cpu against reference: f32 and tiles against f64 and none.
+//! The cpu backend against the reference backend.
 
 use glam::DVec3;
 use wildcity_render::View;
@@ -12,7 +12,7 @@ use crate::images::{agree, cpu, render, render_one, view_along};
 use crate::scene_files::gaussians;
 use crate::streets::{demo_street, street, street_views};
 
-/// Compares all views, and returns the least agreement in dB.
+/// Asserts that all views agree, and returns the lowest PSNR in dB.
 fn compare(scene: &Gaussians, profile: &RenderProfile, views: &[View]) -> f64 {
     let scene = Scene::from_gaussians(scene);
     let images = render(&cpu(), &scene, profile, views);
@@ -51,15 +51,15 @@ fn every_field_of_the_profile() {
 
 #[test]
 fn a_cloud_around_the_camera() {
-    // Centres from beside the lens to 2 m, half of them behind.
+    // Centres up to 2 m from the camera, half of them behind it.
     let view = view_along([128, 96], 80.0, DVec3::ZERO, DVec3::new(0.3, -0.2, 1.0), DVec3::Y);
     compare(&gaussians(3_000, 2, 2.0, 8), &RenderProfile::default(), &[view]);
 }
 
 #[test]
 fn the_demo_street_from_its_own_cameras() {
-    // Coplanar surfels in thousands: where two depths differ by less than f32 tells, the backends
-    // may draw them in another order.
+    // Thousands of coplanar surfels: where depths differ by less than the resolution of f32, the backends may
+    // draw them in different orders.
     let (street, views) = demo_street();
     compare(&street, &RenderProfile::default(), &views);
 }
@@ -105,7 +105,7 @@ fn every_instruction_set_of_this_machine() {
 
 /// A comparison that cannot fail proves nothing.
 #[test]
-fn a_slip_of_the_scene_is_caught() {
+fn a_mutated_scene_is_caught() {
     let right = street(20_000, 1, 9);
     let profile = RenderProfile::default();
     let view = street_views()[0];
@@ -115,16 +115,16 @@ fn a_slip_of_the_scene_is_caught() {
         agree(&image, &truth).is_err()
     };
     assert!(!caught(&right));
-    let slips: [fn(&mut Gaussians); 5] = [
+    let mutations: [fn(&mut Gaussians); 5] = [
         |g| g.means_m.iter_mut().for_each(|m| m[0] += 0.002),
         |g| g.quats_wxyz.iter_mut().for_each(|q| q[1] = -q[1]),
         |g| g.ln_scales.iter_mut().for_each(|s| s.swap(0, 2)),
         |g| g.logit_opacities.iter_mut().for_each(|o| *o += 0.01),
         |g| g.sh.chunks_mut(12).for_each(|k| k.swap(3, 9)),
     ];
-    for (i, slip) in slips.into_iter().enumerate() {
+    for (i, mutate) in mutations.into_iter().enumerate() {
         let mut wrong = right.clone();
-        slip(&mut wrong);
-        assert!(caught(&wrong), "slip {i} went unnoticed");
+        mutate(&mut wrong);
+        assert!(caught(&wrong), "mutation {i} went unnoticed");
     }
 }

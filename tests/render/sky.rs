@@ -1,4 +1,4 @@
-//! Skies: against numpy, baked against exact, and behind Gaussians.
+//! Skies: compared with numpy, baked maps with the exact sky, and skies behind Gaussians.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use crate::streets::{street, street_views};
 /// A sky that is evaluated for every pixel.
 const EXACT: RenderProfile = RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT };
 
-/// One that is baked finely.
+/// A sky that is baked with a small error.
 const FINE: RenderProfile = RenderProfile { sky_error: 0.001, ..RenderProfile::DEFAULT };
 
 fn anywhere(random: &mut Random) -> DVec3 {
@@ -37,8 +37,8 @@ fn map_of(drawn: DrawableSky) -> Arc<CubeMap> {
     }
 }
 
-/// `python scenes/sky.py truths`: a direction, its colour with the mean appearance, and with that of
-/// image 1.
+/// The values are those of `python scenes/sky.py truths`: a direction, its colour with the mean appearance,
+/// and its colour with the appearance of image 1.
 #[test]
 fn the_network_is_what_numpy_says() {
     let truths: Vec<[f64; 9]> = serde_json::from_str(include_str!("sky.json")).unwrap();
@@ -74,7 +74,7 @@ fn what_backends_evaluate_is_exact() {
         assert!(off < 1e-5, "{simd:?}: off by {off}");
         assert!(image.opacity.iter().all(|&opacity| opacity == 0.0), "a sky covers nothing");
     }
-    // By definition, whatever the profile asks.
+    // The reference backend evaluates the sky exactly with every profile.
     let image = render_one(&Reference, &scene, &RenderProfile::DEFAULT, view);
     assert!(max_difference(&image.rgba, &truth) < 1e-6);
 }
@@ -94,7 +94,7 @@ fn networks_of_every_shape() {
         let [image, truth] =
             [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &EXACT, view));
         let off = max_difference(&image.rgba, &truth.rgba);
-        // 512 times a direction of f32 is off by 3e-5 rad.
+        // The highest octave multiplies a direction in f32, and its error, by 512: 3e-5 rad.
         let most = if octaves == 10 { 3e-4 } else { 1e-5 };
         assert!(off < most, "{identity} {octaves} {appearance} {skip}: off by {off}");
     }
@@ -115,7 +115,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
             worst = worst.max((map.rgb(sky.sky_from_world() * away) - exact).abs().max_element());
         }
         assert!(worst <= map.error(), "{worst}, stated {}", map.error());
-        // A bound that is never approached would cost memory for nothing.
+        // A bound that is far too large would waste memory.
         assert!(worst > 0.1 * map.error(), "{worst}, stated {}", map.error());
         edges.push(map.edge());
         assert!(Arc::ptr_eq(&map, &map_of(sky.drawable(wanted).unwrap())), "baked once");
@@ -123,8 +123,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
     assert!(edges.is_sorted() && edges[0] < edges[2], "{edges:?}");
 }
 
-/// Sessions that ask for different errors have maps side by side, and no frame of one bakes anew because
-/// of the other.
+/// Sessions with different errors have a map each, and do not cause each other to bake again.
 #[test]
 fn every_error_keeps_its_map() {
     let sky = sky();
@@ -134,7 +133,7 @@ fn every_error_keeps_its_map() {
     for (wanted, map) in wanted.into_iter().zip(&maps) {
         assert!(Arc::ptr_eq(&map_of(sky.drawable(wanted).unwrap()), map), "{wanted}");
     }
-    // What a coarser map is good enough for is it, whoever asked first.
+    // A session gets the coarsest map that is good enough, in whichever order sessions ask.
     let coarsest = map_of(sky.drawable(1.0).unwrap());
     assert_eq!(coarsest.edge(), 129);
     assert!(coarsest.error() <= 0.05 && Arc::ptr_eq(&coarsest, &maps[0]));
@@ -177,15 +176,15 @@ fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     let mut targets = [Target { rgba: Some(&mut image), ..Target::default() }];
     let refused = cpu().render(&frame, &mut targets, &|_, _| {});
     assert_eq!(refused, Err(RenderError::Sky(error)));
-    // Evaluated, it is drawn.
+    // Evaluated exactly, it is drawn.
     render_one(&cpu(), &scene, &EXACT, view);
 }
 
-/// Behind a street: what the two backends make of it, and what it adds to the street alone.
+/// A sky behind a street: the two backends agree, and it adds the right colours to the street alone.
 #[test]
 fn a_sky_behind_gaussians() {
     let mut gaussians = street(20_000, 1, 6);
-    // Before each camera three veils of 0.9, which leave a thousandth.
+    // In front of each camera three layers of opacity 0.9, which leave a transmittance of 1e-3.
     for view in street_views() {
         for behind in [5.0, 5.1, 5.2] {
             let axes = view.world_from_camera.rotation_matrix();
@@ -220,7 +219,7 @@ fn a_sky_behind_gaussians() {
                 let at_px = DVec2::new(at(pixel % width), at(pixel / width));
                 let rgb = sky.rgb(view.ray_world(at_px).unwrap());
                 let background = 1.0 - f64::from(alone[3]);
-                // Rounded by 1 - (1 - T).
+                // Close to the cut the rounding of 1 - (1 - T) decides.
                 if (background - SKY_CUT).abs() < 1e-6 {
                     continue;
                 }
@@ -236,7 +235,7 @@ fn a_sky_behind_gaussians() {
     }
 }
 
-/// Infinitely far away: nothing moves when the camera does, and everything when it turns.
+/// A sky is infinitely far away: its image does not change when the camera moves, and does when it rotates.
 #[test]
 fn a_sky_has_no_parallax() {
     let scene = empty(sky());
@@ -251,7 +250,7 @@ fn a_sky_has_no_parallax() {
 
 #[test]
 fn images_are_their_own_map() {
-    // Each face a colour of its own, brighter to the right and towards its bottom.
+    // Each face has its own red, and its green and blue rise to the right and to the bottom.
     let side = 16;
     let mut rgb8 = Vec::new();
     for face in 0..6_u8 {
@@ -266,7 +265,8 @@ fn images_are_their_own_map() {
         for profile in [RenderProfile::DEFAULT, EXACT] {
             let [image, truth] =
                 [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &profile, view));
-            // No pixel looks along the very edge of two faces, where either is right: the closest is 6e-5 off.
+            // No pixel looks exactly along the edge of two faces, where either would be right: the closest is
+            // 6e-5 off.
             let off = |limit: f32| {
                 let pairs = image.rgba.iter().zip(&truth.rgba);
                 let within = pairs.filter(|(a, b)| (*a - *b).abs() <= limit).count();
@@ -286,7 +286,7 @@ fn a_background_is_a_sky_of_one_colour() {
     for backend in [&cpu() as &dyn Backend, &Reference] {
         let image = render_one(backend, &Scene::default(), &profile, view);
         assert!(image.rgb8.chunks(3).all(|rgb| rgb == [64, 128, 255]), "{:?}", &image.rgb8[..3]);
-        // Where there is a sky, nothing of it is seen.
+        // With a sky the background is not visible.
         let scene = empty(sky());
         let with = render_one(backend, &scene, &profile, view);
         assert_eq!(with, render_one(backend, &scene, &RenderProfile::DEFAULT, view));

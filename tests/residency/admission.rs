@@ -110,7 +110,9 @@ fn the_end_of_a_frame_makes_room_at_once() {
     for _ in 0..5 {
         let first = resident.scene(&frame(0.0), &PROFILE).unwrap();
         let (tell, told) = channel();
-        let (other, eyes, before) = (resident.clone(), frame(500.0), cache.stats().waits);
+        let other = resident.clone();
+        let eyes = frame(500.0);
+        let before = cache.stats().waits;
         let waiting = std::thread::spawn(move || {
             let second = other.scene(&eyes, &PROFILE).unwrap();
             tell.send(Instant::now()).unwrap();
@@ -134,7 +136,8 @@ fn the_end_of_a_frame_makes_room_at_once() {
 fn race(resident: &Arc<wildcity_twin::residency::Resident>, threads: u64, admitted: bool) {
     let (tell, told) = channel();
     for thread in 0..threads {
-        let (resident, tell) = (resident.clone(), tell.clone());
+        let resident = resident.clone();
+        let tell = tell.clone();
         std::thread::spawn(move || {
             let _reservation = admitted.then(|| resident.reserve(EXTENT).unwrap());
             let mut random = Random(thread + 1);

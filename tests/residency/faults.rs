@@ -26,7 +26,8 @@ fn broken(fault: Fault) -> Broken {
     let cache = Cache::with_source(demo().catalog(), source.clone(), None);
     let resident = cache.open("demo", None).unwrap();
     let at = |station_m| resident.demand(&eyes(&views(demo().at(station_m))), &PROFILE);
-    let (near, far) = (at(0.0), at(300.0));
+    let near = at(0.0);
+    let far = at(300.0);
     let only_far: Vec<_> = far.into_iter().filter(|n| !near.contains(n)).collect();
     let SectionRef { chunk, section } = only_far[only_far.len() / 2];
     let chunk = &resident.version.manifest.chunks[chunk];

@@ -17,7 +17,7 @@ fn front(more: Value) -> Value {
     rig
 }
 
-/// An overlay of 8 x 6 px whose right half is opaque and green.
+/// An overlay of 8 x 6 px. Its right half is opaque and green.
 fn green_half() -> Overlay {
     let pixel = |at: usize| if at % 8 < 4 { [9, 9, 9, 0] } else { [0, 200, 0, 255] };
     Overlay::new(8, (0..48).flat_map(pixel).collect()).unwrap()

@@ -1,4 +1,4 @@
-//! The last frames of each camera, cameras at different rates, warm-up, and frames that nobody reads.
+//! The last frames of each camera, cameras at different rates, warm-up, and frames that are not read.
 
 use std::sync::atomic::Ordering;
 
@@ -12,7 +12,7 @@ use wildcity_twin::store::Catalog;
 
 use crate::support::{Agent, Painter, Seen, TestServer, pose, refused, rig};
 
-/// What a camera of the rig sees from a place on the x axis.
+/// What a camera of the rig sees when the rig is at a point of the x axis.
 fn painted(camera: usize, x_m: f64) -> Vec<u8> {
     let world_from_rig = Pose { position_m: glam::DVec3::new(x_m, 0.0, 0.0), ..Pose::IDENTITY };
     let camera = &rig().cameras[camera];
@@ -32,7 +32,8 @@ fn bundle(seen: &Seen, camera: &str) -> Vec<(i64, Vec<u8>)> {
     let entries = entries.into_iter().flatten().flatten().filter(|image| image["camera"] == camera);
     let tensors = seen.tensors();
     let read = |image: Value| {
-        let (start, end) = (&image["shutter_start_us"], &image["shutter_end_us"]);
+        let start = &image["shutter_start_us"];
+        let end = &image["shutter_end_us"];
         assert_eq!(start, end);
         let pixels = tensors.tensor(image["tensor"].as_str().unwrap()).unwrap().data().to_vec();
         assert_eq!(image["hash"], blake3::hash(&pixels).to_hex().as_str());
@@ -47,14 +48,14 @@ fn driven(camera: usize, times: &[i64]) -> Vec<(i64, Vec<u8>)> {
 }
 
 #[tokio::test]
-async fn earlier_frames_are_believed_as_far_as_they_were() {
+async fn the_trust_of_earlier_frames_is_that_of_their_time() {
     let server = TestServer::start().await;
     // The drive ends at 9 m.
     let outputs = json!({ "encoding": "raw", "frames": 3, "trust": true });
     let mut agent = open(&server, json!({ "outputs": outputs, "decision_us": 200_000 })).await;
     agent.look(json!({ "type": "reset" })).await;
     let between = agent.step(29.0).await;
-    assert_eq!(between.meta["images"], json!([]), "nobody decides here");
+    assert_eq!(between.meta["images"], json!([]), "there is no decision at this step");
     let seen = agent.step(8.0).await;
     let away_m = |list: &str| -> Vec<f64> {
         let images = seen.meta[list].as_array().unwrap().iter();
@@ -62,7 +63,7 @@ async fn earlier_frames_are_believed_as_far_as_they_were() {
         front.map(|image| image["trust"]["distance_m"].as_f64().unwrap()).collect()
     };
     assert_eq!((away_m("images"), away_m("history")), (vec![0.0], vec![20.0, 0.0]));
-    // Where nobody decided, the ego was off its model all the same.
+    // The ego was off its model at a step without a decision, and that counts.
     let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
     assert_eq!(summary["outcome"], "off_model");
 }
@@ -89,7 +90,7 @@ async fn the_last_frames_of_each_camera_newest_first() {
     // A new episode begins with nothing of the old one.
     let again = agent.look(json!({ "type": "reset" })).await;
     assert_eq!(bundle(&again, "front"), driven(0, &[0]));
-    // A look beside the way is no frame of it.
+    // Images of `observe` are not part of the history.
     agent.step(1.0).await;
     agent.look(json!({ "type": "observe", "poses": [pose(7.0), pose(8.0)] })).await;
     assert_eq!(bundle(&agent.step(2.0).await, "front"), driven(0, &[2, 1, 0]));
@@ -101,7 +102,8 @@ async fn files_of_earlier_frames_are_the_files_of_then() {
     for encoding in ["jpeg", "png"] {
         let outputs = json!({ "encoding": encoding, "frames": 2 });
         let mut agent = open(&server, json!({ "outputs": outputs })).await;
-        let (then, now) = (agent.step(1.0).await, agent.step(2.0).await);
+        let then = agent.step(1.0).await;
+        let now = agent.step(2.0).await;
         for camera in ["front", "rear"] {
             let file = |seen: &Seen, tensor: String| {
                 seen.tensors().tensor(&tensor).unwrap().data().to_vec()
@@ -133,7 +135,7 @@ async fn a_slower_camera_takes_every_second_frame() {
 }
 
 #[tokio::test]
-async fn what_no_decision_reads_is_not_drawn() {
+async fn frames_that_no_decision_reads_are_not_drawn() {
     let server = TestServer::start().await;
     let outputs = json!({ "encoding": "raw", "frames": 4 });
     let rare = json!({ "outputs": outputs, "decision_us": 1_000_000 });
@@ -181,18 +183,18 @@ async fn the_drive_before_the_start_is_history_and_frames() {
     let next = agent.step(6.5).await;
     let now = (1, painted(0, 6.5));
     assert_eq!(bundle(&next, "front"), [now.clone(), logged(0), logged(1), logged(2)]);
-    // A step at once shows the same.
+    // A step without a reset before it shows the same.
     let at_once = json!({ "outputs": outputs, "start": start, "warm_up_us": 500_000 });
     let mut agent = open(&server, at_once).await;
     let seen = agent.step(6.5).await;
     assert_eq!(bundle(&seen, "front"), [now, logged(0), logged(1), logged(2)]);
-    // Without a start, as soon as the drive is warm.
+    // Without a start, the episode begins where the warm-up ends.
     let opened = server.agent().await.open(json!({ "warm_up_us": 300_000 })).await;
     assert_eq!(opened["start"], pose(3.0));
 }
 
 #[tokio::test]
-async fn what_cannot_be_scheduled_is_refused() {
+async fn periods_that_do_not_fit_the_steps_are_refused() {
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
     let from_m = |station_m: f64| json!({ "trajectory": "log", "station_m": station_m });

@@ -26,11 +26,13 @@ async fn act(agent: &mut Agent, acceleration: f64, curvature: f64) -> Seen {
 /// What is left of a circle of 25 m radius driven at 5 m/s, of which `driven_s` are over, in the frame of
 /// a rig beside it: 2 s of poses.
 fn rest_of_circle(ego: &Value, driven_s: f64) -> Value {
-    let (xyz, q) = (numbers(&ego["pose"]["xyz"]), numbers(&ego["pose"]["q"]));
+    let xyz = numbers(&ego["pose"]["xyz"]);
+    let q = numbers(&ego["pose"]["q"]);
     let yaw = 2.0 * q[3].atan2(q[0]);
     let timed = |k: usize| {
         let angle = 0.2 * (driven_s + 0.1 * (k + 1) as f64);
-        let (x, y) = (25.0 * angle.sin() - xyz[0], 25.0 * (1.0 - angle.cos()) - xyz[1]);
+        let x = 25.0 * angle.sin() - xyz[0];
+        let y = 25.0 * (1.0 - angle.cos()) - xyz[1];
         let xyz = [x * yaw.cos() + y * yaw.sin(), y * yaw.cos() - x * yaw.sin(), 0.0];
         let half = 0.5 * (angle - yaw);
         let pose = json!({ "xyz": xyz, "q": [half.cos(), 0.0, 0.0, half.sin()] });
@@ -65,7 +67,8 @@ async fn a_kinematic_car_drives_the_arc_that_it_is_told() {
     // 5 * 0.1 + 2 * 0.1² / 2 = 0.51 m on a radius of 10 m.
     let seen = act(&mut agent, 2.0, 0.1).await;
     let ego = &seen.meta["ego"];
-    let (angle, xyz) = (0.051f64, numbers(&ego["pose"]["xyz"]));
+    let angle = 0.051f64;
+    let xyz = numbers(&ego["pose"]["xyz"]);
     assert!((xyz[0] - 10.0 * angle.sin()).abs() < 1e-12, "{ego}");
     assert!((xyz[1] - 10.0 * (1.0 - angle.cos())).abs() < 1e-12, "{ego}");
     assert!((ego["yaw_rate"].as_f64().unwrap() - 0.52).abs() < 1e-12, "{ego}");
@@ -104,7 +107,8 @@ async fn a_trajectory_is_followed() {
             let path = rest_of_circle(&ego, 0.1 * f64::from(step));
             ego =
                 agent.look(json!({ "type": "step", "trajectory": path })).await.meta["ego"].clone();
-            let (xyz, angle) = (numbers(&ego["pose"]["xyz"]), 0.02 * f64::from(step + 1));
+            let xyz = numbers(&ego["pose"]["xyz"]);
+            let angle = 0.02 * f64::from(step + 1);
             let wanted = [25.0 * angle.sin(), 25.0 * (1.0 - angle.cos())];
             let off_m = (xyz[0] - wanted[0]).hypot(xyz[1] - wanted[1]);
             let allowed_m = if step < 40 { begun_m } else { most_m };
@@ -123,7 +127,8 @@ async fn a_trajectory_is_followed() {
 #[tokio::test]
 async fn what_does_not_move_this_ego_is_refused() {
     let server = TestServer::start().await;
-    let (mut teleport, mut driven) = (server.driver("a").await, car(&server, "b", "dynamic").await);
+    let mut teleport = server.driver("a").await;
+    let mut driven = car(&server, "b", "dynamic").await;
     let action = json!({ "type": "step", "action": { "acceleration": 1.0, "curvature": 0.0 } });
     let answer = teleport.ask(action).await;
     refused(&answer, "session_state");

@@ -1,4 +1,4 @@
-//! HTTP: health, twins, and who may upgrade.
+//! HTTP: health, twins, and the checks of an upgrade to WebSocket.
 
 use std::time::Duration;
 
@@ -44,7 +44,7 @@ async fn health_and_twins() {
         serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
     assert_eq!(body["twins"][0]["name"], "test");
     assert_eq!(get(&server, "/nothing").await.0, 404);
-    // A version never changes: what was read of it is not read again.
+    // A version never changes: its manifest is not read again.
     let manifest = body["twins"][0]["version_hash"].as_str().unwrap();
     let mut objects = walk(server.twins.path());
     objects.retain(|path| path.to_string_lossy().replace('/', "").contains(manifest));
@@ -62,7 +62,7 @@ fn walk(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
     paths.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
 }
 
-/// Answers that nobody reads are given up, and their place is free again.
+/// A connection with answers that are not read is closed, and another one can take its place.
 #[tokio::test]
 async fn an_answer_that_is_not_read_is_given_up() {
     let short = Duration::from_millis(300);
@@ -80,7 +80,7 @@ async fn only_local_pages_and_agents_may_drive() {
     let subprotocol = "Sec-WebSocket-Protocol: other, wildcity.v1\n";
     assert_eq!(upgrade(&server, subprotocol).await, 101);
     assert_eq!(upgrade(&server, "").await, 400);
-    // Names of subprotocols have a case, and the key is 16 bytes in base64.
+    // Names of subprotocols are case-sensitive, and the key is 16 bytes in base64.
     assert_eq!(upgrade(&server, "Sec-WebSocket-Protocol: WildCity.v1\n").await, 400);
     for key in ["", "x", "dGhlIHNhbXBsZSBub25jZQ=", "dGhlIHNhbXBsZSBub25jZ!=="] {
         let bad = UPGRADE.replace("dGhlIHNhbXBsZSBub25jZQ==", key);

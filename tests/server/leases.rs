@@ -1,4 +1,4 @@
-//! What a session sees is no garbage, however old it is.
+//! A version that a session uses is not garbage-collected, however old it is.
 
 use std::time::Duration;
 
@@ -18,7 +18,7 @@ async fn a_version_that_a_session_sees_is_kept() {
     }
     agent.step(1.0).await;
     server.running.stop().await;
-    // The last task of the server may still hold it for a moment.
+    // The last task of the server may hold the lease for a moment longer.
     let ended = async {
         while catalog.collect("test", keep, true).unwrap().kept != [2] {
             tokio::time::sleep(Duration::from_millis(10)).await;

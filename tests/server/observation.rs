@@ -1,4 +1,4 @@
-//! What an agent gets: every byte of an observation.
+//! Every byte of an observation.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ async fn open(server: &TestServer, outputs: serde_json::Value) -> Agent {
 }
 
 #[tokio::test]
-async fn nothing_of_what_was_opened_is_implicit() {
+async fn opened_names_every_setting() {
     let server = TestServer::start().await;
     let mut agent = Agent::connect(server.address()).await;
     let welcome = agent.hello().await;
@@ -63,7 +63,7 @@ async fn observations_tell_what_they_waited_for_and_hints_are_taken() {
     let first = agent.step(0.0).await.meta["residency"].clone();
     assert!(first["held_bytes"].as_u64().unwrap() > 0);
     assert!(first["held_bytes"].as_u64() <= first["limit_bytes"].as_u64());
-    // Everything is near everything here, so that the second frame finds it.
+    // The twin is small: all of it is loaded for the first frame.
     let second = agent.step(1.0).await.meta["residency"].clone();
     assert_eq!((&second["waited_for"], &second["waited_us"]), (&json!(0), &json!(0)));
     let answer = agent.ask(json!({ "type": "prefetch", "poses": [] })).await;
@@ -79,7 +79,8 @@ async fn raw_pixels_and_maps_are_the_renderers() {
     let seen = agent.step(2.0).await;
     let tensors = seen.tensors();
     for (k, camera) in rig().cameras.iter().enumerate() {
-        let (w, h) = (camera.camera.width_px as usize, camera.camera.height_px as usize);
+        let w = camera.camera.width_px as usize;
+        let h = camera.camera.height_px as usize;
         let rgb = tensors.tensor(&format!("camera/{}/rgb", camera.name)).unwrap();
         assert_eq!(rgb.shape(), [h, w, 3]);
         let expected =
@@ -148,7 +149,7 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
 }
 
 #[tokio::test]
-async fn how_far_images_may_be_believed_is_said_if_asked_for() {
+async fn trust_is_sent_if_it_is_requested() {
     let server = TestServer::start().await;
     let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
     // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the
@@ -173,7 +174,7 @@ async fn how_far_images_may_be_believed_is_said_if_asked_for() {
     let images = looks.meta["images"].as_array().unwrap();
     let distances_m: Vec<_> = images.iter().map(|image| &image["trust"]["distance_m"]).collect();
     assert_eq!(distances_m, [0.0, 0.0, 3.0, 3.0].map(|m| json!(m)).iter().collect::<Vec<_>>());
-    // What is only looked at is no place where the ego was.
+    // Poses that are only observed do not count as poses of the ego.
     let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
     assert_eq!(
         *summary,
@@ -236,7 +237,7 @@ async fn png_is_lossless_and_jpeg_is_near() {
         pixels.iter().zip(&truth).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2)).sum()
     };
     assert!(error(&best) < error(&worst), "{} {}", error(&best), error(&worst));
-    // The hash is of the pixels, whatever became of them on the way.
+    // The hash is of the pixels before they are encoded.
     assert_eq!(png.frame_hash(), best.frame_hash());
     assert_eq!(png.frame_hash(), worst.frame_hash());
 }
@@ -324,7 +325,7 @@ async fn cameras_are_chosen_and_ordered_by_the_agent() {
     assert_eq!(start.meta["images"].as_array().unwrap().len(), 6);
 }
 
-/// The header's room is reserved before the header is known: the longest one must fit.
+/// Room for the header is reserved before the header is known: the longest header must fit.
 #[tokio::test]
 async fn the_longest_header_fits() {
     let server = TestServer::start().await;

@@ -1,4 +1,4 @@
-//! Profiles that a server or a session wants otherwise.
+//! Render profiles that a server or a session overrides.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -63,8 +63,8 @@ async fn a_profile_that_cannot_be_had_is_refused_by_its_field() {
     agent.open(json!({})).await;
 }
 
-/// Commits a twin `creased`, whose sky has one kink: half of 8 bits at most where it is baked at the
-/// default, and too much for any map at 1e-4.
+/// Commits a twin `creased`. Its sky has one kink: baked at the default sky_error, the map is off by at
+/// most half a step of 8 bits; for 1e-4 no map is fine enough.
 fn commit_creased(dir: &Path) {
     let floats = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
     let layers: [(usize, usize, Vec<u8>, Vec<u8>); 3] = [
@@ -111,7 +111,7 @@ async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
     assert_eq!(answer["field"], "profile", "{answer}");
     let message = answer["message"].as_str().unwrap();
     assert!(message.contains("sky_error is 0.0001: set sky_error to 0.000"), "{message}");
-    // What it says is the way out: another error, or none.
+    // The message names what works: a larger error, or 0.
     for sky_error in [0.001, 0.0] {
         let opened = server.agent().await.try_open(asked(sky_error)).await;
         assert_eq!(opened["profile"]["sky_error"], sky_error, "{opened}");

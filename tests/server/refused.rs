@@ -1,4 +1,4 @@
-//! Bad input: each has its own error, nothing is lost, and the server serves the next client.
+//! Bad input: each kind has its own error, the session is unchanged, and the server serves the next client.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -52,7 +52,7 @@ async fn what_is_not_a_request() {
     server.still_serves().await;
 }
 
-/// The field that a mistake is in is named, however deep it is.
+/// The field with a mistake is named, however deep it is.
 #[tokio::test]
 async fn mistakes_are_named_by_their_path() {
     let server = TestServer::start().await;
@@ -91,7 +91,7 @@ async fn mistakes_are_named_by_their_path() {
 }
 
 #[tokio::test]
-async fn poses_that_are_none() {
+async fn invalid_poses_are_refused() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
     let step = |pose: &str| format!(r#"{{"type":"step","seq":2,"pose":{pose}}}"#);
@@ -313,7 +313,7 @@ async fn silence_ends_a_connection() {
     server.still_serves().await;
 }
 
-/// Rubbish is answered, but does not put off the time by which `hello` must have come.
+/// Invalid messages are answered, but do not extend the deadline of `hello`.
 #[tokio::test]
 async fn hello_must_come_in_time_whatever_else_comes() {
     let hello = Duration::from_millis(400);
@@ -333,7 +333,7 @@ async fn hello_must_come_in_time_whatever_else_comes() {
 }
 
 #[tokio::test]
-async fn what_is_too_much_to_draw_is_the_agents_affair() {
+async fn a_frame_with_too_much_to_draw_is_refused() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
     server.painter.too_many.store(true, Ordering::SeqCst);
@@ -356,7 +356,7 @@ async fn pings_are_answered_and_count_as_life() {
     assert_eq!(agent.step(1.0).await.meta["step"], 1);
 }
 
-/// Pongs that nobody reads must neither pile up in the server nor keep the connection.
+/// Pongs that the client does not read must neither accumulate in the server nor keep the connection open.
 #[tokio::test]
 async fn pings_of_a_client_that_does_not_read_are_no_life() {
     let send = Duration::from_millis(300);

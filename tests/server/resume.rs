@@ -1,4 +1,4 @@
-//! Connections that are lost, and sessions that are not.
+//! Sessions outlive lost connections.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use wildcity_server::Limits;
 
 use crate::support::{Agent, Reply, TestServer, pose, refused};
 
-/// Resumes a session on a new connection, whose numbers go on after `last_seq` then.
+/// Resumes a session on a new connection. The numbers of requests continue after `last_seq`.
 async fn resume(server: &TestServer, name: &str, last_seq: u64) -> (Agent, serde_json::Value) {
     let mut agent = server.agent().await;
     let request = json!({ "type": "resume", "session": name, "last_seq": last_seq });
@@ -74,7 +74,7 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
             socket.unwrap();
         }
         drop(agent);
-        // Resumed while the step still runs: it is finished first.
+        // Resumed while the step still runs: the step is finished first.
         let (mut agent, resumed) = resume(&server, name, last_seq).await;
         assert_eq!((&resumed["last_seq"], &resumed["step"]), (&json!(last_seq + 1), &json!(2)));
         let begun = server.painter.begun.load(Ordering::SeqCst);
@@ -87,7 +87,7 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
     server.still_serves().await;
 }
 
-/// A refused request used up its number, on this connection and on the next.
+/// A refused request has used its number, on this connection and on the next.
 #[tokio::test]
 async fn numbers_go_on_after_a_refused_request() {
     let server = TestServer::start().await;
@@ -105,7 +105,7 @@ async fn numbers_go_on_after_a_refused_request() {
     }
 }
 
-/// After a network failure the client is back before the server knows that it was gone.
+/// After a network failure the client reconnects before the server notices the failure.
 #[tokio::test]
 async fn resuming_takes_over_from_a_dead_connection() {
     let server = TestServer::start().await;
@@ -113,7 +113,7 @@ async fn resuming_takes_over_from_a_dead_connection() {
     old.step(1.0).await;
     let (mut new, resumed) = resume(&server, "a", old.seq - 1).await;
     assert_eq!(resumed["type"], "resumed", "{resumed}");
-    let Reply::Text(told) = old.receive().await else { panic!("no word") };
+    let Reply::Text(told) = old.receive().await else { panic!("no notification") };
     refused(&told, "session_state");
     old.closed().await;
     assert_eq!(new.step(2.0).await.meta["step"], 2);
@@ -124,7 +124,7 @@ async fn resuming_takes_over_from_a_dead_connection() {
 #[tokio::test]
 async fn what_cannot_be_resumed() {
     let server = TestServer::start().await;
-    refused(&resume(&server, "nobody", 0).await.1, "unknown_session");
+    refused(&resume(&server, "no-such", 0).await.1, "unknown_session");
     refused(&resume(&server, "../x", 0).await.1, "invalid_name");
     let agent = server.driver("a").await;
     refused(&resume(&server, "a", agent.seq + 5).await.1, "seq_out_of_order");
@@ -136,7 +136,7 @@ async fn what_cannot_be_resumed() {
 }
 
 #[tokio::test]
-async fn nobody_waits_for_ever() {
+async fn a_session_that_is_not_resumed_ends() {
     let resume_grace = Duration::from_millis(200);
     let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
     let mut agent = server.driver("a").await;
@@ -150,7 +150,7 @@ async fn nobody_waits_for_ever() {
 
 impl Agent {
     async fn closed_after_takeover(mut self) {
-        let Reply::Text(told) = self.receive().await else { panic!("no word") };
+        let Reply::Text(told) = self.receive().await else { panic!("no notification") };
         refused(&told, "session_state");
     }
 }

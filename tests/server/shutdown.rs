@@ -1,4 +1,4 @@
-//! Stopping: running steps are finished, everybody is told, every episode has an end.
+//! Stopping: running steps are finished, every client is notified, every episode has an end.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -7,15 +7,15 @@ use serde_json::json;
 
 use crate::support::{Agent, Reply, TestServer, pose, refused};
 
-async fn told(agent: &mut Agent) {
-    let Reply::Text(answer) = agent.receive().await else { panic!("no word") };
+async fn is_notified(agent: &mut Agent) {
+    let Reply::Text(answer) = agent.receive().await else { panic!("no notification") };
     refused(&answer, "shutting_down");
     assert_eq!(answer["fatal"], true);
     agent.closed().await;
 }
 
 #[tokio::test]
-async fn running_steps_are_answered_and_waiting_clients_told() {
+async fn running_steps_are_answered_and_waiting_clients_notified() {
     let server = TestServer::start().await;
     let mut waiting = server.driver("waiting").await;
     waiting.step(1.0).await;
@@ -30,8 +30,8 @@ async fn running_steps_are_answered_and_waiting_clients_told() {
     let TestServer { running: server, episodes, .. } = server;
     let stopping = tokio::spawn(server.stop());
     assert_eq!(running.seen().await.meta["step"], 1);
-    told(&mut running).await;
-    told(&mut waiting).await;
+    is_notified(&mut running).await;
+    is_notified(&mut waiting).await;
     tokio::time::timeout(Duration::from_secs(8), stopping).await.expect("stopped").unwrap();
     for name in ["waiting", "running", "parked"] {
         let text =

@@ -1,4 +1,5 @@
-//! Sessions that drive: through the engine, with a small budget, and over what breaks.
+//! Sessions that drive through the engine: with a small memory budget, and with sections that cannot be
+//! read.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +16,7 @@ use wildcity_twin::residency::{Cache, ResidencyError, Resident, SectionRef};
 use crate::source::{Fault, Faulty, Place};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 
-/// An engine with its own room for episodes.
+/// An engine with its own directory of episodes.
 struct Bench {
     engine: Arc<Engine>,
     _episodes: tempfile::TempDir,
@@ -47,13 +48,13 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let opening = SessionOptions {
+        let options = SessionOptions {
             start: Some(wildcity_session::Start::Pose(demo().at(0.0))),
             rig: Some(RigChoice::Full(rig())),
             deadline,
             ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
         };
-        Session::open(self.engine.clone(), name.to_owned(), opening).await
+        Session::open(self.engine.clone(), name.to_owned(), options).await
     }
 }
 
@@ -77,16 +78,16 @@ fn place(resident: &Resident, SectionRef { chunk, section }: SectionRef) -> Plac
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn thirty_metres_a_second_wait_for_nothing_once_under_way() {
+async fn at_thirty_metres_a_second_no_frame_waits_after_the_first_seconds() {
     let all = unlimited().open("demo", None).unwrap();
     let lens = wildcity_twin::residency::RigExtent { focal_px: 70.0, radius_m: 1.7 };
     let limit_bytes = all.worst_case_bytes(lens) * 3 / 2;
-    assert!(limit_bytes < all.total_bytes() / 2, "else all of it fits");
+    assert!(limit_bytes < all.total_bytes() / 2, "otherwise all of it would fit");
     let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
     let mut session = bench.session("a", None).await.unwrap();
     let mut waited = Vec::new();
     for step in 0..180 {
-        // What an agent thinks: a quarter of what it may, so that it drives at 120 m/s.
+        // The agent takes 25 ms for a step of 0.1 s, so that it drives at 120 m/s in real time.
         tokio::time::sleep(Duration::from_millis(25)).await;
         let frame = session.step(demo().at(3.0 * f64::from(step)), false).await.unwrap();
         assert!(frame.residency.held_bytes <= limit_bytes);
@@ -99,7 +100,7 @@ async fn thirty_metres_a_second_wait_for_nothing_once_under_way() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hint_is_loaded_before_it_is_driven() {
+async fn a_hint_is_loaded_before_the_ego_is_there() {
     let source = Arc::new(Faulty::new(demo().catalog()));
     let bench = bench(Cache::with_source(demo().catalog(), source.clone(), None));
     let mut session = bench.session("a", None).await.unwrap();
@@ -108,7 +109,7 @@ async fn a_hint_is_loaded_before_it_is_driven() {
     session.prefetch(vec![there]).unwrap();
     let began = std::time::Instant::now();
     let resident = session.resident().clone();
-    // Until all of it was asked for, and has come: then a jump there finds everything.
+    // Wait until all of it was requested and has been loaded; a jump there must then wait for nothing.
     let needed = resident.demand(&eyes(&views(there)), &PROFILE);
     let begun = || needed.iter().all(|&one| source.reads(place(&resident, one)) > 0);
     while !begun() || resident.stats().loads < source.all_reads() {
@@ -127,7 +128,7 @@ async fn a_hint_is_loaded_before_it_is_driven() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on() {
+async fn a_section_that_breaks_stops_its_session_until_it_is_healed() {
     let truth = bench(unlimited());
     let mut healthy = truth.session("healthy", None).await.unwrap();
     for fault in [Fault::Damaged, Fault::Hangs] {
@@ -160,7 +161,7 @@ async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on(
                 }
             }
         }
-        // Nothing has happened to the session, and others drive.
+        // The failed step has not happened, and other sessions drive on.
         let stopped_at = stopped_at.expect("the section was never needed");
         assert_eq!(driver.episode().step(), u64::from(stopped_at));
         other.step(demo().at(0.0), false).await.unwrap();
@@ -175,7 +176,7 @@ async fn a_section_that_breaks_in_mid_drive_stops_its_session_and_lets_it_go_on(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frame_that_waits_for_a_disk_holds_up_nobody_elses() {
+async fn a_frame_that_waits_for_a_disk_does_not_delay_other_sessions() {
     let source = Arc::new(Faulty::new(demo().catalog()));
     let place = later_section();
     source.break_section(place, Fault::Hangs);
@@ -193,7 +194,7 @@ async fn a_frame_that_waits_for_a_disk_holds_up_nobody_elses() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_made_ready_takes_nothing_from_a_session_that_drives() {
+async fn a_preload_takes_no_memory_from_a_session_that_drives() {
     let all = unlimited().open("demo", None).unwrap();
     let probe = bench(unlimited());
     let limit_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
@@ -205,24 +206,24 @@ async fn what_is_made_ready_takes_nothing_from_a_session_that_drives() {
     }
     let far = (0..8).map(|k| eyes(&views(demo().at(250.0 + 40.0 * f64::from(k))))).collect();
     assert!(crate::streaming::need_bytes(&all, demo().at(250.0)) > limit_bytes / 4);
-    bench.engine.prepare("demo", 1, far).await.unwrap();
+    bench.engine.preload("demo", 1, far).await.unwrap();
     let frame = driver.observe(vec![demo().at(6.0)]).await.unwrap();
     assert_eq!(frame.residency.waited_for, 0);
 
-    // Nor does it stand in the way of frames while a section does not come.
+    // Nor does it delay frames while a section does not arrive.
     source.break_section(later_section(), Fault::Hangs);
     let engine = bench.engine.clone();
     let far = vec![eyes(&views(demo().at(250.0)))];
-    let preparing = tokio::spawn(async move { engine.prepare("demo", 1, far).await });
+    let preloading = tokio::spawn(async move { engine.preload("demo", 1, far).await });
     for station_m in [9.0, 20.0, 40.0] {
         driver.step(demo().at(station_m), false).await.unwrap();
     }
     source.heal();
-    preparing.await.unwrap().unwrap();
+    preloading.await.unwrap().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_session_that_does_not_fit_is_refused_and_one_that_closes_makes_room() {
+async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     let all = unlimited().open("demo", None).unwrap();
     let probe = bench(unlimited());
     let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();

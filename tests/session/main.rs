@@ -1,4 +1,4 @@
-//! Episodes: what sessions draw, foresee and keep.
+//! Sessions and episodes: what they render, prefetch and keep, and the trust of their images.
 
 #[path = "../support/images.rs"]
 mod images;

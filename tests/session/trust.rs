@@ -1,8 +1,8 @@
-//! How far images may be believed, against what a twin that was recorded on one drive gets wrong.
+//! The trust of images, compared with what a twin that was recorded on one drive gets wrong.
 //!
-//! The demo street stands for the world, and its twin has of it what a camera of the drive saw; the rest
-//! is missing. A pixel is right if it is as the world's within 16 of 255. Training errs in what it saw,
-//! too, so that a real twin is right in fewer pixels than this one: a bound, not a promise.
+//! The demo street plays the real world. Its twin has only the Gaussians that a camera of the drive saw. A
+//! pixel is right if it differs from the world's by at most 16 of 255. Training has errors also in what it
+//! saw, so a real twin is right in fewer pixels than this one: the test gives an upper bound.
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::{Street, StreetSettings};
@@ -19,16 +19,16 @@ use crate::images::{Image, cpu, render};
 /// Images are this much smaller than the vehicle's own.
 const SHRINK: u32 = 6;
 
-/// A world, its twin, and what draws them.
+/// A world, its twin, and the backend that renders both.
 struct Pair {
     street: Street,
     world: Scene,
     twin: Scene,
-    trained: TrainingCoverage,
+    coverage: TrainingCoverage,
     cpu: Cpu,
 }
 
-/// What is said and what is so of all cameras at some places: means.
+/// Means over all cameras at some places: the share of right pixels, and the trust with its parts.
 #[derive(Clone, Copy, Debug)]
 struct Measured {
     right: f64,
@@ -38,7 +38,7 @@ struct Measured {
 }
 
 #[test]
-fn trust_falls_beside_the_drive_and_is_no_more_than_what_is_right() {
+fn trust_falls_beside_the_drive_and_is_at_most_the_share_of_right_pixels() {
     let pair = pair();
     let close = |trust: f64, wanted: f64| (trust - wanted).abs() < 0.02;
     for (offset_m, wanted) in [(0.0, 1.0), (1.0, 0.82), (3.0, 0.55), (5.0, 0.37)] {
@@ -56,19 +56,19 @@ fn trust_falls_beside_the_drive_and_is_no_more_than_what_is_right() {
 }
 
 #[test]
-fn far_from_everything_nothing_is_believed() {
+fn far_from_the_recorded_drive_the_trust_is_zero() {
     let pair = pair();
     let away = Pose { position_m: DVec3::new(5_000.0, 0.0, 0.0), ..Pose::IDENTITY };
     let view = View::of_rig(&small_rig().cameras, away)[0];
     let clear = vec![1.0; view.camera.pixels()];
-    let Trust { value, outside, low_coverage, .. } = pair.trained.trust(&away, &view, &clear);
+    let Trust { value, outside, low_coverage, .. } = pair.coverage.trust(&away, &view, &clear);
     assert!(value < 1e-6 && outside == 1.0 && low_coverage == 0.0, "{value} {outside}");
     let on_it = pair.street.trajectory.at_station(30.0);
     let view = View::of_rig(&small_rig().cameras, on_it)[0];
-    let Trust { value, outside, angle_rad, .. } = pair.trained.trust(&on_it, &view, &clear);
+    let Trust { value, outside, angle_rad, .. } = pair.coverage.trust(&on_it, &view, &clear);
     assert!(value > 0.95 && outside == 0.0 && angle_rad < 0.05, "{value} {outside} {angle_rad}");
     let empty = vec![0.2; view.camera.pixels()];
-    assert_eq!(pair.trained.trust(&on_it, &view, &empty).value, 0.0);
+    assert_eq!(pair.coverage.trust(&on_it, &view, &empty).value, 0.0);
 }
 
 impl Pair {
@@ -84,7 +84,7 @@ impl Pair {
             let draw = |scene| render(&self.cpu, scene, &RenderProfile::default(), &views);
             for ((world, twin), view) in draw(&self.world).iter().zip(&draw(&self.twin)).zip(&views)
             {
-                let trust = self.trained.trust(&world_from_rig, view, &twin.opacity);
+                let trust = self.coverage.trust(&world_from_rig, view, &twin.opacity);
                 all.push((share_right(world, twin), trust));
             }
         }
@@ -99,7 +99,7 @@ impl Pair {
     }
 }
 
-/// Share of pixels of which no channel is off by more than 16 of 255.
+/// Share of pixels in which each channel is off by at most 16 of 255.
 fn share_right(world: &Image, twin: &Image) -> f64 {
     let pairs = world.rgb8.chunks_exact(3).zip(twin.rgb8.chunks_exact(3));
     let is_right = |(a, b): &(&[u8], &[u8])| a.iter().zip(*b).all(|(a, b)| a.abs_diff(*b) <= 16);
@@ -114,7 +114,8 @@ fn pair() -> Pair {
         ..StreetSettings::default()
     };
     let street = wildcity_generate::street(&settings).unwrap();
-    let (world, cpu) = (Scene::from_gaussians(&street.gaussians), cpu());
+    let world = Scene::from_gaussians(&street.gaussians);
+    let cpu = cpu();
     let seen = seen(&street, &world, &cpu);
     let twin = recorded(&street.gaussians, &seen);
     let dir = tempfile::tempdir().unwrap();
@@ -124,16 +125,16 @@ fn pair() -> Pair {
         ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();
-    let trained = TrainingCoverage::new(&version.manifest).unwrap();
-    Pair { twin: Scene::from_gaussians(&twin), street, world, trained, cpu }
+    let coverage = TrainingCoverage::new(&version.manifest).unwrap();
+    Pair { twin: Scene::from_gaussians(&twin), street, world, coverage, cpu }
 }
 
-/// Of each Gaussian whether a camera of the drive saw it: its centre is in the image, or as near to it as
-/// it is wide, and nothing is in front of it.
+/// For each Gaussian, whether a camera of the drive saw it: its centre is in the image or at most its own
+/// extent outside, and nothing is in front of it.
 fn seen(street: &Street, world: &Scene, cpu: &Cpu) -> Vec<bool> {
     let gaussians = &street.gaussians;
     let mut seen = vec![false; gaussians.len()];
-    // Every second metre: the next keyframes see the same.
+    // Every second metre: the keyframes between see the same.
     for keyframe in street.trajectory.keyframes.iter().step_by(4) {
         let views = View::of_rig(&small_rig().cameras, keyframe.world_from_rig);
         for (image, view) in
@@ -156,7 +157,7 @@ fn seen(street: &Street, world: &Scene, cpu: &Cpu) -> Vec<bool> {
                 let inside = (-wide_px..width + wide_px).contains(&at_px.x)
                     && (-wide_px..height + wide_px).contains(&at_px.y);
                 let pixel = |px: f64, side: f64| px.clamp(0.0, side - 1.0) as usize;
-                // The farthest surface within its width, but for that.
+                // The farthest surface within its extent; it is seen if it is not far behind that.
                 let mut behind_m = 0.0_f64;
                 for dy in [-wide_px, 0.0, wide_px] {
                     for dx in [-wide_px, 0.0, wide_px] {
@@ -172,7 +173,7 @@ fn seen(street: &Street, world: &Scene, cpu: &Cpu) -> Vec<bool> {
     seen
 }
 
-/// What was seen.
+/// The Gaussians that were seen.
 fn recorded(world: &Gaussians, seen: &[bool]) -> Gaussians {
     let mut twin = Gaussians::with_capacity(world.sh_degree, world.len());
     for (index, _) in seen.iter().enumerate().filter(|(_, seen)| **seen) {

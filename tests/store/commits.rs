@@ -75,7 +75,8 @@ fn object(manifest: &Manifest, cell: [i32; 2]) -> &str {
 
 #[test]
 fn part_by_part_is_the_same_version_as_at_once() {
-    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
     let scene = gaussians(5_000, 1, 150.0, 3);
     let storage = StorageOptions::default();
     let whole = commit(one.path(), NewVersion { storage, ..street(&scene) }).unwrap();
@@ -106,7 +107,8 @@ fn a_dropped_commit_leaves_nothing_and_does_not_affect_others() {
     let dir = tempfile::tempdir().unwrap();
     let (catalog, first) = three(&dir);
     let before = files(dir.path());
-    let (one, two) = (changed(&catalog, &[[0, 0]], 2), changed(&catalog, &[[0, 0]], 3));
+    let one = changed(&catalog, &[[0, 0]], 2);
+    let two = changed(&catalog, &[[0, 0]], 3);
     assert_ne!(one.id(), two.id());
     // Another start removes what was abandoned, and nothing else.
     assert_eq!(Catalog::open(dir.path()).unwrap().version("street", None).unwrap(), first);

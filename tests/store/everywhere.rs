@@ -82,7 +82,8 @@ fn the_same_cell_is_refused_and_an_old_version_comes_back() {
     everywhere(|place| {
         let catalog = place.catalog();
         let first = commit(&catalog, &gaussians(1_000, 0, 40.0, 1));
-        let (one, two) = (change(&catalog, [3, 3], 1), change(&catalog, [3, 3], 2));
+        let one = change(&catalog, [3, 3], 1);
+        let two = change(&catalog, [3, 3], 2);
         one.change(1, cells_alone()).unwrap();
         let error = two.change(1, cells_alone()).unwrap_err();
         let StoreError::Overlap { cells, latest: 2, .. } = &error else { panic!("{error}") };

@@ -123,7 +123,8 @@ fn a_commit_in_preparation_is_not_disturbed() {
     let place = Place::Directory(tempfile::tempdir().unwrap());
     let catalog = twin(&place, 3);
     // One commit with a new object, and one with an object that is removed meanwhile.
-    let (new, old) = (change(&catalog, [5, 5], 7), change(&catalog, [3, 3], 2));
+    let new = change(&catalog, [5, 5], 7);
+    let old = change(&catalog, [3, 3], 2);
     let keep = Retention { versions: 1, grace: NOW };
     let removed: u64 = (0..3)
         .map(|_| place.catalog().collect("street", keep, false).unwrap().removed.objects)

@@ -189,9 +189,10 @@ fn fsck_finds_objects_that_only_the_cache_has() {
 fn a_section_has_a_shorter_time_out_than_a_cell() {
     let s3 = S3::start();
     let version = commit(&s3.catalog(), &gaussians(500, 0, 50.0, 1)).unwrap();
-    let (section_timeout, section_tries) = (Duration::from_millis(200), 2);
-    let patience = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
-    let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, patience).unwrap();
+    let section_timeout = Duration::from_millis(200);
+    let section_tries = 2;
+    let retry = RetryPolicy { section_timeout, section_tries, ..RetryPolicy::default() };
+    let catalog = Catalog::over(s3.store(), &S3::url(), "twins", None, retry).unwrap();
     let chunk = &version.manifest.chunks[0];
     assert_eq!(catalog.read_and_discard(&version, chunk).unwrap(), chunk.bytes);
     s3.fail("GET", "/objects/", 2, Fault::Silence);

@@ -49,7 +49,8 @@ fn what_is_committed_is_read_back_bit_by_bit() {
 
 #[test]
 fn the_same_content_is_the_same_version() {
-    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
     let scene = gaussians(2_000, 1, 100.0, 1);
     let first = commit(one.path(), street(&scene)).unwrap();
     let elsewhere = commit(two.path(), street(&scene)).unwrap();

@@ -1,4 +1,4 @@
-//! The stress table on a device. That its bounds can be missed: `tests/render/extremes.rs`.
+//! The stress cases on a device. That each check can fail is tested in `mutations.rs`.
 
 use wildcity_stress::{CASES, Verdict};
 
@@ -11,7 +11,7 @@ fn the_table_holds() {
     let wrong = outcomes.filter(|outcome| match outcome.case {
         // 70 million keys take gigabytes.
         "T21" => outcome.verdict != Verdict::NotRun,
-        // A driver may count to 65,535 only.
+        // A driver may support at most 65,535 layers.
         "T28" => !matches!(outcome.verdict, Verdict::Held | Verdict::Refused),
         _ => outcome.verdict != Verdict::Held,
     });

@@ -1,4 +1,4 @@
-//! The stress table: it holds on a device, and each of its checks can fail.
+//! The stress cases hold on every backend, and each of their checks can fail.
 
 #[path = "../support/gpu.rs"]
 mod gpu;

@@ -1,4 +1,4 @@
-//! A camera of every model, and what each must show.
+//! A camera of every model, and what its images must show.
 
 use glam::{DQuat, DVec2, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -15,7 +15,7 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 use crate::images::{psnr, render_one, view_along};
 use crate::streets::street;
 
-/// A camera of each model at moderate distortion, 160 x 100 px, and one bent windshield.
+/// Cameras of 160 x 100 px: one of each model with moderate distortion, and two behind a windshield.
 pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
     let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let with = |lens| Camera { lens, ..ideal };
@@ -53,15 +53,16 @@ pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
     ]
 }
 
-/// A street, and where a camera stands in it.
+/// A street, and a camera's pose in it.
 pub(crate) fn street_scene() -> (Scene, Pose) {
     let at = DVec3::new(0.4, 0.0, 20.0);
     let pose = view_along([1, 1], 1.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y).world_from_camera;
     (Scene::from_gaussians(&street(20_000, 1, 31)), pose)
 }
 
-/// A camera that came 0.9 m and 0.01 rad during the exposure: 30 m/s for 30 ms, in a curve.
-pub(crate) fn driven(camera: Camera, pose: Pose, direction: ShutterDirection) -> View {
+/// A view with a rolling shutter: the camera moves by 0.9 m and rotates by 0.01 rad during the exposure, as
+/// at 30 m/s for 30 ms in a curve.
+pub(crate) fn rolling_view(camera: Camera, pose: Pose, direction: ShutterDirection) -> View {
     let world_from_camera_first = Pose {
         position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
         rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
@@ -70,9 +71,9 @@ pub(crate) fn driven(camera: Camera, pose: Pose, direction: ShutterDirection) ->
     View { camera, world_from_camera: pose, rolling_shutter }
 }
 
-/// A camera to the side at 30 m/s, whose columns are exposed in 100 ms against the way that things pass: what
-/// is 1.5 m away moves by more than the image meanwhile.
-pub(crate) fn passing() -> View {
+/// A camera that looks to the side at 30 m/s. Its columns are exposed in 100 ms, in the direction against the
+/// motion of the image; an object 1.5 m away moves by more than the width of the image meanwhile.
+pub(crate) fn sideways_rolling_view() -> View {
     let camera = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let first = Pose { position_m: DVec3::new(-3.0, 0.0, 0.0), ..Pose::IDENTITY };
     let rolling_shutter =
@@ -80,10 +81,15 @@ pub(crate) fn passing() -> View {
     View { rolling_shutter: Some(rolling_shutter), ..View::new(camera, Pose::IDENTITY) }
 }
 
-/// Of small opaque balls on a wall 2 m ahead, so far apart, each is drawn alone and compared; returns how
-/// many the camera sees.
-pub(crate) fn lands(backend: &dyn Backend, name: &str, camera: Camera, apart_m: f64) -> usize {
-    // Its own image is as wide as the blur, so that the centroid is not that of a bent disc.
+/// Asserts that small balls, `apart_m` apart in a plane 2 m ahead, each rendered alone, appear at the pixels
+/// that the camera model gives. Returns the number of visible balls.
+pub(crate) fn check_projections(
+    backend: &dyn Backend,
+    name: &str,
+    camera: Camera,
+    apart_m: f64,
+) -> usize {
+    // A ball is so small that its image is as wide as the blur, and its centroid is that of its centre.
     let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
     let size_px = [camera.width_px, camera.height_px];
     let steps = |most_m: f64| (-(most_m / apart_m) as i32)..=(most_m / apart_m) as i32;
@@ -105,13 +111,13 @@ pub(crate) fn lands(backend: &dyn Backend, name: &str, camera: Camera, apart_m: 
     seen
 }
 
-/// Every camera at half its size, and a part of its image.
-pub(crate) fn sizes_of(camera: &Camera) -> [Camera; 3] {
+/// A camera, a smaller size of it, and a part of its image.
+pub(crate) fn scaled_and_cropped(camera: &Camera) -> [Camera; 3] {
     [*camera, camera.scaled(96, 50).unwrap(), camera.cropped([30, 20], [90, 70]).unwrap()]
 }
 
-/// A backend's images through every lens, against every pixel's own ray.
-pub(crate) fn meets_what_each_pixels_ray_meets(backend: &dyn Backend) {
+/// Asserts that a backend's images through every lens have at least 45 dB against exact rays.
+pub(crate) fn check_against_exact_rays(backend: &dyn Backend) {
     let (street, pose) = street_scene();
     let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
     for (name, camera) in lenses() {

@@ -1,6 +1,7 @@
 //! An S3 server on loopback that can be told to fail.
 //!
-//! The server is s3s-fs, which does not put atomically if absent: puts take turns here.
+//! The server is s3s-fs, within the process of the tests, so that neither Python nor a download is
+//! needed. It honours `If-None-Match`, but does not put atomically if absent: puts are serialised here.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 

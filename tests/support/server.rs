@@ -30,7 +30,7 @@ use wildcity_twin::store::{Catalog, NewVersion};
 /// How long a test waits for anything before it fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Paints a pattern that is a function of where the camera stands, and nothing else.
+/// A backend that paints a pattern that depends on the pose of the camera alone.
 #[derive(Debug, Default)]
 pub(crate) struct Painter {
     /// Milliseconds that a frame takes.
@@ -110,7 +110,7 @@ pub(crate) fn commit_twin(dir: &Path) {
     commit_twin_of(dir, 2.0);
 }
 
-/// The same of a logarithm of the odds of opacity: another number, another version.
+/// The same with Gaussians of some opacity, given before the sigmoid: another opacity is another version.
 pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
     let gaussians = Gaussians {
         sh_degree: 0,
@@ -170,7 +170,8 @@ impl TestServer {
     }
 
     pub(crate) async fn configured(change: impl FnOnce(&mut Config)) -> Self {
-        let (twins, painter) = (twins(), Arc::new(Painter::default()));
+        let twins = twins();
+        let painter = Arc::new(Painter::default());
         let episodes = tempfile::tempdir().expect("a temporary directory");
         let mut config = Config {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
@@ -206,7 +207,7 @@ impl TestServer {
         agent
     }
 
-    /// Proves that the server still serves: a whole session of a client of its own.
+    /// Checks that the server still serves: a whole session of a new client.
     pub(crate) async fn still_serves(&self) {
         let mut agent = self.driver("still-serves").await;
         assert_eq!(agent.step(3.0).await.meta["step"], 1);
@@ -234,13 +235,13 @@ impl TestServer {
     }
 }
 
-/// A client without a library: what it sends is what the test says.
+/// A client without a library: it sends exactly what the test says.
 pub(crate) struct Agent {
     pub(crate) socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
     pub(crate) seq: u64,
 }
 
-/// What came back.
+/// A message from the server.
 #[derive(Clone, Debug)]
 pub(crate) enum Reply {
     Text(Value),
@@ -255,7 +256,7 @@ pub(crate) struct Seen {
     pub(crate) bytes: Bytes,
 }
 
-/// Room for every observation.
+/// WebSocket limits that every observation fits.
 pub(crate) fn client_limits() -> Option<WebSocketConfig> {
     let bytes = Some(wildcity_protocol::limits::OBSERVATION_BYTES);
     Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
@@ -346,7 +347,7 @@ impl Agent {
         assert!(matches!(reply, Reply::Closed), "{reply:?}");
     }
 
-    /// The TCP connection, for what WebSocket has no word for.
+    /// The TCP connection, for bytes that are not WebSocket.
     pub(crate) fn tcp(&mut self) -> &mut TcpStream {
         match self.socket.get_mut() {
             MaybeTlsStream::Plain(stream) => stream,

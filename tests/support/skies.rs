@@ -15,7 +15,8 @@ use wildcity_twin::ingest;
 use crate::images::Image;
 use crate::scene_files::Random;
 
-/// Takes the world's axes to those of [`sky`]: a rotation with a mirror, so that a slip is seen.
+/// Takes the world's axes to those of [`sky`]: a rotation with a reflection, so that an error in the axes
+/// shows.
 pub(crate) const SKY_FROM_WORLD: DMat3 = DMat3::from_cols(
     DVec3::new(0.0, 0.6, 0.8),
     DVec3::new(1.0, 0.0, 0.0),
@@ -27,12 +28,12 @@ pub(crate) fn demo_sky() -> PathBuf {
     root().join("scenes/sky.safetensors")
 }
 
-/// It, with the appearance of an image or of all.
+/// The demo twin's sky with the appearance of one image, or the mean appearance.
 pub(crate) fn demo_model(image: Option<u32>) -> SkyModel {
     ingest::sky::read(&demo_sky(), image).unwrap().model
 }
 
-/// A small network of random weights, gentle enough to be baked coarsely.
+/// A small network with random weights, smooth enough for a coarse map.
 pub(crate) fn network(identity: bool, octaves: usize, appearance: usize, skip: bool) -> Network {
     let mut random = Random(octaves as u64 + 10 * appearance as u64 + 100 * u64::from(skip));
     let width = 20;
@@ -51,17 +52,17 @@ pub(crate) fn network(identity: bool, octaves: usize, appearance: usize, skip: b
     Network::new(layers, appearance).unwrap()
 }
 
-/// A sky of such a network, in axes of its own.
+/// A sky of such a network, with the axes of [`SKY_FROM_WORLD`].
 pub(crate) fn sky() -> Arc<Sky> {
     Arc::new(Sky::new(SkyModel::network(network(true, 3, 4, true)), SKY_FROM_WORLD))
 }
 
-/// Nothing but a sky.
+/// A scene with a sky and no Gaussians.
 pub(crate) fn empty(sky: Arc<Sky>) -> Scene {
     Scene { sky: Some(sky), ..Scene::default() }
 }
 
-/// An exposure that mixes channels, and a hood over the lower half, opaque at the bottom.
+/// An exposure that mixes channels, and an overlay like a car's hood over the lower half, opaque at the bottom.
 pub(crate) fn appearance(view: View) -> Appearance {
     let (width, height) = (view.camera.width_px, view.camera.height_px);
     let pixel = |k: u32| {
@@ -79,7 +80,7 @@ pub(crate) fn appearance(view: View) -> Appearance {
     }
 }
 
-/// The image of one view as such a camera records it.
+/// The image of one view with a camera's exposure and overlay.
 pub(crate) fn draw_seen(
     backend: &dyn Backend,
     scene: &Scene,

@@ -1,4 +1,4 @@
-//! Scenes with the shape of a street: flat things, thin things, near and far.
+//! Scenes shaped like a street: flat and thin Gaussians, near and far.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -60,7 +60,7 @@ pub(crate) fn street_views() -> [View; 3] {
     ]
 }
 
-/// The demo street, and what two of its cameras see at an eighth of their size.
+/// The demo street, and the views of two of its cameras at an eighth of their size.
 pub(crate) fn demo_street() -> (Gaussians, [View; 2]) {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let rig = Rig::preset("vehicle6").unwrap();

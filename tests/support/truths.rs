@@ -1,4 +1,4 @@
-//! Images that other renderers made of the same Gaussians.
+//! Images of the same Gaussians by other renderers.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use wildcity_twin::ingest;
 use crate::data::real;
 use crate::images::view_along;
 
-/// Somebody else's image, and what it was made of.
+/// An image by another renderer, with its scene, profile and view.
 pub(crate) struct Truth {
     pub(crate) scene: Scene,
     pub(crate) profile: RenderProfile,
@@ -21,7 +21,7 @@ pub(crate) struct Truth {
     pub(crate) rgba: Vec<f32>,
 }
 
-/// The tiny case of gsplat's CUDA kernels.
+/// gsplat's small test case, rendered by its CUDA kernels.
 pub(crate) fn gsplat() -> Option<Truth> {
     let path = real("reference/gsplat_tiny_case.safetensors")?;
     let file = std::fs::read(&path).unwrap();
@@ -40,7 +40,7 @@ pub(crate) fn gsplat() -> Option<Truth> {
     Some(Truth { scene: read(&path), profile: GSPLAT_OF_THEN, view, rgba })
 }
 
-/// A real capture, by an independent f64 renderer.
+/// A real capture, rendered by an independent renderer in f64.
 pub(crate) fn skull_front() -> Option<Truth> {
     let (scene, camera, image) = (
         real("scenes/skull/skull.ply")?,
@@ -58,7 +58,7 @@ pub(crate) fn read(path: &Path) -> Scene {
     Scene::from_gaussians(&ingest::read(path, &mut |_, _| {}).unwrap())
 }
 
-/// How gsplat rendered when the images of the real data were made.
+/// gsplat's settings when the images were rendered.
 const GSPLAT_OF_THEN: RenderProfile = RenderProfile { alpha_cap: 0.999, ..RenderProfile::DEFAULT };
 
 /// The values of a little-endian float32 `.npy` file.

@@ -79,7 +79,7 @@ pub(super) struct LimitOptions {
 }
 
 impl LimitOptions {
-    /// The limits of a server whose twins may take `resident_bytes` of memory.
+    /// The limits of a server. Its twins may take `resident_bytes` of memory.
     pub(super) fn limits(&self, resident_bytes: Option<u64>) -> Limits {
         let seconds = Duration::from_secs_f64;
         Limits {

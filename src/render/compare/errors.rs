@@ -1,5 +1,5 @@
-//! Errors of images against reference images: PSNR, SSIM, the largest error and its 99.9th percentile, and the mean error
-//! of depth in metres.
+//! Errors of images against reference images: PSNR, SSIM, the largest error and its 99.9th percentile, and
+//! the mean error of depth in metres.
 
 use serde::Serialize;
 
@@ -40,8 +40,8 @@ pub struct Image {
 }
 
 impl Image {
-    /// The image at another size: colour and opacity are interpolated bilinearly; depth is that of the nearest pixel,
-    /// since there is no surface between two depths.
+    /// The image at another size: colour and opacity are interpolated bilinearly; depth is that of the
+    /// nearest pixel, since there is no surface between two depths.
     pub fn resized(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px.map(|px| px as usize);
         let mut new = Self {
@@ -50,7 +50,8 @@ impl Image {
             depth_m: Vec::with_capacity((width * height) as usize),
             opacity: Vec::with_capacity((width * height) as usize),
         };
-        // Of a new pixel's centre, the two neighbouring centres of the old image, and the position between them.
+        // Of a new pixel's centre, the two neighbouring centres of the old image, and the position between
+        // them.
         let neighbours = |i: u32, count: u32, own: usize| {
             let at = (f64::from(i) + 0.5) * own as f64 / f64::from(count) - 0.5;
             let at = at.clamp(0.0, (own - 1) as f64);
@@ -137,8 +138,8 @@ const SIGMA_PX: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// Mean structural similarity (Wang et al. 2004) of luma over all windows within the image. An image smaller than a window
-/// is one window.
+/// Mean structural similarity (Wang et al. 2004) of luma over all windows within the image. An image smaller
+/// than a window is one window.
 pub fn ssim(image: &Image, truth: &Image) -> f64 {
     let [width, height] = image.size_px.map(|px| px as usize);
     let a = luma(&image.rgb);

@@ -1,5 +1,5 @@
-//! Serialization of numbers that JSON lacks: infinity and NaN become the strings `"inf"`, `"-inf"` and `"NaN"`, as in the
-//! CSV.
+//! Serialization of numbers that JSON lacks: infinity and NaN become the strings `"inf"`, `"-inf"` and
+//! `"NaN"`, as in the CSV.
 
 use serde::{Serialize, Serializer};
 

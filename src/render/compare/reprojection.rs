@@ -22,8 +22,8 @@ pub struct ReprojectionErrors {
 }
 
 impl ReprojectionErrors {
-    /// Renders a grid of small Gaussians, each on the ray of a known pixel, and measures the distances of their images'
-    /// centroids from these pixels.
+    /// Renders a grid of small Gaussians, each on the ray of a known pixel, and measures the distances of
+    /// their images' centroids from these pixels.
     ///
     /// # Errors
     /// The backend cannot draw them.

@@ -8,7 +8,7 @@ use crate::constants::BLOCK_PX;
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::chunk::LANES;
 
-/// Applies exposure, then the overlay, to the colours of a tile whose top left pixel is `at_px`.
+/// Applies exposure, then the overlay, to the colours of a tile with its top left pixel at `at_px`.
 #[inline(always)]
 pub(super) fn apply<S: Simd>(
     simd: S,
@@ -43,7 +43,7 @@ fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> 
     Vec3x16 { x: row(0), y: row(1), z: row(2) }
 }
 
-/// Blends the overlay over the block whose top left pixel is `at_px`: `(1 - alpha) rgb + alpha color`.
+/// Blends the overlay over the block with its top left pixel at `at_px`: `(1 - alpha) rgb + alpha color`.
 #[inline(always)]
 fn blend_overlay<S: Simd>(
     simd: S,

@@ -70,7 +70,7 @@ impl Background {
         }
     }
 
-    /// Adds what shows through a tile whose top left pixel is `at_px`.
+    /// Adds what shows through a tile with its top left pixel at `at_px`.
     #[inline(always)]
     pub(super) fn add<S: Simd>(
         &self,

@@ -327,7 +327,7 @@ fn for_each_span(splat: &Splat, grid: &Grid, log2_cut: f32, mut visit: impl FnMu
     }
 }
 
-/// First and last pixel of a row or column whose centre, at +0.5, lies between `center + low` and
+/// First and last pixel of a row or column with its centre, at +0.5, between `center + low` and
 /// `center + high`, within 0 to `last`.
 ///
 /// Conversion of float to int saturates, so a splat of any size is handled.

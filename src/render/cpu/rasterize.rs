@@ -3,10 +3,10 @@
 //! **The 16 lanes of a vector are a block of 4 x 4 pixels, not a row of 16.** On the benchmark street a splat
 //! touches 10.5 rows of a tile on average, but only 8 blocks, which saves a third of the evaluations.
 //!
-//! **Splats are matched in batches of 64.** Each splat of a batch is tested against the 16 blocks of the tile at
-//! once, one block per lane, which gives a bit for each block. The matrix of 64 x 16 bits is transposed with
-//! vector compares. Each block then takes the splats of its 64 bits in order, with all its sums in registers.
-//! Building a list per block instead of transposing bits cost 25 % of the whole stage.
+//! **Splats are matched in batches of 64.** Each splat of a batch is tested against the 16 blocks of the tile
+//! at once, one block per lane, which gives a bit for each block. The matrix of 64 x 16 bits is transposed
+//! with vector compares. Each block then takes the splats of its 64 bits in order, with all its sums in
+//! registers. Building a list per block instead of transposing bits cost 25 % of the whole stage.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 

@@ -83,7 +83,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
         .collect()
 }
 
-/// Writes one tile whose left edge is at column `left`.
+/// Writes one tile with its left edge at column `left`.
 #[inline(always)]
 pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, left: u32, band: &mut Band<'_>) {
     for block in 0..BLOCKS {

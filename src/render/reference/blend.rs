@@ -18,8 +18,8 @@ pub(super) struct Pixel {
 
 /// One row of pixels, from the left.
 ///
-/// Splats that reach alpha_cut nowhere in the row are left out first: the image is the same, and takes a twentieth of the
-/// time.
+/// Splats that reach alpha_cut nowhere in the row are left out first: the image is the same, and takes a
+/// twentieth of the time.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
     let near_row = |splat: &&Splat| (splat.mean_px.y - y_px).abs() <= splat.reach_px.y + 1e-6;

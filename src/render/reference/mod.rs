@@ -1,7 +1,8 @@
-//! The reference backend: the image by definition, in f64, without tiles, SIMD or bounds. It is slow and simple.
+//! The reference backend: the image by definition, in f64, without tiles, SIMD or bounds. It is slow and
+//! simple.
 //!
-//! It differentiates the camera numerically and inverts the covariance directly, so that an error in a formula that
-//! the other backends derive by hand shows up as a difference.
+//! It differentiates the camera numerically and inverts the covariance directly, so that an error in a
+//! formula that the other backends derive by hand shows up as a difference.
 
 mod background;
 mod blend;

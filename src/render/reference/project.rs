@@ -1,7 +1,7 @@
 //! Stage project by definition.
 //!
-//! The determinant of a covariance is computed as the sum of the squared minors of its root. `xx yy - xy²` would lose all
-//! digits for a needle of 3e8 px, even in f64.
+//! The determinant of a covariance is computed as the sum of the squared minors of its root. `xx yy - xy²`
+//! would lose all digits for a needle of 3e8 px, even in f64.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -31,8 +31,8 @@ pub struct Splat {
     pub reach_px: DVec2,
 }
 
-/// Projects every Gaussian between near and far whose opacity reaches alpha_cut, on the image or beside it, in order of
-/// global ids.
+/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or beside
+/// it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
     let chunks = scene.chunks.par_iter().enumerate();
     chunks
@@ -45,8 +45,8 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
         .collect()
 }
 
-/// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition, since
-/// backends sort 32 bits.
+/// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition,
+/// since backends sort 32 bits.
 pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }
@@ -168,8 +168,8 @@ fn project_unscented(
     })
 }
 
-/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes clamped to 0.3 half-widths
-/// beyond the image (gsplat's `persp_proj`).
+/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes clamped to 0.3
+/// half-widths beyond the image (gsplat's `persp_proj`).
 fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
     let p = &camera.pinhole;
     let width = f64::from(camera.width_px);

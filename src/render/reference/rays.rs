@@ -1,9 +1,10 @@
-//! Exact rays (`rays=exact`): every pixel's own ray against every Gaussian, without any projection. Lenses, windshields
-//! and shutters are compared with this.
+//! Exact rays (`rays=exact`): every pixel's own ray against every Gaussian, without any projection. Lenses,
+//! windshields and shutters are compared with this.
 //!
-//! A Gaussian's alpha on a ray is its response at the point of the ray that is closest in standard deviations (Wu et al.
-//! 2024, 3DGUT). This is a 2D Gaussian of the distances across the ray. The blur of the profile is a Gaussian of distances
-//! on the image, so it is added in the pixels around this very ray, where the one distance is proportional to the other.
+//! A Gaussian's alpha on a ray is its response at the point of the ray that is closest in standard deviations
+//! (Wu et al. 2024, 3DGUT). This is a 2D Gaussian of the distances across the ray. The blur of the profile is
+//! a Gaussian of distances on the image, so it is added in the pixels around this very ray, where the one
+//! distance is proportional to the other.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -38,7 +39,8 @@ pub(super) fn world_gaussians(scene: &Scene, splats: &[Splat]) -> Vec<WorldGauss
     splats.iter().map(world_gaussian).collect()
 }
 
-/// One row of pixels, from the left. Splats, in order of depth, give colours and depths, and `gaussians` the shapes.
+/// One row of pixels, from the left. Splats, in order of depth, give colours and depths, and `gaussians` the
+/// shapes.
 pub(super) fn row(
     splats: &[Splat],
     gaussians: &[WorldGaussian],
@@ -99,7 +101,8 @@ impl Ray {
         let inverse = DMat3::from_cols(u, v, direction).inverse().transpose();
         let x = inverse.x_axis;
         let y = inverse.y_axis;
-        // The smaller singular value of a 2 x 3 matrix is at least the area |x × y| divided by the Frobenius norm.
+        // The smaller singular value of a 2 x 3 matrix is at least the area |x × y| divided by the Frobenius
+        // norm.
         let least_px_per_rad = x.cross(y).length() / x.length().hypot(y.length());
         let origin_m = pose.position_m;
         Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad })
@@ -109,7 +112,8 @@ impl Ray {
     fn alpha(&self, gaussian: &WorldGaussian, profile: &RenderProfile) -> f64 {
         let to_mean_m = gaussian.mean_m - self.origin_m;
         let along_m = to_mean_m.dot(self.direction);
-        // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is widest at its far end.
+        // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is widest at its
+        // far end.
         let across_m2 = to_mean_m.length_squared() - along_m * along_m;
         let farthest_m = along_m.max(0.0) + 4.0 * gaussian.sigma_m;
         let blur_m2 = profile.blur * (farthest_m / self.least_px_per_rad).powi(2);

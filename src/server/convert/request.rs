@@ -22,7 +22,7 @@ use super::rig::rig_of;
 /// A text frame, checked as far as it can be without a session.
 #[derive(Debug)]
 pub(crate) enum Parsed {
-    /// A request whose number could be read.
+    /// A request with a number that could be read.
     Numbered {
         /// The number.
         seq: u64,
@@ -83,7 +83,7 @@ pub(crate) enum Command {
     Resume {
         /// The session.
         session: String,
-        /// Number of the last request whose answer arrived.
+        /// Number of the last request with an answer that arrived.
         last_seq: u64,
     },
 }
@@ -140,8 +140,9 @@ fn invalid(text: &str, error: &serde_json::Error) -> Fault {
     let deserializer = &mut serde_json::Deserializer::from_str(text);
     match serde_path_to_error::deserialize::<_, Fields>(deserializer) {
         Err(found) if found.path().iter().next().is_some() => {
-            let (field, reason) = (found.path().to_string(), found.inner());
-            Fault::InvalidRequest { reason: format!("{field}: {reason}"), field: Some(field) }
+            let field = found.path().to_string();
+            let reason = format!("{field}: {}", found.inner());
+            Fault::InvalidRequest { reason, field: Some(field) }
         }
         _ => Fault::InvalidRequest { field: None, reason: error.to_string() },
     }

@@ -17,7 +17,7 @@ use crate::limits;
 
 use super::digest::Digest;
 
-/// Value of [`Upload::held`] for an upload whose digest was checked.
+/// Value of [`Upload::held`] for an upload after its digest was checked.
 const COMPLETE: u64 = u64::MAX;
 
 /// One upload. It is not removed while an `Arc` of it is held outside the spool.

@@ -1,23 +1,25 @@
-//! What is open is in use: the store is told so, and garbage collection leaves it alone, wherever it
-//! runs.
+//! Leases of open versions: they keep garbage collection, in any process, from deleting what is in use.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Weak};
 
-use crate::limits;
+use parking_lot::Mutex;
+
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::{Catalog, Lease, StoreError};
+
+use crate::limits;
 
 /// Leases of the versions that are open, by twin and number.
 #[derive(Debug)]
 pub(crate) struct Leases {
     catalog: Catalog,
-    /// Who reads the logs of a store finds this there.
+    /// What the store's log names as the holder.
     holder: String,
-    held: Mutex<BTreeMap<(String, u64), LeasedVersion>>,
+    leased: Mutex<BTreeMap<(String, u64), LeasedVersion>>,
 }
 
-/// A lease, and for whom.
+/// A lease, and the open version that needs it.
 #[derive(Debug)]
 struct LeasedVersion {
     resident: Weak<Resident>,
@@ -27,36 +29,39 @@ struct LeasedVersion {
 impl Leases {
     pub(crate) fn new(catalog: Catalog) -> Self {
         let holder = format!("wildcity serve, process {}", std::process::id());
-        Self { catalog, holder, held: Mutex::default() }
+        Self { catalog, holder, leased: Mutex::default() }
     }
 
-    /// Takes a lease of a version, unless there is one. Blocks. Where nothing may be written, it is
-    /// logged: whoever collects garbage there must know what is in use.
-    pub(crate) fn hold(&self, resident: &Arc<Resident>) {
+    /// Takes a lease of a version unless there is one already. Blocks.
+    ///
+    /// A failure is only logged: on a store without write access, the process that collects garbage must
+    /// know by other means what is in use.
+    pub(crate) fn take(&self, resident: &Arc<Resident>) {
         let version = &resident.version;
-        let (name, number) = (&version.manifest.twin, version.number);
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(held) = held.get_mut(&(name.clone(), number)) {
-            held.resident = Arc::downgrade(resident);
+        let name = &version.manifest.twin;
+        let number = version.number;
+        let mut leased = self.leased.lock();
+        if let Some(known) = leased.get_mut(&(name.clone(), number)) {
+            known.resident = Arc::downgrade(resident);
             return;
         }
         match self.catalog.lease(name, number, &self.holder, limits::LEASE) {
             Ok(lease) => {
                 let resident = Arc::downgrade(resident);
-                held.insert((name.clone(), number), LeasedVersion { resident, lease });
+                leased.insert((name.clone(), number), LeasedVersion { resident, lease });
             }
             Err(error) => tracing::warn!(twin = name, version = number, "no lease: {error}"),
         }
     }
 
-    /// Renews the leases of what is still open and ends the others. Blocks.
+    /// Renews the leases of versions that are still open and ends the others. Blocks.
     ///
     /// # Errors
-    /// The first that cannot be renewed; the others are.
+    /// The first lease that cannot be renewed; the others are renewed all the same.
     pub(crate) fn renew(&self) -> Result<(), StoreError> {
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
-        held.retain(|_, held| held.resident.strong_count() > 0);
-        let renewed: Vec<_> = held.values_mut().map(|held| held.lease.renew()).collect();
+        let mut leased = self.leased.lock();
+        leased.retain(|_, known| known.resident.strong_count() > 0);
+        let renewed: Vec<_> = leased.values_mut().map(|known| known.lease.renew()).collect();
         renewed.into_iter().collect()
     }
 }

@@ -1,21 +1,23 @@
-//! What a client is told of each twin before it opens one.
+//! The list of twins that a client gets before it opens one.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
+
+use parking_lot::Mutex;
 
 use wildcity_scene::Trajectory;
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
-/// The latest version of a twin, in a few numbers.
+/// The latest version of a twin, summarized.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TwinSummary {
-    /// Name.
+    /// Name of the twin.
     pub name: String,
-    /// The version.
+    /// Number of the version.
     pub number: u64,
-    /// BLAKE3 of its manifest, in hex.
+    /// BLAKE3 of the version's manifest, in hex.
     pub hash: String,
-    /// Gaussians in it.
+    /// Number of Gaussians.
     pub gaussians: u64,
     /// Spherical-harmonic degree.
     pub sh_degree: u8,
@@ -23,19 +25,19 @@ pub struct TwinSummary {
     pub trajectories: Vec<TrajectorySummary>,
 }
 
-/// A recorded trajectory, in a few numbers.
+/// A recorded trajectory, summarized.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectorySummary {
-    /// Name.
+    /// Name of the trajectory.
     pub name: String,
     /// Length, in metres.
     pub length_m: f64,
-    /// Keyframes.
+    /// Number of keyframes.
     pub keyframes: u64,
 }
 
-/// Summaries of the twins of a catalog. A manifest can have megabytes and never changes, so each is
-/// read once.
+/// Summaries of the twins of a catalog. A manifest may have megabytes and never changes, so each is read
+/// once.
 #[derive(Debug)]
 pub(crate) struct SummaryCache {
     catalog: Catalog,
@@ -47,28 +49,29 @@ impl SummaryCache {
         Self { catalog, known: Mutex::default() }
     }
 
-    /// The latest version of every twin, in order of name, or the one that is `held` in its place. A
-    /// damaged one is logged and left out, so that it does not hide the others.
+    /// The latest version of every twin in order of name, or the version that `pinned` returns for a twin.
+    /// A damaged twin is logged and left out, so that it does not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
     pub(crate) fn read(
         &self,
-        held: &dyn Fn(&str) -> Option<u64>,
+        pinned: &dyn Fn(&str) -> Option<u64>,
     ) -> Result<Vec<Arc<TwinSummary>>, StoreError> {
         let listed = self.catalog.twins()?;
-        // Held while reading, so that clients that come together read each manifest once.
-        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        // The lock is held while manifests are read, so that simultaneous requests read each one once.
+        let mut known = self.known.lock();
         let mut fresh = BTreeMap::new();
         for listing in listed {
-            // Asked for after the log is read: a push holds the latest before it commits.
-            let held = held(&listing.name);
-            let number = held.unwrap_or(listing.number);
-            // The hash of one that is held is not listed: numbers go up while it is.
-            let is_this = |summary: &Arc<TwinSummary>| {
-                summary.number == number && (held.is_some() || summary.hash == listing.hash)
+            // Looked up after the log is read: a push pins the latest version before it commits.
+            let pinned = pinned(&listing.name);
+            let number = pinned.unwrap_or(listing.number);
+            // `listing.hash` is that of the latest version, so a pinned version is compared by number
+            // alone: numbers only rise while a version is pinned.
+            let is_current = |summary: &Arc<TwinSummary>| {
+                summary.number == number && (pinned.is_some() || summary.hash == listing.hash)
             };
-            let summary = match known.remove(&listing.name).filter(is_this) {
+            let summary = match known.remove(&listing.name).filter(is_current) {
                 Some(summary) => summary,
                 None => match self.catalog.version(&listing.name, Some(number)) {
                     Ok(version) => Arc::new(TwinSummary::of(version)),
@@ -84,7 +87,7 @@ impl SummaryCache {
         Ok(known.values().cloned().collect())
     }
 
-    /// Whether the directory of twins can be read.
+    /// Checks that the directory of twins can be read.
     ///
     /// # Errors
     /// It cannot.
@@ -108,9 +111,12 @@ impl TwinSummary {
 }
 
 impl TrajectorySummary {
-    /// Of a trajectory.
-    pub fn of(log: &Trajectory) -> Self {
-        let (length_m, keyframes) = (log.length_m(), log.keyframes.len() as u64);
-        Self { name: log.name.clone(), length_m, keyframes }
+    /// The summary of a trajectory.
+    pub fn of(trajectory: &Trajectory) -> Self {
+        Self {
+            name: trajectory.name.clone(),
+            length_m: trajectory.length_m(),
+            keyframes: trajectory.keyframes.len() as u64,
+        }
     }
 }

@@ -4,15 +4,15 @@ use std::sync::Arc;
 
 use super::schedule::Schedule;
 use super::trust::Trust;
-use crate::engine::{AnswerBudget, BudgetShare};
+use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 
-/// What cameras took and a decision still looks at, in the order in which it was taken. What is
-/// common to two albums is in memory once.
+/// The frames that coming decisions will show, in the order in which they were taken. Copies share the
+/// frames' bytes.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct FrameHistory(Vec<Arc<PastFrame>>);
+pub(crate) struct FrameHistory(Vec<Arc<KeptFrame>>);
 
-/// A frame of a camera.
+/// A frame of a camera, encoded.
 #[derive(Debug)]
 pub(crate) struct PastFrame {
     /// Index of the camera.
@@ -21,35 +21,39 @@ pub(crate) struct PastFrame {
     pub(crate) time_us: i64,
     /// BLAKE3 of its pixels.
     pub(crate) hash: blake3::Hash,
-    /// How far it may be believed, if that was asked for.
+    /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
-    /// As it travels: a file, or its pixels.
+    /// As it travels: a JPEG or PNG file, or raw pixels.
     pub(crate) bytes: Vec<u8>,
-    /// Its part of the budget for answers.
-    _hold: BudgetShare,
+}
+
+#[derive(Debug)]
+struct KeptFrame {
+    frame: PastFrame,
+    _share: BudgetShare,
 }
 
 impl FrameHistory {
-    /// Puts a frame in, which counts against the budget for answers from now on.
+    /// Adds a frame. Its bytes count against the budget until no history holds it.
     pub(crate) fn add(
         &mut self,
-        answers: &AnswerBudget,
-        (camera, time_us): (usize, i64),
-        (hash, trust): (blake3::Hash, Option<Trust>),
-        bytes: Vec<u8>,
+        budget: &AnswerBudget,
+        frame: PastFrame,
     ) -> Result<(), SessionError> {
-        let _hold = answers.hold(bytes.len() as u64)?;
-        self.0.push(Arc::new(PastFrame { camera, time_us, hash, trust, bytes, _hold }));
+        let share = budget.reserve(frame.bytes.len() as u64)?;
+        self.0.push(Arc::new(KeptFrame { frame, _share: share }));
         Ok(())
     }
 
-    /// The frame of a camera of a time, in microseconds.
-    pub(crate) fn find(&self, camera: usize, time_us: i64) -> Option<&Arc<PastFrame>> {
-        self.0.iter().find(|shown| (shown.camera, shown.time_us) == (camera, time_us))
+    /// The frame of a camera that was taken at a time, in microseconds.
+    pub(crate) fn find(&self, camera: usize, time_us: i64) -> Option<&PastFrame> {
+        let frames = self.0.iter().map(|kept| &kept.frame);
+        frames.into_iter().find(|frame| frame.camera == camera && frame.time_us == time_us)
     }
 
-    /// Throws out what no decision after a time looks at.
-    pub(crate) fn forget(&mut self, schedule: &Schedule, time_us: i64) {
-        self.0.retain(|shown| schedule.kept(shown.camera, shown.time_us, time_us));
+    /// Drops the frames that no decision after a time will show.
+    pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
+        self.0
+            .retain(|kept| schedule.is_shown_after(kept.frame.camera, kept.frame.time_us, time_us));
     }
 }

@@ -1,4 +1,4 @@
-//! What an observation consists of, before it is named on the wire.
+//! What an observation consists of, before `server` writes its header.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -9,9 +9,9 @@ use super::trust::Trust;
 /// A finished observation.
 #[derive(Debug)]
 pub struct Observation {
-    /// The bytes of all tensors, behind the reserved header.
+    /// The bytes of all tensors, behind the bytes reserved for the header.
     pub buffer: ObservationBuffer,
-    /// What is where in the buffer, in order and without gaps.
+    /// Where the tensors are in the buffer, in order and without gaps.
     pub tensors: Vec<Tensor>,
     /// The images, pose by pose, camera by camera.
     pub images: Vec<ImageInfo>,
@@ -21,41 +21,41 @@ pub struct Observation {
     pub frame_hash: blake3::Hash,
     /// How many poses of the ego history were driven.
     pub history_count: usize,
-    /// What it cost.
+    /// How long its parts took.
     pub timings: Timings,
-    /// What of it had to be loaded.
+    /// Memory of the twins, and what had to be loaded for this observation.
     pub residency: ResidencyStats,
 }
 
-/// Memory behind an observation.
+/// Memory of the twins, and what had to be loaded for an observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ResidencyStats {
     /// Bytes of Gaussians in memory, of all twins.
     pub held_bytes: u64,
-    /// Bytes that there may be.
+    /// The most bytes of Gaussians that may be in memory.
     pub limit_bytes: u64,
-    /// Sections that were not in memory when it was asked for.
+    /// Sections that were not in memory when they were requested.
     pub waited_for: usize,
     /// How long it took until they were.
     pub waited: Duration,
 }
 
-/// One image of a [`Observation`].
+/// One image of an [`Observation`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
-    /// Which of the request's poses.
+    /// Index of the pose among those of the request.
     pub pose: usize,
     /// When it was taken, in microseconds since the episode's start.
     pub time_us: i64,
     /// BLAKE3 of the pixels, `[height, width, 3]`.
     pub hash: blake3::Hash,
-    /// How far it may be believed, if that was asked for.
+    /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
 }
 
-/// One image of a [`Observation`] that was taken before it.
+/// One earlier image of an [`Observation`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PastImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
@@ -66,11 +66,11 @@ pub struct PastImageInfo {
     pub time_us: i64,
     /// BLAKE3 of the pixels, `[height, width, 3]`.
     pub hash: blake3::Hash,
-    /// How far it may be believed, if that was asked for.
+    /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
 }
 
-/// One tensor of a [`Observation`].
+/// One tensor of an [`Observation`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
     /// What it holds.
@@ -79,7 +79,7 @@ pub struct Tensor {
     pub dtype: DType,
     /// Its shape, row-major.
     pub shape: Vec<usize>,
-    /// Where its bytes are, from the end of the header.
+    /// Its bytes, counted from the end of the header.
     pub bytes: Range<usize>,
 }
 
@@ -96,9 +96,9 @@ pub enum TensorKind {
     Opacity(usize),
     /// Unit normals in the camera's axes: `[height, width, 3]`.
     Normals(usize),
-    /// Colour: `[height, width, 3]`, or the `[n]` bytes of a file.
+    /// Colour: `[height, width, 3]` pixels, or the `[n]` bytes of a file.
     Rgb(usize),
-    /// Colour of an earlier frame, by its index in [`Observation::history`]: the same.
+    /// Colour of an earlier image, by its index in [`Observation::history`]; shape as [`Self::Rgb`].
     PastRgb(usize),
 }
 
@@ -111,21 +111,21 @@ pub enum DType {
     U8,
 }
 
-/// What an observation cost.
+/// How long the parts of an observation took.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Timings {
-    /// Waiting for other sessions' frames.
+    /// Time in the render queue.
     pub queue: Duration,
-    /// Rendering, with the encoding that ran beside it.
+    /// Rendering, including the encoding that ran beside it.
     pub render: Duration,
-    /// CPU time of encoding and hashing.
+    /// Encoding and hashing, summed over all threads.
     pub encode: Duration,
-    /// Wall time per render stage, in milliseconds, in the order of the chain.
+    /// Wall time per render stage, in milliseconds, in the order of the stages.
     pub stages_ms: Vec<(&'static str, f64)>,
 }
 
 impl DType {
-    /// Bytes of one.
+    /// Bytes of one element.
     pub(crate) fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,

@@ -1,188 +1,146 @@
-//! Where the ego may be soon, so that what it will see there can be loaded before it is asked for.
-//! A guess: it changes when things are in memory, never what is drawn.
+//! Where the ego may be in the next steps.
 
 use glam::DVec3;
 
-use crate::limits;
-use wildcity_scene::Trajectory;
-use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_scene::route::BoxIndex;
+use wildcity_scene::geometry::Pose;
 use wildcity_twin::residency::Urgency;
 
-/// A recorded drive that the ego may follow.
-#[derive(Debug)]
-pub(crate) struct RecordedDrive {
-    poses: Vec<Pose>,
-    /// Distance of each pose along the drive, in metres.
-    stations_m: Vec<f64>,
-    /// The ways from each pose to the next; of one pose, that pose.
-    ways: BoxIndex,
-}
+use super::recorded_drive::RecordedDrive;
+use crate::limits;
 
-/// What is known of where the ego goes.
+/// What is known about the ego's way.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct EgoForecast<'a> {
-    /// `world_from_rig` now.
-    pub(crate) now: Pose,
-    /// The way of the last step, in metres along world axes; zero at the start.
+    /// Where the ego is now.
+    pub(crate) world_from_rig: Pose,
+    /// The displacement of one step at the current velocity, in metres along world axes.
     pub(crate) last_step_m: DVec3,
-    /// Steps to look ahead.
+    /// How many steps to look ahead.
     pub(crate) steps: usize,
-    /// The drive that it may follow.
-    pub(crate) route: Option<&'a RecordedDrive>,
-    /// Where the agent says that it may go next, in order.
+    /// The recorded drive that the ego may follow.
+    pub(crate) drive: Option<&'a RecordedDrive>,
+    /// Where the agent says that it goes next: poses (`world_from_rig`), in order.
     pub(crate) hint: &'a [Pose],
 }
 
+/// A place along a recorded drive that the ego follows.
+#[derive(Clone, Copy)]
+struct FollowedDrive<'a> {
+    drive: &'a RecordedDrive,
+    /// Distance along the drive, in metres.
+    station_m: f64,
+}
+
 impl EgoForecast<'_> {
-    /// Poses (`world_from_rig`), the soonest first: the next steps' own places, then some metres apart
-    /// as far as the steps reach, then along the hint.
+    /// Poses (`world_from_rig`) to prefetch, the soonest first: the exact poses of the next steps, then
+    /// poses some metres apart as far as the steps reach, then poses along the hint.
     ///
-    /// Near the drive and not against it, the ego is taken to follow it, as far beside it and as turned
-    /// as it is now; else it is taken to go straight on.
+    /// The exact poses matter: levels of detail change at exact distances, so that two metres off another
+    /// section is needed. Near a recorded drive and not against its direction, the ego is assumed to follow
+    /// it, at its current offset and angle; otherwise it is assumed to go straight on.
     pub(crate) fn places(&self) -> Vec<(Urgency, Pose)> {
         let step_m = self.last_step_m.length();
         let moves = step_m > limits::STANDSTILL_STEP_M;
-        let mut places = Vec::new();
-        let followed = self.followed();
-        let after = |way_m: f64| match followed {
-            Some((route, station_m)) => {
-                let rig_from_route = route.at(station_m).inverse() * self.now;
-                route.at(station_m + way_m) * rig_from_route
+        let followed = self.followed_drive();
+        let pose_after = |distance_m: f64| match followed {
+            Some(FollowedDrive { drive, station_m }) => {
+                let drive_from_rig = drive.pose_at(station_m).inverse() * self.world_from_rig;
+                drive.pose_at(station_m + distance_m) * drive_from_rig
             }
             None => {
-                let position_m = self.now.position_m + self.last_step_m * (way_m / step_m);
-                Pose { position_m, ..self.now }
+                let moved_m = self.last_step_m * (distance_m / step_m);
+                let position_m = self.world_from_rig.position_m + moved_m;
+                Pose { position_m, ..self.world_from_rig }
             }
         };
-        let mut way_m = 0.0;
+
+        let mut places = Vec::new();
+        let mut distance_m = 0.0;
         if moves {
             for _ in 0..self.steps.min(limits::IMMINENT_STEPS) {
-                way_m += step_m;
-                places.push((Urgency::Imminent, after(way_m)));
+                distance_m += step_m;
+                places.push((Urgency::Imminent, pose_after(distance_m)));
             }
         }
-        let far_m = match (moves, followed) {
+
+        let reach_m = match (moves, followed) {
             (true, _) => step_m * self.steps as f64,
-            // It stands where a drive goes on.
+            // The ego stands on a drive and is likely to start along it.
             (false, Some(_)) => limits::STANDSTILL_AHEAD_M,
             (false, None) => 0.0,
         };
-        while way_m < far_m && places.len() < limits::PREFETCH_PLACES {
-            way_m += limits::PREFETCH_SPACING_M;
-            places.push((Urgency::Speculative, after(way_m)));
+        while distance_m < reach_m && places.len() < limits::PREFETCH_PLACES {
+            distance_m += limits::PREFETCH_SPACING_M;
+            places.push((Urgency::Speculative, pose_after(distance_m)));
         }
-        places.extend(along(self.hint).into_iter().map(|pose| (Urgency::Speculative, pose)));
+
+        let hinted = sample_polyline(self.hint);
+        places.extend(hinted.into_iter().map(|pose| (Urgency::Speculative, pose)));
         places
     }
 
-    /// The drive, and where along it the ego is, if it follows it.
-    fn followed(&self) -> Option<(&RecordedDrive, f64)> {
-        let route = self.route?;
-        let (station_m, distance_m) = route.nearest(self.now.position_m)?;
-        let on = route.at(station_m + 1.0).position_m - route.at(station_m).position_m;
-        let along = on.dot(self.last_step_m) >= 0.0;
-        (distance_m <= limits::ROUTE_NEAR_M && along).then_some((route, station_m))
+    /// The drive, if the ego is near it and does not move against its direction.
+    fn followed_drive(&self) -> Option<FollowedDrive<'_>> {
+        let drive = self.drive?;
+        let nearest = drive.nearest(self.world_from_rig.position_m)?;
+        let station_m = nearest.station_m;
+        let ahead_m = drive.pose_at(station_m + 1.0).position_m;
+        let direction_m = ahead_m - drive.pose_at(station_m).position_m;
+        let is_near = nearest.distance_m <= limits::ROUTE_NEAR_M;
+        let is_along = direction_m.dot(self.last_step_m) >= 0.0;
+        (is_near && is_along).then_some(FollowedDrive { drive, station_m })
     }
 }
 
-/// What is left of a hint for an ego that has come so far: what lies behind the last pose that it is
-/// near is done. A pose that is much farther along the hint than from its front to the ego is still to
-/// come, however near: a hint may lead back to its start.
-pub(crate) fn rest(hint: &[Pose], now: Pose) -> &[Pose] {
+/// The part of a hint that is still ahead of an ego at `now`: what follows the last pose that the ego is
+/// near.
+///
+/// A hint may lead back to its start. So a pose counts as passed only if it is not much farther along the
+/// hint than the ego is from the hint's first pose.
+pub(crate) fn remaining_hint(hint: &[Pose], now: Pose) -> &[Pose] {
     let near_m = 2.0 * limits::PREFETCH_SPACING_M;
-    let Some(front) = hint.first() else { return hint };
-    let most_m = 2.0 * front.position_m.distance(now.position_m) + near_m;
-    let (mut way_m, mut before, mut done) = (0.0, front, 0);
+    let Some(first) = hint.first() else { return hint };
+    let passable_m = 2.0 * first.position_m.distance(now.position_m) + near_m;
+    let mut along_m = 0.0;
+    let mut previous = first;
+    let mut passed = 0;
     for (index, pose) in hint.iter().enumerate() {
-        way_m += pose.position_m.distance(before.position_m);
-        if way_m > most_m {
+        along_m += pose.position_m.distance(previous.position_m);
+        if along_m > passable_m {
             break;
         }
         if pose.position_m.distance(now.position_m) <= near_m {
-            done = index + 1;
+            passed = index + 1;
         }
-        before = pose;
+        previous = pose;
     }
-    &hint[done..]
+    &hint[passed..]
 }
 
-/// Poses along straight lines between others, some metres apart.
-fn along(corners: &[Pose]) -> Vec<Pose> {
+/// Poses along the straight lines between `corners`, at most `PREFETCH_SPACING_M` apart and at most
+/// `PREFETCH_PLACES` in number.
+fn sample_polyline(corners: &[Pose]) -> Vec<Pose> {
     let mut poses: Vec<Pose> = corners.first().copied().into_iter().collect();
     for pair in corners.windows(2) {
         let length_m = pair[0].position_m.distance(pair[1].position_m);
         let parts = (length_m / limits::PREFETCH_SPACING_M).ceil().max(1.0);
         let left = limits::PREFETCH_PLACES.saturating_sub(poses.len());
-        let between = (1..=(parts as usize).min(left)).map(|part| part as f64 / parts);
-        poses.extend(between.map(|t| pair[0].interpolate(&pair[1], t)));
+        let fractions = (1..=(parts as usize).min(left)).map(|part| part as f64 / parts);
+        poses.extend(fractions.map(|t| pair[0].interpolate(&pair[1], t)));
     }
     poses.truncate(limits::PREFETCH_PLACES);
     poses
-}
-
-impl RecordedDrive {
-    /// Of a trajectory.
-    pub(crate) fn new(log: &Trajectory) -> Self {
-        let poses: Vec<Pose> = log.keyframes.iter().map(|frame| frame.world_from_rig).collect();
-        let mut stations_m = Vec::with_capacity(poses.len());
-        let mut way_m = 0.0;
-        for (index, pose) in poses.iter().enumerate() {
-            let before = poses[index.saturating_sub(1)];
-            way_m += pose.position_m.distance(before.position_m);
-            stations_m.push(way_m);
-        }
-        let way = |index: usize| {
-            let mut bounds = Bounds::EMPTY;
-            for pose in &poses[index..poses.len().min(index + 2)] {
-                bounds.add(pose.position_m, DVec3::ZERO);
-            }
-            bounds
-        };
-        let count = poses.len().saturating_sub(1).max(poses.len().min(1));
-        let ways: Vec<Bounds> = (0..count).map(way).collect();
-        Self { poses, stations_m, ways: BoxIndex::new(&ways) }
-    }
-
-    /// The place along the drive that is nearest to a point, and how near: both in metres.
-    fn nearest(&self, point_m: DVec3) -> Option<(f64, f64)> {
-        // How far along a way the nearest place is, and how near.
-        let on_way = |index: usize| {
-            let from_m = self.poses[index].position_m;
-            let to_m = self.poses.get(index + 1).map_or(from_m, |next| next.position_m);
-            let (way_m, to_point_m) = (to_m - from_m, point_m - from_m);
-            let t = (to_point_m.dot(way_m) / way_m.length_squared().max(1e-12)).clamp(0.0, 1.0);
-            (t * way_m.length(), (to_point_m - t * way_m).length())
-        };
-        // No less than the distance to the way's box but for rounding, which may prefer an equal one.
-        let (index, distance_m) = self.ways.min_cost(point_m, |index| on_way(index).1)?;
-        Some((self.stations_m[index] + on_way(index).0, distance_m))
-    }
-
-    /// The pose at a distance along the drive, in metres. It goes straight on beyond its end.
-    fn at(&self, station_m: f64) -> Pose {
-        let after = self.stations_m.partition_point(|&m| m < station_m);
-        let last = self.poses.len() - 1;
-        if after > last {
-            let end = self.poses[last];
-            let beyond_m = station_m - self.stations_m[last];
-            return Pose { position_m: end.position_m + end.rotation * DVec3::X * beyond_m, ..end };
-        }
-        let before = after.saturating_sub(1);
-        let length_m = self.stations_m[after] - self.stations_m[before];
-        let t = if length_m > 0.0 { (station_m - self.stations_m[before]) / length_m } else { 1.0 };
-        self.poses[before].interpolate(&self.poses[after], t)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::DQuat;
+    use wildcity_scene::Trajectory;
     use wildcity_scene::trajectory::Keyframe;
 
     /// 100 m east, then 100 m north.
-    fn route() -> RecordedDrive {
+    fn corner_drive() -> RecordedDrive {
         let pose = |i: i64| {
             let way_m = i as f64;
             let (position_m, yaw) = if way_m <= 100.0 {
@@ -206,15 +164,16 @@ mod tests {
     fn ahead<'a>(
         now: Pose,
         step_m: DVec3,
-        route: Option<&'a RecordedDrive>,
+        drive: Option<&'a RecordedDrive>,
         hint: &'a [Pose],
     ) -> Vec<Pose> {
-        let ahead = EgoForecast { now, last_step_m: step_m, steps: 20, route, hint };
-        ahead.places().into_iter().map(|(_, pose)| pose).collect()
+        let forecast =
+            EgoForecast { world_from_rig: now, last_step_m: step_m, steps: 20, drive, hint };
+        forecast.places().into_iter().map(|(_, pose)| pose).collect()
     }
 
     #[test]
-    fn straight_on_without_a_drive_the_next_steps_to_the_metre() {
+    fn without_a_drive_the_ego_goes_straight_on_step_by_step() {
         let places = ahead(at(10.0, 5.0), DVec3::X * 3.0, None, &[]);
         for (k, pose) in places[..limits::IMMINENT_STEPS].iter().enumerate() {
             let wanted = DVec3::new(13.0 + 3.0 * k as f64, 5.0, 0.0);
@@ -222,44 +181,44 @@ mod tests {
         }
         let last = places[places.len() - 1].position_m.x;
         assert!((70.0..=70.0 + limits::PREFETCH_SPACING_M).contains(&last), "20 steps: {last}");
-        assert_eq!(ahead(at(10.0, 5.0), DVec3::ZERO, None, &[]), [], "who stands stays");
+        assert_eq!(ahead(at(10.0, 5.0), DVec3::ZERO, None, &[]), [], "an ego that stands stays");
     }
 
     #[test]
-    fn around_the_corner_along_a_drive_and_as_far_beside_it() {
-        let route = route();
-        let places = ahead(at(90.0, -2.0), DVec3::X * 3.0, Some(&route), &[]);
+    fn along_a_drive_the_ego_keeps_its_offset_around_the_corner() {
+        let drive = corner_drive();
+        let places = ahead(at(90.0, -2.0), DVec3::X * 3.0, Some(&drive), &[]);
         let after_corner = places.iter().filter(|pose| pose.position_m.y > 5.0);
         for pose in after_corner.clone() {
             assert!((pose.position_m.x - 102.0).abs() < 1e-6, "2 m to its right: {pose:?}");
         }
         assert!(after_corner.count() >= 4, "{places:?}");
-        // Against it, or far from it, it is no guide.
-        let against = ahead(at(90.0, -2.0), DVec3::X * -3.0, Some(&route), &[]);
+        // An ego that moves against it, or is far from it, does not follow it.
+        let against = ahead(at(90.0, -2.0), DVec3::X * -3.0, Some(&drive), &[]);
         assert!(against.iter().all(|pose| pose.position_m.x < 90.0));
-        let far = ahead(at(90.0, -50.0), DVec3::X * 3.0, Some(&route), &[]);
+        let far = ahead(at(90.0, -50.0), DVec3::X * 3.0, Some(&drive), &[]);
         assert!(far.iter().all(|pose| (pose.position_m.y + 50.0).abs() < 1e-9));
-        // Who stands on it may start.
-        let start = ahead(at(0.0, 0.0), DVec3::ZERO, Some(&route), &[]);
+        // An ego that stands on it may start.
+        let start = ahead(at(0.0, 0.0), DVec3::ZERO, Some(&drive), &[]);
         assert!(start.len() >= 5 && start[0].position_m.x > 0.0);
     }
 
     #[test]
-    fn a_hint_is_followed_until_it_is_driven() {
+    fn a_hint_is_prefetched_until_the_ego_has_passed_it() {
         let hint = [at(0.0, 0.0), at(0.0, 40.0), at(40.0, 40.0)];
         let places = ahead(at(-100.0, 0.0), DVec3::ZERO, None, &hint);
         assert_eq!(places.len(), 11, "every 8 m: {places:?}");
         assert!(places.contains(&hint[1]) && places.contains(&hint[2]));
-        assert_eq!(rest(&hint, at(-100.0, 0.0)), hint);
-        assert_eq!(rest(&hint, at(5.0, 38.0)), &hint[2..]);
-        assert_eq!(rest(&hint, at(40.0, 40.0)), []);
+        assert_eq!(remaining_hint(&hint, at(-100.0, 0.0)), hint);
+        assert_eq!(remaining_hint(&hint, at(5.0, 38.0)), &hint[2..]);
+        assert_eq!(remaining_hint(&hint, at(40.0, 40.0)), []);
         // Around a block, back to where it began.
         let block = [at(0.0, 0.0), at(0.0, 40.0), at(40.0, 40.0), at(40.0, 0.0), at(0.0, 0.0)];
-        assert_eq!(rest(&block, at(0.0, 0.0)), &block[1..]);
-        assert_eq!(rest(&block[1..], at(0.0, 2.0)), &block[1..]);
-        assert_eq!(rest(&block[1..], at(0.0, 30.0)), &block[2..]);
-        assert_eq!(rest(&block[4..], at(3.0, 0.0)), []);
+        assert_eq!(remaining_hint(&block, at(0.0, 0.0)), &block[1..]);
+        assert_eq!(remaining_hint(&block[1..], at(0.0, 2.0)), &block[1..]);
+        assert_eq!(remaining_hint(&block[1..], at(0.0, 30.0)), &block[2..]);
+        assert_eq!(remaining_hint(&block[4..], at(3.0, 0.0)), []);
         let long = [at(0.0, 0.0), at(1e6, 0.0)];
-        assert_eq!(along(&long).len(), limits::PREFETCH_PLACES);
+        assert_eq!(sample_polyline(&long).len(), limits::PREFETCH_PLACES);
     }
 }

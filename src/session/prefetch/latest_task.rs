@@ -1,68 +1,65 @@
-//! Who looks ahead for a session: one submit at a time, and only the latest of those that wait.
+//! Runs tasks in the background, one at a time, and of those that wait only the latest.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
-/// Does one submit after the other beside the session, which never waits for it.
+use parking_lot::Mutex;
+
+/// Runs one task after the other beside its owner, which never waits for them.
 #[derive(Debug, Default)]
 pub(crate) struct LatestTask(Arc<Mutex<State>>);
 
 #[derive(Default)]
 struct State {
-    /// A task is under way, which takes `next` when it is done with the one before.
-    busy: bool,
+    /// A blocking thread runs a task, and takes `next` when that is done.
+    running: bool,
     next: Option<Task>,
 }
 
 type Task = Box<dyn FnOnce() + Send>;
 
 impl LatestTask {
-    /// Does this soon, in place of what waits.
-    pub(crate) fn submit(&self, submit: impl FnOnce() + Send + 'static) {
+    /// Runs a task soon, in place of one that still waits.
+    pub(crate) fn submit(&self, task: impl FnOnce() + Send + 'static) {
         let replaced = {
-            let mut state = lock(&self.0);
-            if !state.busy {
-                state.busy = true;
+            let mut state = self.0.lock();
+            if !state.running {
+                state.running = true;
                 let shared = self.0.clone();
-                // Nobody waits for it.
+                // Nothing waits for the thread's end.
                 drop(tokio::task::spawn_blocking(move || run_all(&shared)));
             }
-            state.next.replace(Box::new(submit))
+            state.next.replace(Box::new(task))
         };
-        // Once the lock is open: it may hold anything.
+        // Dropped without the lock: a task may own anything, and dropping it may take long.
         drop(replaced);
     }
 }
 
 impl Drop for LatestTask {
     fn drop(&mut self) {
-        // Nobody is interested any more.
-        let _next = lock(&self.0).next.take();
+        // The owner has ended, so the waiting task has no use.
+        let _next = self.0.lock().next.take();
     }
 }
 
-/// Until nothing waits.
+/// Runs tasks until none waits.
 fn run_all(shared: &Mutex<State>) {
     loop {
         let next = {
-            let mut state = lock(shared);
-            state.busy = state.next.is_some();
+            let mut state = shared.lock();
+            state.running = state.next.is_some();
             state.next.take()
         };
-        let Some(submit) = next else { return };
-        // A defect in one is logged where it happens, and the next is looked at all the same.
-        let _looked = catch_unwind(AssertUnwindSafe(submit));
+        let Some(task) = next else { return };
+        // A panic is logged where it happens, and the next task runs all the same.
+        let _panic = catch_unwind(AssertUnwindSafe(task));
     }
-}
-
-/// A panic elsewhere leaves nothing half-done behind this lock.
-fn lock(state: &Mutex<State>) -> MutexGuard<'_, State> {
-    state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl std::fmt::Debug for State {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("State").field("busy", &self.busy).finish_non_exhaustive()
+        f.debug_struct("State").field("running", &self.running).finish_non_exhaustive()
     }
 }
 
@@ -72,25 +69,25 @@ mod tests {
     use std::sync::mpsc::channel;
 
     #[tokio::test]
-    async fn one_look_at_a_time_and_then_the_latest() {
-        let lookout = LatestTask::default();
-        let (begun, has_begun) = channel();
-        let (go_on, may_go_on) = channel();
-        let (tell, told) = channel();
-        lookout.submit(move || {
-            begun.send(()).unwrap();
-            may_go_on.recv().unwrap();
-            panic!("this crash was asked for");
+    async fn one_task_runs_at_a_time_and_then_the_latest() {
+        let tasks = LatestTask::default();
+        let (first_started, wait_for_first) = channel();
+        let (release_first, wait_for_release) = channel();
+        let (report, reported) = channel();
+        tasks.submit(move || {
+            first_started.send(()).unwrap();
+            wait_for_release.recv().unwrap();
+            panic!("this panic is part of the test");
         });
-        has_begun.recv().unwrap();
+        wait_for_first.recv().unwrap();
         for number in 0..1000 {
-            let tell = tell.clone();
-            lookout.submit(move || tell.send(number).unwrap());
+            let report = report.clone();
+            tasks.submit(move || report.send(number).unwrap());
         }
-        assert!(told.try_recv().is_err(), "the first is still under way");
-        go_on.send(()).unwrap();
-        assert_eq!(told.recv().unwrap(), 999);
-        drop(tell);
-        assert!(told.recv().is_err(), "no other submit was kept");
+        assert!(reported.try_recv().is_err(), "the first task still runs");
+        release_first.send(()).unwrap();
+        assert_eq!(reported.recv().unwrap(), 999);
+        drop(report);
+        assert!(reported.recv().is_err(), "no other task was kept");
     }
 }

@@ -1,4 +1,4 @@
-//! Drives a recorded episode again, command by command, and compares where that leads.
+//! Drives a recorded episode again, command by command, and compares the poses with the recorded ones.
 
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::ego::Path;
@@ -8,7 +8,7 @@ use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
 use crate::episode::Episode;
 use crate::error::SessionError;
 
-/// A step whose command leads elsewhere than it did.
+/// A step at which the command leads to another pose than the recorded one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DivergedStep {
     /// Line of the episode's file, from 1.
@@ -17,7 +17,7 @@ pub struct DivergedStep {
     pub step: u64,
     /// `world_from_rig` as recorded.
     pub recorded: Pose,
-    /// As it is now.
+    /// `world_from_rig` now.
     pub now: Pose,
 }
 
@@ -32,34 +32,34 @@ impl EgoReplay {
         Self { episode: Episode::new(seed, Ego::new(dynamics, start), dt_us) }
     }
 
-    /// How far it is.
+    /// The episode after the frames so far.
     pub(crate) fn episode(&self) -> &Episode {
         &self.episode
     }
 
-    /// Does the step of a frame, if it is one. Poses are compared to the bit.
+    /// Drives the step of a frame, if it is one, and compares the poses bit by bit.
     ///
     /// # Errors
-    /// The recorded command is none for this ego.
-    pub(crate) fn follow(
+    /// The ego cannot execute the recorded command.
+    pub(crate) fn drive(
         &mut self,
         frame: &FrameRecord,
         line: usize,
         ground: &Ground<'_>,
     ) -> Result<Option<DivergedStep>, SessionError> {
-        // Others before it are of frames that a later observation shows.
-        let (FrameRequest::Step, Some(recorded)) = (frame.request, frame.poses.last()) else {
+        // The poses before the last one are those of a warm-up's frames.
+        let (FrameRequest::Step, Some(&recorded)) = (frame.request, frame.poses.last()) else {
             return Ok(None);
         };
         let command = match &frame.command {
-            None => Command::Pose(*recorded),
+            None => Command::Pose(recorded),
             Some(RecordedCommand::Action(action)) => Command::Action(*action),
             Some(RecordedCommand::Trajectory(poses)) => {
                 Command::Path(Path::checked(poses.clone()).map_err(SessionError::Ego)?)
             }
         };
         self.episode = self.episode.stepped(&command, ground, false)?;
-        let (now, recorded) = (self.episode.world_from_rig(), *recorded);
+        let now = self.episode.world_from_rig();
         Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))
     }
 }

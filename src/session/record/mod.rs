@@ -1,5 +1,13 @@
 //! Records of episodes, and their replay.
+//!
+//! Every answer with images is on record before it is sent, so that whatever an agent has seen can be
+//! rendered again. A replay drives the recorded commands, renders the recorded poses, and compares both with
+//! the record: poses to the bit, images by their hashes.
 
 pub(crate) mod ego_replay;
+pub(crate) mod error;
 pub(crate) mod format;
+pub(crate) mod recorded_episode;
+pub(crate) mod recorder;
 pub(crate) mod replay;
+pub(crate) mod replay_report;

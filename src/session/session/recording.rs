@@ -1,61 +1,64 @@
 //! What a session writes to its episodes' files.
 
+use wildcity_scene::Rig;
+
 use super::Session;
+use crate::blocking::run_blocking;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
-use crate::observe::builder::RenderedObservation;
+use crate::observe::builder::finish::RenderedObservation;
 use crate::options::PixelMaps;
 use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOutputs, RecordedVersion,
-    Recorder,
 };
-use wildcity_scene::Rig;
+use crate::record::recorder::{NewFile, Recorder};
 
 impl Session {
-    /// Writes what was rendered to the episode's file, which begins with its first frame.
-    pub(crate) async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
-        let line = Line::Frame(frame);
+    /// Appends a frame to the episode's file. The first frame of an episode creates the file.
+    pub(super) async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
+        let frame = Line::Frame(frame);
         match self.recorder.clone() {
             Some(recorder) => {
-                let version = self.switched.then(|| self.version_line());
-                append(recorder, version.into_iter().chain([line]).collect()).await?;
+                let version = self.version_switched.then(|| self.version_line());
+                append(recorder, version.into_iter().chain([frame]).collect()).await?;
             }
             None => {
-                let (recorder, number) = self.begin_recording(&self.episode, line).await?;
-                (self.recorder, self.episode_number) = (Some(recorder), number);
+                let file = self.create_file(&self.episode, frame).await?;
+                self.recorder = Some(file.recorder);
+                self.episode_number = file.number;
             }
         }
-        self.switched = false;
+        self.version_switched = false;
         Ok(())
     }
 
-    /// Says what was rendered.
-    pub(crate) fn frame_line(
+    /// The record of a rendered observation, without the command that led there.
+    pub(super) fn frame_record(
         &self,
         request: FrameRequest,
         episode: &Episode,
-        drawing: &RenderedObservation,
+        rendered: &RenderedObservation,
     ) -> FrameRecord {
-        let RenderedObservation { frame, shots, hashes, .. } = drawing;
-        let all = self.layout.cameras().len();
-        let mut cameras: Vec<_> = shots.iter().map(|shot| shot.cameras.clone()).collect();
-        if cameras.iter().all(|of_pose| of_pose.len() == all) {
+        let RenderedObservation { observation, captures, hashes, .. } = rendered;
+        let all_cameras = self.layout.cameras().len();
+        let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
+        if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
             cameras.clear();
         }
         FrameRecord {
             request,
             step: episode.step(),
             time_us: episode.time_us(),
-            poses: shots.iter().map(|shot| shot.world_from_rig).collect(),
+            poses: captures.iter().map(|capture| capture.world_from_rig).collect(),
             cameras,
             command: None,
             terminated: episode.terminated(),
-            frame_hash: frame.frame_hash.to_hex().to_string(),
+            frame_hash: observation.frame_hash.to_hex().to_string(),
             images: hashes.iter().map(|hash| hash.to_hex().to_string()).collect(),
         }
     }
 
-    /// Says that what follows is of this version.
+    /// The line that says that what follows was rendered from another version of the twin.
     fn version_line(&self) -> Line {
         let version = &self.resident().version;
         Line::Version(RecordedVersion {
@@ -67,12 +70,12 @@ impl Session {
         })
     }
 
-    /// Begins the file of an episode that has not moved yet, with its first frame.
-    pub(crate) async fn begin_recording(
+    /// Creates the file of an episode that has not moved yet, with its header and its first frame.
+    pub(super) async fn create_file(
         &self,
         episode: &Episode,
         first_frame: Line,
-    ) -> Result<(Recorder, u64), SessionError> {
+    ) -> Result<NewFile, SessionError> {
         let version = &self.resident().version;
         let PixelMaps { depth, opacity, normals } = self.layout.maps();
         let cameras = self.layout.cameras().to_vec();
@@ -94,26 +97,24 @@ impl Session {
             start: episode.world_from_rig(),
             dt_us: self.dt_us,
         };
-        let (dir, name) = (self.engine.episodes().to_owned(), self.name.clone());
-        let (first_number, lines) =
-            (self.episode_number + 1, [Line::Episode(Box::new(header)), first_frame]);
-        let created = tokio::task::spawn_blocking(move || {
-            Recorder::create(&dir, &name, first_number, &lines)
-        });
-        let created = created.await;
-        Ok(created.map_err(|_| SessionError::Crashed)??)
+        let dir = self.engine.episodes().to_owned();
+        let name = self.name.clone();
+        let first_number = self.episode_number + 1;
+        let lines = [Line::Episode(Box::new(header)), first_frame];
+        let created = run_blocking(move || Recorder::create(&dir, &name, first_number, &lines));
+        Ok(created.await??)
     }
 
-    /// Writes the last line. The episode is over either way: a failure is only logged.
-    pub(crate) async fn finish(&mut self, outcome: Outcome) {
+    /// Writes the last line of the episode's file. A failure is only logged: the episode is over either
+    /// way.
+    pub(super) async fn end_recording(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
         if let Err(error) = append(recorder, vec![Line::End(self.episode.summary(outcome))]).await {
-            tracing::warn!(session = self.name, "the episode's summary is missing: {error}");
+            tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
     }
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
-    let appended = tokio::task::spawn_blocking(move || recorder.append(&lines)).await;
-    Ok(appended.map_err(|_| SessionError::Crashed)??)
+    Ok(run_blocking(move || recorder.append(&lines)).await??)
 }

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! demand, index       which sections a frame draws, computed from the table of a version alone
-//! cache, resident     the versions that are open, and the one that a session draws
-//! pager               loads what frames request and hands each frame all of it at once; threads, one lock
+//! cache, resident     the open versions, and requests for the frames of one
+//! pager               loads what frames request and hands each frame all of it at once
 //! requests            which request waits for which section, and which section is loaded next
 //! table               which sections are in memory, and which may be evicted
 //! reservation         a session's share of the memory, and what it prefetches

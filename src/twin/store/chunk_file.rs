@@ -19,8 +19,8 @@
 //!
 //! What is read, decoded, and drawn as one unit is a section: one level of detail of one block of
 //! 16 m, within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer knows nothing of
-//! levels. A sparse cell, such as a skyline, is one block: with 3,000 blocks of three Gaussians
-//! each, the demo street took 9 ms more per frame.
+//! levels. A sparse cell, such as a skyline, is one block: 3,000 blocks of three Gaussians
+//! each took 9 ms of every frame of the demo street.
 
 use std::io::{self, Write};
 

@@ -61,7 +61,7 @@ const COLLECTED: &str = "gc/collected";
 /// What a run does.
 #[derive(Debug, Default)]
 struct CollectionPlan {
-    collected: CollectionReport,
+    report: CollectionReport,
     candidates: Candidates,
     remove: Vec<String>,
     /// Versions that lose objects.
@@ -86,7 +86,7 @@ impl Catalog {
         let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
-            return Ok(plan.collected);
+            return Ok(plan.report);
         }
         if !plan.remove.is_empty() {
             self.objects.remove_objects(name, &mut || {
@@ -101,7 +101,7 @@ impl Catalog {
         for lease in self.leases(name)?.iter().filter(|lease| !lease.is_live(now_us)) {
             lease.remove(self, name)?;
         }
-        Ok(plan.collected)
+        Ok(plan.report)
     }
 
     /// Records that versions are collected, before their objects are removed: otherwise they would
@@ -132,6 +132,7 @@ impl Catalog {
         self.read_side_json(name, COLLECTED)
     }
 
+    /// Decides what to keep, to note, and to remove. `before` are the candidates of the last run.
     fn plan(
         &self,
         name: &str,
@@ -139,6 +140,7 @@ impl Catalog {
         before: &Candidates,
         now_us: i64,
     ) -> Result<CollectionPlan, StoreError> {
+        // Versions to keep: the latest ones, and those in use.
         let numbers = self.numbers(name)?;
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
@@ -147,6 +149,7 @@ impl Catalog {
         let gone = self.collected(name)?;
         kept.retain(|number| !gone.contains(number));
 
+        // Their objects are needed; all others are garbage.
         let mut named = BTreeSet::new();
         for &number in &kept {
             named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);
@@ -160,21 +163,22 @@ impl Catalog {
             }
             let noted_us = before.get(&object.hash).copied();
             if noted_us.is_some_and(is_old) && is_old(object.written_us) {
-                plan.collected.removed.add(object.bytes);
+                plan.report.removed.add(object.bytes);
                 plan.remove.push(object.hash);
             } else if plan.candidates.len() < limits::GC_CANDIDATES {
-                plan.collected.noted.add(object.bytes);
+                plan.report.noted.add(object.bytes);
                 plan.candidates.insert(object.hash, noted_us.unwrap_or(now_us));
             }
         }
-        // A record that cannot be read names no object that could be removed.
+        // Versions that lose their manifest. A record that cannot be read names no object that could
+        // be removed.
         for number in numbers.into_iter().filter(|number| !kept.contains(number)) {
             if self.record(name, number).is_ok_and(|record| plan.remove.contains(&record.manifest))
             {
                 plan.gone.insert(number);
             }
         }
-        plan.collected.kept = kept.into_iter().collect();
+        plan.report.kept = kept.into_iter().collect();
         Ok(plan)
     }
 

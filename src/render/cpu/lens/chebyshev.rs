@@ -5,7 +5,7 @@ use fearless_simd::{f32x16, prelude::*};
 /// Nodes at which a function is sampled.
 const NODES: usize = 32;
 
-/// Most terms of a series. Real lenses need 8 to 14, and a fisheye whose image ends at 100° off the axis 18
+/// Most terms of a series. Real lenses need 8 to 14, and a fisheye with an image up to 100° off the axis 18
 /// to 22.
 const MAX_TERMS: usize = 24;
 
@@ -20,8 +20,8 @@ pub(super) struct ChebyshevSeries {
 }
 
 impl ChebyshevSeries {
-    /// The fewest terms whose remainder changes f by less than `max_error`; `None` if that takes more than
-    /// [`MAX_TERMS`].
+    /// The fewest terms with a remainder that changes f by less than `max_error`; `None` if that takes more
+    /// than [`MAX_TERMS`].
     pub(super) fn fit(limit: f64, max_error: f64, f: &dyn Fn(f64) -> f64) -> Option<Self> {
         // Sample at the Chebyshev nodes, and take the discrete cosine transform.
         let node = |j: usize| std::f64::consts::PI * (j as f64 + 0.5) / NODES as f64;

@@ -3,13 +3,13 @@
 //! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With
 //! `t = tan(θ/2) = |(x, y)|/(|p| + z)` the angle θ needs a square root instead of an arc tangent, and the
 //! image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's polynomial leads.
-//! 8 to 14 Chebyshev terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel to its
-//! ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within 8e-4 px
-//! of f64, with a rolling shutter too. Before, a step of a real six-camera rig spent four fifths of its time
-//! in Newton's method.
+//! 8 to 14 Chebyshev terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel
+//! to its ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within
+//! 8e-4 px of f64, with a rolling shutter too. Before, a step of a real six-camera rig spent four fifths of
+//! its time in Newton's method.
 //!
 //! Three kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field,
-//! those whose row the search does not find, and those of cameras that this module does not describe.
+//! those for which the search finds no row, and those of cameras that this module does not describe.
 
 mod chebyshev;
 mod rays;
@@ -66,7 +66,7 @@ pub(super) struct ExposedPixels<S: Simd> {
 }
 
 impl LensProjection {
-    /// `None` for windshields whose polynomials lead from the inside to the outside, for fields that no
+    /// `None` for windshields with polynomials from the inside to the outside, for fields that no
     /// short series describes, and for cameras that rotate far during one exposure.
     pub(super) fn new(view: &View) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;

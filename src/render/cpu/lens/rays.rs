@@ -40,7 +40,7 @@ struct RoundLens {
 
 impl LensRays {
     /// `None` for OpenCV's polynomials of slopes, for what [`super::LensProjection`] does not describe, and
-    /// for a windshield whose effect fades within the image.
+    /// for a windshield with a refraction that fades within the image.
     pub(in crate::cpu) fn new(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
         let shutter = match view.shutter_motion() {

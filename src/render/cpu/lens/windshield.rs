@@ -9,8 +9,8 @@ use crate::cpu::math::{asin, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield whose polynomials lead from the outside to the inside, where it refracts in full: at large
-/// angles [`Windshield`] fades its effect out, which this does not.
+/// A windshield with polynomials that lead from the outside to the inside, at angles where it refracts in
+/// full. At large angles [`Windshield`] fades the refraction out; this type does not.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
     horizontal: Polynomial2,

@@ -37,8 +37,8 @@ impl<S: Simd> Ellipse<S> {
     ///
     /// `Σ′ = V Vᵀ + blur I`. With the 2 x 2 minors `m` of `V` (its rows' cross product), Cauchy and Binet's
     /// formula gives `det Σ′ = |m|² + blur |V|² + blur²`: a sum of positives, exact to rounding even for
-    /// needles whose `ac - b²` cancels to nothing. The determinant is of fourth order in the size, so that a
-    /// splat wider than [`MAX_SIGMA_PX`] is computed in a unit larger than the pixel.
+    /// needles, for which `ac - b²` cancels to nothing. The determinant is of fourth order in the size, so
+    /// that a splat wider than [`MAX_SIGMA_PX`] is computed in a unit larger than the pixel.
     #[inline(always)]
     pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, blur_px2: f32) -> Self {
         let splat = |value: f32| f32x16::splat(simd, value);

@@ -2,7 +2,7 @@
 //! ([`crate::unscented`] explains the method).
 //!
 //! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32. Those with a
-//! point beyond the lens' field, or with a point whose row the search did not find, are projected one by one
+//! point beyond the lens' field, or with a point for which the search found no row, are projected one by one
 //! in f64 by [`UnscentedView`].
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
@@ -103,9 +103,9 @@ pub(super) fn project_block<S: Simd>(
     Some(splats)
 }
 
-/// Projects those of a block whose six points all lie within the lens' field. Returns their splats, and a bit
-/// for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera to the centres,
-/// in world axes.
+/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
+/// and a bit for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera to the
+/// centres, in world axes.
 #[inline(always)]
 fn project_lanes<S: Simd>(
     simd: S,

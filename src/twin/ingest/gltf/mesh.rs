@@ -98,6 +98,7 @@ fn read_primitive(
         let reason = format!("has mode {:?}; only lists of triangles are read", primitive.mode());
         return Err(bad(place, reason));
     }
+    // Check the accessors before the gltf crate reads them.
     let material = primitive.material();
     let base = material.pbr_metallic_roughness();
     let set = base.base_color_texture().map_or(0, |texture| texture.tex_coord());
@@ -113,6 +114,7 @@ fn read_primitive(
             check(&accessor, dimensions, types, buffers).map_err(|reason| bad(place, reason))?;
         }
     }
+    // Count what will be allocated.
     let reader = primitive.reader(|buffer| buffers.get(buffer.index()).copied());
     let positions = reader.read_positions().ok_or_else(|| bad(place, "has no POSITION".into()))?;
     let uv = reader.read_tex_coords(set).map(|uv| uv.into_f32());
@@ -125,6 +127,7 @@ fn read_primitive(
         (count * size_of::<Triangle>() + corners * 3 * size_of::<DVec4>()) as u128,
     )?;
 
+    // Positions, colours, and texture coordinates per corner.
     let positions_m: Vec<DVec3> = positions.map(|m| DVec3::from_array(m.map(f64::from))).collect();
     let uv: Option<Vec<DVec2>> =
         uv.map(|uv| uv.map(|uv| DVec2::from_array(uv.map(f64::from))).collect());
@@ -147,6 +150,8 @@ fn read_primitive(
         let uv = uv.as_ref().map_or(Some(DVec2::ZERO), |uv| uv.get(index).copied())?;
         Some((*positions_m.get(index)?, color, uv))
     };
+
+    // Triangles: three corners each, by index or in order.
     let indices: Vec<usize> = match reader.read_indices() {
         Some(indices) => indices.into_u32().map(|index| index as usize).collect(),
         None => (0..corners).collect(),

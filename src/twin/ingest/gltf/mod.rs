@@ -100,6 +100,7 @@ pub(super) fn read(
 ) -> Result<Gaussians, IngestError> {
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
+    // Buffers: from URIs, or within the GLB file.
     let mut fetched = Vec::new();
     for (index, buffer) in document.buffers.iter().enumerate() {
         fetched.push(match &buffer.uri {
@@ -120,6 +121,8 @@ pub(super) fn read(
         };
         buffers.push(bytes);
     }
+
+    // Splats of all mesh instances, or else the triangles.
     let mut all = Gaussians::default();
     let mut found = false;
     let placed = instances::mesh_instances(&document)?;

@@ -26,6 +26,7 @@ pub(super) fn read(
     file_bytes: u64,
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
+    // Find the columns, and check the size of the file.
     let (chunk, vertex, colour) = tables(header)?;
     let sh_degree = colour.map_or(Ok(0), degree)?;
     let ranges = ValueRanges::find(chunk)?;
@@ -37,6 +38,7 @@ pub(super) fn read(
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;
 
+    // Value ranges, then vertices, then higher SH degrees: the order of the body.
     let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
     let mut body = Body { input, done: header.bytes, file_bytes, progress };
     body.rows(chunk, |row| chunks.push(ranges.value(row)))?;

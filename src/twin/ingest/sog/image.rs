@@ -10,6 +10,12 @@ use wildcity_scene::sh;
 
 use super::{FORMAT, body};
 
+/// A file of the scene, which is named in errors.
+pub(super) struct NamedFile {
+    pub(super) name: String,
+    pub(super) bytes: Vec<u8>,
+}
+
 /// A decoded image.
 pub(super) struct Image {
     bytes: Vec<u8>,
@@ -21,7 +27,7 @@ pub(super) struct Image {
 impl Image {
     /// Decodes a named image of at least `count` pixels.
     pub(super) fn decode(
-        (name, file): (String, Vec<u8>),
+        NamedFile { name, bytes: file }: NamedFile,
         count: usize,
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
@@ -34,10 +40,10 @@ impl Image {
         };
         let held = file.len() as u64;
         if promised > held {
-            let reason = format!("{held} of {promised} bytes are there: it is truncated");
+            let reason = format!("it has {held} of {promised} bytes: it is truncated");
             return Err(body(&name, reason));
         }
-        let damaged = |e| body(&name, format!("is no sound WebP image: {e}; copy it again"));
+        let damaged = |e| body(&name, format!("is a damaged WebP image: {e}; copy it again"));
         let mut decoder = WebPDecoder::new(Cursor::new(file)).map_err(damaged)?;
         if decoder.is_lossy() {
             return Err(body(
@@ -85,13 +91,13 @@ impl Palette {
     /// Decodes an image, and checks its number of entries and its degree where they are known. Its
     /// width implies the degree, too.
     pub(super) fn decode(
-        part: (String, Vec<u8>),
+        file: NamedFile,
         entries: Option<u64>,
         bands: Option<u8>,
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
-        let name = part.0.clone();
-        let image = Image::decode(part, 0, budget)?;
+        let name = file.name.clone();
+        let image = Image::decode(file, 0, budget)?;
         let [width_px, height_px] = image.size_px;
         let wide = |d: &u8| ENTRIES_PER_ROW * (sh::coefficients(*d) - 1) == width_px;
         let degree = (1..=sh::MAX_DEGREE).find(wide).filter(|d| bands.is_none_or(|b| b == *d));

@@ -18,7 +18,7 @@ use wildcity_scene::{Gaussians, sh};
 use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
 use super::{IngestError, activation, check_count};
-use image::Image;
+use image::{Image, NamedFile};
 use meta::{Meta, Tables};
 
 const FORMAT: &str = "SOG";
@@ -57,9 +57,10 @@ fn read_one(
     let tables = Tables::of(&meta).map_err(|reason| bad(name, reason))?;
     let count = check_count(tables.count)?;
     // All files are read first, because the limit of unpacking depends on their total size.
-    let mut fetch = |file: &str| -> Result<(String, Vec<u8>), IngestError> {
+    let mut fetch = |file: &str| -> Result<NamedFile, IngestError> {
         let file = format!("{folder}{file}");
-        parts.read(&file, limits::SCENE_PART_BYTES).map(|bytes| (file, bytes))
+        let bytes = parts.read(&file, limits::SCENE_PART_BYTES)?;
+        Ok(NamedFile { name: file, bytes })
     };
     let [means_l, means_u] = [fetch(&meta.means.files.0)?, fetch(&meta.means.files.1)?];
     let scales = fetch(&meta.scales.files.0)?;
@@ -69,8 +70,9 @@ fn read_one(
         Some(sh_n) => Some([fetch(&sh_n.files.0)?, fetch(&sh_n.files.1)?]),
         None => None,
     };
-    let mut decode = |part: (String, Vec<u8>)| Image::decode(part, count, parts.budget());
+    let mut decode = |file: NamedFile| Image::decode(file, count, parts.budget());
 
+    // Centres: 16 bits between mins and maxs, of the signed logarithm.
     let [low, high] = [decode(means_l)?, decode(means_u)?];
     let mut gaussians = Gaussians { means_m: Vec::with_capacity(count), ..Gaussians::default() };
     for (low, high) in low.pixels(count).zip(high.pixels(count)) {
@@ -83,6 +85,8 @@ fn read_one(
         gaussians.means_m.push(mean);
     }
     drop([low, high]);
+
+    // Rotations, scales, and opacities.
     for [r, g, b, largest] in decode(quats)?.pixels(count) {
         if largest < 252 {
             let index = gaussians.quats_wxyz.len();
@@ -100,12 +104,14 @@ fn read_one(
     }
     let colours = decode(sh0)?;
     gaussians.logit_opacities.extend(colours.pixels(count).map(|p| pick(&tables.logits, p[3])));
+
+    // Colours: degree 0, and higher degrees by labels.
     let dc = |pixel: [u8; 4]| -> [f32; 3] {
         std::array::from_fn(|channel| pick(&tables.colours[channel], pixel[channel]))
     };
     match (higher, tables.higher) {
         (Some([centroids, labels]), Some(table)) => {
-            let name = centroids.0.clone();
+            let name = centroids.name.clone();
             let palette =
                 image::Palette::decode(centroids, table.entries, table.bands, parts.budget())?;
             let labels = Image::decode(labels, count, parts.budget())?;

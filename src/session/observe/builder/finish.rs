@@ -1,0 +1,209 @@
+//! Closes an observation: appends what was encoded, names the tensors, and updates the frame history.
+
+use std::mem;
+
+use super::ObservationBuilder;
+use crate::error::SessionError;
+use crate::limits;
+use crate::observe::encode::{EncodedImage, Encoding};
+use crate::observe::frame_history::{FrameHistory, PastFrame};
+use crate::observe::layout::RigCapture;
+use crate::observe::observation::{
+    DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind,
+};
+use crate::observe::trust::Trust;
+use crate::options::PixelMaps;
+
+/// A finished observation, and what it leaves for its record and for later observations.
+pub(crate) struct RenderedObservation {
+    pub(crate) observation: Observation,
+    /// The history after this observation; empty if it was built without one.
+    pub(crate) frame_history: FrameHistory,
+    /// What was rendered, in order.
+    pub(crate) captures: Vec<RigCapture>,
+    /// The hash of each rendered image.
+    pub(crate) hashes: Vec<blake3::Hash>,
+    trusts: Vec<Option<Trust>>,
+}
+
+impl RenderedObservation {
+    /// The trusts of the rendered images, those that only later observations show included. None if the
+    /// session's images come without.
+    pub(crate) fn trusts(&self) -> impl Iterator<Item = f64> {
+        self.trusts.iter().flatten().map(|trust| trust.value)
+    }
+}
+
+impl ObservationBuilder {
+    /// Appends the encoded images and the earlier frames that the history has, and names every tensor.
+    ///
+    /// `history` has the frames of all earlier observations. Without it, as for `observe`, the observation
+    /// shows no earlier frames.
+    pub(crate) fn finish(
+        mut self,
+        history: Option<FrameHistory>,
+        held_bytes: u64,
+        limit_bytes: u64,
+    ) -> Result<RenderedObservation, SessionError> {
+        let shown = self.shown_images();
+        self.append_files(&shown)?;
+        let mut tensors = self.name_tensors(&shown);
+
+        let mut frame_history = FrameHistory::default();
+        let mut past_images = Vec::new();
+        if let Some(history) = history {
+            frame_history = history;
+            past_images = self.append_earlier_frames(&mut frame_history, &mut tensors)?;
+        }
+
+        let images: Vec<ImageInfo> = shown.into_iter().map(|image| image.info).collect();
+        let frame_hash = frame_hash(images.iter().map(|image| image.hash));
+        Ok(RenderedObservation {
+            observation: Observation {
+                buffer: self.buffer,
+                tensors: tensors.list,
+                images,
+                history: past_images,
+                frame_hash,
+                history_count: self.history_count,
+                timings: self.timings,
+                residency: ResidencyStats { held_bytes, limit_bytes, ..self.residency },
+            },
+            frame_history,
+            captures: self.captures,
+            hashes: self.encoded.iter().map(|image| image.hash).collect(),
+            trusts: self.encoded.iter().map(|image| image.trust).collect(),
+        })
+    }
+
+    /// The images of the captures that the observation shows now.
+    fn shown_images(&self) -> Vec<ShownImage> {
+        let mut shown = Vec::new();
+        let mut encoded = 0;
+        let mut pose = 0;
+        for capture in &self.captures {
+            for &camera in &capture.cameras {
+                if capture.shown {
+                    let EncodedImage { hash, trust, .. } = self.encoded[encoded];
+                    let time_us = capture.time_us;
+                    shown.push(ShownImage {
+                        info: ImageInfo { camera, pose, time_us, hash, trust },
+                        encoded,
+                    });
+                }
+                encoded += 1;
+            }
+            pose += usize::from(capture.shown);
+        }
+        shown
+    }
+
+    /// Appends the files of the shown images. Raw pixels are in the buffer already.
+    fn append_files(&mut self, shown: &[ShownImage]) -> Result<(), SessionError> {
+        let files: Vec<&[u8]> = match self.layout.encoding() {
+            Encoding::Raw => Vec::new(),
+            Encoding::Jpeg(_) | Encoding::Png => {
+                shown.iter().map(|image| &self.encoded[image.encoded].file[..]).collect()
+            }
+        };
+        self.buffer.append(&self.budget, &files)
+    }
+
+    /// The tensors of the ego history and of the shown images, in the order of the buffer.
+    fn name_tensors(&self, shown: &[ShownImage]) -> TensorList {
+        let layout = &self.layout;
+        let mut tensors = TensorList { list: Vec::new(), end: 0 };
+        let poses = limits::HISTORY_POSES;
+        tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
+        tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
+        let PixelMaps { depth, opacity, normals } = layout.maps();
+        for (index, image) in shown.iter().enumerate() {
+            let [height, width] = layout.size_px(image.info.camera);
+            if depth {
+                tensors.push(TensorKind::Depth(index), DType::F32, vec![height, width]);
+            }
+            if opacity {
+                tensors.push(TensorKind::Opacity(index), DType::F32, vec![height, width]);
+            }
+            if normals {
+                tensors.push(TensorKind::Normals(index), DType::F32, vec![height, width, 3]);
+            }
+        }
+        for (index, image) in shown.iter().enumerate() {
+            let file_bytes = self.encoded[image.encoded].file.len();
+            let shape = layout.colour_shape(image.info.camera, file_bytes);
+            tensors.push(TensorKind::Rgb(index), DType::U8, shape);
+        }
+        tensors
+    }
+
+    /// Moves the images that later observations show into the history, appends those of earlier times that
+    /// this one shows, and drops from the history what no later one shows.
+    fn append_earlier_frames(
+        &mut self,
+        history: &mut FrameHistory,
+        tensors: &mut TensorList,
+    ) -> Result<Vec<PastImageInfo>, SessionError> {
+        let Some(now_us) = self.captures.last().map(|capture| capture.time_us) else {
+            return Ok(Vec::new());
+        };
+        let layout = &self.layout;
+        let mut encoded = self.encoded.iter_mut();
+        for capture in &self.captures {
+            for (&camera, image) in capture.cameras.iter().zip(&mut encoded) {
+                if layout.is_shown_later(capture, camera) {
+                    let EncodedImage { hash, trust, .. } = *image;
+                    let bytes = mem::take(&mut image.file);
+                    let time_us = capture.time_us;
+                    let frame = PastFrame { camera, time_us, hash, trust, bytes };
+                    history.add(&self.budget, frame)?;
+                }
+            }
+        }
+
+        let mut past_images = Vec::new();
+        if layout.schedule().is_decision(now_us) {
+            let earlier = layout.earlier_frames(history, now_us);
+            let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
+            self.buffer.append(&self.budget, &files)?;
+            for (index, one) in earlier.iter().enumerate() {
+                let PastFrame { camera, time_us, hash, trust, ref bytes } = *one.frame;
+                let shape = layout.colour_shape(camera, bytes.len());
+                tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
+                past_images.push(PastImageInfo { camera, back: one.back, time_us, hash, trust });
+            }
+        }
+        history.drop_unneeded(layout.schedule(), now_us);
+        Ok(past_images)
+    }
+}
+
+/// An image that the observation shows, and its index among the encoded ones.
+struct ShownImage {
+    info: ImageInfo,
+    encoded: usize,
+}
+
+/// Tensors that lie one after the other.
+struct TensorList {
+    list: Vec<Tensor>,
+    end: usize,
+}
+
+impl TensorList {
+    fn push(&mut self, kind: TensorKind, dtype: DType, shape: Vec<usize>) {
+        let bytes = shape.iter().product::<usize>() * dtype.bytes();
+        let start = self.end;
+        self.end += bytes;
+        self.list.push(Tensor { kind, dtype, shape, bytes: start..self.end });
+    }
+}
+
+/// The hash of a frame: BLAKE3 of its images' hashes, in order.
+fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
+    let mut hasher = blake3::Hasher::new();
+    for hash in images {
+        hasher.update(hash.as_bytes());
+    }
+    hasher.finalize()
+}

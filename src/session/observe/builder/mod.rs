@@ -1,0 +1,243 @@
+//! Builds an observation: lays out its buffer, renders into it, and appends the encoded images.
+
+pub(crate) mod finish;
+
+use std::mem;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use wildcity_render::{Backend, Frame, FrameStats, Target, View};
+
+use super::buffer::ObservationBuffer;
+use super::encode::{EncodedImage, Encoding, encode};
+use super::layout::{InPlaceBytes, ObservationLayout, RigCapture};
+use super::observation::{ResidencyStats, Timings};
+use super::trust::TrainingCoverage;
+use crate::engine::answer_budget::AnswerBudget;
+use crate::engine::render_queue::Scratch;
+use crate::episode::{EgoHistory, Episode};
+use crate::error::SessionError;
+use crate::options::PixelMaps;
+
+/// An observation that is being built: one capture after the other is rendered, then `finish` closes it.
+pub(crate) struct ObservationBuilder {
+    layout: Arc<ObservationLayout>,
+    budget: AnswerBudget,
+    /// Where the twin was recorded, if images come with their trust.
+    coverage: Option<Arc<TrainingCoverage>>,
+    buffer: ObservationBuffer,
+    history_count: usize,
+    /// Where the next shown image's floats go, in bytes from the buffer's start.
+    floats_at: usize,
+    /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
+    raw_at: usize,
+    captures: Vec<RigCapture>,
+    /// The images of all captures so far, camera by camera.
+    encoded: Vec<EncodedImage>,
+    timings: Timings,
+    residency: ResidencyStats,
+}
+
+impl ObservationBuilder {
+    /// Reserves the buffer of an observation and writes the ego history into it.
+    pub(crate) fn new(
+        layout: Arc<ObservationLayout>,
+        budget: &AnswerBudget,
+        coverage: Option<Arc<TrainingCoverage>>,
+        episode: &Episode,
+        captures: &[RigCapture],
+    ) -> Result<Self, SessionError> {
+        layout.check_size(captures.iter().filter(|capture| capture.shown).count())?;
+        let EgoHistory { xyz_m, rotation, count } = episode.history();
+        let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
+        let history = history.concat();
+
+        // | header | ego history | floats of all captures | raw pixels of all captures |
+        let header = layout.header_bytes(captures);
+        let floats_at = header + history.len();
+        let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
+        let InPlaceBytes { floats, raw } = in_place.fold(InPlaceBytes::default(), |sum, one| {
+            InPlaceBytes { floats: sum.floats + one.floats, raw: sum.raw + one.raw }
+        });
+        let mut buffer = ObservationBuffer::zeroed(budget, floats_at + floats + raw, header)?;
+        buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
+
+        let images = captures.iter().map(|capture| capture.cameras.len()).sum();
+        Ok(Self {
+            layout,
+            budget: budget.clone(),
+            coverage,
+            buffer,
+            history_count: count,
+            floats_at,
+            raw_at: floats_at + floats,
+            captures: Vec::with_capacity(captures.len()),
+            encoded: Vec::with_capacity(images),
+            timings: Timings::default(),
+            residency: ResidencyStats::default(),
+        })
+    }
+
+    /// Renders the views of a capture that has cameras; captures come in order. Runs on a render thread.
+    pub(crate) fn render(
+        &mut self,
+        capture: &RigCapture,
+        frame: &Frame<'_>,
+        backend: &dyn Backend,
+        scratch: &mut Scratch,
+    ) -> Result<(), SessionError> {
+        let layout = self.layout.clone();
+        let coverage = self.coverage.clone();
+        scratch.resize_with(scratch.len().max(frame.views.len()), Vec::new);
+
+        // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
+        // and normals are computed from depth.
+        let PixelMaps { depth, opacity, normals } = layout.maps();
+        let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
+        let needs_depth = normals && !depth && capture.shown;
+        let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
+        let extra_maps = u64::from(needs_opacity) + u64::from(needs_depth);
+        let _share = self.budget.reserve(4 * pixels * extra_maps)?;
+        let mut opacity_maps = zeroed_maps(frame.views, needs_opacity);
+        let mut depth_maps_m = zeroed_maps(frame.views, needs_depth);
+
+        // Where the renderer writes.
+        let mut targets = self.targets(capture, scratch);
+        for (target, opacity) in targets.iter_mut().zip(&mut opacity_maps) {
+            target.opacity = Some(opacity);
+        }
+        for (target, depth_m) in targets.iter_mut().zip(&mut depth_maps_m) {
+            target.depth_m = Some(depth_m);
+        }
+
+        // Each image is encoded as soon as it is complete, while others are still rendered.
+        let slots: Vec<OnceLock<Result<EncodedImage, String>>> =
+            frame.views.iter().map(|_| OnceLock::new()).collect();
+        let finished = |index: usize, target: &Target<'_>| {
+            let camera = capture.cameras[index];
+            let [height, width] = layout.size_px(camera).map(|side| side as u32);
+            let pixels = target.rgb8.as_deref().unwrap_or_default();
+            let mut image = encode(pixels, width, height, layout.encoding());
+            if let Ok(image) = &mut image {
+                if layout.encoding() == Encoding::Raw && layout.is_shown_later(capture, camera) {
+                    image.file = pixels.to_vec();
+                }
+                if let Some(coverage) = &coverage {
+                    let opacity = target.opacity.as_deref().unwrap_or_default();
+                    let view = &frame.views[index];
+                    image.trust = Some(coverage.trust(&capture.world_from_rig, view, opacity));
+                }
+            }
+            // Setting fails only if the backend finishes a view twice, which it does not.
+            let _ = slots[index].set(image);
+        };
+        let started = Instant::now();
+        let stats = backend.render(frame, &mut targets, &finished)?;
+        self.timings.render += started.elapsed();
+        self.add_stages(stats);
+
+        for (slot, &camera) in slots.into_iter().zip(&capture.cameras) {
+            let image = slot.into_inner().unwrap_or_else(|| Err("it was never finished".into()));
+            let image = image.map_err(|reason| {
+                let camera = layout.cameras()[camera].name.clone();
+                SessionError::Encode { camera, reason }
+            })?;
+            self.timings.encode += image.took;
+            self.encoded.push(image);
+        }
+        Ok(())
+    }
+
+    /// Where the renderer writes a capture's images: into the buffer what the observation holds as
+    /// rendered, and into scratch buffers what is encoded first.
+    fn targets<'a>(
+        &'a mut self,
+        capture: &RigCapture,
+        scratch: &'a mut Scratch,
+    ) -> Vec<Target<'a>> {
+        let layout = &self.layout;
+        let floats_at = self.floats_at;
+        let raw_at = self.raw_at;
+        let InPlaceBytes { floats, raw } = layout.in_place_bytes(capture);
+        self.floats_at += floats;
+        self.raw_at += raw;
+        let (float_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
+        let mut float_part = &mut float_part[floats_at..floats_at + floats];
+        let mut raw_part = &mut raw_part[..raw];
+
+        let mut targets = Vec::with_capacity(capture.cameras.len());
+        for (&camera, scratch) in capture.cameras.iter().zip(scratch) {
+            let camera = &layout.cameras()[camera];
+            let pixels = camera.camera.pixels();
+            let mut map = |held: bool, values: usize| {
+                let bytes = 4 * pixels * values;
+                (held && capture.shown).then(|| as_floats(split_off_front(&mut float_part, bytes)))
+            };
+            // In the order of the tensors.
+            let PixelMaps { depth, opacity, normals } = layout.maps();
+            let depth_m = map(depth, 1);
+            let opacity = map(opacity, 1);
+            let normals = map(normals, 3);
+            let rgb8 = if layout.encoding() == Encoding::Raw && capture.shown {
+                split_off_front(&mut raw_part, 3 * pixels)
+            } else {
+                if scratch.len() < 3 * pixels {
+                    scratch.resize(3 * pixels, 0);
+                }
+                &mut scratch[..3 * pixels]
+            };
+            targets.push(Target {
+                rgba: None,
+                rgb8: Some(rgb8),
+                depth_m,
+                opacity,
+                normals,
+                appearance: Some(&camera.appearance),
+            });
+        }
+        targets
+    }
+
+    fn add_stages(&mut self, stats: FrameStats) {
+        for (stage, ms) in stats.stages_ms {
+            match self.timings.stages_ms.iter_mut().find(|(name, _)| *name == stage) {
+                Some((_, sum)) => *sum += ms,
+                None => self.timings.stages_ms.push((stage, ms)),
+            }
+        }
+    }
+
+    /// Adds a capture that was rendered, or that has no cameras; in order.
+    pub(crate) fn add_capture(&mut self, capture: RigCapture) {
+        self.captures.push(capture);
+    }
+
+    pub(crate) fn add_queue_time(&mut self, queued: Duration) {
+        self.timings.queue += queued;
+    }
+
+    /// Adds sections that had to be loaded, and how long that took.
+    pub(crate) fn add_load(&mut self, sections: usize, waited: Duration) {
+        self.residency.waited_for += sections;
+        self.residency.waited += waited;
+    }
+}
+
+/// A map of zeros for each view; none at all unless `needed`.
+fn zeroed_maps(views: &[View], needed: bool) -> Vec<Vec<f32>> {
+    let views = if needed { views } else { &[] };
+    views.iter().map(|view| vec![0.0; view.camera.pixels()]).collect()
+}
+
+/// Splits the first bytes off a slice.
+fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
+    let (front, others) = mem::take(rest).split_at_mut(bytes);
+    *rest = others;
+    front
+}
+
+/// The same bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
+/// room, the ego history and the maps before them are multiples of 4 bytes.
+fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
+    bytemuck::cast_slice_mut(bytes)
+}

@@ -1,0 +1,236 @@
+//! What every observation of a session looks like: its cameras, their encoding and maps, and which frames
+//! of them are rendered when.
+
+use std::collections::BTreeMap;
+
+use wildcity_render::{MAX_VIEWS, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::rig::{Rig, RigCamera};
+
+use super::encode::Encoding;
+use super::frame_history::{FrameHistory, PastFrame};
+use super::schedule::Schedule;
+use crate::episode::Episode;
+use crate::error::SessionError;
+use crate::limits;
+use crate::options::PixelMaps;
+
+/// The header's length, little-endian, comes before the header.
+pub const HEADER_PREFIX_BYTES: usize = 8;
+
+/// Room for the parts of the header that do not repeat: names of at most 64 bytes, hashes of 64, the ego's
+/// 15 numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
+const HEADER_BASE_BYTES: usize = 4096;
+
+/// Room in the header per image: four tensors of at most 190 bytes, and 16 numbers of at most 24 digits,
+/// two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12 numbers and a windshield
+/// of 42 with their keys, below 1,600 bytes.
+const HEADER_IMAGE_BYTES: usize = 3584;
+
+/// Most images of one answer, whether of several poses or of several times.
+const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
+const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
+
+// A client accepts the longest header, and the renderer renders any rig in one frame.
+const _: () = assert!(
+    HEADER_BASE_BYTES + IMAGES * HEADER_IMAGE_BYTES <= limits::OBSERVATION_HEADER_BYTES as usize
+);
+const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
+
+/// What every observation of a session looks like.
+#[derive(Debug)]
+pub(crate) struct ObservationLayout {
+    cameras: Vec<RigCamera>,
+    /// The share of each camera's image that its lens sees; `None` if that is all of it.
+    visible_shares: Vec<Option<f64>>,
+    encoding: Encoding,
+    maps: PixelMaps,
+    schedule: Schedule,
+}
+
+/// What is rendered at once: some cameras of the rig, at one pose and time.
+#[derive(Clone, Debug)]
+pub(crate) struct RigCapture {
+    /// Where the rig is.
+    pub(crate) world_from_rig: Pose,
+    /// When, in microseconds since the episode's start.
+    pub(crate) time_us: i64,
+    /// Indices of the cameras; there may be none.
+    pub(crate) cameras: Vec<usize>,
+    /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
+    pub(crate) shown: bool,
+}
+
+/// Bytes that the renderer writes straight into the observation's buffer.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct InPlaceBytes {
+    /// Of the float maps.
+    pub(super) floats: usize,
+    /// Of raw pixels.
+    pub(super) raw: usize,
+}
+
+/// A frame of the history that an observation shows.
+pub(super) struct EarlierFrame<'a> {
+    /// How many frames of its camera ago, from 1.
+    pub(super) back: usize,
+    pub(super) frame: &'a PastFrame,
+}
+
+impl ObservationLayout {
+    /// # Errors
+    /// The JPEG quality is out of range, or the images of one observation have too many pixels.
+    pub(crate) fn new(
+        cameras: Vec<RigCamera>,
+        encoding: Encoding,
+        maps: PixelMaps,
+        schedule: Schedule,
+    ) -> Result<Self, SessionError> {
+        if let Encoding::Jpeg(quality) = encoding
+            && !(1..=100).contains(&quality)
+        {
+            let must = format!("{quality}; 1 to 100 are accepted");
+            return Err(SessionError::OutOfRange { field: "outputs.quality", must });
+        }
+        let visible_share = |RigCamera { camera, .. }: &RigCamera| {
+            FieldMask::of(camera).map(|field| field.visible_share(camera))
+        };
+        let visible_shares = cameras.iter().map(visible_share).collect();
+        let layout = Self { cameras, visible_shares, encoding, maps, schedule };
+        layout.check_size(layout.schedule.frames())?;
+        Ok(layout)
+    }
+
+    pub(crate) fn cameras(&self) -> &[RigCamera] {
+        &self.cameras
+    }
+
+    /// The share of a camera's image that its lens sees; `None` if that is all of it.
+    pub(crate) fn visible_share(&self, camera: usize) -> Option<f64> {
+        self.visible_shares[camera]
+    }
+
+    pub(crate) fn encoding(&self) -> Encoding {
+        self.encoding
+    }
+
+    pub(crate) fn maps(&self) -> PixelMaps {
+        self.maps
+    }
+
+    pub(crate) fn schedule(&self) -> &Schedule {
+        &self.schedule
+    }
+
+    /// What to render for an observation at the end of an episode: the frames that this observation or a
+    /// later one shows and that the history lacks. One capture per time; the last is of now, and may have
+    /// no cameras.
+    pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
+        let now_us = episode.time_us();
+        let mut cameras_by_time = BTreeMap::from([(now_us, Vec::new())]);
+        for camera in 0..self.cameras.len() {
+            for time_us in self.schedule.due(camera, now_us) {
+                if time_us >= episode.begin_us() && history.find(camera, time_us).is_none() {
+                    cameras_by_time.entry(time_us).or_default().push(camera);
+                }
+            }
+        }
+        let capture = |(time_us, cameras)| RigCapture {
+            world_from_rig: episode.pose_at(time_us),
+            time_us,
+            cameras,
+            shown: time_us == now_us && self.schedule.is_decision(now_us),
+        };
+        cameras_by_time.into_iter().map(capture).collect()
+    }
+
+    /// All cameras at poses that the ego need not be at, as `observe` requests them.
+    pub(crate) fn captures_at(&self, episode: &Episode, poses: Vec<Pose>) -> Vec<RigCapture> {
+        let cameras: Vec<usize> = (0..self.cameras.len()).collect();
+        let capture = |world_from_rig| RigCapture {
+            world_from_rig,
+            time_us: episode.time_us(),
+            cameras: cameras.clone(),
+            shown: true,
+        };
+        poses.into_iter().map(capture).collect()
+    }
+
+    /// The views of a capture. Those of an earlier time are in the warm-up: the rig stands during the
+    /// exposure.
+    pub(crate) fn views(&self, episode: &Episode, capture: &RigCapture) -> Vec<View> {
+        let in_motion = capture.time_us == episode.time_us();
+        episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, in_motion)
+    }
+
+    /// Checks that the images of so many rigs fit one answer.
+    pub(super) fn check_size(&self, rigs: usize) -> Result<(), SessionError> {
+        let rig_pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
+        let pixel_bytes = 3 + 4 * self.maps.values() as u64;
+        let room_bytes = limits::OBSERVATION_BYTES as u64 - limits::OBSERVATION_HEADER_BYTES;
+        let limit = limits::ANSWER_PIXELS.min(room_bytes / pixel_bytes);
+        let pixels = rig_pixels * rigs as u64;
+        if pixels > limit {
+            return Err(SessionError::AnswerTooLarge { pixels, limit });
+        }
+        Ok(())
+    }
+
+    /// Room for the header of an observation of some captures, its length prefix included.
+    pub(super) fn header_bytes(&self, captures: &[RigCapture]) -> usize {
+        let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
+        // Of several frames per camera, an observation shows more than it renders.
+        let images = rendered.max(self.schedule.frames() * self.cameras.len());
+        HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES
+    }
+
+    /// Bytes that the renderer writes into the buffer for a capture.
+    pub(super) fn in_place_bytes(&self, capture: &RigCapture) -> InPlaceBytes {
+        if !capture.shown {
+            return InPlaceBytes::default();
+        }
+        let pixels = capture.cameras.iter().map(|&camera| self.cameras[camera].camera.pixels());
+        let pixels: usize = pixels.sum();
+        InPlaceBytes {
+            floats: 4 * pixels * self.maps.values(),
+            raw: if self.encoding == Encoding::Raw { 3 * pixels } else { 0 },
+        }
+    }
+
+    /// Whether a later observation shows a camera's image of a capture.
+    pub(super) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
+        !capture.shown || self.schedule.is_shown_after(camera, capture.time_us, capture.time_us)
+    }
+
+    /// The frames of the history that a decision shows beside those of its own time: camera by camera,
+    /// the newest first.
+    pub(super) fn earlier_frames<'a>(
+        &self,
+        history: &'a FrameHistory,
+        now_us: i64,
+    ) -> Vec<EarlierFrame<'a>> {
+        let of_camera = |camera| {
+            let times_us = self.schedule.shown_times(camera, now_us);
+            let earlier_us = times_us.filter(|&time_us| time_us < now_us);
+            let frames = earlier_us.filter_map(move |time_us| history.find(camera, time_us));
+            frames.enumerate().map(|(index, frame)| EarlierFrame { back: index + 1, frame })
+        };
+        (0..self.cameras.len()).flat_map(of_camera).collect()
+    }
+
+    /// Height and width of a camera's images, in pixels.
+    pub(super) fn size_px(&self, camera: usize) -> [usize; 2] {
+        let camera = &self.cameras[camera].camera;
+        [camera.height_px as usize, camera.width_px as usize]
+    }
+
+    /// Shape of a colour tensor: of pixels, or of a file of so many bytes.
+    pub(super) fn colour_shape(&self, camera: usize, file_bytes: usize) -> Vec<usize> {
+        let [height, width] = self.size_px(camera);
+        match self.encoding {
+            Encoding::Raw => vec![height, width, 3],
+            Encoding::Jpeg(_) | Encoding::Png => vec![file_bytes],
+        }
+    }
+}

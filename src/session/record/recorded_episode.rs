@@ -1,0 +1,116 @@
+//! Reads an episode's file.
+
+use std::fs::File;
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::path::Path;
+
+use wildcity_scene::appearance::Overlay;
+
+use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
+use super::replay_report::ReplayError;
+use crate::episode::EpisodeSummary;
+use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
+
+// The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a thousandth that
+// PNG may add. The rest of a rig and a profile are below 1 MiB.
+const _: () =
+    assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= EPISODE_HEAD_BYTES as u64);
+
+/// A recorded episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RecordedEpisode {
+    /// What it was rendered from, and how.
+    pub header: EpisodeHeader,
+    /// All answers with images, in order; the first is line 2 of the file.
+    pub frames: Vec<FrameRecord>,
+    /// Versions that the session switched to, each with the number of frames before it.
+    pub versions: Vec<(usize, RecordedVersion)>,
+    /// How it went; absent if the server was killed or is still running.
+    pub end: Option<EpisodeSummary>,
+}
+
+impl RecordedEpisode {
+    /// Reads an episode's file.
+    ///
+    /// # Errors
+    /// Names the first line that is damaged, incomplete or out of place.
+    pub fn read(path: &Path) -> Result<Self, ReplayError> {
+        let failed = |cause| ReplayError::Read { path: path.to_owned(), cause };
+        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut header: Option<EpisodeHeader> = None;
+        let mut frames = Vec::new();
+        let mut versions = Vec::new();
+        let mut end = None;
+        for number in 1.. {
+            let wrong =
+                |reason: String| ReplayError::Line { path: path.to_owned(), line: number, reason };
+
+            // A line, no longer than its limit.
+            let mut text = Vec::new();
+            let limit = if number == 1 { EPISODE_HEAD_BYTES } else { EPISODE_LINE_BYTES };
+            reader.by_ref().take(limit as u64).read_until(b'\n', &mut text).map_err(failed)?;
+            match text.last() {
+                None => break,
+                Some(b'\n') => {}
+                Some(_) if text.len() == limit => {
+                    return Err(wrong(format!("longer than {limit} bytes")));
+                }
+                Some(_) => return Err(wrong("incomplete: it has no line break".to_owned())),
+            }
+
+            // The first line is the header, and nothing follows the end.
+            let line: Line = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
+            match line {
+                _ if end.is_some() => {
+                    return Err(wrong("it follows the end of the episode".to_owned()));
+                }
+                Line::Episode(first) if number == 1 => {
+                    let format = first.format;
+                    if format != EpisodeHeader::FORMAT {
+                        let known = EpisodeHeader::FORMAT;
+                        return Err(wrong(format!("format {format}; this build reads {known}")));
+                    }
+                    first.rig.check()?;
+                    header = Some(*first);
+                }
+                Line::Frame(frame) if number > 1 => {
+                    let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
+                    check_images(&frame, cameras).map_err(wrong)?;
+                    frames.push(frame);
+                }
+                Line::Version(version) if number > 1 => versions.push((frames.len(), version)),
+                Line::End(summary) if number > 1 => end = Some(summary),
+                Line::Episode(_) => return Err(wrong("a second header".to_owned())),
+                Line::Frame(_) | Line::Version(_) | Line::End(_) => {
+                    return Err(wrong("the episode's header is missing".to_owned()));
+                }
+            }
+        }
+        let empty =
+            || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
+        Ok(Self { header: header.ok_or_else(empty)?, frames, versions, end })
+    }
+}
+
+/// Checks that the cameras and images of a frame match its poses. Returns what is wrong otherwise.
+fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
+    let poses = frame.poses.len();
+    if !frame.cameras.is_empty() && frame.cameras.len() != poses {
+        return Err(format!("cameras for {} poses, but {poses} poses", frame.cameras.len()));
+    }
+    for cameras in &frame.cameras {
+        let rising = cameras.is_sorted_by(|a, b| a < b);
+        let exist = cameras.last().is_none_or(|&last| last < rig_cameras);
+        if !rising || !exist {
+            return Err(format!(
+                "cameras {cameras:?}: not rising, or beyond the rig's {rig_cameras} cameras"
+            ));
+        }
+    }
+    let expected: usize = (0..poses).map(|pose| frame.cameras_of(pose, rig_cameras).len()).sum();
+    let images = frame.images.len();
+    if images != expected {
+        return Err(format!("{images} images, but {expected} cameras of {poses} poses"));
+    }
+    Ok(())
+}

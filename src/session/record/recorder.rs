@@ -1,0 +1,121 @@
+//! Writes an episode's file.
+//!
+//! A line is written before its answer is sent, so that every answer is on record. If that fails, for
+//! example on a full disk, the file is truncated to its last whole line and the request is refused.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write as _};
+use std::path::Path;
+use std::sync::Arc;
+
+use super::error::RecordError;
+use super::format::Line;
+
+/// An episode's file, open for appending.
+#[derive(Clone, Debug)]
+pub(crate) struct Recorder {
+    file: Arc<File>,
+    path: Arc<Path>,
+}
+
+/// A newly created file, and the number in its name.
+#[derive(Debug)]
+pub(crate) struct NewFile {
+    pub(crate) recorder: Recorder,
+    pub(crate) number: u64,
+}
+
+impl Recorder {
+    /// Creates a file with the first free number from `first_number` on, and writes its first lines. No
+    /// file is left behind if that fails.
+    pub(crate) fn create(
+        dir: &Path,
+        session: &str,
+        first_number: u64,
+        lines: &[Line],
+    ) -> Result<NewFile, RecordError> {
+        let failed = |path: &Path, cause| RecordError { path: path.to_owned(), cause };
+        fs::create_dir_all(dir).map_err(|cause| failed(dir, cause))?;
+        let mut number = first_number;
+        let (file, path) = loop {
+            let path = dir.join(format!("{session}-{number}.jsonl"));
+            match OpenOptions::new().append(true).create_new(true).open(&path) {
+                Ok(file) => break (file, path),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => number += 1,
+                Err(cause) => return Err(failed(&path, cause)),
+            }
+        };
+        let recorder = Self { file: Arc::new(file), path: path.into() };
+        if let Err(error) = recorder.append(lines) {
+            // The first failure says more than one of removing the file would.
+            let _ = fs::remove_file(&recorder.path);
+            return Err(error);
+        }
+        Ok(NewFile { recorder, number })
+    }
+
+    /// Appends whole lines, or nothing.
+    pub(crate) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
+        self.try_append(lines).map_err(|cause| RecordError { path: self.path.to_path_buf(), cause })
+    }
+
+    fn try_append(&self, lines: &[Line]) -> io::Result<()> {
+        let mut text = Vec::with_capacity(2048);
+        for line in lines {
+            serde_json::to_writer(&mut text, line)?;
+            text.push(b'\n');
+        }
+        let length_before = self.file.metadata()?.len();
+        let written = (&*self.file).write_all(&text);
+        if written.is_err() {
+            self.file.set_len(length_before)?;
+        }
+        written
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::episode::{EpisodeSummary, Outcome};
+
+    fn end(steps: u64) -> Line {
+        Line::End(EpisodeSummary {
+            outcome: Outcome::Completed,
+            steps,
+            time_us: 0,
+            distance_m: 0.0,
+            least_trust: None,
+        })
+    }
+
+    #[test]
+    fn files_that_exist_are_left_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let first = Recorder::create(dir.path(), "a", 1, &[end(1)]).unwrap();
+        assert_eq!(first.number, 1);
+        let second = Recorder::create(dir.path(), "a", 1, &[end(2)]).unwrap();
+        assert_eq!(second.number, 2);
+        first.recorder.append(&[end(3)]).unwrap();
+        let text = fs::read_to_string(dir.path().join("a-1.jsonl")).unwrap();
+        assert_eq!(text.lines().count(), 2);
+        assert!(text.ends_with('\n'));
+    }
+
+    #[test]
+    fn a_directory_that_cannot_be_created_is_named() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let dir = file.path().join("episodes");
+        let error = Recorder::create(&dir, "a", 1, &[end(1)]).unwrap_err();
+        assert!(error.to_string().contains("episodes"), "{error}");
+    }
+
+    #[test]
+    fn a_full_disk_refuses_the_line() {
+        let full = OpenOptions::new().append(true).open("/dev/full").unwrap();
+        let path = Path::new("/dev/full").into();
+        let recorder = Recorder { file: Arc::new(full), path };
+        let error = recorder.append(&[end(1)]).unwrap_err();
+        assert!(error.to_string().contains("/dev/full"), "{error}");
+    }
+}

@@ -1,0 +1,155 @@
+//! What a replay finds, and why one can fail.
+
+use std::io;
+use std::path::PathBuf;
+
+use wildcity_render::RenderError;
+use wildcity_scene::rig::{RigCamera, RigError};
+use wildcity_twin::residency::ResidencyError;
+
+use super::ego_replay::DivergedStep;
+use super::format::FrameRequest;
+use crate::error::SessionError;
+
+/// The result of a replay.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReplayReport {
+    /// Number of images that were rendered again.
+    pub images: u64,
+    /// What differs from when the episode was recorded and may explain differing images.
+    pub changes: Vec<ProvenanceChange>,
+    /// The first step at which the command leads to another pose than the recorded one.
+    pub diverged: Option<DivergedStep>,
+    /// The first image that differs.
+    pub difference: Option<ImageDifference>,
+}
+
+/// Where a replay stops.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ReplayUntil {
+    /// At the episode's end, whatever differs.
+    End,
+    /// At the first image that differs, or the first step that diverges.
+    FirstDifference,
+}
+
+/// A difference between what recorded the episode and what replays it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ProvenanceChange {
+    /// `build`, `backend`, `backend detail`, `version hash` or `profile hash`.
+    pub what: &'static str,
+    /// As recorded.
+    pub recorded: String,
+    /// As it is now.
+    pub now: String,
+}
+
+/// An image that differs from the recorded one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ImageDifference {
+    /// Line of the episode's file, from 1.
+    pub line: usize,
+    /// Which request was answered.
+    pub request: FrameRequest,
+    /// The step.
+    pub step: u64,
+    /// Index of the pose among those of the record; 0 but for `observe`, or for frames of a warm-up.
+    pub pose: usize,
+    /// Name of the camera.
+    pub camera: String,
+    /// The recorded hash.
+    pub recorded: String,
+    /// The hash now.
+    pub now: String,
+}
+
+/// An image that was rendered again.
+#[derive(Clone, Copy, Debug)]
+pub struct ReplayedImage<'a> {
+    /// Index of its record in [`RecordedEpisode::frames`](crate::RecordedEpisode::frames).
+    pub frame: usize,
+    /// Which request was answered.
+    pub request: FrameRequest,
+    /// The step.
+    pub step: u64,
+    /// Index of the pose among those of the record.
+    pub pose: usize,
+    /// The camera.
+    pub camera: &'a RigCamera,
+    /// The pixels, `[height, width, 3]`.
+    pub rgb8: &'a [u8],
+}
+
+/// Why an episode could not be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The file cannot be read.
+    #[error("cannot read {}: {cause}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// A line is damaged, incomplete or out of place.
+    #[error("{}, line {line}: {reason}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The recorded cameras are invalid.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// A version of the twin does not exist or cannot be read.
+    #[error(transparent)]
+    Twin(#[from] ResidencyError),
+    /// What a frame needs does not fit into memory, or could not be loaded.
+    #[error("step {step}: {cause}")]
+    Residency {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: ResidencyError,
+    },
+    /// The episode's ego cannot execute a recorded command.
+    #[error("step {step}: {cause}")]
+    Ego {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: Box<SessionError>,
+    },
+    /// The backend refused a frame.
+    #[error("step {step}: {cause}")]
+    Render {
+        /// The step.
+        step: u64,
+        /// Why.
+        cause: RenderError,
+    },
+    /// The caller's function failed on an image.
+    #[error("step {step}, camera {camera:?}: {reason:#}")]
+    Visit {
+        /// The step.
+        step: u64,
+        /// Name of the camera.
+        camera: String,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl std::fmt::Display for ImageDifference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { line, step, pose, camera, recorded, now, request } = self;
+        write!(f, "step {step}, camera {camera:?}")?;
+        if *request == FrameRequest::Observe {
+            write!(f, ", pose {pose} of observe")?;
+        }
+        write!(f, " (line {line}): recorded {recorded}, now {now}")
+    }
+}

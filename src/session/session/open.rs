@@ -1,0 +1,288 @@
+//! Opening a session, from top to bottom; and switching it to another version of the twin.
+
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use wildcity_render::View;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
+use wildcity_scene::{Manifest, Trajectory};
+use wildcity_twin::residency::{Resident, RigExtent, Urgency};
+
+use super::Session;
+use crate::blocking::run_blocking;
+use crate::engine::Engine;
+use crate::error::SessionError;
+use crate::limits;
+use crate::observe::frame_history::FrameHistory;
+use crate::observe::layout::ObservationLayout;
+use crate::observe::schedule::Schedule;
+use crate::observe::trust::TrainingCoverage;
+use crate::options::{ImagePart, Outputs, RigChoice, SessionOptions, Start};
+use crate::prefetch::latest_task::LatestTask;
+use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::record::format::profile_hash;
+use crate::start::EpisodeStart;
+use crate::viewpoint::viewpoints;
+
+impl Session {
+    /// Opens a session, and reserves the memory for its worst frame.
+    ///
+    /// # Errors
+    /// Names the first field of `options` that is invalid or cannot be satisfied. Nothing stays open then.
+    pub async fn open(
+        engine: Arc<Engine>,
+        name: String,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        // How long a step takes in simulated time, and an answer in real time.
+        let dt_us = check_dt(options.dt_us)?;
+        let deadline = check_deadline(options.deadline, engine.step_timeout())?;
+
+        // The version of the twin. Its Gaussians are loaded frame by frame.
+        let resident = engine.open_version(options.twin, options.version).await?;
+        let manifest = &resident.version.manifest;
+
+        // The cameras. Scaling their overlays takes a second at worst.
+        let outputs = options.outputs;
+        let rig = {
+            let resident = resident.clone();
+            let choice = options.rig;
+            let outputs = outputs.clone();
+            run_blocking(move || {
+                let rig = select_cameras(&resident.version.manifest, choice, &outputs)?;
+                crop_and_scale(rig, &outputs)
+            })
+            .await??
+        };
+        let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
+        let extent = rig_extent(&rig.cameras);
+
+        // Which images an observation holds, and how they lie in its message.
+        let schedule = Schedule::new(
+            &rig.cameras,
+            dt_us,
+            outputs.frames,
+            &outputs.periods_us,
+            options.decision_us,
+        )?;
+        let layout = ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+
+        // Where episodes start, and the recorded drive that the ego may follow from there.
+        let start = EpisodeStart::resolve(
+            manifest,
+            options.start.as_ref(),
+            options.warm_up_us,
+            options.dynamics,
+        )?;
+        let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
+        let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
+
+        // How it is rendered, and the sky that this needs.
+        let profile = options.profile.apply(manifest.profile)?;
+        Engine::bake_sky(resident.clone(), profile).await?;
+
+        // Where the twin was recorded, for the trust of images.
+        let coverage = match outputs.trust {
+            true => Some(training_coverage(&resident).await?),
+            false => None,
+        };
+
+        // The memory for the worst frame anywhere in the twin.
+        let reservation = Engine::reserve(resident.clone(), extent, profile).await?;
+
+        let session = Self {
+            engine,
+            reservation,
+            prefetch_task: LatestTask::default(),
+            name,
+            profile_overrides: options.profile,
+            profile,
+            profile_hash: profile_hash(&profile),
+            rig_name: rig.name,
+            layout: Arc::new(layout),
+            _overlays: overlays,
+            dynamics: options.dynamics,
+            episode: start.episode(options.seed, options.dynamics, dt_us),
+            start,
+            warm_up_us: options.warm_up_us,
+            dt_us,
+            deadline,
+            frame_history: FrameHistory::default(),
+            episode_number: 0,
+            recorder: None,
+            version_switched: false,
+            drive,
+            hint: Vec::new(),
+            coverage,
+            last_frame_at: Instant::now(),
+            // Assume real time until a step shows the agent's pace.
+            frame_interval: Duration::from_micros(dt_us.unsigned_abs()),
+        };
+        // The first frame is likely to be at the start: load that while the agent prepares.
+        session.prefetch_at(vec![(Urgency::Imminent, session.start())]);
+        Ok(session)
+    }
+
+    /// Switches to another version of the twin, or to its latest; the episode goes on.
+    ///
+    /// The switch is recorded together with the next frame, so that one which fails or is dropped leaves
+    /// no trace.
+    ///
+    /// # Errors
+    /// The version cannot be opened, or its worst frame does not fit. The session stays on its own version.
+    pub async fn switch_version(&mut self, version: Option<u64>) -> Result<(), SessionError> {
+        let current = &self.resident().version;
+        let resident = self.engine.open_version(current.manifest.twin.clone(), version).await?;
+        if resident.version.number == current.number {
+            return Ok(());
+        }
+        let extent = rig_extent(self.layout.cameras());
+        let profile = self.profile_overrides.apply(resident.version.manifest.profile)?;
+        Engine::bake_sky(resident.clone(), profile).await?;
+        let bytes = Engine::worst_case_bytes(resident.clone(), extent, profile).await?;
+        let coverage = match &self.coverage {
+            Some(_) => Some(training_coverage(&resident).await?),
+            None => None,
+        };
+        // There is no `await` from here on, so that a dropped future cannot leave half a switch.
+        self.reservation.exchange(resident, bytes)?;
+        self.coverage = coverage;
+        self.profile = profile;
+        self.profile_hash = profile_hash(&profile);
+        self.version_switched = true;
+        let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
+        places.extend(self.forecast().places());
+        self.prefetch_at(places);
+        Ok(())
+    }
+}
+
+fn check_dt(dt_us: Option<i64>) -> Result<i64, SessionError> {
+    let dt_us = dt_us.unwrap_or(limits::DT_US);
+    let accepted_us: RangeInclusive<i64> = limits::DT_MIN_US..=limits::DT_MAX_US;
+    if !accepted_us.contains(&dt_us) {
+        let must = format!("{dt_us} µs; {accepted_us:?} µs are accepted");
+        return Err(SessionError::OutOfRange { field: "dt_us", must });
+    }
+    Ok(dt_us)
+}
+
+fn check_deadline(
+    deadline: Option<Duration>,
+    step_timeout: Duration,
+) -> Result<Duration, SessionError> {
+    let deadline = deadline.unwrap_or(step_timeout);
+    if deadline.is_zero() || deadline > step_timeout {
+        let must =
+            format!("{deadline:?}; more than zero and at most {step_timeout:?} are accepted");
+        return Err(SessionError::OutOfRange { field: "deadline_ms", must });
+    }
+    Ok(deadline)
+}
+
+/// The chosen rig, or the twin's, or the default preset, with the requested cameras in the requested order.
+fn select_cameras(
+    manifest: &Manifest,
+    choice: Option<RigChoice>,
+    outputs: &Outputs,
+) -> Result<Rig, SessionError> {
+    let preset = |name: &str| {
+        Rig::preset(name).ok_or_else(|| SessionError::UnknownRig {
+            name: name.to_owned(),
+            known: Rig::preset_names().collect(),
+        })
+    };
+    let rig = match choice {
+        Some(RigChoice::Full(rig)) => rig,
+        Some(RigChoice::Preset(name)) => preset(&name)?,
+        None => match &manifest.rig {
+            Some(rig) => rig.clone(),
+            None => preset(limits::RIG)?,
+        },
+    };
+    let Some(names) = &outputs.cameras else { return Ok(rig) };
+    if !(1..=rig.cameras.len()).contains(&names.len()) {
+        let must = format!("{} names; 1 to {} are accepted", names.len(), rig.cameras.len());
+        return Err(SessionError::OutOfRange { field: "outputs.cameras", must });
+    }
+    let mut selected: Vec<RigCamera> = Vec::with_capacity(names.len());
+    for (index, name) in names.iter().enumerate() {
+        let camera = rig.cameras.iter().find(|camera| camera.name == *name).ok_or_else(|| {
+            let known = rig.cameras.iter().map(|camera| camera.name.clone()).collect();
+            let field = format!("outputs.cameras[{index}]");
+            SessionError::UnknownCamera { field, name: name.clone(), known }
+        })?;
+        if selected.contains(camera) {
+            return Err(SessionError::CameraTwice { index, name: name.clone() });
+        }
+        selected.push(camera.clone());
+    }
+    Ok(Rig { name: rig.name, cameras: selected })
+}
+
+/// The same rig with the requested crops and sizes.
+fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> {
+    let refused = |must: String| SessionError::OutOfRange { field: "outputs.images", must };
+    // Check the overlays' sizes before any of them is scaled up.
+    let rendered_pixels = |camera: &RigCamera| {
+        let full = [camera.camera.width_px, camera.camera.height_px].map(u64::from);
+        let part = outputs.images.get(&camera.name).copied().unwrap_or_default();
+        let cropped = part.crop.map_or(full, |[_, _, width, height]| [width, height]);
+        let [width, height] = part.size.unwrap_or(cropped);
+        width.saturating_mul(height)
+    };
+    let overlaid = rig.cameras.iter().filter(|camera| camera.appearance.overlay.is_some());
+    let pixels = overlaid.map(rendered_pixels).fold(0, u64::saturating_add);
+    check_overlay_pixels(pixels).map_err(|cause| refused(cause.to_string()))?;
+
+    for (name, ImagePart { crop, size }) in &outputs.images {
+        let camera = rig.cameras.iter_mut().find(|camera| camera.name == *name);
+        let camera =
+            camera.ok_or_else(|| refused(format!("camera {name:?}, which is not rendered")))?;
+        if let Some([left, top, width, height]) = *crop {
+            let cropped = camera.cropped([left, top], [width, height]);
+            *camera = cropped.map_err(|cause| refused(cause.to_string()))?;
+        }
+        if let Some([width, height]) = *size {
+            let scaled = camera.scaled(width, height);
+            *camera = scaled.map_err(|cause| refused(cause.to_string()))?;
+        }
+    }
+    Ok(rig)
+}
+
+/// What of a rig decides how much memory its frames need.
+fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
+    let viewpoints = viewpoints(&View::of_rig(cameras, Pose::IDENTITY));
+    RigExtent {
+        focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
+        radius_m: viewpoints.iter().fold(0.0, |most, one| one.position_m.length().max(most)),
+    }
+}
+
+/// The drive that the start names, else the twin's first.
+fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Option<&'a Trajectory> {
+    match start {
+        Some(Start::Station { trajectory, .. }) => {
+            drives.iter().find(|drive| drive.name == *trajectory)
+        }
+        Some(Start::Pose(_)) | None => drives.first(),
+    }
+}
+
+/// Where a version of the twin was recorded and trained.
+async fn training_coverage(
+    resident: &Arc<Resident>,
+) -> Result<Arc<TrainingCoverage>, SessionError> {
+    let resident = resident.clone();
+    // Blocking: a long drive has half a million keyframes and blocks.
+    let coverage = run_blocking(move || TrainingCoverage::new(&resident.version.manifest)).await?;
+    coverage.map(Arc::new).ok_or_else(|| {
+        let must = "true, and the twin has no recorded drive to compare with".to_owned();
+        SessionError::OutOfRange { field: "outputs.trust", must }
+    })
+}

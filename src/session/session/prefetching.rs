@@ -1,0 +1,67 @@
+//! Prefetching: loads what the next steps will need while the agent computes.
+
+use tokio::time::Instant;
+
+use wildcity_render::View;
+use wildcity_scene::geometry::Pose;
+use wildcity_twin::residency::Urgency;
+
+use super::Session;
+use crate::error::SessionError;
+use crate::limits;
+use crate::prefetch::forecast::{EgoForecast, remaining_hint};
+use crate::viewpoint::viewpoints;
+
+impl Session {
+    /// Takes a hint where the agent goes next: from 1 to [`limits::PREFETCH_POSES`] poses
+    /// (`world_from_rig`), in order. Loads what is seen from these poses and from between them, as far as
+    /// memory allows. Does not wait for it.
+    ///
+    /// # Errors
+    /// The number of poses is out of range.
+    pub fn prefetch(&mut self, poses: Vec<Pose>) -> Result<(), SessionError> {
+        if !(1..=limits::PREFETCH_POSES).contains(&poses.len()) {
+            let must = format!("{}; 1 to {} are accepted", poses.len(), limits::PREFETCH_POSES);
+            return Err(SessionError::OutOfRange { field: "poses", must });
+        }
+        self.hint = poses;
+        self.prefetch_at(self.forecast().places());
+        Ok(())
+    }
+
+    /// After a step: measures the agent's pace and prefetches for the next steps.
+    pub(super) fn look_ahead(&mut self) {
+        self.frame_interval = self.last_frame_at.elapsed();
+        self.last_frame_at = Instant::now();
+        self.hint = remaining_hint(&self.hint, self.episode.world_from_rig()).to_vec();
+        self.prefetch_at(self.forecast().places());
+    }
+
+    /// Where the ego may go in the time that loading takes.
+    pub(super) fn forecast(&self) -> EgoForecast<'_> {
+        let (shortest, longest) = limits::PREFETCH_AHEAD;
+        let ahead = (3 * self.resident().load_p99()).clamp(shortest, longest);
+        let steps = ahead.as_secs_f64() / self.frame_interval.as_secs_f64().max(1e-3);
+        EgoForecast {
+            world_from_rig: self.episode.world_from_rig(),
+            last_step_m: self.episode.ego().velocity_m_s() * (self.dt_us as f64 * 1e-6),
+            steps: (steps.ceil() as usize).min(limits::STEPS_AHEAD),
+            drive: self.drive.as_deref(),
+            hint: &self.hint,
+        }
+    }
+
+    /// Loads in the background what is seen from some poses, in place of what was to be prefetched before.
+    pub(super) fn prefetch_at(&self, places: Vec<(Urgency, Pose)>) {
+        let prefetcher = self.reservation.prefetcher().clone();
+        let layout = self.layout.clone();
+        let profile = self.profile;
+        self.prefetch_task.submit(move || {
+            let places: Vec<_> = places
+                .into_iter()
+                .map(|(urgency, pose)| (urgency, viewpoints(&View::of_rig(layout.cameras(), pose))))
+                .collect();
+            prefetcher.prefetch(&places, &profile);
+        });
+    }
+}

@@ -1,0 +1,16 @@
+//! From views of the renderer to the viewpoints that decide how much detail they need.
+
+use wildcity_render::View;
+use wildcity_twin::residency::Viewpoint;
+
+/// The viewpoint of each view: its position, and its focal length along the finer axis.
+///
+/// For a rolling shutter this is the position at the end of the exposure. The level of detail depends on
+/// the distance alone, whatever the direction.
+pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
+    let viewpoint = |view: &View| Viewpoint {
+        position_m: view.world_from_camera.position_m,
+        focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
+    };
+    views.iter().map(viewpoint).collect()
+}
