@@ -1,16 +1,19 @@
-//! The render profile: how the twin's trainer rendered, which every backend must repeat.
+//! The render profile: constants of the image formation that a twin's trainer used and that every backend
+//! must reproduce.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-/// How a Gaussian becomes pixels.
+/// How a Gaussian is evaluated at a pixel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rays {
-    /// It is projected once, as an ellipse.
+    /// Each Gaussian is projected once, to a 2D ellipse (a splat). All backends.
     #[default]
     Splats,
-    /// Every pixel's own ray meets it: by definition, and as slow. The reference backend alone does.
+    /// Each pixel's ray is evaluated against the 3D Gaussian at its point of closest approach. This defines
+    /// the correct image and is slow; only the reference backend supports it. Lenses, windshields and
+    /// shutters are tested against it.
     Exact,
 }
 
@@ -22,14 +25,24 @@ impl Rays {
 
 /// Constants of the image formation that differ between trainers (gsplat, INRIA, brush, ...).
 ///
-/// The defaults are gsplat 1.6's "classic" mode. Sources per field: rendering semantics of gsplat
-/// and of Kerbl et al. 2023's reference code.
+/// The defaults are those of gsplat 1.6 in its "classic" mode. The fields follow the rendering semantics of
+/// gsplat and of the reference code of Kerbl et al. 2023.
+///
+/// ```
+/// use wildcity_scene::RenderProfile;
+///
+/// let mut profile = RenderProfile::default();
+/// profile.set("near=0.2")?;
+/// assert_eq!(profile.near, 0.2);
+/// assert!(profile.set("alpha_cap=1").is_err());
+/// # Ok::<(), wildcity_scene::profile::ProfileError>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RenderProfile {
-    /// Nearest camera-space z of a centre that is drawn, in metres. INRIA: 0.2.
+    /// A Gaussian is culled if the camera-space z of its mean is below this, in metres. INRIA: 0.2.
     pub near: f64,
-    /// Farthest camera-space z of a centre that is drawn, in metres.
+    /// A Gaussian is culled if the camera-space z of its mean is above this, in metres.
     pub far: f64,
     /// Variance added to both axes of the screen covariance, in px². Mip-splatting: 0.1.
     pub blur: f64,
@@ -37,24 +50,24 @@ pub struct RenderProfile {
     pub antialiased: bool,
     /// Largest alpha of one Gaussian at one pixel. gsplat before 2026-02 and brush: 0.999.
     pub alpha_cap: f64,
-    /// Smallest alpha that is blended; below it a Gaussian does not touch the pixel.
+    /// Smallest alpha that is blended; with a smaller one a Gaussian does not contribute to the pixel.
     pub alpha_cut: f64,
-    /// A Gaussian that would bring the transmittance to this or below ends its pixel, unblended.
+    /// Blending of a pixel stops before the Gaussian that would reduce the transmittance to this value or
+    /// below; that Gaussian is not blended.
     pub stop: f64,
-    /// Largest error of a level of detail on the screen, in pixels: a block of 16 m is drawn at the
-    /// coarsest level that keeps below it. 0 is full detail everywhere.
+    /// Largest error of a level of detail on the screen, in pixels: each block of 16 m is drawn at the
+    /// coarsest level whose error stays below it. 0 draws full detail everywhere.
     pub tau_px: f64,
-    /// Distance from the nearest camera beyond which a block is not drawn, in metres; none, and
-    /// everything is.
+    /// Blocks farther than this from the nearest camera are not drawn, in metres. `None` draws all.
     pub reach_m: Option<f64>,
-    /// How Gaussians become pixels. Not written unless it is said.
+    /// How Gaussians are evaluated. Serialized only if it is not the default.
     #[serde(skip_serializing_if = "Rays::is_splats")]
     pub rays: Rays,
-    /// Largest error of a baked sky anywhere, in colour from 0 to 1; 0 evaluates the sky for every pixel.
-    /// At 0.025 the edge of a cloud may be off by six steps of 8 bits, and 99 of 100 directions of the
-    /// demo's sky are by less than one. No matter to twins without a sky.
+    /// Largest error of a baked sky in any direction, as a colour from 0 to 1; 0 evaluates the sky network
+    /// for every pixel. At 0.025 the edge of a cloud may be wrong by six steps of 8 bits, but 99 of 100
+    /// directions of the demo's sky are wrong by less than one step. Ignored by twins without a sky.
     pub sky_error: f64,
-    /// What is behind everything in twins without a sky: linear red, green, blue.
+    /// Background colour of twins without a sky: linear red, green, blue.
     pub background: [f64; 3],
 }
 
@@ -64,7 +77,7 @@ impl Default for RenderProfile {
     }
 }
 
-/// Fields of a profile that somebody wants otherwise, by their names: JSON as `{"tau_px": 2.0}`.
+/// Values for some fields of a profile, by field name. JSON: `{"tau_px": 2.0}`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct ProfileOverrides(Map<String, Value>);
@@ -72,7 +85,7 @@ pub struct ProfileOverrides(Map<String, Value>);
 /// Why a profile was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ProfileError {
-    /// A field is outside what the stages can compute with.
+    /// A field is outside the range that the render stages support.
     #[error("profile field {field} is {value:?}; {must}")]
     Value {
         /// The field.
@@ -82,26 +95,26 @@ pub enum ProfileError {
         /// What must hold instead.
         must: &'static str,
     },
-    /// Changes are not what they should be.
+    /// An override has an unknown field or a value of the wrong type.
     #[error("cannot read profile field {field}: {reason}; the fields are {}", RenderProfile::KEYS.join(", "))]
     Change {
         /// The field.
         field: String,
-        /// What is wrong with it.
+        /// Why it was refused.
         reason: String,
     },
     /// `key=value` did not parse.
     #[error("cannot read profile setting {setting:?}: {reason}; the keys are {}", RenderProfile::KEYS.join(", "))]
     Setting {
-        /// The text given.
+        /// The refused text.
         setting: String,
-        /// What is wrong with it.
+        /// Why it was refused.
         reason: String,
     },
 }
 
 impl RenderProfile {
-    /// As gsplat 1.6 renders in its classic mode.
+    /// The constants of gsplat 1.6 in its classic mode.
     pub const DEFAULT: Self = Self {
         near: 0.01,
         far: 1e10,
@@ -117,7 +130,7 @@ impl RenderProfile {
         background: [0.0; 3],
     };
 
-    /// Names of the fields, as `--profile` and manifests spell them.
+    /// Names of the fields in `--profile` and in manifests.
     pub const KEYS: [&'static str; 12] = [
         "near",
         "far",
@@ -133,10 +146,12 @@ impl RenderProfile {
         "background",
     ];
 
+    /// Checks that every field is in range. The ranges keep the f32 arithmetic of all stages finite.
+    ///
     /// # Errors
-    /// Names the first field out of range. The bounds keep every stage's f32 arithmetic finite.
+    /// [`ProfileError::Value`] names the first field out of range.
     pub fn check(&self) -> Result<(), ProfileError> {
-        let holds = [
+        let checks = [
             ("near", self.near, (1e-4..=1e3).contains(&self.near), "near is from 1e-4 to 1e3 m"),
             (
                 "far",
@@ -183,13 +198,13 @@ impl RenderProfile {
                 "each of its colours is from 0 to 1",
             ),
         ];
-        match holds.into_iter().find(|(_, _, holds, _)| !holds) {
+        match checks.into_iter().find(|(_, _, in_range, _)| !in_range) {
             Some((field, value, _, must)) => Err(ProfileError::Value { field, value, must }),
             None => Ok(()),
         }
     }
 
-    /// Applies one `key=value` of the command line.
+    /// Sets one field from `key=value`, as given on the command line.
     ///
     /// # Errors
     /// The key is unknown, the value does not parse, or the result is out of range.
@@ -230,12 +245,12 @@ impl RenderProfile {
 }
 
 impl ProfileOverrides {
-    /// What a JSON object says, which need not fit a profile yet.
+    /// Overrides from a JSON object. They are checked by [`ProfileOverrides::apply`].
     pub fn new(fields: Map<String, Value>) -> Self {
         Self(fields)
     }
 
-    /// A profile with the changes.
+    /// `profile` with these values in place of its own.
     ///
     /// # Errors
     /// Names the field that does not exist, does not parse, or is out of range.
@@ -255,7 +270,7 @@ impl ProfileOverrides {
         Ok(changed)
     }
 
-    /// These, and what else others want.
+    /// These overrides, and those of `others` for fields that these do not set.
     pub fn or(&self, others: &Self) -> Self {
         let mut fields = others.0.clone();
         fields.extend(self.0.clone());
@@ -268,7 +283,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn changes_are_of_named_fields_and_are_checked() {
+    fn overrides_name_fields_and_are_checked() {
         let changes = |json: &str| serde_json::from_str::<ProfileOverrides>(json).unwrap();
         let own = RenderProfile { near: 0.2, ..Default::default() };
         let both = changes(r#"{"tau_px": 2}"#).or(&changes(r#"{"tau_px": 4, "reach_m": 90.0}"#));
@@ -312,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn the_keys_are_the_fields() {
+    fn keys_lists_every_field() {
         let json = serde_json::to_value(RenderProfile { rays: Rays::Exact, ..Default::default() });
         let json = json.unwrap();
         let mut fields: Vec<_> = json.as_object().unwrap().keys().map(String::as_str).collect();

@@ -10,12 +10,12 @@ use crate::geometry::camera::Shutter;
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::{Camera, CameraError, Pose};
 
-/// A camera on the vehicle.
+/// A camera mounted on the vehicle.
 ///
-/// In rig files, manifests and episodes it looks as on the wire: `{"name", "width", "height", "fx",
-/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels; what is no pinhole
-/// has `lens`, `windshield` and `shutter` besides ([`crate::geometry::camera::json`]), what is not
-/// recorded as it is `exposure`, and what has its own car before it `overlay` ([`Appearance`]).
+/// JSON in rig files, manifests and recordings is the same as on the wire: `{"name", "width", "height", "fx",
+/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels. Optional fields are
+/// `lens`, `windshield` and `shutter` ([`crate::geometry::camera::json`]), `exposure` and `overlay`
+/// ([`Appearance`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
@@ -23,16 +23,16 @@ pub struct RigCamera {
     pub name: String,
     /// Size, intrinsics and lens.
     pub camera: Camera,
-    /// Where the camera stands on the rig (`camera_to_rig` on the wire).
+    /// Pose of the camera on the rig (`camera_to_rig` on the wire).
     pub rig_from_camera: Pose,
-    /// How its rows are exposed one after the other; all at once if absent.
+    /// Rolling shutter; `None` for a global one.
     pub shutter: Option<Shutter>,
-    /// What it makes of colours, and what of its own car it sees.
+    /// Exposure and overlay of its images.
     pub appearance: Appearance,
 }
 
 impl RigCamera {
-    /// A camera whose rows are exposed all at once, and which shows what is there.
+    /// A camera with a global shutter and without exposure or overlay.
     pub fn new(name: impl Into<String>, camera: Camera, rig_from_camera: Pose) -> Self {
         let appearance = Appearance::default();
         Self { name: name.into(), camera, rig_from_camera, shutter: None, appearance }
@@ -41,23 +41,23 @@ impl RigCamera {
     /// The camera whose image is a part of this one's: first column and row, then width and height.
     ///
     /// # Errors
-    /// It is not within the image, or the lens does not see it.
+    /// As [`Camera::cropped`].
     pub fn cropped(&self, at_px: [u64; 2], size_px: [u64; 2]) -> Result<Self, RigError> {
         let camera = self.camera.cropped(at_px, size_px).map_err(|cause| self.wrong(cause))?;
-        // Within the image: they are small.
+        // The part is within the image, so its position fits u32.
         self.part(camera, at_px.map(|at| at as u32), [camera.width_px, camera.height_px])
     }
 
-    /// The camera with the same field of view and another number of pixels.
+    /// The camera with the same field of view and an image of another size, in pixels.
     ///
     /// # Errors
-    /// There is no such camera.
+    /// As [`Camera::scaled`].
     pub fn scaled(&self, width_px: u64, height_px: u64) -> Result<Self, RigError> {
         let camera = self.camera.scaled(width_px, height_px).map_err(|cause| self.wrong(cause))?;
         self.part(camera, [0, 0], [self.camera.width_px, self.camera.height_px])
     }
 
-    /// With another camera, which sees a part of the image, and that part of what lies over it.
+    /// This camera with other intrinsics, which show a part of the image, and with that part of the overlay.
     fn part(&self, camera: Camera, at_px: [u32; 2], part_px: [u32; 2]) -> Result<Self, RigError> {
         let mut appearance = self.appearance.clone();
         if let Some(overlay) = &mut appearance.overlay {
@@ -77,7 +77,19 @@ impl RigCamera {
     }
 }
 
-/// The cameras of one vehicle, in the order in which images are answered.
+/// The cameras of one vehicle, in the order of the images in an observation.
+///
+/// ```
+/// use wildcity_scene::Rig;
+///
+/// let rig = Rig::preset("vehicle6").expect("a preset");
+/// rig.check()?;
+/// assert_eq!(rig.cameras.len(), 6);
+///
+/// let front = rig.cameras[0].scaled(720, 464)?;
+/// assert_eq!((front.name.as_str(), front.camera.width_px), ("front", 720));
+/// # Ok::<(), wildcity_scene::rig::RigError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "RigFields")]
 pub struct Rig {
@@ -90,18 +102,20 @@ pub struct Rig {
 /// Why a rig was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RigError {
-    /// No cameras, or more than a step can render.
+    /// No cameras, or more than [`Rig::MAX_CAMERAS`].
     #[error("rig {rig:?} has {count} cameras; 1 to {limit} are accepted")]
     Count {
         /// The rig.
         rig: String,
-        /// How many it has.
+        /// Number of cameras.
         count: usize,
-        /// How many are accepted.
+        /// Largest accepted number.
         limit: usize,
     },
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
-    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
+    #[error(
+        "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+    )]
     Name {
         /// The refused name.
         name: String,
@@ -112,33 +126,33 @@ pub enum RigError {
         /// The name.
         name: String,
     },
-    /// A camera cannot be used.
+    /// The intrinsics or the shutter of a camera are invalid.
     #[error("camera {name:?}: {cause}")]
     Camera {
         /// The camera.
         name: String,
-        /// What is wrong with it.
+        /// Why it was refused.
         cause: CameraError,
     },
-    /// What it makes of an image cannot be used.
+    /// The exposure or the overlay of a camera is invalid.
     #[error("camera {name:?}: {cause}")]
     Appearance {
         /// The camera.
         name: String,
-        /// What is wrong with it.
+        /// Why it was refused.
         cause: AppearanceError,
     },
-    /// Overlays that would take too much memory.
+    /// The overlays together would take too much memory.
     #[error("the overlays of a rig have {pixels} pixels in all; at most {limit} are accepted")]
     Overlays {
-        /// Their pixels.
+        /// Pixels of all overlays.
         pixels: u64,
-        /// How many are accepted.
+        /// Largest accepted number.
         limit: u64,
     },
 }
 
-/// Rigs that come with the program, by name: the JSON of `scenes/rigs`.
+/// Rigs that are part of the program, by name: the JSON files of `scenes/rigs`.
 const PRESETS: [(&str, &str); 4] = [
     ("vehicle6", include_str!("../../scenes/rigs/vehicle6.json")),
     ("surround6", include_str!("../../scenes/rigs/surround6.json")),
@@ -147,23 +161,25 @@ const PRESETS: [(&str, &str); 4] = [
 ];
 
 impl Rig {
-    /// Names of the rigs that come with the program, for [`Rig::preset`].
+    /// Names of the rigs that are part of the program, for [`Rig::preset`].
     pub fn preset_names() -> impl Iterator<Item = &'static str> {
         PRESETS.into_iter().map(|(name, _)| name)
     }
 
-    /// A rig that comes with the program; `None` if there is none of this name.
+    /// A rig that is part of the program; `None` if there is none of this name.
     pub fn preset(name: &str) -> Option<Self> {
         let (_, json) = PRESETS.into_iter().find(|(preset, _)| *preset == name)?;
-        // A test parses every preset, so `ok` never turns a broken file into "no such rig".
+        // A test parses every preset, so `ok` cannot hide a broken file as an unknown name.
         serde_json::from_str(json).ok()
     }
 
-    /// Most cameras of a rig: the depth sort's key keeps 4 bits for the camera.
+    /// Largest number of cameras: the key of the depth sort has 4 bits for the camera.
     pub const MAX_CAMERAS: usize = 16;
 
+    /// Checks number, names, intrinsics, shutters and appearances of the cameras.
+    ///
     /// # Errors
-    /// Names the first camera that cannot be used.
+    /// Names the first camera that is invalid.
     pub fn check(&self) -> Result<(), RigError> {
         let count = self.cameras.len();
         if !(1..=Self::MAX_CAMERAS).contains(&count) {
@@ -191,6 +207,8 @@ impl Rig {
     }
 }
 
+/// Checks the size of all overlays of some cameras together.
+///
 /// # Errors
 /// [`RigError::Overlays`].
 pub fn check_overlays(cameras: &[RigCamera]) -> Result<(), RigError> {
@@ -198,6 +216,8 @@ pub fn check_overlays(cameras: &[RigCamera]) -> Result<(), RigError> {
     check_overlay_pixels(overlays.map(|overlay| overlay.rgba8().len() as u64 / 4).sum())
 }
 
+/// Checks a number of pixels against [`Overlay::MAX_PIXELS`].
+///
 /// # Errors
 /// [`RigError::Overlays`].
 pub fn check_overlay_pixels(pixels: u64) -> Result<(), RigError> {
@@ -208,18 +228,17 @@ pub fn check_overlay_pixels(pixels: u64) -> Result<(), RigError> {
     }
 }
 
-/// Memory of all overlays, in bytes: their pixels, and the files that they are written as.
+/// Memory of all overlays, in bytes: decoded pixels and PNG files.
 pub fn overlay_bytes(cameras: &[RigCamera]) -> u64 {
     let overlays = cameras.iter().filter_map(|camera| camera.appearance.overlay.as_ref());
     overlays.map(|overlay| overlay.bytes()).sum()
 }
 
-/// Longest name, in bytes.
+/// Largest length of a name, in bytes.
 pub const MAX_NAME_BYTES: usize = 64;
 
-/// Whether a text may name a twin, a rig, a camera, a trajectory or a session.
-///
-/// 1 to 64 of `a-z 0-9 . _ -`, not starting with a dot: safe as a file name, never a path.
+/// Whether a text is a valid name of a twin, a rig, a camera, a trajectory or a session: 1 to 64 of
+/// `a-z 0-9 . _ -`, not starting with a dot. Such a name is safe as a file name and cannot be a path.
 pub fn is_name(text: &str) -> bool {
     let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"._-".contains(&b);
     (1..=MAX_NAME_BYTES).contains(&text.len())
@@ -259,7 +278,8 @@ struct RigFields {
     cameras: Vec<CameraFields>,
 }
 
-/// Stops at the camera whose overlay is too much, so that no more is unpacked than a rig may have.
+/// Stops at the first camera whose overlay exceeds the limit, so that no more overlays are decoded than a rig
+/// may have.
 impl TryFrom<RigFields> for Rig {
     type Error = RigError;
 
@@ -277,7 +297,9 @@ impl From<RigCamera> for CameraFields {
     fn from(from: RigCamera) -> Self {
         let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter, appearance } = from;
         let Intrinsics { size_px, focal_px, center_px, lens, windshield } = Intrinsics::of(&camera);
-        let ([width, height], [fx, fy], [cx, cy]) = (size_px, focal_px, center_px);
+        let [width, height] = size_px;
+        let [fx, fy] = focal_px;
+        let [cx, cy] = center_px;
         let Appearance { exposure, overlay } = appearance;
         let overlay = overlay.map(|overlay| overlay.to_data_uri());
         Self {
@@ -298,14 +320,16 @@ impl From<RigCamera> for CameraFields {
     }
 }
 
-/// Whoever reads a rig calls [`Rig::check`], which names the camera at fault; this refuses only what
-/// makes no camera at all.
+/// Refuses only fields that form no camera at all. Callers that read a rig also call [`Rig::check`], which
+/// checks the values and names the camera at fault.
 impl TryFrom<CameraFields> for RigCamera {
     type Error = RigError;
 
     fn try_from(fields: CameraFields) -> Result<Self, RigError> {
         let CameraFields { name, width, height, fx, fy, cx, cy, lens, windshield, .. } = fields;
-        let (size_px, focal_px, center_px) = ([width, height], [fx, fy], [cx, cy]);
+        let size_px = [width, height];
+        let focal_px = [fx, fy];
+        let center_px = [cx, cy];
         let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
         let camera = match intrinsics.camera() {
             Ok(camera) => camera,
@@ -316,8 +340,13 @@ impl TryFrom<CameraFields> for RigCamera {
             Ok(appearance) => appearance,
             Err(cause) => return Err(RigError::Appearance { name, cause }),
         };
-        let (rig_from_camera, shutter) = (fields.camera_to_rig, fields.shutter);
-        Ok(Self { name, camera, rig_from_camera, shutter, appearance })
+        Ok(Self {
+            name,
+            camera,
+            rig_from_camera: fields.camera_to_rig,
+            shutter: fields.shutter,
+            appearance,
+        })
     }
 }
 

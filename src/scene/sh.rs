@@ -10,7 +10,7 @@ use glam::{DMat3, DVec3};
 
 /// Largest supported degree.
 pub const MAX_DEGREE: u8 = 3;
-/// Largest magnitude of a coefficient that a scene may have: a colour of 282, where 1 is white.
+/// Largest accepted magnitude of a coefficient in a scene: a colour of 282, where 1 is white.
 pub const MAX_COEFFICIENT: f32 = 1e3;
 
 /// `½ √(1/π)`.
@@ -37,7 +37,7 @@ pub const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
 ];
 
-/// Coefficients per colour channel of a degree: `(degree + 1)²`.
+/// Number of coefficients per colour channel at a degree: `(degree + 1)²`.
 pub const fn coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
 }
@@ -66,12 +66,13 @@ pub fn basis(direction: DVec3) -> [f64; 16] {
     ]
 }
 
-/// Turns colours with the scene: what was seen from `d` is seen from `M d`.
+/// Rotation of SH coefficients with the scene, by an orthogonal matrix M (mirrors included): a colour that was
+/// seen along `d` is afterwards seen along `M d`.
 ///
-/// The basis Y is orthonormal, so `Y(M d) = B Y(d)` with `B_jk = ∫ Y_j(M d) Y_k(d) dω`, and the
-/// coefficients turn with the same B, which mixes no degrees and is orthogonal. The integrand is a
-/// polynomial of degree 6 at most; 4 Gauss-Legendre heights by 8 azimuths integrate degree 7
-/// exactly, so B has the accuracy of f64.
+/// The basis Y is orthonormal, so `Y(M d) = B Y(d)` with `B_jk = ∫ Y_j(M d) Y_k(d) dω` (Ramamoorthi and
+/// Hanrahan 2001). Coefficients are multiplied with the same B, which is orthogonal and mixes no degrees. The
+/// integrand is a polynomial of degree 6 at most; 4 Gauss-Legendre heights times 8 azimuths integrate degree
+/// 7 exactly, so B has the accuracy of f64.
 #[derive(Clone, Debug)]
 pub struct ShRotation {
     /// `B`, of which the first `coefficients(degree)` rows and columns are used.
@@ -80,7 +81,8 @@ pub struct ShRotation {
 }
 
 impl ShRotation {
-    /// For an orthogonal matrix, mirrors included, and colours of a degree.
+    /// The rotation for an orthogonal matrix that takes old directions to new ones, and for coefficients up to
+    /// `degree`.
     pub fn new(turned_from_plain: DMat3, degree: u8) -> Self {
         // Abscissae and weights of the 4-point rule on [-1, 1] (Abramowitz & Stegun, table 25.4).
         const HEIGHTS: [(f64, f64); 2] = [
@@ -93,7 +95,8 @@ impl ShRotation {
                 let (sin, cos) = (f64::from(step) * FRAC_PI_4).sin_cos();
                 let radius = (1.0 - height * height).sqrt();
                 let direction = DVec3::new(radius * cos, radius * sin, height);
-                let (plain, turned) = (basis(direction), basis(turned_from_plain * direction));
+                let plain = basis(direction);
+                let turned = basis(turned_from_plain * direction);
                 for (row, turned) in matrix.iter_mut().zip(turned) {
                     for (entry, plain) in row.iter_mut().zip(plain) {
                         *entry += weight * FRAC_PI_4 * turned * plain;
@@ -104,7 +107,7 @@ impl ShRotation {
         Self { matrix, count: coefficients(degree) }
     }
 
-    /// Turns the colour of one Gaussian in place, `[(degree + 1)², 3]`.
+    /// Rotates the coefficients of one Gaussian in place, `[(degree + 1)², 3]`.
     pub fn apply(&self, colour: &mut [f32]) {
         let mut plain = [[0.0; 3]; 16];
         for (plain, colour) in plain.iter_mut().zip(colour.chunks_exact(3)) {
@@ -124,7 +127,7 @@ mod tests {
     use super::*;
     use glam::DQuat;
 
-    /// The constants and signs once more, by another road: the basis must be orthonormal.
+    /// Checks the constants independently: the basis must be orthonormal.
     #[test]
     fn the_basis_is_orthonormal() {
         let matrix = ShRotation::new(DMat3::IDENTITY, 3).matrix;
@@ -137,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn turned_colours_are_seen_from_turned_directions() {
+    fn rotated_colours_are_seen_from_rotated_directions() {
         let rotation = DMat3::from_quat(DQuat::from_xyzw(0.3, -0.5, 0.7, 0.2).normalize());
         let mirror = DMat3::from_diagonal(DVec3::new(1.0, -1.0, 1.0)) * rotation;
         for matrix in [rotation, mirror] {

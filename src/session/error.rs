@@ -8,7 +8,7 @@ use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-use crate::record::recorder::RecordError;
+use crate::record::error::RecordError;
 
 /// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]

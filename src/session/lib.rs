@@ -45,11 +45,11 @@ pub use observe::observation::{
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
 pub use record::ego_replay::DivergedStep;
+pub use record::error::RecordError;
 pub use record::format::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOutputs, RecordedVersion,
 };
 pub use record::recorded_episode::RecordedEpisode;
-pub use record::recorder::RecordError;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };

@@ -218,7 +218,7 @@ fn absurd_coefficients_are_refused_with_the_reason() {
         (ftheta([1.0, 90.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), "lens.polynomial[0]", "is 0"),
         (ftheta([0.0, -90.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), "lens", "folds back"),
         (ftheta([0.0, 90.0, 0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0]), "lens.linear_cde", "0.001"),
-        (ftheta([0.0, 80.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), "fx", "leave fx and fy out"),
+        (ftheta([0.0, 80.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), "fx", "omit fx and fy"),
     ] {
         let (named, why) = refused(lens);
         assert_eq!(named, field, "{why}");

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// An axis-aligned box in metres; empty until something is added.
+/// An axis-aligned box, in metres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Bounds {
     /// Smallest corner, in metres.
@@ -13,31 +13,31 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// Contains nothing; the neutral element of [`Bounds::union`].
+    /// The empty box: the neutral element of [`Bounds::union`].
     pub const EMPTY: Self = Self { min_m: DVec3::INFINITY, max_m: DVec3::NEG_INFINITY };
 
-    /// Whether nothing was added yet.
+    /// Whether the box contains no point.
     pub fn is_empty(&self) -> bool {
         self.min_m.x > self.max_m.x
     }
 
-    /// Grows to contain the box of half-size `reach_m` around a point.
-    pub fn add(&mut self, point_m: DVec3, reach_m: DVec3) {
-        self.min_m = self.min_m.min(point_m - reach_m);
-        self.max_m = self.max_m.max(point_m + reach_m);
+    /// Grows to contain the box with half-size `half_size_m` around `point_m`, both in metres.
+    pub fn add(&mut self, point_m: DVec3, half_size_m: DVec3) {
+        self.min_m = self.min_m.min(point_m - half_size_m);
+        self.max_m = self.max_m.max(point_m + half_size_m);
     }
 
-    /// The smallest box that contains both.
+    /// The smallest box that contains both boxes.
     pub fn union(&self, other: &Self) -> Self {
         Self { min_m: self.min_m.min(other.min_m), max_m: self.max_m.max(other.max_m) }
     }
 
-    /// How far a point is from the nearest one of the box, in metres; 0 within.
+    /// Distance from a point to the box, in metres; 0 inside.
     pub fn distance_m(&self, point_m: DVec3) -> f64 {
         point_m.clamp(self.min_m, self.max_m).distance(point_m)
     }
 
-    /// The middle, in metres; meaningless for an empty box.
+    /// Centre of the box, in metres; meaningless for an empty box.
     pub fn center_m(&self) -> DVec3 {
         0.5 * (self.min_m + self.max_m)
     }

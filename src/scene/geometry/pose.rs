@@ -5,39 +5,54 @@ use std::ops::Mul;
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A rigid transform `a_from_b`: where frame `b` stands in frame `a`.
+/// A rigid transform `a_from_b`: the pose of frame `b` in frame `a`.
 ///
-/// On the wire `{"xyz": [m, m, m], "q": [w, x, y, z]}`. [`Pose::checked`] is the door for poses
-/// from outside; inside, `rotation` is a unit quaternion.
+/// JSON: `{"xyz": [m, m, m], "q": [w, x, y, z]}`. Poses from untrusted input are built with
+/// [`Pose::checked`], which guarantees finite values and a unit quaternion.
+///
+/// ```
+/// use glam::DVec3;
+/// use wildcity_scene::geometry::Pose;
+///
+/// // 10 m east of the origin, turned a quarter to the left: its forward axis (x) points north (y).
+/// let half_turn = std::f64::consts::FRAC_1_SQRT_2;
+/// let world_from_rig = Pose::checked([10.0, 0.0, 0.0], [half_turn, 0.0, 0.0, half_turn])?;
+/// let ahead_m = world_from_rig.transform_point(DVec3::X);
+/// assert!((ahead_m - DVec3::new(10.0, 1.0, 0.0)).length() < 1e-12);
+///
+/// let back_m = world_from_rig.inverse().transform_point(ahead_m);
+/// assert!((back_m - DVec3::X).length() < 1e-12);
+/// # Ok::<(), wildcity_scene::geometry::PoseError>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Origin of `b`, in metres along the axes of `a`.
     pub position_m: DVec3,
-    /// Rotation that takes directions in `b` to `a`; unit.
+    /// Rotation that takes directions in `b` to directions in `a`; a unit quaternion.
     pub rotation: DQuat,
 }
 
-/// Why a pose from outside was refused.
+/// Why [`Pose::checked`] refused a pose.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PoseError {
     /// A component is NaN or infinite.
     #[error("{field} is {value:?}; a pose needs finite numbers")]
     NotFinite {
-        /// Which component, as `xyz[0]` or `q[3]`.
+        /// The component, such as `xyz[0]` or `q[3]`.
         field: &'static str,
         /// The refused value.
         value: f64,
     },
-    /// The quaternion's length is too far from one to be a rotation.
+    /// The norm of the quaternion differs from one by more than [`Pose::MAX_NORM_ERROR`].
     #[error("q has length {length:?}; a rotation needs a unit quaternion (w, x, y, z)")]
     NotARotation {
-        /// Euclidean length of (w, x, y, z).
+        /// Euclidean norm of (w, x, y, z).
         length: f64,
     },
-    /// Farther from the origin than any twin reaches.
+    /// A coordinate exceeds [`Pose::MAX_COORDINATE_M`].
     #[error("{field} is {value:?} m; at most {limit_m:?} m from the twin's origin is accepted")]
     TooFar {
-        /// Which component, as `xyz[0]`.
+        /// The component, such as `xyz[0]`.
         field: &'static str,
         /// The refused value, in metres.
         value: f64,
@@ -47,7 +62,7 @@ pub enum PoseError {
 }
 
 impl PoseError {
-    /// The component at fault, as it is called on the wire.
+    /// The component at fault, by its name on the wire.
     pub fn field(&self) -> &'static str {
         match self {
             Self::NotFinite { field, .. } | Self::TooFar { field, .. } => field,
@@ -57,16 +72,16 @@ impl PoseError {
 }
 
 impl Pose {
-    /// The frame itself.
+    /// The identity transform.
     pub const IDENTITY: Self = Self { position_m: DVec3::ZERO, rotation: DQuat::IDENTITY };
 
-    /// Largest accepted coordinate, in metres: a city is 1e5 m, UTM northings reach 1e7 m.
+    /// Largest accepted magnitude of a coordinate, in metres. A city spans 1e5 m; UTM northings reach 1e7 m.
     pub const MAX_COORDINATE_M: f64 = 1e8;
 
-    /// How far a quaternion's length may be from one before it is refused rather than normalised.
+    /// A quaternion whose norm differs from one by at most this is normalised; otherwise it is refused.
     pub const MAX_NORM_ERROR: f64 = 1e-3;
 
-    /// A pose from outside: position in metres, quaternion as (w, x, y, z).
+    /// A pose from untrusted input: position in metres, quaternion as (w, x, y, z).
     ///
     /// # Errors
     /// Names the first component that is not finite, too far away, or not a rotation.
@@ -91,30 +106,30 @@ impl Pose {
         if !is_rotation {
             return Err(PoseError::NotARotation { length });
         }
-        // Normalising leaves a few ulps, and doing it again would move them: a unit quaternion
-        // stays as it is, so that a pose written and read again is the same pose to the bit.
+        // Normalising twice can change the last bits. A quaternion that is already unit is therefore kept,
+        // so that a pose that is written and read again is bit-identical.
         let is_unit = (rotation.length_squared() - 1.0).abs() <= 8.0 * f64::EPSILON;
         let rotation = if is_unit { rotation } else { rotation.normalize() };
         Ok(Self { position_m: DVec3::from_array(xyz_m), rotation })
     }
 
-    /// The transform the other way: `b_from_a`.
+    /// The inverse transform `b_from_a`.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { position_m: -(rotation * self.position_m), rotation }
     }
 
-    /// Takes a point from `b` to `a`, in metres.
+    /// Transforms a point in `b` to `a`, in metres.
     pub fn transform_point(&self, point_m: DVec3) -> DVec3 {
         self.rotation * point_m + self.position_m
     }
 
-    /// The rotation as a matrix whose columns are the axes of `b` in `a`.
+    /// The rotation as a matrix; its columns are the axes of `b` in `a`.
     pub fn rotation_matrix(&self) -> DMat3 {
         DMat3::from_quat(self.rotation)
     }
 
-    /// The pose a fraction `t` in [0, 1] of the way to `other`: linear position, spherical rotation.
+    /// Interpolates to `other` by `t` in [0, 1]: positions linearly, rotations spherically (slerp).
     pub fn interpolate(&self, other: &Self, t: f64) -> Self {
         Self {
             position_m: self.position_m.lerp(other.position_m, t),
@@ -186,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_pose_is_named() {
+    fn errors_name_the_component_at_fault() {
         let unit = [1.0, 0.0, 0.0, 0.0];
         let refused = |xyz, q| Pose::checked(xyz, q).unwrap_err().field();
         assert_eq!(refused([f64::NAN, 0.0, 0.0], unit), "xyz[0]");
@@ -197,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_read_again_is_the_same_to_the_bit() {
+    fn reading_a_written_pose_is_bit_identical() {
         for i in 0..10_000 {
             let q = [0, 1, 2, 3].map(|k| (f64::from(i) * 0.37 + f64::from(k) * 1.1).sin());
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();

@@ -1,37 +1,39 @@
-//! The nearest of the items of a drive, without a look at each of them.
+//! A spatial index of items along a drive: a list of bounding boxes of consecutive items.
 
 use glam::DVec3;
 
 use crate::geometry::Bounds;
 
-/// Items in the order of a drive, in boxes of `BOX_ITEMS` that follow each other.
+/// Items in the order of a drive, grouped into boxes of `BOX_ITEMS` consecutive items.
 ///
-/// A search looks at every box, and into few: of 84 km at 0.5 m, 2,600 boxes and some hundred of
-/// 168,000 keyframes.
+/// A search tests every box but opens few: for 84 km of keyframes at 0.5 m, 2,600 boxes and some hundred of
+/// the 168,000 keyframes.
 #[derive(Clone, Debug)]
 pub struct BoxIndex {
     bounds: Vec<Bounds>,
     items: usize,
 }
 
-/// Near the root of 168,000, half of it: looking into a box costs more than looking at one.
+/// Number of items per box. The square root of 168,000 would balance boxes and items; it is less than half of
+/// that because testing an item costs more than testing a box.
 const BOX_ITEMS: usize = 64;
 
 impl BoxIndex {
-    /// Of items that lie in these bounds, in order.
+    /// An index of items with these bounds, in order.
     pub fn new(items: &[Bounds]) -> Self {
         let union = |chunk: &[Bounds]| chunk.iter().fold(Bounds::EMPTY, |all, one| all.union(one));
         Self { bounds: items.chunks(BOX_ITEMS).map(union).collect(), items: items.len() }
     }
 
-    /// The item of the least cost, the first of several, and its cost. A cost is in metres, and no less
-    /// than the distance between the point and the item's bounds; the less it exceeds that, the faster.
+    /// The index of the item with the smallest cost, and that cost; the first of several equal ones. A cost is
+    /// in metres and must not be less than the distance from the point to the item's bounds; the closer to
+    /// that distance, the faster the search.
     pub fn min_cost(&self, point_m: DVec3, cost_m: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
         let distances_m = self.bounds.iter().map(|bounds| bounds.distance_m(point_m));
         let (nearest, _) =
             distances_m.enumerate().min_by(|(_, a_m), (_, b_m)| a_m.total_cmp(b_m))?;
         let mut best: Option<(usize, f64)> = None;
-        let look_into = |place: usize, best: &mut Option<(usize, f64)>| {
+        let search_box = |place: usize, best: &mut Option<(usize, f64)>| {
             let first = place * BOX_ITEMS;
             for item in first..(first + BOX_ITEMS).min(self.items) {
                 let cost = cost_m(item);
@@ -41,11 +43,12 @@ impl BoxIndex {
                 }
             }
         };
-        look_into(nearest, &mut best);
+        // Start with the nearest box: it usually holds the answer, and then most others are skipped.
+        search_box(nearest, &mut best);
         for (place, bounds) in self.bounds.iter().enumerate() {
             let may_be_less = |(_, least)| bounds.distance_m(point_m) <= least;
             if place != nearest && best.is_none_or(may_be_less) {
-                look_into(place, &mut best);
+                search_box(place, &mut best);
             }
         }
         best
@@ -57,7 +60,7 @@ mod tests {
     use super::*;
     use std::cell::Cell;
 
-    /// Around a block of 100 x 60 m, twice, a metre a pose.
+    /// Twice around a block of 100 m x 60 m, one pose per metre.
     fn drive() -> Vec<DVec3> {
         let at = |way_m: f64| match way_m % 320.0 {
             m if m < 100.0 => DVec3::new(m, 0.0, 0.0),
@@ -69,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_of_the_nearest_as_if_all_were_looked_at() {
+    fn the_result_is_that_of_a_linear_search() {
         let drive = drive();
         let point = |at_m: &DVec3| Bounds { min_m: *at_m, max_m: *at_m };
         let boxes = BoxIndex::new(&drive.iter().map(point).collect::<Vec<_>>());

@@ -1,31 +1,31 @@
-//! Two clocks: which times belong together, and poses at other times than the log's.
+//! Association of the timestamps of two clocks, and poses at times between keyframes.
 
 use super::{Route, RouteError, between};
 use crate::geometry::Pose;
 
-/// Times of one clock with those of another one.
+/// The result of [`associate`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Association {
-    /// What belongs together, in order of time.
+    /// Associated times, in order of time.
     pub pairs: Vec<TimePair>,
-    /// Places of the first clock's times that found nothing.
+    /// Indices of times of the first clock without a partner.
     pub unmatched: Vec<usize>,
 }
 
-/// Two times that belong together.
+/// Two associated times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimePair {
-    /// Place among the first clock's times.
+    /// Index in the first clock's times.
     pub first: usize,
-    /// Place among the second clock's times.
+    /// Index in the second clock's times.
     pub second: usize,
     /// Second minus first, in microseconds.
     pub residual_us: i64,
 }
 
-/// Pairs the times of two clocks, both strictly increasing, in microseconds: two times belong
-/// together if each is the other's nearest and they are at most `tolerance_us` apart. So nothing is
-/// used twice, and nothing crosses. Of two equally near ones the earlier counts.
+/// Associates the times of two clocks, both strictly increasing, in microseconds. Two times are associated if
+/// each is the nearest to the other and they differ by at most `tolerance_us`. So no time is used twice, and
+/// pairs do not cross. Of two equally near times the earlier one counts.
 ///
 /// # Errors
 /// [`RouteError::Order`] names the first time that is out of order; [`RouteError::Value`] if the
@@ -41,14 +41,15 @@ pub fn associate(
         let (field, value) = ("tolerance_us", tolerance_us as f64);
         return Err(RouteError::Value { field, value, must: "a tolerance is 0 µs or more" });
     }
-    let (mut pairs, mut unmatched) = (Vec::new(), Vec::new());
+    let mut pairs = Vec::new();
+    let mut unmatched = Vec::new();
     for (first, &time_us) in first_us.iter().enumerate() {
         let mutual = nearest(second_us, time_us)
             .filter(|&second| nearest(first_us, second_us[second]) == Some(first))
             .filter(|&second| time_us.abs_diff(second_us[second]) <= tolerance_us.unsigned_abs());
         match mutual {
             Some(second) => {
-                // Within the tolerance, hence within i64.
+                // The difference is within the tolerance, so it fits i64.
                 let residual_us = second_us[second].saturating_sub(time_us);
                 pairs.push(TimePair { first, second, residual_us });
             }
@@ -59,8 +60,8 @@ pub fn associate(
 }
 
 impl Route<'_> {
-    /// Where the drive was at a time, in microseconds of its clock: position linear, rotation
-    /// spherical, between the keyframes before and after.
+    /// The pose at a time in microseconds, interpolated between the keyframes before and after it: position
+    /// linearly, rotation spherically.
     ///
     /// # Errors
     /// [`RouteError::Outside`] before the first keyframe or after the last one.
@@ -82,7 +83,7 @@ impl Route<'_> {
     }
 }
 
-/// The place of the time that is nearest, the earlier of two.
+/// The index of the nearest time; of two equally near ones the earlier.
 fn nearest(times_us: &[i64], time_us: i64) -> Option<usize> {
     let after = times_us.partition_point(|&other_us| other_us < time_us);
     let candidates = [after.checked_sub(1), (after < times_us.len()).then_some(after)];

@@ -1,6 +1,7 @@
-//! Routes: what follows from a recorded drive's keyframes unmatched.
+//! Routes: quantities that follow from the keyframes of a recorded drive alone.
 //!
-//! Distances are along the keyframes, `s_0 = 0` and `s_k = s_{k-1} + |p_k - p_{k-1}|`, in metres.
+//! The *station* of a keyframe is its distance along the polyline through the keyframes, in metres:
+//! `s_0 = 0` and `s_k = s_{k-1} + |p_k - p_{k-1}|`.
 
 mod box_index;
 mod clock;
@@ -22,41 +23,59 @@ pub const ROUTE_CHUNK_LENGTH_M: f64 = 5_000.0;
 /// Lengths of sub-trajectories, in metres.
 pub const SUB_TRAJECTORY_LENGTHS_M: [f64; 6] = [50.0, 250.0, 500.0, 1_000.0, 2_500.0, 5_000.0];
 
-/// A recorded drive and how far along it each keyframe lies.
+/// A recorded drive with the station of each keyframe.
+///
+/// ```
+/// use glam::DVec3;
+/// use wildcity_scene::Trajectory;
+/// use wildcity_scene::geometry::Pose;
+/// use wildcity_scene::route::Route;
+/// use wildcity_scene::trajectory::Keyframe;
+///
+/// let keyframe = |i: i64| Keyframe {
+///     time_us: i * 100_000,
+///     world_from_rig: Pose { position_m: i as f64 * DVec3::X, ..Pose::IDENTITY },
+/// };
+/// let drive = Trajectory { name: "log".into(), keyframes: (0..=100).map(keyframe).collect() };
+/// let route = Route::new(&drive)?;
+/// assert_eq!(route.length_m(), 100.0);
+/// assert_eq!(route.at(12.5).time_us, 1_250_000);
+/// # Ok::<(), wildcity_scene::route::RouteError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Route<'a> {
     trajectory: &'a Trajectory,
     stations_m: Vec<f64>,
 }
 
-/// A stretch of 5 km of a route.
+/// A part of a route of [`ROUTE_CHUNK_LENGTH_M`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct RouteChunk {
-    /// `c_k = floor(s_k / 5000)` of its keyframes.
+    /// `floor(s_k / 5000)` of its keyframes' stations.
     pub number: u64,
-    /// Its keyframes.
+    /// Indices of its keyframes.
     pub keyframes: Range<usize>,
     /// Stations of its first and last keyframe, in metres.
     pub stations_m: [f64; 2],
 }
 
-/// Why a route tool refused.
+/// Why a computation on a route was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RouteError {
-    /// The drive itself cannot be used, or what would be made of it.
+    /// The drive, or a trajectory derived from it, is invalid.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
-    /// A length, a stride or a tolerance.
+    /// A length, a stride or a tolerance is out of range.
     #[error("{field} is {value:?}; {must}")]
     Value {
-        /// Which.
+        /// The parameter.
         field: &'static str,
         /// The refused value.
         value: f64,
         /// What must hold instead.
         must: &'static str,
     },
-    /// Nothing is extrapolated.
+    /// A time before the first or after the last keyframe.
     #[error(
         "time {time_us} µs is not within trajectory {name:?}, {from_us} to {to_us} µs: poses are \
          interpolated, not extrapolated"
@@ -71,12 +90,12 @@ pub enum RouteError {
         /// The last keyframe's time, in microseconds.
         to_us: i64,
     },
-    /// Times of one clock must increase strictly.
+    /// The times of a clock do not increase strictly.
     #[error("{clock}[{index}] is {time_us} µs, not after the one before it ({before_us} µs)")]
     Order {
-        /// Which clock.
+        /// The clock: `first` or `second`.
         clock: &'static str,
-        /// Which of its times.
+        /// Index of the time.
         index: usize,
         /// That time, in microseconds.
         time_us: i64,
@@ -86,7 +105,7 @@ pub enum RouteError {
 }
 
 impl<'a> Route<'a> {
-    /// Measures a drive.
+    /// Computes the stations of a drive's keyframes.
     ///
     /// # Errors
     /// As [`Trajectory::check`].
@@ -101,31 +120,32 @@ impl<'a> Route<'a> {
         Ok(Self { trajectory, stations_m })
     }
 
-    /// How far along each keyframe lies, in metres: never falling.
+    /// Stations of the keyframes, in metres; they never decrease.
     pub fn stations_m(&self) -> &[f64] {
         &self.stations_m
     }
 
-    /// From the first keyframe to the last one, in metres.
+    /// Length of the route, in metres.
     pub fn length_m(&self) -> f64 {
         self.stations_m.last().copied().unwrap_or(0.0)
     }
 
-    /// Where the drive was at a station, clamped to its ends, in metres, and when. Where it stood
-    /// still, the moment it got there.
+    /// The interpolated pose and time at a station in metres, clamped to the ends of the route. Where the
+    /// vehicle stood still, the time is that of its arrival.
     pub fn at(&self, station_m: f64) -> Keyframe {
         let keyframes = &self.trajectory.keyframes;
-        // The first keyframe that is not before the station; it is not the first of all then, unless
-        // the station is at or before the start.
+        // The first keyframe at or after the station. It is keyframe 0 only if the station is at or before
+        // the start.
         let after = self.stations_m.partition_point(|&s_m| s_m < station_m);
         let after = after.min(keyframes.len() - 1);
         let Some(before) = after.checked_sub(1) else { return keyframes[0] };
-        let (from_m, to_m) = (self.stations_m[before], self.stations_m[after]);
+        let from_m = self.stations_m[before];
+        let to_m = self.stations_m[after];
         let t = ((station_m - from_m) / (to_m - from_m)).min(1.0);
         between(&keyframes[before], &keyframes[after], t)
     }
 
-    /// The drive in chunks of 5 km, those without a keyframe left out.
+    /// The route in chunks of 5 km, without chunks that have no keyframe.
     pub fn chunks(&self) -> Vec<RouteChunk> {
         let number = |s_m: f64| (s_m / ROUTE_CHUNK_LENGTH_M).floor() as u64;
         let mut first = 0;
@@ -139,9 +159,9 @@ impl<'a> Route<'a> {
         .collect()
     }
 
-    /// The recorded poses that are at least `step_m` apart: the first one, and each one so far from
-    /// the one kept before it. As the crow flies, so that a position that jitters where the vehicle
-    /// stands still does not add up.
+    /// The recorded keyframes that are at least `step_m` apart: the first one, and each one at this distance
+    /// from the previously kept one. The distance is Euclidean and not along the route, so that position
+    /// jitter of a standing vehicle does not accumulate.
     ///
     /// # Errors
     /// [`RouteError::Value`] if the step is not positive and finite.
@@ -149,8 +169,7 @@ impl<'a> Route<'a> {
         positive("step_m", step_m)?;
         let mut kept: Vec<Keyframe> = Vec::new();
         for keyframe in &self.trajectory.keyframes {
-            // A thousandth less, so that keyframes of just that distance are kept whatever rounding
-            // did to them.
+            // 0.1 % less, so that keyframes at exactly this distance are kept in spite of rounding.
             if kept.last().is_none_or(|last| distance_m(last, keyframe) >= 0.999 * step_m) {
                 kept.push(*keyframe);
             }
@@ -159,12 +178,12 @@ impl<'a> Route<'a> {
     }
 }
 
-/// The moment a fraction `t` in [0, 1] of the way from one keyframe to another one.
+/// Interpolates time and pose between two keyframes by `t` in [0, 1].
 fn between(from: &Keyframe, to: &Keyframe, t: f64) -> Keyframe {
     if t >= 1.0 {
         return *to;
     }
-    // i128: the clocks of two logs may lie on both ends of i64.
+    // i128, since the difference of two i64 times may overflow i64.
     let span_us = (i128::from(to.time_us) - i128::from(from.time_us)) as f64;
     Keyframe {
         time_us: from.time_us.saturating_add((t * span_us).round() as i64),

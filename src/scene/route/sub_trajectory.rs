@@ -1,26 +1,26 @@
-//! Sub-trajectories: pieces of a drive of one length, in the drive's own frame.
+//! Sub-trajectories: parts of a drive with a common length, in the drive's world frame.
 
 use super::{Route, RouteError, positive};
 use crate::Trajectory;
 
-/// A piece of a drive.
+/// A part of a drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SubTrajectory {
-    /// Where it begins and ends on the drive, in metres.
+    /// Stations of its start and end on the drive, in metres.
     pub stations_m: [f64; 2],
-    /// When it begins, on the drive's clock, in microseconds; its own clock begins with it.
+    /// Time of its start on the drive's clock, in microseconds. The sub-trajectory's own times start at 0.
     pub from_us: i64,
-    /// The drive's keyframes in between, and poses at both ends, in the drive's world. Its name is
-    /// the drive's with length and number, as `log-250m-0003` or `log-2.5km-0000`.
+    /// The drive's keyframes between the ends and interpolated poses at both ends, in the drive's world. The
+    /// name is that of the drive with length and number, such as `log-250m-0003` or `log-2.5km-0000`.
     pub trajectory: Trajectory,
 }
 
-/// Most pieces of a drive: one every metre of 100 km.
+/// Largest number of sub-trajectories of a drive: one per metre of 100 km.
 pub const MAX_SUB_TRAJECTORIES: usize = 100_000;
 
-/// Pieces of `length_m`, one every `stride_m` from the start of a drive; what is left at its end is
-/// in none. With a stride as long as the pieces they do not overlap, and each begins where the one
-/// before ends.
+/// Sub-trajectories of length `length_m`, one starting every `stride_m` from the start of a drive. A shorter
+/// rest at its end is omitted. With `stride_m == length_m` they do not overlap, and each begins where the
+/// previous one ends.
 ///
 /// # Errors
 /// [`RouteError::Value`] if a length is not positive and finite, or the stride makes more than
@@ -32,11 +32,11 @@ pub fn sub_trajectories<'a>(
 ) -> Result<impl Iterator<Item = Result<SubTrajectory, RouteError>> + use<'a>, RouteError> {
     positive("length_m", length_m)?;
     positive("stride_m", stride_m)?;
-    // A micrometre: a drive of 100 m has two pieces of 50 m, whatever rounding did to its length.
+    // A tolerance of one micrometre: a drive of 100 m has two pieces of 50 m in spite of rounding.
     let left_m = route.length_m() + 1e-6 - length_m;
     let count = if left_m < 0.0 { 0.0 } else { 1.0 + (left_m / stride_m).floor() };
     if count > MAX_SUB_TRAJECTORIES as f64 {
-        let must = "a stride makes at most 100000 pieces of a drive";
+        let must = "a stride divides a drive into at most 100000 pieces";
         return Err(RouteError::Value { field: "stride_m", value: stride_m, must });
     }
     let station_m = move |number: usize| number as f64 * stride_m;
@@ -51,8 +51,8 @@ fn piece(
 ) -> Result<SubTrajectory, RouteError> {
     let [from_m, to_m] = stations_m;
     let [first, last] = stations_m.map(|station_m| route.at(station_m));
-    // Keyframes between the ends in space and, where the drive stood still or an end was rounded to
-    // a microsecond, in time.
+    // Keyframes strictly between the ends in space, and also in time: the two may differ where the vehicle
+    // stood still, or where an end was rounded to a microsecond.
     let inner = route.trajectory.keyframes.iter().zip(&route.stations_m);
     let inner = inner
         .skip(route.stations_m.partition_point(|&s_m| s_m <= from_m))
@@ -71,7 +71,7 @@ fn piece(
     Ok(SubTrajectory { stations_m, from_us: first.time_us, trajectory })
 }
 
-/// A length as names of pieces have it, to the millimetre or the metre: `50m`, `2.5km`.
+/// A length as in names of sub-trajectories, rounded to a millimetre (below 1 km) or a metre: `50m`, `2.5km`.
 pub fn length_label(length_m: f64) -> String {
     let millimetre_m = |value: f64| (1e3 * value).round() / 1e3;
     if length_m < 1_000.0 {

@@ -1,44 +1,46 @@
-//! A network as cube maps whose error is known.
+//! Baking a sky network into cube maps with a known error bound.
 //!
-//! There are four, each of twice the resolution of the one before, and what is asked for gets the coarsest that
-//! is close enough. So whoever asks for what, a sky has at most four maps, of 0.8, 3, 13 and 50 MB, and none is
-//! baked twice.
+//! There are four levels, each of twice the resolution of the previous one. A request gets the coarsest map
+//! whose error is small enough. So a sky has at most four maps, of 0.8, 3, 13 and 50 MB, for any combination of
+//! requests, and none is baked twice.
 //!
-//! A grid is compared with one of twice its resolution: at the middle of every edge of a cell and at
-//! its centre. Where a function bends smoothly, that is where a bilinear patch is farthest off. Where it
-//! has one kink (ReLU) between two nodes, at `a` of the way, a line is off by `a (1 - a)` of the kink
-//! there and by `a / 2` in the middle (a below a half): at most twice what is seen. So twice the largest
-//! difference is the error that is stated, and rounding to 16 bits on top.
+//! The error of a grid is measured against a grid of twice the resolution, at the middle of every edge of a
+//! cell and at its centre. For a smooth function these are the points where a bilinear patch is worst. For one
+//! kink (of a ReLU) between two nodes, at a fraction `a` below a half, the error of linear interpolation is
+//! `a (1 - a)` times the kink at the kink and `a / 2` times the kink in the middle: at most twice the measured
+//! one. So the bound is twice the largest difference, plus rounding to 16 bits. The sharpest kink decides: at
+//! the default `sky_error` of 0.025, 99 of 100 directions of the demo's sky are wrong by less than a step of
+//! 8 bits.
 //!
-//! The first grid has 129 values along an edge, 0.9° or less apart, and is compared with one of 0.45°: the
-//! finest sine of seven octaves has a period of 5.6°, so that nothing that it draws lies unseen between.
+//! The first grid has 129 values along an edge, at most 0.9° apart, and is compared with one of 0.45°. The
+//! finest sine of seven octaves has a period of 5.6°, so no feature of it falls between the samples.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use fearless_simd::{Level as Simd, dispatch, f32x16, prelude::*};
+use parking_lot::{Mutex, MutexGuard};
 use rayon::prelude::*;
 
 use super::{CubeMap, FACES, InferenceNetwork, SkyError};
 use crate::chunk::LANES;
 
-/// Values along an edge of the first grid.
+/// Number of values along an edge of the first grid.
 const FIRST_EDGE: usize = 129;
 
-/// What is known of the maps of a network.
+/// The maps of a network that were baked so far, and the error bounds of its levels.
 #[derive(Debug, Default)]
 pub(super) struct Maps {
-    /// The coarsest first. Held for moments alone: frames that have their map never wait for one that is
-    /// baked for somebody else.
+    /// The coarsest first. Locked only briefly, so that frames whose map exists never wait for a bake.
     levels: Mutex<Vec<Level>>,
-    /// Whoever bakes; who comes meanwhile waits for the map rather than bakes another.
+    /// Locked while baking, so that concurrent requests for the same map wait for it instead of baking it again.
     baking: Mutex<()>,
 }
 
 #[derive(Debug)]
 struct Level {
-    /// How far a map of this resolution is off, at most.
+    /// Error bound of a map of this resolution.
     error: f64,
-    /// It, if anybody asked for it.
+    /// The map, if it was requested.
     map: Option<Arc<CubeMap>>,
 }
 
@@ -46,7 +48,7 @@ impl Maps {
     /// The coarsest map whose error is at most `wanted`.
     ///
     /// # Errors
-    /// [`SkyError::Coarse`] if the finest one is worse.
+    /// [`SkyError::Coarse`] if the error of the finest map is larger.
     pub(super) fn get(
         &self,
         network: &InferenceNetwork,
@@ -55,7 +57,7 @@ impl Maps {
         if let Ok(answer) = self.known(wanted) {
             return answer;
         }
-        let _turn = self.baking.lock().unwrap_or_else(PoisonError::into_inner);
+        let _baking = self.baking.lock();
         let simd = Simd::new();
         let mut next: Option<Grid> = None;
         loop {
@@ -80,7 +82,7 @@ impl Maps {
         }
     }
 
-    /// What is known to be the answer, or else the level that is to be baked.
+    /// The answer if it is known, or else the level to bake next.
     fn known(&self, wanted: f64) -> Result<Result<Arc<CubeMap>, SkyError>, usize> {
         let levels = self.levels();
         let found = levels.iter().position(|level| level.error <= wanted);
@@ -101,16 +103,16 @@ impl Maps {
     }
 
     fn levels(&self) -> MutexGuard<'_, Vec<Level>> {
-        self.levels.lock().unwrap_or_else(PoisonError::into_inner)
+        self.levels.lock()
     }
 }
 
-/// Values along an edge of the grids of a level.
+/// Number of values along an edge of the grids of a level.
 fn edge(level: usize) -> usize {
     ((FIRST_EDGE - 1) << level) + 1
 }
 
-/// The network at `i / (edge - 1)` along both sides of six faces.
+/// Values of the network at `i / (edge - 1)` along both sides of six faces.
 struct Grid {
     edge: usize,
     rgb: Vec<[f32; 3]>,
@@ -122,7 +124,8 @@ impl Grid {
         rgb.par_chunks_mut(edge).enumerate().for_each_init(
             || network.scratch(),
             |scratch, (row, to)| {
-                let (face, t) = (row / edge, (row % edge) as f64 / (edge - 1) as f64);
+                let face = row / edge;
+                let t = (row % edge) as f64 / (edge - 1) as f64;
                 for (block, to) in to.chunks_mut(LANES).enumerate() {
                     let mut directions = [[0.0; LANES]; 3];
                     for lane in 0..LANES {
@@ -151,17 +154,20 @@ impl Grid {
         CubeMap::from_nodes(self.edge, &self.rgb, error)
     }
 
-    /// How far its patches are from the values of a grid of twice the resolution, at most.
+    /// Largest difference of the bilinear patches from the values of a grid of twice the resolution.
     fn difference(&self, finer: &Self) -> f64 {
         let rows = finer.rgb.par_chunks(finer.edge).enumerate();
         let worst = rows.map(|(row, values)| {
-            let (face, row) = (row / finer.edge, row % finer.edge);
+            let face = row / finer.edge;
+            let row = row % finer.edge;
             let coarse =
                 |row: usize| &self.rgb[(face * self.edge + row) * self.edge..][..self.edge];
-            let (above, below) = (coarse(row / 2), coarse(row.div_ceil(2)));
+            let above = coarse(row / 2);
+            let below = coarse(row.div_ceil(2));
             let mut worst: f32 = 0.0;
             for (column, value) in values.iter().enumerate() {
-                let (left, right) = (column / 2, column.div_ceil(2));
+                let left = column / 2;
+                let right = column.div_ceil(2);
                 for c in 0..3 {
                     let patch = above[left][c] + above[right][c] + below[left][c] + below[right][c];
                     worst = worst.max((0.25 * patch - value[c]).abs());

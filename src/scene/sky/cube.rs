@@ -1,51 +1,51 @@
-//! A cube map: six square grids of colours around the viewer.
+//! A cube map: six square grids of colours around the viewer, interpolated bilinearly.
 //!
-//! Faces are in the order +x, -x, +y, -y, +z, -z, their columns and rows as OpenGL and most files have
-//! them. x is right, y up, z ahead: in these left-handed axes, seen from within, each face is upright. Between the values of a grid, colours are
-//! bilinear.
+//! Faces are in the order +x, -x, +y, -y, +z, -z, with columns and rows as in OpenGL and most files. x is right,
+//! y up, z ahead: in these left-handed axes, seen from inside, each face is upright.
 
 use glam::DVec3;
 
 use super::SkyError;
 
-/// Faces of a cube.
+/// Number of faces of a cube.
 pub const FACES: usize = 6;
 
 /// Six grids of `edge` x `edge` values.
 ///
-/// A direction whose largest component is that of a face meets it at `(s, t)` in [0, 1]², and looks up
-/// the value at `(scale s + offset, scale t + offset)`. What was baked has values on the very edges,
-/// which neighbours share; images have values in the middle of their pixels, and one more all around
-/// that is looked up from the neighbours. So no seam is to be seen in either.
+/// A direction intersects the face of its largest component at `(s, t)` in [0, 1]², and the value is looked up
+/// at `(scale s + offset, scale t + offset)`. Baked maps have values on the very edges, shared by neighbouring
+/// faces. Images have values at pixel centres, and a border of one value that is looked up from the
+/// neighbouring faces. So neither has a visible seam.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CubeMap {
     edge: usize,
     scale: f64,
     offset: f64,
     error: f64,
-    /// 16 bits each of red, green; and of blue.
+    /// 16 bits each: red in the lower and green in the upper half of the first word, blue in the second.
     texels: Vec<[u32; 2]>,
 }
 
 impl CubeMap {
-    /// Most values along an edge of what is baked: 50 MB, and a texel is 0.09° in the middle of a face.
+    /// Largest number of values along an edge of a baked map: 50 MB; a texel is 0.09° at the centre of a face.
     pub const MAX_EDGE: usize = 1025;
 
-    /// Widest face of images: 113 MB of texels, within the 128 MiB that a binding of any GPU holds.
+    /// Largest width of a face of images: 113 MB of texels, within the 128 MiB that any GPU allows per binding.
     pub const MAX_SIDE_PX: usize = 1536;
 
-    /// How far 16 bits are off at most.
+    /// Largest rounding error of a value in 16 bits.
     pub const STEP: f64 = 0.5 / 65_535.0;
 
-    /// From six images of `side_px` x `side_px` pixels of RGB, face by face, row by row.
+    /// A map from six images of `side_px` x `side_px` pixels, `[face, row, column, 3]`: red, green, blue.
     ///
     /// # Errors
-    /// The faces are empty or too large, or there are not as many pixels.
+    /// The faces are empty or too large, or the number of bytes is wrong.
     pub fn from_faces(side_px: usize, rgb8: &[u8]) -> Result<Self, SkyError> {
         if !(1..=Self::MAX_SIDE_PX).contains(&side_px) {
             return Err(SkyError::Side { side_px });
         }
-        let (wanted, given) = (FACES * side_px * side_px * 3, rgb8.len());
+        let wanted = FACES * side_px * side_px * 3;
+        let given = rgb8.len();
         if given != wanted {
             return Err(SkyError::Pixels { side_px, wanted, given });
         }
@@ -53,14 +53,18 @@ impl CubeMap {
             let first = 3 * ((face * side_px + row) * side_px + column);
             DVec3::new(rgb8[first].into(), rgb8[first + 1].into(), rgb8[first + 2].into()) / 255.0
         };
-        // Within a face alone, its outermost pixels going on to its edges.
+        // A look-up within one face, whose outermost pixels extend to its edges.
         let clamped = |(face, [s, t]): (usize, [f64; 2])| {
             let last = side_px - 1;
             let at = |x: f64| (x * side_px as f64 - 0.5).clamp(0.0, last as f64);
-            let (u, v) = (at(s), at(t));
-            let (column, row) = (u as usize, v as usize);
-            let (right, below) = ((column + 1).min(last), (row + 1).min(last));
-            let (fu, fv) = (u - column as f64, v - row as f64);
+            let u = at(s);
+            let v = at(t);
+            let column = u as usize;
+            let row = v as usize;
+            let right = (column + 1).min(last);
+            let below = (row + 1).min(last);
+            let fu = u - column as f64;
+            let fv = v - row as f64;
             let upper = pixel(face, column, row).lerp(pixel(face, right, row), fu);
             upper.lerp(pixel(face, column, below).lerp(pixel(face, right, below), fu), fv)
         };
@@ -88,20 +92,23 @@ impl CubeMap {
         Self { edge: 2, scale: 1.0, offset: 0.0, error: Self::STEP, texels }
     }
 
-    /// From values at `i / (edge - 1)`, face by face, row by row; `error` is how far off they are.
+    /// A map from values at `i / (edge - 1)`, `[face, row, column]`; `error` is the bound of their error.
     pub(super) fn from_nodes(edge: usize, nodes: &[[f32; 3]], error: f64) -> Self {
         let texel = |rgb: &[f32; 3]| packed(DVec3::from_array(rgb.map(f64::from)));
         let texels = nodes.iter().map(texel).collect();
         Self { edge, scale: (edge - 1) as f64, offset: 0.0, error, texels }
     }
 
-    /// The colour towards a direction of any length but 0, in [0, 1].
+    /// The colour in [0, 1] along a direction of any length except 0.
     pub fn rgb(&self, direction: DVec3) -> DVec3 {
         let (face, [s, t]) = face_of(direction);
-        let (u, v) = (self.scale * s + self.offset, self.scale * t + self.offset);
+        let u = self.scale * s + self.offset;
+        let v = self.scale * t + self.offset;
         let last = self.edge - 2;
-        let (column, row) = ((u as usize).min(last), (v as usize).min(last));
-        let (fu, fv) = (u - column as f64, v - row as f64);
+        let column = (u as usize).min(last);
+        let row = (v as usize).min(last);
+        let fu = u - column as f64;
+        let fv = v - row as f64;
         let at = |column: usize, row: usize| {
             let [rg, b] = self.texels[(face * self.edge + row) * self.edge + column];
             DVec3::new((rg & 0xFFFF).into(), (rg >> 16).into(), b.into()) / 65_535.0
@@ -110,10 +117,11 @@ impl CubeMap {
         upper.lerp(at(column, row + 1).lerp(at(column + 1, row + 1), fu), fv)
     }
 
-    /// The direction, not of unit length, in which a face has the point `[s, t]`, from the left and from
-    /// the top; beyond [0, 1] the face's plane goes on.
+    /// The direction, not of unit length, of the point `[s, t]` of a face, from its left and top edges. Outside
+    /// of [0, 1] the point is on the plane of the face.
     pub fn direction(face: usize, [s, t]: [f64; 2]) -> DVec3 {
-        let (right, down) = (2.0 * s - 1.0, 2.0 * t - 1.0);
+        let right = 2.0 * s - 1.0;
+        let down = 2.0 * t - 1.0;
         match face {
             0 => DVec3::new(1.0, -down, -right),
             1 => DVec3::new(-1.0, -down, right),
@@ -124,7 +132,7 @@ impl CubeMap {
         }
     }
 
-    /// Values along an edge of a face.
+    /// Number of values along an edge of a face.
     pub fn edge(&self) -> usize {
         self.edge
     }
@@ -134,17 +142,18 @@ impl CubeMap {
         [self.scale, self.offset]
     }
 
-    /// How far it is off what it was baked from, at most; 0 of images.
+    /// Bound of the error against the network that was baked; 0 for images.
     pub fn error(&self) -> f64 {
         self.error
     }
 
-    /// The values, `[face, row, column]`: red in the lower and green in the upper 16 bits, and blue.
+    /// The values, `[face, row, column]`: red in the lower and green in the upper 16 bits of the first word,
+    /// blue in the second.
     pub fn texels(&self) -> &[[u32; 2]] {
         &self.texels
     }
 
-    /// Memory that it takes, in bytes.
+    /// Memory of the texels, in bytes.
     pub fn bytes(&self) -> usize {
         size_of_val(&*self.texels)
     }
@@ -155,7 +164,7 @@ fn packed(rgb: DVec3) -> [u32; 2] {
     [r | g << 16, b]
 }
 
-/// The face that a direction meets, and where: `[s, t]` in [0, 1], from the left and from the top.
+/// The face that a direction intersects, and the point `[s, t]` in [0, 1], from its left and top edges.
 pub(super) fn face_of(direction: DVec3) -> (usize, [f64; 2]) {
     let DVec3 { x, y, z } = direction;
     let [ax, ay, az] = direction.abs().to_array();
@@ -176,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_face_and_back() {
+    fn face_of_inverts_direction() {
         for face in 0..FACES {
             for [s, t] in [[0.5, 0.5], [0.1, 0.9], [0.99, 0.02]] {
                 let (met, [u, v]) = face_of(3.0 * CubeMap::direction(face, [s, t]));
@@ -232,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn faces_of_absurd_size_are_refused() {
+    fn faces_of_invalid_size_are_refused() {
         assert_eq!(CubeMap::from_faces(0, &[]), Err(SkyError::Side { side_px: 0 }));
         let side_px = CubeMap::MAX_SIDE_PX + 1;
         assert_eq!(CubeMap::from_faces(side_px, &[]), Err(SkyError::Side { side_px }));

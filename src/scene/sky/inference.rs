@@ -1,30 +1,30 @@
-//! A network for 16 directions at once, in f32.
+//! Fast evaluation of a sky network: 16 directions at once, in f32.
 //!
-//! The appearance is the same for every direction: its products are part of the biases. Eight outputs
-//! are summed side by side, so that an input is read once for all of them.
+//! The appearance embedding is the same for every direction, so its products with the weights are folded into
+//! the biases. Eight outputs are accumulated at once, so that each input is loaded once for all of them.
 
 use fearless_simd::{f32x16, i32x16, prelude::*};
 
 use super::Network;
 use crate::chunk::{LANES, Lanes};
 
-/// Outputs that are summed side by side.
+/// Number of outputs that are accumulated at once.
 const GROUP: usize = 8;
 
-/// A network whose appearance is folded into its biases.
+/// A network whose appearance embedding is folded into its biases.
 #[derive(Clone, Debug)]
 pub struct InferenceNetwork {
     octaves: usize,
     identity: bool,
     skip: bool,
-    /// Values of a direction and its octaves.
+    /// Number of values of an encoded direction: identity, sines and cosines.
     encoded: usize,
-    /// Outputs of a hidden layer, rounded up to whole groups: those added are 0.
+    /// Outputs of a hidden layer, rounded up to whole groups; padded outputs are 0.
     width: usize,
     layers: [Dense; 3],
 }
 
-/// A layer, group by group of outputs.
+/// A linear layer, stored by groups of outputs.
 #[derive(Clone, Debug)]
 struct Dense {
     inputs: usize,
@@ -34,22 +34,22 @@ struct Dense {
     bias: Vec<[f32; GROUP]>,
 }
 
-/// What an evaluation writes on its way: made once, used for many.
+/// Buffers for intermediate values, to be reused between evaluations.
 #[derive(Clone, Debug)]
 pub struct Scratch {
-    /// The first layer's outputs, and behind them the encoded direction.
+    /// Outputs of the first layer, followed by the encoded direction.
     joined: Vec<Lanes>,
     hidden: Vec<Lanes>,
     logits: [Lanes; GROUP],
 }
 
 impl InferenceNetwork {
-    /// The same network.
+    /// The fast form of a network.
     pub fn new(network: &Network) -> Self {
         let [first, second, third] = network.layers();
         let encoded = first.inputs - network.appearance().len();
         let width = first.outputs.next_multiple_of(GROUP);
-        // Inputs of the second layer: the first one's outputs, then the encoded direction.
+        // Inputs of the second layer: the outputs of the first, padded to `width`, then the encoded direction.
         let joined = |input: usize| match input {
             _ if input < width => (input < first.outputs).then_some(input),
             _ => Some(input - width + first.outputs),
@@ -71,7 +71,7 @@ impl InferenceNetwork {
             layers: [
                 Dense::new(first, encoded, Some, |output| folded(first, output, encoded)),
                 Dense::new(second, joined_inputs, joined, |output| {
-                    // Behind the last input there is no weight: nothing is folded without a skip.
+                    // Without a skip connection no weights follow these inputs, and nothing is folded.
                     folded(second, output, first.outputs + encoded)
                 }),
                 Dense::new(
@@ -89,33 +89,34 @@ impl InferenceNetwork {
         self.width
     }
 
-    /// Octaves of sines and cosines.
+    /// Number of octaves of sines and cosines.
     pub fn octaves(&self) -> usize {
         self.octaves
     }
 
-    /// Values of a direction and its octaves.
+    /// Number of values of an encoded direction: identity, sines and cosines.
     pub fn encoded(&self) -> usize {
         self.encoded
     }
 
-    /// Whether the direction itself is one of them.
+    /// Whether the direction itself is part of the encoded direction.
     pub fn identity(&self) -> bool {
         self.identity
     }
 
-    /// Whether the second layer reads them again, behind the first one's outputs.
+    /// Whether the second layer also reads the encoded direction, after the outputs of the first.
     pub fn skip(&self) -> bool {
         self.skip
     }
 
-    /// All numbers, layer by layer and output by output: the bias, and then the weights of inputs, four by
-    /// four, those of the encoded direction filled up with zeros.
+    /// All parameters for a GPU, by layer and output: the bias, followed by the weights in groups of four; the
+    /// last group is padded with zeros.
     pub fn weights(&self) -> Vec<[f32; 4]> {
         let mut rows = Vec::new();
         for (layer, outputs) in self.layers.iter().zip([self.width, self.width, 3]) {
             for output in 0..outputs {
-                let (group, k) = (output / GROUP, output % GROUP);
+                let group = output / GROUP;
+                let k = output % GROUP;
                 rows.push([layer.bias[group][k], 0.0, 0.0, 0.0]);
                 let weights = &layer.weight[group * layer.inputs..][..layer.inputs];
                 rows.extend(weights.chunks(4).map(|four| {
@@ -126,13 +127,13 @@ impl InferenceNetwork {
         rows
     }
 
-    /// Memory of its numbers, in bytes.
+    /// Memory of the parameters, in bytes.
     pub fn bytes(&self) -> usize {
         let of_layer = |layer: &Dense| (layer.weight.len() + layer.bias.len()) * 4 * GROUP;
         self.layers.iter().map(of_layer).sum()
     }
 
-    /// Room for evaluations.
+    /// Buffers for [`InferenceNetwork::rgb`].
     pub fn scratch(&self) -> Scratch {
         let zero = |len| vec![Lanes([0.0; LANES]); len];
         Scratch {
@@ -142,7 +143,7 @@ impl InferenceNetwork {
         }
     }
 
-    /// Red, green, blue in (0, 1) towards 16 unit directions: x, y, z.
+    /// Red, green, blue in (0, 1) along 16 unit directions, given as x, y, z.
     #[inline(always)]
     pub fn rgb<S: Simd>(
         &self,
@@ -191,7 +192,7 @@ impl InferenceNetwork {
 }
 
 impl Dense {
-    /// From a layer whose input `source(i)` becomes input `i`; there is none where it is `None`.
+    /// A layer whose input `i` is input `source(i)` of `layer`; where that is `None`, its weights are 0.
     fn new(
         layer: &super::Layer,
         inputs: usize,
@@ -206,7 +207,8 @@ impl Dense {
             })
         };
         let weight = (0..groups * inputs).map(|at| {
-            let (group, input) = (at / inputs, at % inputs);
+            let group = at / inputs;
+            let input = at % inputs;
             let weight = |output: usize| {
                 source(input).map_or(0.0, |source| layer.weight[output * layer.inputs + source])
             };
@@ -239,11 +241,13 @@ impl Dense {
     }
 }
 
-/// `sin(x + quarter π)` for `quarter` 0, and 0.5: the cosine. Within 1.5e-7 for |x| up to 1,000.
+/// `sin(x + quarter π)`: the sine for `quarter` 0, the cosine for 0.5. The error is below 1.5e-7 for |x| up to
+/// 1,000.
 ///
-/// x less the nearest multiple of π (for the cosine, of π/2 and whole π), in three parts of π of which
-/// the first two have so few bits that their products are exact; then the minimax fit of degree 9, 5e-9
-/// off on [-π/2, π/2]. Adding π/2 to x instead would round it to 4e-6 at 64.
+/// Range reduction after Cody and Waite: subtract the nearest multiple of π (for the cosine, of π shifted by
+/// π/2), with π split into three parts of which the first two have so few bits that their products are exact.
+/// Then a minimax polynomial of degree 9, with an error of 5e-9 on [-π/2, π/2]. Adding π/2 to x for the cosine
+/// would instead cost a rounding error of 4e-6 at x = 64.
 #[inline(always)]
 fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -258,7 +262,8 @@ fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
         .mul_add(square, splat(8.333_017e-3))
         .mul_add(square, splat(-1.666_665_7e-1));
     let sine = (fit * square).mul_add(r, r);
-    // Every half turn changes the sign; and the cosine falls where the sine of the rest rises.
+    // The sign flips with every multiple of π. For the cosine it flips once more, since it falls where the sine
+    // of the remainder rises.
     let half_turns: i32x16<S> = whole.to_int();
     let odd = if quarter > 0.0 { half_turns + 1 } else { half_turns };
     let bits: i32x16<S> = sine.bitcast();
@@ -272,7 +277,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sines_are_sines() {
+    fn sine_and_cosine_are_accurate() {
         for i in -64_000..=64_000 {
             let x = i as f32 / 640.0;
             for (quarter, truth) in [(0.0, f64::from(x).sin()), (0.5, f64::from(x).cos())] {

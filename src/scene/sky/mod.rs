@@ -1,9 +1,19 @@
-//! What lies behind everything: a colour for every direction, infinitely far away.
+//! Skies: a colour for every direction, infinitely far away.
 //!
-//! A pixel is `C = C_gaussians + T C_sky(direction)`, where T is the share of the background that its
-//! Gaussians let through. A sky is a network, as street reconstructions train it, or six images. As it
-//! depends on the direction alone, a network is baked into a cube map when a twin opens, as finely as
-//! the profile's `sky_error` asks; 0 evaluates it for every pixel.
+//! A pixel is `C = C_gaussians + T C_sky(direction)`, where T is the transmittance of its Gaussians. A sky is a
+//! network, as street reconstructions train it, or a cube map of six images.
+//!
+//! Since a sky depends on the direction alone, a network of 12,000 multiplications per pixel is baked into a
+//! cube map of at most 50 MB when a twin is opened (`bake.rs`). The field `sky_error` of the render profile
+//! bounds the error of the map in any direction; 0 evaluates the network for every pixel, in f32. The
+//! reference backend always evaluates the network, in f64. A sky that one session shares with others has at
+//! most four maps, one per resolution, 67 MB together; none is baked twice. A session whose `sky_error` is
+//! below the error of the finest map is refused when it opens.
+//!
+//! Images become the faces of a cube map at import and are not baked. Baked grids have values on the very
+//! edges of the faces, which neighbouring faces share; images have a border of one value that is looked up
+//! from the neighbouring faces. Both use one formula with another scale and offset, so no look-up needs to
+//! test where a face ends.
 
 mod bake;
 mod cube;
@@ -20,40 +30,41 @@ pub use cube::{CubeMap, FACES};
 pub use inference::{InferenceNetwork, Scratch};
 pub use network::{Layer, Network};
 
-/// Where the background shows by less than this, the sky is left away: it would add at most one step of
-/// 8 bits, and nine pixels in ten of a street are such. It is part of what an image is, in every backend.
+/// The sky is not evaluated where the transmittance is below this value: it would change a pixel by at most
+/// one step of 8 bits, and nine of ten pixels of a street are of this kind. Every backend does the same, so it
+/// is part of the definition of an image.
 pub const SKY_CUT: f64 = 1.0 / 255.0;
 
-/// A sky, ready to be looked at.
+/// A sky, ready to be evaluated.
 #[derive(Debug)]
 pub struct Sky {
     model: SkyModel,
-    /// Takes world axes to the model's: a rotation, perhaps with a mirror.
+    /// Takes world axes to the axes of the model: orthonormal, possibly a reflection.
     sky_from_world: DMat3,
-    /// What was baked so far.
+    /// The maps that were baked so far.
     baked: Maps,
 }
 
-/// What a sky is made of.
+/// The model of a sky.
 #[derive(Clone, Debug)]
 pub enum SkyModel {
-    /// Weights, and the same for fast evaluation.
+    /// The network by definition, and its form for fast evaluation.
     Network(Arc<Network>, Arc<InferenceNetwork>),
     /// Six images.
     Cube(Arc<CubeMap>),
 }
 
-/// A sky in the form in which a backend draws it.
+/// A sky in the form in which a backend evaluates it.
 #[derive(Clone, Debug)]
 pub enum DrawableSky {
-    /// The network, pixel by pixel.
+    /// The network, evaluated for every pixel.
     Network(Arc<InferenceNetwork>),
     /// A cube map.
     CubeMap(Arc<CubeMap>),
 }
 
 impl DrawableSky {
-    /// Whether it is the very same.
+    /// Whether both share the same data in memory.
     pub fn ptr_eq(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Network(own), Self::Network(other)) => Arc::ptr_eq(own, other),
@@ -62,7 +73,7 @@ impl DrawableSky {
         }
     }
 
-    /// Memory of what is looked up or multiplied, in bytes.
+    /// Memory of the weights or texels, in bytes.
     pub fn bytes(&self) -> usize {
         match self {
             Self::Network(network) => network.bytes(),
@@ -74,35 +85,35 @@ impl DrawableSky {
 /// Why a sky was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SkyError {
-    /// A tensor does not fit the others, or is of absurd size.
+    /// The shape of a tensor does not fit the others, or is too large.
     #[error("tensor {tensor} has shape {shape:?}; {must}")]
     Shape {
-        /// Its name in the file.
+        /// Name of the tensor in the file.
         tensor: &'static str,
-        /// Its shape.
+        /// Shape of the tensor.
         shape: Vec<usize>,
         /// What must hold instead.
         must: String,
     },
-    /// A weight that no arithmetic survives.
+    /// A weight is not finite or too large.
     #[error("tensor {tensor} holds {value:?} at {index}; weights are finite and within 1e6")]
     Value {
-        /// Its name in the file.
+        /// Name of the tensor in the file.
         tensor: &'static str,
         /// Index of the value, row by row.
         index: usize,
         /// The value.
         value: f32,
     },
-    /// No such appearance.
+    /// There is no appearance embedding of this index.
     #[error("the sky has the appearances of {count} images, from 0; there is no image {image}")]
     Image {
-        /// The image asked for.
+        /// The requested index.
         image: u32,
-        /// How many there are.
+        /// Number of embeddings.
         count: usize,
     },
-    /// Faces that are empty or too large.
+    /// The faces are empty or too large.
     #[error(
         "a face of the sky is {side_px} pixels wide; 1 to {} are accepted",
         CubeMap::MAX_SIDE_PX
@@ -111,38 +122,38 @@ pub enum SkyError {
         /// Width of a face, in pixels.
         side_px: usize,
     },
-    /// Not as many pixels as six faces have.
+    /// The number of bytes is not that of six faces.
     #[error("six faces of {side_px} x {side_px} pixels are {wanted} bytes of RGB, not {given}")]
     Pixels {
         /// Width of a face, in pixels.
         side_px: usize,
-        /// Bytes that they have.
+        /// Bytes of six such faces.
         wanted: usize,
         /// Bytes given.
         given: usize,
     },
-    /// The sky is too sharp for the error that is asked for.
+    /// No cube map is fine enough for the requested error.
     #[error(
-        "as a cube map with faces of {edge} x {edge} the sky is off by up to {reached:.5}, and sky_error \
+        "as a cube map with faces of {edge} x {edge} the sky has an error of up to {reached:.5}, and sky_error \
          is {wanted}: set sky_error to {reached:.5} or more, or to 0, which evaluates every pixel"
     )]
     Coarse {
         /// Values along an edge of the largest map.
         edge: usize,
-        /// The bound of its error.
+        /// Error bound of that map.
         reached: f64,
-        /// The bound that is asked for.
+        /// The requested error bound.
         wanted: f64,
     },
 }
 
 impl Sky {
-    /// A sky whose model has axes of its own: `sky_from_world` is orthonormal.
+    /// A sky with a model in its own axes; `sky_from_world` must be orthonormal.
     pub fn new(model: SkyModel, sky_from_world: DMat3) -> Self {
         Self { model, sky_from_world, baked: Maps::default() }
     }
 
-    /// The colour towards a unit direction in world axes, in [0, 1]: by definition, in f64.
+    /// The colour in [0, 1] along a unit direction in world axes, evaluated in f64 without baking.
     pub fn rgb(&self, direction_world: DVec3) -> DVec3 {
         let direction = self.sky_from_world * direction_world;
         match &self.model {
@@ -151,22 +162,22 @@ impl Sky {
         }
     }
 
-    /// Takes directions in world axes to the axes of what [`Sky::drawable`] gives.
+    /// The matrix that takes directions in world axes to the axes of [`Sky::drawable`].
     pub fn sky_from_world(&self) -> DMat3 {
         self.sky_from_world
     }
 
-    /// What it is made of.
+    /// The model.
     pub fn model(&self) -> &SkyModel {
         &self.model
     }
 
-    /// The form in which it is drawn with a profile's `sky_error`. Bakes a network the first time, which
-    /// takes about a second, and ten for the finest of its four maps; they stay. Images are their own cube
-    /// map, whatever the error.
+    /// The form in which a backend evaluates the sky with a profile's `sky_error`. A network is baked on first
+    /// use, which takes about a second, or ten seconds for the finest of the four maps; maps are kept. Images
+    /// are returned as their own cube map for any error.
     ///
     /// # Errors
-    /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] is close enough.
+    /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] has a small enough error.
     pub fn drawable(&self, sky_error: f64) -> Result<DrawableSky, SkyError> {
         match &self.model {
             SkyModel::Cube(map) => Ok(DrawableSky::CubeMap(map.clone())),
@@ -179,7 +190,7 @@ impl Sky {
         }
     }
 
-    /// Memory that it takes, in bytes.
+    /// Memory of the model and of its baked maps, in bytes.
     pub fn bytes(&self) -> usize {
         self.baked.bytes()
             + match &self.model {
@@ -190,13 +201,13 @@ impl Sky {
 }
 
 impl SkyModel {
-    /// A network.
+    /// A model from a network.
     pub fn network(network: Network) -> Self {
         let folded = Arc::new(InferenceNetwork::new(&network));
         Self::Network(Arc::new(network), folded)
     }
 
-    /// Six images.
+    /// A model from six images.
     pub fn cube(map: CubeMap) -> Self {
         Self::Cube(Arc::new(map))
     }

@@ -1,14 +1,14 @@
-//! The network of a sky: OmniRe's (Chen et al. 2024), in f64 and by definition.
+//! The network of a sky, as in OmniRe (Chen et al. 2024), evaluated in f64 by its definition.
 //!
-//! The direction itself (if the weights have room for it), its sines and then its cosines at 1, 2, 4, ..
-//! times its size, x, y, z within each octave, and an appearance; three layers, ReLU between them, the
-//! input again beside what the second one reads; a sigmoid at the end.
+//! Inputs, in order: the direction itself (if the first layer has inputs for it); its sines at frequencies
+//! 1, 2, 4, ..., each with x, y, z; its cosines likewise; an appearance embedding. Three linear layers with
+//! ReLU between them; with a skip connection, the second layer also reads the inputs; a sigmoid at the end.
 
 use glam::DVec3;
 
 use super::SkyError;
 
-/// A checked network with the appearance that it is seen with.
+/// A checked network with one appearance embedding.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Network {
     octaves: usize,
@@ -21,9 +21,9 @@ pub struct Network {
 /// One linear layer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// How many values it gives.
+    /// Number of outputs.
     pub outputs: usize,
-    /// How many it reads.
+    /// Number of inputs.
     pub inputs: usize,
     /// `[outputs, inputs]`.
     pub weight: Vec<f32>,
@@ -31,7 +31,7 @@ pub struct Layer {
     pub bias: Vec<f32>,
 }
 
-/// What files call the layers' tensors.
+/// Names of the layers' tensors in files.
 const TENSORS: [[&str; 2]; 3] = [
     ["sky_head.layers.0.weight", "sky_head.layers.0.bias"],
     ["sky_head.layers.1.weight", "sky_head.layers.1.bias"],
@@ -39,16 +39,19 @@ const TENSORS: [[&str; 2]; 3] = [
 ];
 
 impl Network {
-    /// Widest layer: four times what is trained, and 0.4 s per million pixels and core.
+    /// Largest width of a layer: four times that of trained skies. Evaluation takes 0.4 s per million pixels
+    /// and core.
     pub const MAX_WIDTH: usize = 256;
-    /// Most octaves. f32 directions are off by 6e-8, 512 times that is 3e-5 rad of the finest sine.
+    /// Largest number of octaves. The rounding error of an f32 direction, 6e-8, times 512 is 3e-5 rad in the
+    /// argument of the finest sine.
     pub const MAX_OCTAVES: usize = 10;
-    /// Longest appearance.
+    /// Largest length of an appearance embedding.
     pub const MAX_APPEARANCE: usize = 256;
-    /// Largest weight. Three layers of at most 575 inputs stay below 3e36, within f32.
+    /// Largest accepted weight. Three layers of at most 575 inputs stay below 3e36, within f32.
     const MAX_WEIGHT: f32 = 1e6;
 
-    /// Reads octaves, identity and skip connection off the shapes. `appearance` may be empty.
+    /// A network from its layers. Octaves, identity inputs and skip connection follow from the shapes.
+    /// `appearance` may be empty.
     ///
     /// # Errors
     /// A shape does not fit the others or is too large, or a weight is not finite.
@@ -58,16 +61,20 @@ impl Network {
             Err(SkyError::Shape { tensor: TENSORS[layer][0], shape: vec![outputs, inputs], must })
         };
         if appearance.len() > Self::MAX_APPEARANCE {
-            let (tensor, shape) = ("appearance_embedding.weight", vec![appearance.len()]);
-            let must = format!("an appearance is of at most {} numbers", Self::MAX_APPEARANCE);
+            let tensor = "appearance_embedding.weight";
+            let shape = vec![appearance.len()];
+            let must = format!("an appearance has at most {} numbers", Self::MAX_APPEARANCE);
             return Err(SkyError::Shape { tensor, shape, must });
         }
-        let (inputs, width) = (layers[0].inputs, layers[0].outputs);
+        let inputs = layers[0].inputs;
+        let width = layers[0].outputs;
         if !(1..=Self::MAX_WIDTH).contains(&width) {
             return shape(0, format!("a layer is from 1 to {} wide", Self::MAX_WIDTH));
         }
         let encoded = inputs.saturating_sub(appearance.len());
-        let (octaves, identity) = (encoded / 6, encoded % 6 == 3);
+        // 6 inputs per octave (sine and cosine of x, y, z), and 3 more for the direction itself.
+        let octaves = encoded / 6;
+        let identity = encoded % 6 == 3;
         let fits = inputs >= appearance.len() && encoded > 0 && matches!(encoded % 6, 0 | 3);
         if !fits || octaves > Self::MAX_OCTAVES {
             let must = format!(
@@ -101,7 +108,7 @@ impl Network {
         Ok(Self { octaves, identity, skip, layers, appearance })
     }
 
-    /// The colour towards a unit direction, in (0, 1).
+    /// The colour in (0, 1) along a unit direction.
     pub fn rgb(&self, direction: DVec3) -> DVec3 {
         let mut input = Vec::with_capacity(self.layers[0].inputs);
         if self.identity {
@@ -124,17 +131,17 @@ impl Network {
         DVec3::new(logits[0], logits[1], logits[2]).map(|logit| 1.0 / (1.0 + (-logit).exp()))
     }
 
-    /// Octaves of sines and cosines.
+    /// Number of octaves of sines and cosines.
     pub fn octaves(&self) -> usize {
         self.octaves
     }
 
-    /// Whether the direction itself is read, too.
+    /// Whether the direction itself is an input.
     pub fn identity(&self) -> bool {
         self.identity
     }
 
-    /// Whether the second layer reads the input again.
+    /// Whether the second layer also reads the inputs.
     pub fn skip(&self) -> bool {
         self.skip
     }
@@ -144,12 +151,12 @@ impl Network {
         &self.layers
     }
 
-    /// The appearance that it is seen with.
+    /// The appearance embedding.
     pub fn appearance(&self) -> &[f32] {
         &self.appearance
     }
 
-    /// Memory of its weights, in bytes.
+    /// Memory of the weights, in bytes.
     pub(super) fn bytes(&self) -> usize {
         let weights = |layer: &Layer| layer.weight.len() + layer.bias.len();
         4 * (self.layers.iter().map(weights).sum::<usize>() + self.appearance.len())

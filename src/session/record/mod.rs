@@ -5,6 +5,7 @@
 //! the record: poses to the bit, images by their hashes.
 
 pub(crate) mod ego_replay;
+pub(crate) mod error;
 pub(crate) mod format;
 pub(crate) mod recorded_episode;
 pub(crate) mod recorder;

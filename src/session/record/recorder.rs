@@ -5,20 +5,11 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
+use super::error::RecordError;
 use super::format::Line;
-
-/// Why an episode could not be recorded.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot record the episode in {}: {cause}", path.display())]
-pub struct RecordError {
-    /// The file or directory.
-    pub path: PathBuf,
-    /// What the operating system says.
-    pub cause: io::Error,
-}
 
 /// An episode's file, open for appending.
 #[derive(Clone, Debug)]

@@ -6,7 +6,7 @@ use super::Session;
 use crate::blocking::run_blocking;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
-use crate::observe::builder::RenderedObservation;
+use crate::observe::builder::finish::RenderedObservation;
 use crate::options::PixelMaps;
 use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOutputs, RecordedVersion,

@@ -1,20 +1,22 @@
-//! What of its image a lens sees, and how far off the axis that is.
+//! The part of an image within a lens' field, and bounds of the projection over that field.
 
 use glam::{DVec2, DVec3};
 
 use super::{Camera, Lens, WIDEST_RAD};
 
-/// The columns of each row that a lens sees, where it does not see all of its image.
+/// The columns of each row that lie within a lens' field, for cameras whose field does not cover the image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldMask {
-    /// First column and the one after the last, row by row; equal where nothing is seen.
+    /// First column and the column after the last, for each row; equal where no column is in the field.
     pub columns: Vec<[u32; 2]>,
 }
 
 impl FieldMask {
-    /// `None` where the whole image is seen, as almost always; telling that costs some microseconds.
+    /// The mask of a camera; `None` if the field covers the whole image, as for most cameras. That test takes
+    /// some microseconds.
     ///
-    /// A field has no holes, and neither has a row of it: every model's is a disc, slightly bent.
+    /// The field of every model is a slightly deformed disc, so it has no holes and each row of it is one
+    /// interval.
     pub fn of(camera: &Camera) -> Option<Self> {
         let sees = |column: u32, row: u32| {
             let at_px = DVec2::new(f64::from(column) + 0.5, f64::from(row) + 0.5);
@@ -25,9 +27,9 @@ impl FieldMask {
         }
         let middle = camera.pinhole.cx.clamp(0.0, f64::from(camera.width_px - 1)) as u32;
         let columns = (0..camera.height_px).map(|row| {
-            // Some column of the row that is seen: the one at the axis, or the first of 64.
-            let few = (0..64).map(|k| (u64::from(camera.width_px) * k / 64) as u32);
-            let Some(seen) = [middle].into_iter().chain(few).find(|&column| sees(column, row))
+            // Find any column of the row in the field: the one at the axis, or one of 64 samples.
+            let samples = (0..64).map(|k| (u64::from(camera.width_px) * k / 64) as u32);
+            let Some(seen) = [middle].into_iter().chain(samples).find(|&column| sees(column, row))
             else {
                 return [0, 0];
             };
@@ -38,13 +40,13 @@ impl FieldMask {
         Some(Self { columns: columns.collect() })
     }
 
-    /// The share of the image that is seen.
+    /// Share of the image's pixels in the field, 0 to 1.
     pub fn visible_share(&self, camera: &Camera) -> f64 {
         let seen: u64 = self.columns.iter().map(|[first, end]| u64::from(end - first)).sum();
         seen as f64 / camera.pixels() as f64
     }
 
-    /// Zeroes what is not seen, of an image with so many values a pixel.
+    /// Sets pixels outside of the field to the default value. `image` has `values` values per pixel.
     pub fn clear_outside<T: Default + Clone>(
         &self,
         camera: &Camera,
@@ -53,29 +55,33 @@ impl FieldMask {
     ) {
         let rows = image.chunks_mut(values * camera.width_px as usize);
         for (row, [first, end]) in rows.zip(&self.columns) {
-            let (first, end) = (values * *first as usize, values * *end as usize);
+            let first = values * *first as usize;
+            let end = values * *end as usize;
             row[..first].fill(T::default());
             row[end..].fill(T::default());
         }
     }
 }
 
-/// Places along the border of an image, 33 a side.
+/// Pixels along the border of an image, 33 per side.
 fn border(camera: &Camera) -> impl Iterator<Item = [u32; 2]> {
-    let (right, bottom) = (camera.width_px - 1, camera.height_px - 1);
+    let right = camera.width_px - 1;
+    let bottom = camera.height_px - 1;
     let along = |most: u32, k: u32| (u64::from(most) * u64::from(k) / 32) as u32;
     (0..=32).flat_map(move |k| {
-        let (x, y) = (along(right, k), along(bottom, k));
+        let x = along(right, k);
+        let y = along(bottom, k);
         [[x, 0], [x, bottom], [0, y], [right, y]]
     })
 }
 
-/// The column nearest to `end` that is seen, between it and one that is.
+/// The column nearest to `end` that is in the field, by bisection between `end` and `seen`, which is in it.
 fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
     if sees(end) {
         return end;
     }
-    let (mut out, mut within) = (end, seen);
+    let mut out = end;
+    let mut within = seen;
     while out.abs_diff(within) > 1 {
         let middle = out.midpoint(within);
         if sees(middle) {
@@ -87,23 +93,26 @@ fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
     within
 }
 
-/// What of a lens decides whether something may be seen: a cone around its axis.
+/// Bounds of a camera's projection around its axis, from which culling decides whether a Gaussian may be
+/// visible.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FieldCone {
-    /// All pixels' rays are within this angle of the axis, in radians.
+    /// Every pixel's ray is within this angle of the axis, in radians.
     pub image_rad: f64,
-    /// Beyond, the distance from the axis' pixel grows by at least so many pixels a radian.
+    /// Beyond [`FieldCone::image_rad`], the distance from the principal point grows by at least this many
+    /// pixels per radian.
     pub least_px_per_rad: f64,
-    /// Nowhere within [`WIDEST_RAD`] do two rays land farther apart than so many pixels a radian.
+    /// Upper bound within [`WIDEST_RAD`] of the pixels between two projected rays per radian between them.
     pub most_px_per_rad: f64,
 }
 
 impl FieldCone {
-    /// Steps of the angle off the axis, and of the azimuth, at which a lens is looked at.
+    /// Number of angles off the axis and of azimuths at which the projection is sampled.
     const STEPS: u32 = 64;
     const AZIMUTHS: u32 = 16;
 
-    /// Of a lens, from a thousand of its rays. What lies between two of them is granted a fifth.
+    /// Bounds of a camera from a thousand samples of its projection, with a margin of a fifth for what lies
+    /// between samples.
     pub fn of(camera: &Camera) -> Self {
         let axis_px = DVec2::new(camera.pinhole.cx, camera.pinhole.cy);
         let corner_px = axis_px.abs().max((camera.size_px() - axis_px).abs()).length();

@@ -1,4 +1,4 @@
-//! NVIDIA's f-theta: a polynomial between the angle off the axis and the distance in pixels.
+//! NVIDIA's f-theta model: a polynomial between the angle off the axis and the distance in pixels.
 
 use glam::{DMat2, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -10,8 +10,8 @@ use super::monotone::{MonotonePolynomial, TERMS};
 /// `pixel = [[c, d], [e, 1]] r(θ) (x, y)/|(x, y)| + principal point`, for the angle
 /// `θ = atan2(|(x, y)|, z)` (NVIDIA's public description of its vehicle cameras).
 ///
-/// Calibrations give two polynomials, of which one is exact and the other its approximate inverse.
-/// Only the exact one, the reference, is kept here, and inverted by Newton's method.
+/// Calibrations give two polynomials: one is exact (the reference), the other approximates its inverse. Only
+/// the reference is kept here; it is inverted with Newton's method.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FTheta {
     reference: FThetaReference,
@@ -21,7 +21,7 @@ pub struct FTheta {
     rising: MonotonePolynomial,
 }
 
-/// Which way the exact polynomial goes.
+/// The direction of the reference polynomial.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FThetaReference {
@@ -32,11 +32,11 @@ pub enum FThetaReference {
 }
 
 impl FTheta {
-    /// Longest distance from the principal point, in pixels: what keeps a polynomial of pixels in f64.
+    /// Largest distance from the principal point, in pixels, so that powers of pixels stay within f64.
     const MOST_PX: f64 = 65_536.0;
 
-    /// With coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and how far off the axis
-    /// rays are seen.
+    /// A lens from the coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and the limit of its
+    /// field in radians off the axis.
     pub fn new(
         reference: FThetaReference,
         polynomial: [f64; 6],
@@ -55,7 +55,7 @@ impl FTheta {
         Self { reference, polynomial, linear_cde, max_angle_rad, rising }
     }
 
-    /// Which way the polynomial goes.
+    /// The direction of the polynomial.
     pub fn reference(&self) -> FThetaReference {
         self.reference
     }
@@ -70,12 +70,12 @@ impl FTheta {
         self.linear_cde
     }
 
-    /// The angle off the axis that was asked for.
+    /// The field's limit as given, in radians off the axis.
     pub fn max_angle_rad(&self) -> f64 {
         self.max_angle_rad
     }
 
-    /// How far off the axis it sees.
+    /// Where the field ends, in radians off the axis: at most [`FTheta::max_angle_rad`].
     pub fn limit_rad(&self) -> f64 {
         match self.reference {
             FThetaReference::AngleToPixel => self.rising.end(),
@@ -91,7 +91,8 @@ impl FTheta {
         DVec2::new(self.linear_cde[0], 1.0) * self.central_px()
     }
 
-    /// How far from the principal point an angle off the axis lands before `[[c, d], [e, 1]]`, in pixels.
+    /// `r(θ)`: distance from the principal point in pixels, before `[[c, d], [e, 1]]`, of an angle off the
+    /// axis in radians.
     #[inline(always)]
     pub fn radius_px(&self, angle_rad: f64) -> f64 {
         match self.reference {
@@ -100,7 +101,7 @@ impl FTheta {
         }
     }
 
-    /// The angle off the axis that lands so far from the principal point, the other way.
+    /// The inverse of [`FTheta::radius_px`], in radians.
     pub fn angle_rad(&self, radius_px: f64) -> f64 {
         match self.reference {
             FThetaReference::AngleToPixel => self.rising.invert(radius_px),
@@ -108,7 +109,7 @@ impl FTheta {
         }
     }
 
-    /// The reference polynomial, as far as it is used: radians to pixels, or the other way.
+    /// The reference polynomial on the range that is used: radians to pixels or pixels to radians.
     pub fn rising(&self) -> &MonotonePolynomial {
         &self.rising
     }
@@ -119,7 +120,7 @@ impl FTheta {
         DMat2::from_cols(DVec2::new(c, e), DVec2::new(d, 1.0))
     }
 
-    /// The same for an image that is `scale` times as wide and high.
+    /// The lens of an image that is `scale.x` times as wide and `scale.y` times as high.
     pub(super) fn scaled(&self, scale: DVec2) -> Self {
         let [c, d, e] = self.linear_cde;
         let wider = scale.x / scale.y;
@@ -151,13 +152,14 @@ impl FTheta {
         super::check_field("lens", self.limit_rad())
     }
 
-    /// Where a direction lands, in pixels from the principal point; beyond the limit it goes on straight.
+    /// Projects a direction, in pixels from the principal point; extrapolates linearly in the angle beyond
+    /// the limit.
     #[inline(always)]
     pub(super) fn offset_px(&self, direction: DVec3) -> DVec2 {
         self.linear() * radial(direction, |angle| self.radius_px(angle), self.central_px())
     }
 
-    /// The unit direction that lands there, if it is within the limit.
+    /// The unit direction that projects to `offset_px`, or `None` beyond the limit.
     pub(super) fn direction(&self, offset_px: DVec2) -> Option<DVec3> {
         let round = self.linear().inverse() * offset_px;
         at_angle(round, self.angle_rad(round.length()), self.limit_rad())

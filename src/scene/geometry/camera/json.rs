@@ -1,4 +1,4 @@
-//! Lenses and windshields as rig files and camera lists write them.
+//! JSON of lenses and windshields in rig files and camera lists.
 //!
 //! ```text
 //! {"model": "opencv", "k": [k1, .. k6], "p": [p1, p2], "s": [s1, .. s4]}
@@ -15,22 +15,22 @@ use super::{
     Windshield, WindshieldReference,
 };
 
-/// A camera without its place: what JSON says of it.
+/// The intrinsics of a camera as JSON holds them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Width and height, in pixels.
     pub size_px: [u32; 2],
-    /// Focal lengths, in pixels; an f-theta lens has its own.
+    /// Focal lengths x and y, in pixels. `None` for an f-theta lens, whose polynomial defines them.
     pub focal_px: [Option<f64>; 2],
     /// Principal point, in pixels.
     pub center_px: [f64; 2],
-    /// What is no pinhole.
+    /// The lens; `None` for a pinhole.
     pub lens: Option<LensFields>,
-    /// What stands before it.
+    /// The windshield before the lens.
     pub windshield: Option<WindshieldFields>,
 }
 
-/// A lens.
+/// JSON of a lens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "lowercase", deny_unknown_fields)]
 pub enum LensFields {
@@ -49,28 +49,28 @@ pub enum LensFields {
     Fisheye {
         /// k1 to k4.
         k: [f64; 4],
-        /// How far off the axis it sees, in radians; as far as the polynomial rises if absent.
+        /// Limit of the field, in radians off the axis; by default where the polynomial stops rising.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max_angle: Option<f64>,
     },
     /// NVIDIA's f-theta.
     Ftheta {
-        /// Which way the polynomial goes.
+        /// The direction of the polynomial.
         reference: FThetaReference,
         /// Coefficients of powers 0 to 5.
         polynomial: [f64; 6],
         /// `[c, d, e]` of `[[c, d], [e, 1]]`.
         linear_cde: [f64; 3],
-        /// How far off the axis it sees, in radians.
+        /// Limit of the field, in radians off the axis.
         max_angle: f64,
     },
 }
 
-/// A windshield.
+/// JSON of a windshield.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WindshieldFields {
-    /// Which way the polynomials go.
+    /// The direction of the polynomials.
     pub reference: WindshieldReference,
     /// Coefficients of the angle to the right.
     pub horizontal: Vec<f64>,
@@ -79,10 +79,10 @@ pub struct WindshieldFields {
 }
 
 impl Intrinsics {
-    /// The camera that they describe; whether it can be used is for [`Camera::check`] to say.
+    /// The camera with these intrinsics. The caller checks it with [`Camera::check`].
     ///
     /// # Errors
-    /// A focal length is missing, or a windshield has no polynomial's number of coefficients.
+    /// A focal length is missing, or the number of a windshield's coefficients fits no polynomial.
     pub fn camera(&self) -> Result<Camera, CameraError> {
         let lens = self.lens.as_ref().map(LensFields::lens).unwrap_or_default();
         let own = match &lens {
@@ -100,7 +100,7 @@ impl Intrinsics {
         Ok(Camera { width_px, height_px, pinhole, lens, windshield })
     }
 
-    /// What describes a camera.
+    /// The intrinsics of a camera.
     pub fn of(camera: &Camera) -> Self {
         let Pinhole { fx, fy, cx, cy } = camera.pinhole;
         Self {

@@ -1,8 +1,24 @@
-//! Camera models: one file each.
+//! Camera models, one file each.
 //!
-//! A direction in the camera's frame goes through the windshield, if there is one, then through the
-//! lens, and lands on a pixel. What a lens does not see is not drawn: every model has a valid field
-//! that ends before the image would fold back, and nothing outside of it is ever projected.
+//! A direction in the camera frame is refracted by the windshield, if there is one, and then projected by the
+//! lens to a pixel. Each lens has a valid field that ends before the image would fold back; pixels outside of
+//! it are not drawn.
+//!
+//! # Extrapolation beyond the field
+//! The projection of a Gaussian needs points of it that may lie outside of the field, where the model folds
+//! back or is undefined. There it is continued linearly in the angle ([`Camera::project_extrapolated`]). The
+//! limit belongs to the lens and not to the image, so that rendering a part of an image gives the same pixels
+//! as the whole, except for images that reach beyond 73° off the axis with a model of slopes (pinhole, OpenCV).
+//! These are continued linearly from slope 4, 76° off the axis, or from the farthest corner. With a limit of
+//! 8, where slopes rise by 65 per radian, a road below the camera was torn into splats that reached into the
+//! image: 42 dB behind a windshield and 28 dB with a shutter that rolls from the right, instead of 47 to
+//! 49 dB. Pixels outside of the field are masked in the final image ([`FieldMask`]), since no bound on splats
+//! keeps them empty.
+//!
+//! # Depth
+//! Depth is the distance to the camera for lenses that may see 90° and more (fisheye, f-theta), where z is
+//! neither an order nor a distance. It is z for pinhole and OpenCV lenses, so that a small distortion changes
+//! little.
 
 pub mod field;
 pub mod fisheye;
@@ -25,32 +41,50 @@ pub use pinhole::Pinhole;
 pub use shutter::{Shutter, ShutterDirection};
 pub use windshield::{Bivariate, Windshield, WindshieldReference};
 
-/// The widest field of any lens, in radians off the axis: 160°. Where all directions but one land on a
-/// ring, pixels per radian across the ring grow beyond all bounds; at 160° they are three times those
-/// along it.
+/// Upper limit of the field of every lens, in radians off the axis: 160°. Towards 180° a whole ring of pixels
+/// shows almost the same direction, so that pixels per radian around the ring grow without bound; at 160°
+/// they are three times those along the radius.
 pub const WIDEST_RAD: f64 = 2.8;
 
-/// An image size and the model that maps camera rays to its pixels.
+/// The intrinsics of a camera: an image size and the model that maps directions to pixels.
 ///
 /// Pixel (column, row) covers `[column, column + 1) x [row, row + 1)`; its centre is at +0.5.
+///
+/// ```
+/// use glam::{DVec2, DVec3};
+/// use wildcity_scene::geometry::Camera;
+/// use wildcity_scene::geometry::camera::Pinhole;
+///
+/// let pinhole = Pinhole { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
+/// let camera = Camera::checked(640, 480, pinhole)?;
+///
+/// // 1 m to the right at a depth of 10 m: 500 px / 10 m = 50 px right of the principal point.
+/// let point_m = DVec3::new(1.0, 0.0, 10.0);
+/// let at_px = camera.project(point_m).expect("in front of the camera");
+/// assert_eq!(at_px, DVec2::new(370.0, 240.0));
+///
+/// let direction = camera.unproject(at_px).expect("a pinhole sees all of its image");
+/// assert!((direction - point_m.normalize()).length() < 1e-12);
+/// # Ok::<(), wildcity_scene::geometry::CameraError>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Image width, in pixels.
     pub width_px: u32,
     /// Image height, in pixels.
     pub height_px: u32,
-    /// Focal lengths at the axis, and where the axis lands.
+    /// Focal lengths at the axis, and the principal point.
     pub pinhole: Pinhole,
-    /// What the lens does otherwise than a pinhole.
+    /// The lens model.
     pub lens: Lens,
-    /// What stands before the lens.
+    /// The windshield before the lens.
     pub windshield: Option<Windshield>,
 }
 
 /// How a lens maps the angle off its axis to the image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Lens {
-    /// By its tangent: straight lines stay straight.
+    /// No distortion: the distance from the principal point is proportional to the tangent of the angle.
     #[default]
     Pinhole,
     /// OpenCV's radial, tangential and thin prism distortion.
@@ -84,13 +118,13 @@ pub enum CameraError {
         /// What must hold instead.
         must: &'static str,
     },
-    /// An intrinsic is not there.
-    #[error("{field} is missing; only an f-theta lens has its focal lengths from its polynomial")]
+    /// A focal length is missing.
+    #[error("{field} is missing; only an f-theta lens takes its focal lengths from its polynomial")]
     Missing {
         /// `fx` or `fy`.
         field: &'static str,
     },
-    /// A part of an image does not lie within it.
+    /// A crop is not within the image.
     #[error(
         "crop is {left}, {top}, {width} x {height} px; it must lie within the image of {of_width} x {of_height} px"
     )]
@@ -103,15 +137,15 @@ pub enum CameraError {
         width: u64,
         /// Rows.
         height: u64,
-        /// Columns that there are.
+        /// Width of the image, in pixels.
         of_width: u32,
-        /// Rows that there are.
+        /// Height of the image, in pixels.
         of_height: u32,
     },
 }
 
 impl CameraError {
-    /// The field at fault, as it is called in camera files and on the wire.
+    /// The field at fault, by its name in camera files and on the wire.
     pub fn field(&self) -> &'static str {
         match self {
             Self::Size { field, .. } | Self::Intrinsic { field, .. } | Self::Missing { field } => {
@@ -123,18 +157,19 @@ impl CameraError {
 }
 
 impl Camera {
-    /// The largest accepted side, in pixels: 16 K panoramas, and 16-bit tile coordinates suffice.
+    /// Largest accepted width or height, in pixels: enough for 16 K panoramas, and tile coordinates fit
+    /// 16 bits.
     pub const MAX_SIDE_PX: u32 = 16_384;
 
-    /// Least share of an image that its lens must see.
+    /// Smallest accepted share of the image that is within the lens' field.
     const LEAST_SHARE: f64 = 0.125;
 
-    /// A pinhole camera of these pixels, as it is.
+    /// A pinhole camera, not checked.
     pub fn from_pinhole(width_px: u32, height_px: u32, pinhole: Pinhole) -> Self {
         Self { width_px, height_px, pinhole, lens: Lens::Pinhole, windshield: None }
     }
 
-    /// A pinhole camera from outside, all in pixels.
+    /// A pinhole camera from untrusted input, all in pixels.
     ///
     /// # Errors
     /// Names the first field that cannot be used.
@@ -145,6 +180,8 @@ impl Camera {
         Ok(camera)
     }
 
+    /// Checks size, intrinsics, lens and windshield.
+    ///
     /// # Errors
     /// Names the first field that cannot be used.
     pub fn check(&self) -> Result<(), CameraError> {
@@ -163,7 +200,7 @@ impl Camera {
             windshield.check(self.corner_rad())?;
         }
         if self.lens != Lens::Pinhole {
-            // Middles of 16 x 16 parts.
+            // Sample the centres of a grid of 16 x 16 parts of the image.
             let part = |i: u32| (f64::from(i) + 0.5) / 16.0;
             let at = |i: u32| DVec2::new(part(i % 16), part(i / 16)) * self.size_px();
             let seen = (0..256).filter(|&i| self.unproject(at(i)).is_some()).count();
@@ -180,18 +217,18 @@ impl Camera {
         Ok(())
     }
 
-    /// Pixels in the image.
+    /// Number of pixels of the image.
     pub fn pixels(&self) -> usize {
         self.width_px as usize * self.height_px as usize
     }
 
-    /// Whether it is a pinhole and nothing else.
+    /// Whether this is a pinhole without a windshield.
     pub fn is_pinhole(&self) -> bool {
         self.lens == Lens::Pinhole && self.windshield.is_none()
     }
 
-    /// Where a camera-space point lands, in pixels, on the image or beside it; `None` outside of the
-    /// valid field.
+    /// Projects a camera-space point, in metres, to pixels, possibly outside of the image. `None` outside of
+    /// the valid field.
     pub fn project(&self, point_m: DVec3) -> Option<DVec2> {
         let inside = self.inside(point_m);
         let off_axis = inside.truncate().length();
@@ -205,18 +242,21 @@ impl Camera {
         seen.then(|| self.land(inside, OpenCv::MOST_SLOPE))
     }
 
-    /// Where a camera-space point lands if the model is continued beyond its field: at the same rate
-    /// in the angle as at its end. For the shape of what reaches into the field from beyond.
+    /// Projects a camera-space point, in metres, to pixels. Beyond its field the model is continued linearly
+    /// in the angle, at the rate that it has at the limit. Used for the shape of Gaussians that reach into the
+    /// field from outside.
     #[inline(always)]
     pub fn project_extrapolated(&self, point_m: DVec3) -> DVec2 {
         self.land(self.inside(point_m), self.extrapolation_slope())
     }
 
-    /// The slope from which pinholes and OpenCV's lenses are continued straight in the angle: 4, 76° off the
-    /// axis, or where the farthest corner of the image is, but never beyond 8.
+    /// The slope (tangent of the angle off the axis) from which pinhole and OpenCV lenses are extrapolated
+    /// linearly in the angle: 4, 76° off the axis, or the slope of the farthest corner of the image if that is
+    /// larger, at most 8.
     ///
-    /// A slope grows with the square of its own per radian: at 8, what lies beside the camera, a road below
-    /// it, is torn into splats of some hundred pixels that reach into the image. At 4 none did.
+    /// The slope's derivative by the angle is `1 + slope²`. With a limit of 8, geometry beside the camera, such
+    /// as the road below it, was torn into splats of some hundred pixels that reached into the image. With 4
+    /// none did.
     #[inline(always)]
     pub fn extrapolation_slope(&self) -> f64 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
@@ -226,8 +266,8 @@ impl Camera {
         (corner / OpenCv::LEAST_FACTOR).clamp(4.0, OpenCv::MOST_SLOPE)
     }
 
-    /// The unit direction in the camera's frame that lands on a place of the image, in pixels; `None`
-    /// outside of the valid field.
+    /// The unit direction in the camera frame that projects to an image position, in pixels. `None` outside
+    /// of the valid field.
     pub fn unproject(&self, at_px: DVec2) -> Option<DVec3> {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let offset_px = at_px - DVec2::new(cx, cy);
@@ -244,20 +284,20 @@ impl Camera {
         })
     }
 
-    /// What is called depth of a camera-space point, in metres: its z where the field is that of a
-    /// pinhole, its distance where there may be something at 90° and beyond.
+    /// Depth of a camera-space point, in metres: its distance for lenses that may see 90° and more (fisheye,
+    /// f-theta), its z for all others.
     #[inline(always)]
     pub fn depth_m(&self, point_m: DVec3) -> f64 {
         if self.depth_is_distance() { point_m.length() } else { point_m.z }
     }
 
-    /// Whether depth is distance.
+    /// Whether depth is the distance to the camera, and not z.
     #[inline(always)]
     pub fn depth_is_distance(&self) -> bool {
         matches!(self.lens, Lens::Fisheye(_) | Lens::FTheta(_))
     }
 
-    /// How far off the axis the lens sees, in radians.
+    /// Limit of the lens' field, in radians off the axis.
     pub fn limit_rad(&self) -> f64 {
         match &self.lens {
             Lens::Pinhole => std::f64::consts::FRAC_PI_2,
@@ -267,15 +307,15 @@ impl Camera {
         }
     }
 
-    /// Width and height, in pixels.
+    /// Width and height of the image, in pixels.
     pub fn size_px(&self) -> DVec2 {
         DVec2::new(f64::from(self.width_px), f64::from(self.height_px))
     }
 
-    /// The same view in an image of another size.
+    /// The camera with the same field of view and an image of another size, in pixels.
     ///
     /// # Errors
-    /// The size, or what it makes of the intrinsics, cannot be used.
+    /// The size or the scaled intrinsics are out of range.
     pub fn scaled(&self, width_px: u64, height_px: u64) -> Result<Self, CameraError> {
         let [width_px, height_px] = sides(width_px, height_px)?;
         let scale = DVec2::new(f64::from(width_px), f64::from(height_px)) / self.size_px();
@@ -292,17 +332,16 @@ impl Camera {
         Ok(scaled)
     }
 
-    /// A part of the image, from a column and a row on.
+    /// The camera whose image is a part of this one's: first column and row, then width and height.
     ///
     /// # Errors
-    /// It is not within the image, or the lens does not see it.
-    pub fn cropped(
-        &self,
-        [left, top]: [u64; 2],
-        [width, height]: [u64; 2],
-    ) -> Result<Self, CameraError> {
+    /// The part is not within the image, or too little of it is within the lens' field.
+    pub fn cropped(&self, at_px: [u64; 2], size_px: [u64; 2]) -> Result<Self, CameraError> {
+        let [left, top] = at_px;
+        let [width, height] = size_px;
         let [width_px, height_px] = sides(width, height)?;
-        let (of_width, of_height) = (self.width_px, self.height_px);
+        let of_width = self.width_px;
+        let of_height = self.height_px;
         let within = left <= u64::from(of_width - width_px.min(of_width))
             && top <= u64::from(of_height - height_px.min(of_height))
             && width_px <= of_width
@@ -317,7 +356,7 @@ impl Camera {
         Ok(cropped)
     }
 
-    /// The direction behind the windshield.
+    /// The direction behind the windshield: the one that reaches the lens.
     #[inline(always)]
     fn inside(&self, point_m: DVec3) -> DVec3 {
         match &self.windshield {
@@ -326,11 +365,13 @@ impl Camera {
         }
     }
 
-    /// Where a direction behind the windshield lands; what has slopes goes on straight from one on.
+    /// Projects a direction behind the windshield to pixels. Models of slopes are extrapolated linearly in the
+    /// angle from slope `straight` on.
     #[inline(always)]
     fn land(&self, inside: DVec3, straight: f64) -> DVec2 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
-        let (focal_px, center_px) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
+        let focal_px = DVec2::new(fx, fy);
+        let center_px = DVec2::new(cx, cy);
         match &self.lens {
             Lens::Pinhole => center_px + focal_px * Pinhole::extrapolated_slope(inside, straight),
             Lens::OpenCv(lens) => center_px + focal_px * lens.plane(inside, straight),
@@ -339,8 +380,8 @@ impl Camera {
         }
     }
 
-    /// How far off the axis the corners of the image look behind the windshield, in radians: as far as the
-    /// lens sees, where it does not see them.
+    /// The largest angle off the axis of the image's corners behind the windshield, in radians. Corners
+    /// outside of the lens' field count with the limit of the field.
     pub fn corner_rad(&self) -> f64 {
         let bare = Self { windshield: None, ..*self };
         let corners = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
@@ -351,13 +392,14 @@ impl Camera {
         angles_rad.into_iter().fold(0.0, f64::max)
     }
 
-    /// An f-theta lens has its focal lengths from its polynomial; what else is said must agree.
+    /// The focal lengths of an f-theta lens follow from its polynomial; given ones must agree with these.
     fn check_focal_px(&self, lens: &FTheta) -> Result<(), CameraError> {
         let DVec2 { x, y } = lens.focal_px();
         for (field, value, derived) in [("fx", self.pinhole.fx, x), ("fy", self.pinhole.fy, y)] {
             let agrees = (value - derived).abs() <= 1e-6 * derived;
             if !agrees {
-                let must = "an f-theta lens has its focal lengths from its polynomial: leave fx and fy out";
+                let must =
+                    "an f-theta lens takes its focal lengths from its polynomial: omit fx and fy";
                 return Err(CameraError::Intrinsic { field, value, must });
             }
         }
@@ -366,7 +408,7 @@ impl Camera {
 }
 
 impl Lens {
-    /// OpenCV's model; a pinhole where all coefficients are zero, so that it is drawn as one.
+    /// An OpenCV lens, or a pinhole if all coefficients are zero, so that it takes the faster path.
     pub fn opencv(lens: OpenCv) -> Self {
         if lens.is_pinhole() { Self::Pinhole } else { Self::OpenCv(lens) }
     }
@@ -381,11 +423,11 @@ fn sides(width: u64, height: u64) -> Result<[u32; 2], CameraError> {
     Ok([side("width", width)?, side("height", height)?])
 }
 
-/// Coefficients beyond this are mistakes: a calibration in pixels has 1e5.
-const MOST: f64 = 1e9;
+/// Largest accepted magnitude of a coefficient. Calibrations in pixels reach 1e5; larger is a mistake.
+const MAX_COEFFICIENT: f64 = 1e9;
 
 fn check_numbers(field: &'static str, numbers: &[f64]) -> Result<(), CameraError> {
-    let usable = |value: &f64| value.is_finite() && value.abs() <= MOST;
+    let usable = |value: &f64| value.is_finite() && value.abs() <= MAX_COEFFICIENT;
     match numbers.iter().copied().find(|value| !usable(value)) {
         None => Ok(()),
         Some(value) => {
@@ -405,7 +447,8 @@ fn check_max_angle(max_angle_rad: Option<f64>) -> Result<(), CameraError> {
     }
 }
 
-/// A lens that sees less than this, in radians off its axis, has a polynomial that falls from the start.
+/// Smallest accepted field, in radians off the axis. A smaller one means a polynomial that falls from the
+/// start.
 const LEAST_FIELD_RAD: f64 = 1e-3;
 
 fn check_field(field: &'static str, value: f64) -> Result<(), CameraError> {

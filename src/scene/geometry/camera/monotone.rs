@@ -1,26 +1,26 @@
-//! Polynomials that rise: from the angle off the axis to a distance on the image, or the other way.
+//! Monotone polynomials: from the angle off the axis to the distance on the image, or the inverse.
 
-/// Coefficients of a polynomial, the constant first.
+/// Number of coefficients of a polynomial: powers 0 to 9.
 pub const TERMS: usize = 10;
 
-/// A polynomial that is 0 at 0, on the range from 0 on over which it rises.
+/// A polynomial with value 0 at 0, restricted to the range `0..=end` on which it rises.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MonotonePolynomial {
     coefficients: [f64; TERMS],
-    /// Where the range ends; 0 if it does not even begin.
+    /// End of the range; 0 if the polynomial does not rise at 0.
     end: f64,
 }
 
 impl MonotonePolynomial {
-    /// How much of its slope at 0 a polynomial must keep: a pixel at the end of the range sees fifty
-    /// times the angle of one in the middle, and beyond, the image would fold back.
+    /// The range ends where the slope falls below this share of the slope at 0. A pixel there covers fifty
+    /// times the angle of one in the centre; farther out the image would fold back.
     const LEAST_SLOPE: f64 = 0.02;
 
-    /// Steps in which the end is looked for, before it is halved to the last bit: the slope of a
-    /// polynomial of degree 9 has at most eight zeros.
+    /// Number of steps in which the end of the range is searched before it is bisected to the last bit. It
+    /// is large because the slope of a polynomial of degree 9 may have eight zeros.
     const STEPS: u32 = 2048;
 
-    /// The polynomial on as much of `0..=most` as it rises over.
+    /// The polynomial on the largest range `0..=end` within `0..=most` on which it rises.
     pub(super) fn new(coefficients: [f64; TERMS], most: f64) -> Self {
         let mut rising = Self { coefficients, end: 0.0 };
         let central = rising.slope(0.0);
@@ -30,12 +30,12 @@ impl MonotonePolynomial {
         };
         let usable = rises(0.0) && coefficients[0] == 0.0 && most.is_finite() && most > 0.0;
         if usable {
-            rising.end = last(rises, most, Self::STEPS);
+            rising.end = largest_valid(rises, most, Self::STEPS);
         }
         rising
     }
 
-    /// Its value; beyond the end it goes on straight.
+    /// The value at `x` (Horner's scheme); beyond the end the tangent at the end.
     #[inline(always)]
     pub fn at(&self, x: f64) -> f64 {
         let within = x.min(self.end);
@@ -43,13 +43,13 @@ impl MonotonePolynomial {
         if x > self.end { value + self.slope(self.end) * (x - self.end) } else { value }
     }
 
-    /// Its slope within the range.
+    /// The derivative at `x`, for `x` within the range.
     #[inline(always)]
     pub fn slope(&self, x: f64) -> f64 {
         (1..TERMS).rev().fold(0.0, |sum, k| sum * x + k as f64 * self.coefficients[k])
     }
 
-    /// Where it reaches a value of at least 0; beyond the end, where its straight continuation does.
+    /// The inverse: the `x` with value `y`, for `y` of at least 0; beyond the end that of the tangent.
     pub fn invert(&self, y: f64) -> f64 {
         let top = self.at(self.end);
         let beyond = y >= top;
@@ -57,31 +57,34 @@ impl MonotonePolynomial {
             return self.end + (y - top) / self.slope(self.end);
         }
         let first = (y / self.slope(0.0)).clamp(0.0, self.end);
-        reaches(y, first, self.end, 1e-15, |x| [self.at(x), self.slope(x)])
+        invert_monotone(y, first, self.end, 1e-15, |x| [self.at(x), self.slope(x)])
     }
 
-    /// Of powers 0 to 9.
+    /// Coefficients of powers 0 to 9.
     pub fn coefficients(&self) -> &[f64; TERMS] {
         &self.coefficients
     }
 
-    /// Where the range ends.
+    /// End of the range; 0 if the polynomial does not rise at 0.
     pub fn end(&self) -> f64 {
         self.end
     }
 }
 
-/// Where something that rises from 0 to an end, given with its slope, reaches a value; the end if that is
-/// beyond. Newton's steps from a first guess, and halves of what is left where one would leave it, until one is
-/// below a share of the end.
-pub(super) fn reaches(
+/// The `x` in `0..=end` at which a rising function has a value; `end` if it does not reach it. `at` gives the
+/// function's value and slope.
+///
+/// Newton's method from `first`, safeguarded by bisection: a step that would leave the bracket is replaced by
+/// the bracket's midpoint. It ends when a step is below `tolerance * end`.
+pub(super) fn invert_monotone(
     value: f64,
     first: f64,
     end: f64,
-    still: f64,
+    tolerance: f64,
     at: impl Fn(f64) -> [f64; 2],
 ) -> f64 {
-    let (mut low, mut high) = (0.0, end);
+    let mut low = 0.0;
+    let mut high = end;
     let mut x = first;
     for _ in 0..64 {
         let [here, slope] = at(x);
@@ -93,7 +96,7 @@ pub(super) fn reaches(
         }
         let next = x - off / slope;
         let next = if next > low && next < high { next } else { 0.5 * (low + high) };
-        let done = (next - x).abs() <= still * end;
+        let done = (next - x).abs() <= tolerance * end;
         x = next;
         if done {
             break;
@@ -102,11 +105,13 @@ pub(super) fn reaches(
     x
 }
 
-/// The largest of `0..=most` up to which something holds, which does at 0.
-pub(super) fn last(holds: impl Fn(f64) -> bool, most: f64, steps: u32) -> f64 {
+/// The largest `x` in `0..=most` such that a condition, which holds at 0, holds on `0..=x`: the first of
+/// `steps` steps that violates it, refined by bisection.
+pub(super) fn largest_valid(holds: impl Fn(f64) -> bool, most: f64, steps: u32) -> f64 {
     let at = |step: u32| most * f64::from(step) / f64::from(steps);
     let Some(first_not) = (1..=steps).find(|&step| !holds(at(step))) else { return most };
-    let (mut low, mut high) = (at(first_not - 1), at(first_not));
+    let mut low = at(first_not - 1);
+    let mut high = at(first_not);
     for _ in 0..60 {
         let middle = 0.5 * (low + high);
         if holds(middle) {
@@ -123,10 +128,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_ends_where_it_stops_rising_and_is_inverted_up_to_there() {
-        // θ - θ³/3 turns at 1, and has 2 % of its slope left at √0.98.
+    fn the_range_ends_where_the_polynomial_stops_rising_and_is_inverted_up_to_there() {
+        // θ - θ³/3 has its maximum at 1, and 2 % of its initial slope at √0.98.
         let mut coefficients = [0.0; TERMS];
-        (coefficients[1], coefficients[3]) = (1.0, -1.0 / 3.0);
+        coefficients[1] = 1.0;
+        coefficients[3] = -1.0 / 3.0;
         let rising = MonotonePolynomial::new(coefficients, 3.0);
         assert!((rising.end() - 0.98_f64.sqrt()).abs() < 1e-12, "{}", rising.end());
         for i in 0..=1000 {

@@ -1,42 +1,45 @@
-//! OpenCV's model of ordinary lenses: radial, tangential and thin prism distortion of the pinhole.
+//! OpenCV's model of ordinary lenses: a pinhole with radial, tangential and thin prism distortion.
 
 use glam::{DMat2, DVec2, DVec3};
 
 use super::CameraError;
 use super::fisheye::azimuth;
-use super::monotone::{last, reaches};
+use super::monotone::{invert_monotone, largest_valid};
 
 /// `(x, y) -> (x, y) icD + tangential + prism` of the slopes `x/z, y/z`, with
-/// `icD = (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's `projectPoints`).
+/// `icD = (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV, `projectPoints`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OpenCv {
     k: [f64; 6],
     p: [f64; 2],
     s: [f64; 4],
-    /// The slope up to which it is used: see [`OpenCv::limit_slope`].
+    /// See [`OpenCv::limit_slope`].
     limit_slope: f64,
 }
 
 impl OpenCv {
-    /// Largest slope of a ray: 82.9° off the axis, where a pixel in the middle is 65 wide.
+    /// Largest slope of a ray: 82.9° off the axis, where one radian is `1 + 8²` = 65 times as many pixels as
+    /// at the axis.
     pub(super) const MOST_SLOPE: f64 = 8.0;
 
-    /// Least radial factor: below, calibrations have left the range that they were made in (gsplat's
-    /// bound).
+    /// Smallest radial factor `icD`. A smaller one means that the calibration is used outside of the range
+    /// that it was made for (gsplat has the same bound).
     pub(super) const LEAST_FACTOR: f64 = 0.8;
 
-    /// How much of its slope at the axis an image must keep in every direction, as of every lens.
+    /// Smallest derivative of the distortion in any direction, as a share of that at the axis (the same for
+    /// every lens model).
     const LEAST_RISE: f64 = 0.02;
 
-    /// How many times its slope at the axis an image may have in any direction: beyond, a rational lens is
-    /// close to a pole, and what reaches there from the field would be torn over the image. Of a lens with one
-    /// the image is 49 dB of per-pixel rays at 8, 33 dB at 16 and 15 dB at 50; an Azure Kinect stays below 2.
+    /// Largest derivative of the distortion in any direction, as a multiple of that at the axis. A larger one
+    /// means that a rational lens is close to a pole, where Gaussians that reach there would be torn over the
+    /// image. For a lens with a pole, the image agrees with per-pixel rays to 49 dB at 8, 33 dB at 16 and 15 dB
+    /// at 50; an Azure Kinect stays below 2.
     const MOST_RISE: f64 = 8.0;
 
-    /// Steps in which the limit is looked for.
+    /// Number of steps in which the limit is searched.
     const STEPS: u32 = 2048;
 
-    /// With coefficients k1 to k6, p1 and p2, s1 to s4.
+    /// A lens with coefficients k1 to k6, p1 and p2, s1 to s4.
     pub fn new(k: [f64; 6], p: [f64; 2], s: [f64; 4]) -> Self {
         let mut lens = Self { k, p, s, limit_slope: 0.0 };
         let usable = |slope: f64| {
@@ -47,7 +50,7 @@ impl OpenCv {
                 && across.min(along) - skew >= Self::LEAST_RISE
                 && across.max(along) + skew <= Self::MOST_RISE
         };
-        lens.limit_slope = last(usable, Self::MOST_SLOPE, Self::STEPS);
+        lens.limit_slope = largest_valid(usable, Self::MOST_SLOPE, Self::STEPS);
         lens
     }
 
@@ -71,11 +74,11 @@ impl OpenCv {
         self.s
     }
 
-    /// How far off the axis it sees, as a slope: as far as `icD` is above 0.8, and the image neither folds
-    /// back nor is torn, but never beyond 8.
+    /// Limit of the field, as the slope (tangent) of the angle off the axis: the largest slope, at most 8, up
+    /// to which `icD` is above 0.8 and the derivative of the distortion is within its bounds.
     ///
-    /// Up to there `distort` leaves the order of slopes as it is: `(distort(b) - distort(a)) . (b - a) > 0`
-    /// of any two, since the symmetric part of its Jacobian is positive definite all over the disc.
+    /// Up to there `distort` is monotone: `(distort(b) - distort(a)) . (b - a) > 0` for any two slopes, since
+    /// the symmetric part of its Jacobian is positive definite on the whole disc.
     pub fn limit_slope(&self) -> f64 {
         self.limit_slope
     }
@@ -87,7 +90,7 @@ impl OpenCv {
         super::check_field(self.at_fault(), self.limit_slope.atan())
     }
 
-    /// The coefficients that end the field where it ends.
+    /// The coefficients that determine where the field ends, for error messages.
     pub(super) fn at_fault(&self) -> &'static str {
         let [tangential, prism] = self.skew(self.limit_slope);
         let alone = Self::new(self.k, [0.0; 2], [0.0; 4]).limit_slope;
@@ -100,8 +103,8 @@ impl OpenCv {
         }
     }
 
-    /// Where a direction lands, in focal lengths; beyond the limit, or this slope if that is sooner, it goes
-    /// on straight in the angle.
+    /// Projects a direction, in focal lengths from the principal point. Beyond the limit, or beyond slope
+    /// `straight` if that is less, it extrapolates linearly in the angle.
     #[inline(always)]
     pub(super) fn plane(&self, direction: DVec3, straight: f64) -> DVec2 {
         let end = straight.min(self.limit_slope);
@@ -117,10 +120,11 @@ impl OpenCv {
         self.distort(edge) + self.jacobian(edge) * azimuth * (slope_per_rad * beyond_rad)
     }
 
-    /// The unit direction that lands there, if it is within the limit.
+    /// The unit direction that projects to `plane`, or `None` beyond the limit.
     pub(super) fn direction(&self, plane: DVec2) -> Option<DVec3> {
         let most = self.limit_slope;
-        // Newton's steps from where the radial part alone would be, halved until they lead nearer.
+        // Damped Newton's method. It starts at the inverse of the radial part alone, and halves each step
+        // until it reduces the residual.
         let mut slope = plane.normalize_or_zero() * self.radial_slope(plane.length());
         let mut off = self.distort(slope) - plane;
         for _ in 0..32 {
@@ -130,15 +134,17 @@ impl OpenCv {
                 let next = (slope - step).clamp_length_max(1.01 * most);
                 let next_off = self.distort(next) - plane;
                 if next_off.length_squared() < off.length_squared() {
-                    (slope, off) = (next, next_off);
+                    slope = next;
+                    off = next_off;
                     break step.length_squared() <= 1e-30;
                 }
-                // Too little to lead anywhere, also where nothing is a number.
+                // Give up if the step is negligible; `moves` is also false for NaN.
                 let moves = step.length_squared() > 1e-30;
                 if !moves || halved == 16 {
                     break true;
                 }
-                (step, halved) = (0.5 * step, halved + 1);
+                step *= 0.5;
+                halved += 1;
             };
             if done {
                 break;
@@ -150,38 +156,41 @@ impl OpenCv {
         seen.then(|| slope.extend(1.0).normalize())
     }
 
-    /// Where `r icD(r)` reaches a distance, or the limit if that is sooner.
+    /// The slope `r` at which `r icD(r)` equals `distance`, at most the limit.
     fn radial_slope(&self, distance: f64) -> f64 {
         let first = distance.min(self.limit_slope);
-        reaches(distance, first, self.limit_slope, 1e-4, |slope| {
+        invert_monotone(distance, first, self.limit_slope, 1e-4, |slope| {
             let [across, along] = self.stretch(slope);
             [slope * across, along]
         })
     }
 
-    /// How much the radial part stretches the image at a slope: across the radius, and along it.
+    /// Derivatives of the radial part at a slope: perpendicular to the radius, and along it.
     #[inline(always)]
     fn stretch(&self, slope: f64) -> [f64; 2] {
         let (factor, rise) = self.radial(slope * slope);
         [factor, factor + 2.0 * slope * slope * rise]
     }
 
-    /// At most how much tangential and prism distortion add to that or take from it, in any direction at
-    /// any azimuth.
+    /// Upper bounds of the derivatives of the tangential and of the prism distortion at a slope, over all
+    /// azimuths and directions.
     ///
-    /// The tangential part is the gradient of `(p2 x + p1 y) r²`, whose second derivatives have eigenvalues
-    /// of at most `6 |p| r`; that of the prism is a product of two vectors.
+    /// The tangential part is the gradient of `(p2 x + p1 y) r²`, whose Hessian has eigenvalues of at most
+    /// `6 |p| r`. The Jacobian of the prism part is an outer product of two vectors.
     fn skew(&self, slope: f64) -> [f64; 2] {
-        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        let [p1, p2] = self.p;
+        let [s1, s2, s3, s4] = self.s;
         let r2 = slope * slope;
         let prism = DVec2::new(s1 + 2.0 * s2 * r2, s3 + 2.0 * s4 * r2).length();
         [6.0 * p1.hypot(p2) * slope, 2.0 * prism * slope]
     }
 
+    /// The distorted slopes (OpenCV, `projectPoints`).
     #[inline(always)]
     fn distort(&self, slope: DVec2) -> DVec2 {
         let DVec2 { x, y } = slope;
-        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        let [p1, p2] = self.p;
+        let [s1, s2, s3, s4] = self.s;
         let r2 = x * x + y * y;
         let (factor, _) = self.radial(r2);
         DVec2::new(
@@ -193,10 +202,12 @@ impl OpenCv {
     /// `∂distort/∂slope`.
     fn jacobian(&self, slope: DVec2) -> DMat2 {
         let DVec2 { x, y } = slope;
-        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        let [p1, p2] = self.p;
+        let [s1, s2, s3, s4] = self.s;
         let r2 = x * x + y * y;
         let (factor, rise) = self.radial(r2);
-        let (prism_x, prism_y) = (2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2));
+        let prism_x = 2.0 * (s1 + 2.0 * s2 * r2);
+        let prism_y = 2.0 * (s3 + 2.0 * s4 * r2);
         let across = 2.0 * x * y * rise;
         DMat2::from_cols(
             DVec2::new(
@@ -210,7 +221,7 @@ impl OpenCv {
         )
     }
 
-    /// `icD` and its derivative by r²; not a number where its denominator is not above zero.
+    /// `icD` and its derivative by r²; NaN where the denominator is not positive.
     #[inline(always)]
     fn radial(&self, r2: f64) -> (f64, f64) {
         let [k1, k2, k3, k4, k5, k6] = self.k;

@@ -1,4 +1,4 @@
-//! The pinhole: `u = fx x/z + cx`, `v = fy y/z + cy`.
+//! The pinhole model: `u = fx x/z + cx`, `v = fy y/z + cy` (OpenCV, `projectPoints`).
 
 use glam::{DVec2, DVec3};
 
@@ -19,11 +19,14 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// Focal lengths and principal points beyond this are mistakes, and would leave f32's comfort.
+    /// Larger focal lengths and principal points are taken for mistakes. They would also lose precision in
+    /// f32.
     const MAX_PX: f64 = 1e6;
 
+    /// Checks the intrinsics.
+    ///
     /// # Errors
-    /// Names the first intrinsic that is not finite, not positive, or absurd.
+    /// Names the first intrinsic that is not finite or out of range.
     pub fn check(&self) -> Result<(), CameraError> {
         for (field, value) in [("fx", self.fx), ("fy", self.fy)] {
             let usable = value.is_finite() && (1e-3..=Self::MAX_PX).contains(&value);
@@ -42,8 +45,9 @@ impl Pinhole {
         Ok(())
     }
 
-    /// The slopes x/z and y/z of a direction; from `straight` on, they rise with the angle as they do there,
-    /// and on behind the camera, so that the shape of what reaches there is finite.
+    /// The slopes x/z and y/z of a direction. Where the slope exceeds `straight`, it is continued linearly in
+    /// the angle off the axis, also behind the camera, so that every direction has a finite slope. The rate
+    /// is that of the tangent: `d tan θ / dθ = 1 + tan² θ`.
     #[inline(always)]
     pub(super) fn extrapolated_slope(direction: DVec3, straight: f64) -> DVec2 {
         let off_axis = direction.truncate().length();
@@ -56,7 +60,7 @@ impl Pinhole {
         azimuth(direction) * (straight + per_rad * beyond_rad)
     }
 
-    /// Where a camera-space point lands, in pixels; meaningless unless `z > 0`.
+    /// Projects a camera-space point to pixels; meaningless unless `z > 0`.
     pub fn project(&self, point_m: DVec3) -> DVec2 {
         DVec2::new(
             self.fx * point_m.x / point_m.z + self.cx,
@@ -70,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn absurd_intrinsics_are_named() {
+    fn errors_name_the_intrinsic_out_of_range() {
         let good = Pinhole { fx: 100.0, fy: 100.0, cx: 50.0, cy: 50.0 };
         assert_eq!(good.check(), Ok(()));
         for (bad, field) in [

@@ -1,22 +1,22 @@
-//! Rolling shutters: rows, or columns, are exposed one after the other.
+//! Rolling shutters: the rows or columns of an image are exposed one after the other.
 
 use glam::DVec2;
 use serde::{Deserialize, Serialize};
 
 use super::{Camera, CameraError};
 
-/// How an image is exposed. A global shutter is none of these.
+/// A rolling shutter. A camera with a global shutter has none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Shutter {
-    /// Which row or column comes first.
+    /// The order of exposure.
     pub direction: ShutterDirection,
-    /// From the exposure of the first row to that of the last, in microseconds. The image's time is
-    /// that of the last.
+    /// Time from the exposure of the first row to that of the last, in microseconds. The time of the image
+    /// is that of the last row.
     pub duration_us: i64,
 }
 
-/// The way a shutter rolls.
+/// The order in which a rolling shutter exposes rows or columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ShutterDirection {
@@ -31,29 +31,31 @@ pub enum ShutterDirection {
 }
 
 impl Shutter {
-    /// Longest exposure, in microseconds: a tenth of the slowest cameras' second.
+    /// Longest accepted duration, in microseconds: 0.1 s, the period of a camera at 10 Hz.
     pub const MAX_US: i64 = 100_000;
 
+    /// Checks the duration.
+    ///
     /// # Errors
-    /// The duration is not within 1 µs to [`Shutter::MAX_US`].
+    /// The duration is not from 1 µs to [`Shutter::MAX_US`].
     pub fn check(&self) -> Result<(), CameraError> {
         if (1..=Self::MAX_US).contains(&self.duration_us) {
             return Ok(());
         }
-        let must = "a shutter rolls for 1 to 100,000 µs; leave shutter out for a global one";
+        let must = "a rolling shutter takes 1 to 100,000 µs; omit shutter for a global one";
         let value = self.duration_us as f64;
         Err(CameraError::Intrinsic { field: "shutter.duration_us", value, must })
     }
 }
 
 impl ShutterDirection {
-    /// When a place on the image is exposed: 0 with the first row's middle, 1 with the last's, and
-    /// neither sooner nor later.
+    /// When an image position (in pixels) is exposed, as a fraction of the duration: 0 at the centre of the
+    /// first row, 1 at the centre of the last row, clamped to [0, 1].
     #[inline(always)]
     pub fn fraction(self, at_px: DVec2, camera: &Camera) -> f64 {
         let along = |at_px: f64, size_px: u32| {
             let last_px = f64::from(size_px) - 1.0;
-            // A single row is the last one.
+            // The only row of an image of one row counts as the last row.
             if last_px > 0.0 { (at_px - 0.5) / last_px } else { 1.0 }
         };
         let fraction = match self {

@@ -1,17 +1,18 @@
-//! A windshield before the lens: it turns rays by what two polynomials of their angles say.
+//! A windshield before the lens: it refracts rays by two bivariate polynomials of their angles.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use super::CameraError;
 
-/// Most coefficients of a polynomial: order 5.
+/// Number of coefficients of a bivariate polynomial of order 5, the highest supported.
 const MOST: usize = 21;
 
-/// `φ = asin(x/|p|)`, `θ = asin(y/|p|)` outside become `h(φ, θ)`, `v(φ, θ)` inside, or the other way
-/// (NVIDIA's public description of its bivariate windshield model).
+/// The angles `φ = asin(x/|p|)`, `θ = asin(y/|p|)` of a ray outside become `h(φ, θ)`, `v(φ, θ)` inside, or the
+/// reverse (NVIDIA's public description of its bivariate windshield model).
 ///
-/// Calibrations give polynomials both ways, of which one pair is exact. Only that is kept here.
+/// Calibrations give polynomials for both directions; one pair is exact (the reference). Only that is kept
+/// here, and inverted by fixed-point iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Windshield {
     reference: WindshieldReference,
@@ -19,17 +20,17 @@ pub struct Windshield {
     vertical: Bivariate,
 }
 
-/// Which way the exact polynomials go.
+/// The direction of the reference polynomials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WindshieldReference {
-    /// From the world's rays to the lens'.
+    /// From rays outside to rays at the lens.
     Forward,
-    /// From the lens' rays to the world's.
+    /// From rays at the lens to rays outside.
     Backward,
 }
 
-/// `Σ c φ^i θ^j`, for j from 0 and, within, i from 0 to order - j.
+/// `Σ c φ^i θ^j`. Coefficients are ordered by j, and within the same j by i from 0 to order - j.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bivariate {
     coefficients: [f64; MOST],
@@ -37,32 +38,32 @@ pub struct Bivariate {
 }
 
 impl Windshield {
-    /// It turns rays in full up to 81° off the axis, and not at all from 87° on: z as a share of their
-    /// length. Without an end, polynomials would turn what is beside the camera anywhere; with a sudden one,
-    /// a Gaussian across it would be torn.
+    /// The refraction fades out between these values of z of the unit direction: full above 0.15 (81° off the
+    /// axis), none below 0.05 (87°). Without a limit, the polynomials would refract rays beside the camera
+    /// arbitrarily; with an abrupt one, a Gaussian across it would be torn.
     pub const FADES_Z: [f64; 2] = [0.05, 0.15];
 
-    /// How far it may turn a ray, in radians. Real ones turn by 0.01.
+    /// Largest accepted refraction, in radians. Real windshields refract by 0.01.
     const MOST_RAD: f64 = 0.2;
 
-    /// How much the turning may differ between two rays, as a share of the angle between them: what
-    /// leaves the inversion halving its error at each step. Real ones have 0.02, and 0.26 far above
-    /// and below their image.
+    /// Largest accepted change of the refraction between two rays, per angle between them. With 0.5 the
+    /// fixed-point inversion at least halves its error in each step. Real windshields have 0.02, and 0.26 far
+    /// above and below the image.
     const MOST_CHANGE: f64 = 0.5;
 
-    /// Steps of the inversion: 2^-52 at worst.
+    /// Steps of the inversion: an error of 2^-52 at worst.
     const STEPS: u32 = 52;
 
-    /// Angles off the axis, up to 87°, and azimuths at which it is checked.
+    /// Number of angles off the axis, up to 87°, and of azimuths at which a windshield is checked.
     const RINGS: u32 = 128;
     const AZIMUTHS: u32 = 64;
 
-    /// With coefficients in the order of [`Bivariate`].
+    /// A windshield with coefficients in the order of [`Bivariate`].
     pub fn new(reference: WindshieldReference, horizontal: Bivariate, vertical: Bivariate) -> Self {
         Self { reference, horizontal, vertical }
     }
 
-    /// Which way the polynomials go.
+    /// The direction of the polynomials.
     pub fn reference(&self) -> WindshieldReference {
         self.reference
     }
@@ -77,8 +78,8 @@ impl Windshield {
         &self.vertical
     }
 
-    /// Checks it over every ray that is within an angle off the axis, in radians, on one side or the other:
-    /// with all of them turned evenly, none is met twice.
+    /// Checks the refraction of all rays within `corner_rad` of the axis, outside or inside. If it changes
+    /// slowly enough everywhere, no two rays are refracted to the same one.
     pub(super) fn check(&self, corner_rad: f64) -> Result<(), CameraError> {
         super::check_numbers("windshield.horizontal", self.horizontal.coefficients())?;
         super::check_numbers("windshield.vertical", self.vertical.coefficients())?;
@@ -100,6 +101,7 @@ impl Windshield {
         Ok(())
     }
 
+    /// Checks the refraction at a ray's angles: its size, and its derivative by central differences.
     fn check_at(&self, at: DVec2) -> Result<(), CameraError> {
         let refused =
             |value, must| Err(CameraError::Intrinsic { field: "windshield", value, must });
@@ -107,7 +109,7 @@ impl Windshield {
         let most = by(at).length();
         let little = most <= Self::MOST_RAD;
         if !little {
-            return refused(most, "a windshield turns rays by at most 0.2 rad");
+            return refused(most, "a windshield refracts rays by at most 0.2 rad");
         }
         let h = 1e-4;
         let change = [DVec2::X, DVec2::Y]
@@ -117,20 +119,20 @@ impl Windshield {
         if !even {
             return refused(
                 change,
-                "neighbouring rays are turned by less than half their angle apart, also where the turning \
-                 fades out, from 81 to 87 degrees off the axis; a max_angle below that leaves those out",
+                "the refraction of two rays differs by less than half the angle between them, also where it \
+                 fades out, from 81 to 87 degrees off the axis; a max_angle below that excludes those rays",
             );
         }
         Ok(())
     }
 
-    /// The unit direction inside, of a direction outside.
+    /// The unit direction at the lens of a direction outside.
     #[inline(always)]
     pub(super) fn inside(&self, outside: DVec3) -> DVec3 {
         self.turn(outside, WindshieldReference::Forward)
     }
 
-    /// The unit direction outside, of a direction inside.
+    /// The unit direction outside of a direction at the lens.
     pub(super) fn outside(&self, inside: DVec3) -> DVec3 {
         self.turn(inside, WindshieldReference::Backward)
     }
@@ -144,7 +146,7 @@ impl Windshield {
         let to = if way == self.reference {
             self.turned(from)
         } else {
-            // turned(x) = from, where x is nearly from.
+            // Solve turned(x) = from by fixed-point iteration; x is close to from.
             let mut x = from;
             for _ in 0..Self::STEPS {
                 let off = self.turned(x) - from;
@@ -159,7 +161,8 @@ impl Windshield {
         DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).normalize()
     }
 
-    /// What becomes of a ray's angles: what the polynomials say, and less of it where the turning fades.
+    /// The angles after refraction: those of the polynomials, blended with the unchanged angles where the
+    /// refraction fades out.
     fn turned(&self, at: DVec2) -> DVec2 {
         let [none, all] = Self::FADES_Z;
         let share = ((z(at) - none) / (all - none)).clamp(0.0, 1.0);
@@ -175,16 +178,16 @@ fn angles(unit: DVec3) -> DVec2 {
     DVec2::new(unit.x.clamp(-1.0, 1.0).asin(), unit.y.clamp(-1.0, 1.0).asin())
 }
 
-/// Of the unit direction with these angles; 0 where there is none.
+/// The z component of the unit direction with these angles; 0 where there is no such direction.
 fn z(angles_rad: DVec2) -> f64 {
     (1.0 - angles_rad.x.sin().powi(2) - angles_rad.y.sin().powi(2)).max(0.0).sqrt()
 }
 
 impl Bivariate {
-    /// From 1, 3, 6, 10, 15 or 21 coefficients: orders 0 to 5.
+    /// A polynomial of order 0 to 5 from its 1, 3, 6, 10, 15 or 21 coefficients.
     ///
     /// # Errors
-    /// Another number of them.
+    /// The number of coefficients is none of these.
     pub fn new(field: &'static str, coefficients: &[f64]) -> Result<Self, CameraError> {
         let count = coefficients.len();
         let whole = (0..=5).any(|order| (order + 1) * (order + 2) / 2 == count);
@@ -198,31 +201,35 @@ impl Bivariate {
         Ok(Self { coefficients: padded, count })
     }
 
-    /// As they were given.
+    /// The coefficients as they were given.
     pub fn coefficients(&self) -> &[f64] {
         &self.coefficients[..self.count]
     }
 
-    /// That of φ^i θ^j; 0 where there is none.
+    /// The coefficient of φ^i θ^j; 0 above the order.
     pub fn coefficient(&self, i: usize, j: usize) -> f64 {
         let order = self.order();
-        // Behind those of smaller j: order + 1, order, ... of them.
+        // Coefficients of smaller j come first: order + 1 of j = 0, order of j = 1, and so on.
         let first = j * (order + 1) - j * j.saturating_sub(1) / 2;
         if i + j <= order { self.coefficients[first + i] } else { 0.0 }
     }
 
-    /// The highest sum of powers.
+    /// The order: the highest sum of powers.
     pub fn order(&self) -> usize {
         (0..=5).find(|order| (order + 1) * (order + 2) / 2 == self.count).unwrap_or(0)
     }
 
     fn at(&self, angles_rad: DVec2) -> f64 {
         let order = self.order();
-        let (mut sum, mut power, mut rest) = (0.0, 1.0, self.coefficients());
+        let mut sum = 0.0;
+        let mut power = 1.0;
+        let mut rest = self.coefficients();
         for j in 0..=order {
             let (row, others) = rest.split_at(order + 1 - j);
+            // Horner's scheme in φ, times θ^j.
             sum += power * row.iter().rev().fold(0.0, |sum, c| sum * angles_rad.x + c);
-            (power, rest) = (power * angles_rad.y, others);
+            power *= angles_rad.y;
+            rest = others;
         }
         sum
     }

@@ -1,6 +1,6 @@
 //! Builds an observation: lays out its buffer, renders into it, and appends the encoded images.
 
-mod finish;
+pub(crate) mod finish;
 
 use std::mem;
 use std::sync::{Arc, OnceLock};
@@ -18,8 +18,6 @@ use crate::engine::render_queue::Scratch;
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
 use crate::options::PixelMaps;
-
-pub(crate) use self::finish::RenderedObservation;
 
 /// An observation that is being built: one capture after the other is rendered, then `finish` closes it.
 pub(crate) struct ObservationBuilder {
