@@ -17,9 +17,9 @@ fn apply_appearance(gathered: Sums, view: u32, at_px: vec2f) -> Sums {
     }
     let at = vec2u(at_px);
     if at.x < appearance.overlay_px.x && at.y < appearance.overlay_px.y {
-        let first = appearance.first_overlay + at.y * appearance.overlay_px.x + at.x;
         for (var k = 0u; k < 4u && at.x + k < appearance.overlay_px.x; k++) {
-            let over = unpack4x8unorm(overlays[first + k]);
+            let index = appearance.first_overlay + at.y * appearance.overlay_px.x + at.x + k;
+            let over = unpack4x8unorm(overlays[index]);
             sums.red[k] = mix(sums.red[k], over.r, over.a);
             sums.green[k] = mix(sums.green[k], over.g, over.a);
             sums.blue[k] = mix(sums.blue[k], over.b, over.a);

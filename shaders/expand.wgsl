@@ -82,6 +82,7 @@ fn list(
         range = vec2u(0u);
     }
     for (var start = range.x; start < range.y; start += EXPAND_BATCH) {
+        // Transpose the batch: from one word of tiles per splat to words of splats per tile.
         for (var k = thread; k < TILES * BATCH_WORDS; k += WORKGROUP) {
             atomicStore(&tile_splats[k], 0u);
         }
@@ -94,6 +95,7 @@ fn list(
             }
         }
         workgroupBarrier();
+        // For each tile, the index of the first instance of each word.
         if thread < TILES {
             for (var word = thread; word < TILES * BATCH_WORDS; word += TILES) {
                 word_starts[word] = next;
@@ -101,6 +103,7 @@ fn list(
             }
         }
         workgroupBarrier();
+        // Write the instances: each splat follows the nearer ones of its word.
         for (var i = start + thread; i < end; i += WORKGROUP) {
             let splat = touch_splats[i];
             let word = (i - start) / 32u * TILES;

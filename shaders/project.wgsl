@@ -3,7 +3,7 @@
 //
 // `cull` decides which Gaussians are visible and counts them, a prefix sum over the cluster views gives
 // each the index of its first splat, and `project` writes the visible splats, so that splats keep the
-// order of their cluster views. Twin of `src/render/cpu/project.rs`, where the equations are documented.
+// order of their cluster views. Twin of `src/render/cpu/project`, where the equations are documented.
 // `PROJECTION` stands for `pinhole` (static pinhole cameras) or `unscented` (lenses and rolling
 // shutters).
 

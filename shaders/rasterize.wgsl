@@ -65,6 +65,7 @@ fn main(
     var batches = 0u;
     let range = ranges[tile];
     for (var first = range.x; first < range.y; first += RASTER_BATCH) {
+        // End when all threads are done.
         workgroupBarrier();
         if thread == 0u {
             done_threads = atomicLoad(&done_count);
@@ -72,6 +73,7 @@ fn main(
         if workgroupUniformLoad(&done_threads) == THREADS {
             break;
         }
+        // Load a batch.
         batches++;
         let count = min(range.y - first, RASTER_BATCH);
         for (var k = thread; k < count; k += THREADS) {

@@ -12,12 +12,12 @@ use super::scene_source::SceneSource;
 
 /// Find the stage of the gpu backend that is wrong, if one is.
 ///
-/// Draws every camera of the list on the cpu backend, on the gpu backend, and with the stages up to
-/// project, sort and bin on the cpu and the rest on the GPU. Prints how close each comes to the cpu's
-/// colours, as PSNR in dB (inf where no value differs, NaN where the GPU counted more than a frame may
-/// hold). A stage is wrong if the image is wrong, below 60 dB, for as long as the GPU runs it, and
-/// right as soon as the cpu does. Exit code 1 if a camera has one. `wildcity render --cpu-through STAGE`
-/// shows the images.
+/// Draws each camera of the list on the cpu backend, on the gpu backend, and with the stages up to
+/// project, sort, or bin on the cpu and the rest on the GPU. Prints the PSNR of each image against the
+/// cpu's in dB (inf if no value differs, NaN if the GPU counted more than a frame can hold). A stage is
+/// wrong if the image is wrong (below 60 dB) when the GPU runs the stage, and right when the cpu runs it.
+/// The exit code is 1 if a camera has a wrong stage. `wildcity render --cpu-through STAGE` writes the
+/// images.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Bisect {
@@ -36,7 +36,8 @@ Examples:
 impl Bisect {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let ready = self.source.open()?;
-        let (cpu, gpu) = (self.hardware.cpu()?, self.hardware.gpu()?);
+        let cpu = self.hardware.cpu()?;
+        let gpu = self.hardware.gpu()?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
         let mut out = io::stdout().lock();

@@ -6,10 +6,10 @@ use serde_json::json;
 
 use wildcity_render::gpu::{DeviceInfo, devices};
 
-/// List the devices that the gpu backend could use, the fastest kind first.
+/// List the devices that the gpu backend can use, the fastest kind first.
 ///
-/// The number or a part of the name is what --device takes. A device of the kind "cpu" is software
-/// (lavapipe): right, and slower than the cpu backend, so --backend auto never takes it.
+/// --device takes the number or a part of the name. A device of the kind "cpu" is software (lavapipe): its
+/// images are right, but it is slower than the cpu backend, so --backend auto never selects it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Devices {
@@ -35,8 +35,8 @@ impl Devices {
         if devices.is_empty() {
             writeln!(
                 out,
-                "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a device \
-                 in software"
+                "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software \
+                 device"
             )?;
         }
         for (number, device) in devices.iter().enumerate() {

@@ -7,7 +7,12 @@
 //!
 //! Nothing is read back in the middle of a frame. The device counts what a region needs, and draws
 //! nothing if that does not fit; then the region is drawn again, in larger buffers or split into more
-//! regions. The next frame of the same kind starts with the regions that fitted.
+//! regions. The next frame of the same kind starts with the regions that fitted. If a single row of tiles
+//! exceeds the device, drawing is an error.
+//!
+//! The alternative, splats and lists in several pages, would make a splat's index a page and an index in
+//! every stage, and a radix sort over pages would scatter into all of them at once. A region costs nothing
+//! when the frame fits. The Gaussians and the pixels do lie in pages, since stages only stream through them.
 
 use std::ops::Range;
 

@@ -1,4 +1,4 @@
-//! What `wildcity bench gpu` found, as Markdown and as JSON.
+//! The report of `wildcity bench gpu`, as Markdown and as JSON.
 
 use std::fmt;
 
@@ -8,21 +8,23 @@ use serde::Serialize;
 use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::gpu::Roofline;
 
-/// The goal: a step of six full cameras, from asking to images on the host, at as many visible pairs.
+/// The goal for a step of six full cameras, from the call to the images on the host, with
+/// [`GOAL_PAIRS`] visible pairs.
 const GOAL_MS: f64 = 4.7;
+/// The (Gaussian, view) pairs to which the goal refers.
 const GOAL_PAIRS: f64 = 5e6;
 
-/// One device.
+/// The measurements of one device.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
-    /// Its name and its driver.
+    /// Name and driver of the device.
     pub(super) device: String,
     #[serde(serialize_with = "measured")]
     pub(super) roofline: Roofline,
     pub(super) scenes: Vec<SceneReport>,
 }
 
-/// One scene, medians of all frames.
+/// The measurements of one scene; times are medians of all frames.
 #[derive(Debug, Serialize)]
 pub(super) struct SceneReport {
     pub(super) gaussians: u32,
@@ -31,15 +33,16 @@ pub(super) struct SceneReport {
     pub(super) touches: u64,
     pub(super) instances: u64,
     pub(super) evaluations: u64,
-    /// Frames that were timed, ...
+    /// Frames that were timed.
     pub(super) frames: u32,
-    /// ... the parts that all of them were drawn in, ...
-    pub(super) parts: u64,
-    /// ... and attempts among them that drew nothing, since buffers were too small.
+    /// Regions in which all of them were drawn.
+    #[serde(rename = "parts")]
+    pub(super) regions: u64,
+    /// Attempts among them that drew nothing since buffers were too small.
     pub(super) retries: u64,
     /// Empty for a device without a clock.
     pub(super) stages: Vec<StageReport>,
-    /// What is left unaccounted comes last: these and the stages add up to the step.
+    /// Name and time of each host row, "unaccounted" last. These and the stages add up to the step.
     pub(super) host_ms: Vec<(&'static str, f64)>,
     pub(super) step_ms: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,22 +51,23 @@ pub(super) struct SceneReport {
     pub(super) images: Option<Images>,
 }
 
-/// The first image against the cpu backend's.
+/// The first image compared with the cpu backend's.
 #[derive(Debug, Serialize)]
 pub(super) struct Images {
     images_equal: bool,
-    /// Of images that are not equal.
+    /// `None` if the images are equal.
     #[serde(skip_serializing_if = "Option::is_none")]
     psnr_db: Option<f64>,
 }
 
 impl Images {
-    /// Compares 8-bit images of one size.
+    /// Compares 8-bit images of the same size.
     ///
     /// # Errors
-    /// They have no pixels, or are not of one size.
+    /// They are empty, or differ in size.
     pub(super) fn compare(a: &[u8], b: &[u8]) -> anyhow::Result<Self> {
-        let (own, other) = (a.len(), b.len());
+        let own = a.len();
+        let other = b.len();
         ensure!(own == other && own > 0, "images of {own} and {other} bytes cannot be compared");
         let images_equal = a == b;
         let psnr_db = (!images_equal).then(|| psnr_db_u8(a.iter().zip(b)));
@@ -71,7 +75,7 @@ impl Images {
     }
 }
 
-/// One stage.
+/// The measurements of one stage.
 #[derive(Debug, Serialize)]
 pub(super) struct StageReport {
     stage: &'static str,
@@ -79,7 +83,7 @@ pub(super) struct StageReport {
     bytes: u64,
     memory_ms: f64,
     arithmetic_ms: f64,
-    /// The larger roofline, as a part of the time.
+    /// The larger one of both rooflines, divided by the device time.
     share: f64,
 }
 
@@ -139,31 +143,32 @@ impl fmt::Display for SceneReport {
             grouped(self.instances),
             grouped(self.evaluations)
         )?;
-        if self.parts > u64::from(self.frames) {
+        if self.regions > u64::from(self.frames) {
             writeln!(
                 f,
-                "**Warning: {} frames were drawn in {} parts: a pair that reaches into two bands of an \
+                "**Warning: {} frames were drawn in {} regions: a pair that reaches into two bands of an \
                  image counts twice.**\n",
-                self.frames, self.parts
+                self.frames, self.regions
             )?;
         }
         if self.retries > 0 {
             writeln!(
                 f,
-                "**Warning: {} attempts within {} frames drew nothing, since buffers were too small; \
+                "**Warning: {} attempts within {} frames drew nothing since buffers were too small; \
                  their time is in the tables.**\n",
                 self.retries, self.frames
             )?;
         }
         writeln!(
             f,
-            "| stage (device time, unless host is said) | ms | MB | memory roofline ms | arithmetic \
+            "| stage (device time, unless marked host) | ms | MB | memory roofline ms | arithmetic \
              roofline ms | share |"
         )?;
         writeln!(f, "|---|---|---|---|---|---|")?;
         let row = |f: &mut fmt::Formatter<'_>, name: &str, stage: &StageReport| {
             let StageReport { device_ms, bytes, memory_ms, arithmetic_ms, share, .. } = *stage;
-            let (mb, percent) = (bytes as f64 / 1e6, 100.0 * share);
+            let mb = bytes as f64 / 1e6;
+            let percent = 100.0 * share;
             writeln!(
                 f,
                 "| {name} | {device_ms:.3} | {mb:.1} | {memory_ms:.3} | {arithmetic_ms:.3} | \
@@ -208,7 +213,7 @@ impl fmt::Display for SceneReport {
 }
 
 impl SceneReport {
-    /// All stages; of the rooflines the larger one of each.
+    /// The sum of all stages; its share uses the larger roofline of each stage.
     fn all(&self) -> StageReport {
         let sum = |of: fn(&StageReport) -> f64| self.stages.iter().map(of).sum::<f64>();
         let device_ms = sum(|stage| stage.device_ms);
@@ -223,7 +228,7 @@ impl SceneReport {
     }
 }
 
-/// With commas between thousands.
+/// A number with commas between thousands.
 fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut grouped = String::new();

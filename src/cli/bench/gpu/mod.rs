@@ -1,4 +1,4 @@
-//! `wildcity bench gpu`: the whole measurement of a device, in one command.
+//! `wildcity bench gpu`: measures a device with one command.
 
 mod report;
 
@@ -16,21 +16,21 @@ use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{RenderProfile, Rig, Scene};
 
-/// Measure a device: steps of six full cameras in streets of several sizes, stage by stage, beside
-/// what its memory and arithmetic allow.
+/// Measure a device: the time of each stage of a step with six full cameras, in streets of several
+/// sizes, next to the limits of the device's memory and arithmetic (its roofline).
 ///
-/// Prints tables in Markdown. The streets are made in memory, on every machine the same up to rounding.
-/// Stages are device time, by the device's own clock; rows marked "host" are host time, and the last of
-/// them, "unaccounted", is what no other row has: copying pixels to where the host reads them, mapping
-/// them, and waiting between submissions. So the rows add up to the step, as its caller sees it. What
-/// the device can do at most is measured in the same run, by a copy and by a loop of multiply-adds;
-/// what a stage must move is computed from what the frame counted (`src/render/gpu/traffic.rs` has the
-/// sums). The cpu backend draws the same step for comparison, and the first image of both is compared,
-/// so that a device that is fast and wrong is noticed.
+/// Prints tables in Markdown. The streets are generated in memory and are the same on every machine up to
+/// rounding. Times of stages are device time, by the device's clock. Rows marked "host" are host time; the
+/// last of them, "unaccounted", is the rest of the step: copying pixels to memory that the host can read,
+/// mapping it, and waiting between submissions. So the rows add up to the step as its caller sees it. The
+/// peak rates of the device are measured in the same run, by a copy and by a loop of multiply-adds. The
+/// bytes that a stage must move are computed from the counts of the frame
+/// (`src/render/gpu/bandwidth.rs` has the formulas). The cpu backend draws the same step for comparison,
+/// and the first images of both are compared, so that a device that is fast but wrong is detected.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Gpu {
-    /// Sizes of the streets.
+    /// Numbers of Gaussians of the streets.
     #[arg(
         long,
         value_name = "COUNT,...",
@@ -40,16 +40,15 @@ pub(super) struct Gpu {
     )]
     gaussians: Vec<u32>,
 
-    /// The device: its number in `wildcity devices`, or a part of its name; the fastest kind if not
-    /// given.
+    /// The device: its number in `wildcity devices`, or a part of its name. Default: the fastest kind.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time, after two that are not counted.
+    /// Frames to time, after two that are not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
-    /// Leave out the cpu backend, and with it the comparison of images.
+    /// Do not run the cpu backend, and do not compare images.
     #[arg(long)]
     no_cpu: bool,
 
@@ -64,7 +63,7 @@ Examples:
   wildcity bench gpu --gaussians 100000 --repeat 3 --device llvmpipe
   wildcity bench gpu --json > report.json";
 
-/// Frames before those that are timed: the first uploads the scene and makes room.
+/// Frames before those that are timed: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
 
 impl Gpu {
@@ -122,7 +121,7 @@ impl Gpu {
             instances: usage.last_frame.instances,
             evaluations: own.stats.evaluations,
             frames: self.repeat,
-            parts: usage.regions.saturating_sub(before.regions),
+            regions: usage.regions.saturating_sub(before.regions),
             retries: usage.retries.saturating_sub(before.retries),
             host_ms: host(&own, &usage.last_frame, &stages),
             stages,
@@ -133,26 +132,27 @@ impl Gpu {
     }
 }
 
-/// What a vehicle sees from the middle of the street: 3 x 1440x928 and 3 x 1240x728.
+/// The views of a vehicle in the middle of the street: 3 x 1440x928 and 3 x 1240x728.
 fn views() -> anyhow::Result<Vec<View>> {
     let rig = Rig::preset("vehicle6").context("the rig vehicle6 comes with the program")?;
     ensure!(!rig.cameras.is_empty(), "the rig vehicle6 has no cameras");
     Ok(View::of_rig(&rig.cameras, Pose::IDENTITY))
 }
 
-fn stages(own: &Timed, work: &FrameCounts, roofline: &Roofline) -> Vec<StageReport> {
-    let bytes = work.stage_bytes().into_iter();
+/// Device time, bytes, and rooflines of each stage; empty for a device without a clock.
+fn stages(own: &Timed, counts: &FrameCounts, roofline: &Roofline) -> Vec<StageReport> {
+    let bytes = counts.stage_bytes().into_iter();
     let stages = bytes.filter_map(|(stage, bytes)| {
         let device_ms = own.stats.stages_ms.iter().find(|(name, _)| *name == stage)?.1;
-        let operations = if stage == "rasterize" { work.rasterize_operations() } else { 0 };
+        let operations = if stage == "rasterize" { counts.rasterize_operations() } else { 0 };
         Some(StageReport::new(stage, device_ms, bytes, operations, roofline))
     });
     stages.collect()
 }
 
-/// What is not the device's own time: what the host timed, and what is left of the step.
-fn host(own: &Timed, work: &FrameCounts, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
-    let bytes = work.stage_bytes();
+/// Host times: those that the host measured, then the rest of the step.
+fn host(own: &Timed, counts: &FrameCounts, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
+    let bytes = counts.stage_bytes();
     let is_host = |name: &str| bytes.iter().all(|(stage, _)| *stage != name);
     let timed = own.stats.stages_ms.iter().filter(|(name, _)| is_host(name));
     let mut host_ms: Vec<(&'static str, f64)> = timed.copied().collect();
