@@ -1,9 +1,14 @@
-//! Levels of detail of a block: ever fewer Gaussians, each with how far off it may be.
+//! Levels of detail of a block: sets of fewer and fewer Gaussians, each with an upper bound of its error.
 //!
-//! A level is made from the one before by merging pairs of neighbours in Morton order, weighted by
-//! opacity x area (`merge.rs`). What a merger moves is bounded: its error is the largest, over all
-//! the Gaussians of level 0 that it stands for, of how far the centre moved plus 3 times what the
-//! standard deviation lost. Limits rise by √2, and a level that saves too little is not kept. No random numbers, no threads, no hashing: the same block, the same levels.
+//! A level is made from the previous one by merging pairs of neighbours in Morton order, weighted by
+//! opacity x area (`merge.rs`). The error of a merged Gaussian is the largest, over all Gaussians of level 0 that
+//! it represents, of the distance that the mean moved plus 3 times the decrease of the standard deviation.
+//!
+//! Levels are merged under a limit of the error and not by halving: limits rise by √2 from 1 mm, each block
+//! merges the pairs below the limit, cheapest first, and a level is kept if it has a third fewer Gaussians than
+//! the previously kept one. So no pair that is far apart spoils the error of a whole level, and the error of a
+//! level is close to its limit. There are no random numbers, no threads and no hashing: the same block gives the
+//! same levels.
 
 mod merge;
 
