@@ -58,7 +58,7 @@ def day(away):
     rgb = rgb + (np.array([0.97, 0.97, 0.96]) - shade - rgb) * (0.90 * cloud)
     # The sun with its glare, as cameras show it: ten times as wide as it is.
     rgb = rgb + (np.array([1.0, 0.995, 0.97]) - rgb) * np.exp(-((angle / 0.07) ** 2))
-    # Below the horizon nobody looks: the haze goes on, darker.
+    # Below the horizon no camera looks: the haze goes on, darker.
     return rgb * (1.0 - 0.35 * smooth((-z - 0.05) / 0.5))
 
 

@@ -11,7 +11,7 @@
 //! | what | thousands | spacing |
 //! |---|---|---|
 //! | road, parking, kerbs, pavements | 72 | lines 6 cm, asphalt 30 x 43 cm, slabs 45 cm |
-//! | houses | 190 | windows 7 to 27 cm, walls 15 to 60 cm, 2.5 times that where nobody drives |
+//! | houses | 190 | windows 7 to 27 cm, walls 15 to 60 cm, 2.5 times that where there is no lane |
 //! | 65 parked cars | 91 | 8 to 16 cm |
 //! | 44 trees | 59 | leaves of 6 cm |
 //! | lamps, lights, signs, bins, planters | 15 | 4 to 40 cm |

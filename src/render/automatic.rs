@@ -16,7 +16,7 @@ use super::{Backend, Frame, RenderError, Target, View};
 pub struct Selection {
     /// The backend.
     pub backend: Box<dyn Backend>,
-    /// One line for the person who started the program.
+    /// One line for the operator.
     pub reason: String,
 }
 

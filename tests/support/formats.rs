@@ -94,7 +94,7 @@ pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// Niantic's version 4, with an extension that nobody knows.
+/// Niantic's version 4, with an extension that no reader knows.
 pub(crate) fn spz4(g: &Gaussians) -> Vec<u8> {
     let streams = spz_attributes(g, 4).into_iter().filter(|stream| !stream.is_empty());
     let streams: Vec<_> = streams.collect();

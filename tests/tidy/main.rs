@@ -1,4 +1,4 @@
-//! What Cargo cannot say about the source: who may use which crate within a package, no import cycles,
+//! What Cargo cannot say about the source: which crate may be used where within a package, no import cycles,
 //! plain prose, links that lead somewhere, licences.
 
 mod cycles;
