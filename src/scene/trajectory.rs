@@ -48,7 +48,7 @@ pub struct Trajectory {
 pub enum TrajectoryError {
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error(
-        "{name:?} cannot name a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+        "{name:?} is not a name of a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
     Name {
         /// The refused name.

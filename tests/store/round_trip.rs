@@ -122,7 +122,7 @@ fn what_cannot_be_used_is_refused_before_anything_is_written() {
         ),
         (
             NewVersion { trajectories: vec![still("A B")], ..street(&good) },
-            "\"A B\" cannot name a trajectory",
+            "\"A B\" is not a name of a trajectory",
         ),
     ];
     for (new, wanted) in cases {
