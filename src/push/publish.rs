@@ -1,4 +1,15 @@
 //! The pipeline of a push: read, check, preview, commit, load ahead.
+//!
+//! A push is uploaded files and the cells that they replace. All cells are published by one record of the
+//! twin's log.
+//!
+//! **Agents never wait for a push.** Small views before and after the change are rendered through the render
+//! queue of the sessions. Until the new version is loaded, `latest` remains the previous version for
+//! sessions that open the twin ([`Engine::pin_latest`]).
+//!
+//! **A push needs no state that survives the server**, because its content is compared with the twin's. A
+//! client that got no answer sends its push again, and the same content as the latest version's is that
+//! version.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

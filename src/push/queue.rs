@@ -1,4 +1,6 @@
 //! The pushes of a server: those that wait, the one that runs, and those that ended not long ago.
+//!
+//! One push runs at a time, since each takes the memory of its files and all cores.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -157,7 +157,11 @@ fn refuse_empty(cells: &[CellChange]) -> Result<(), PushError> {
     Err(PushError::Content { reason, cells: empty.iter().map(|change| change.cell).collect() })
 }
 
-/// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`].
+/// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`] (a tenth) of their
+/// Gaussians.
+///
+/// Trained blocks overlap, so the few Gaussians that a push has in such a cell are assumed to be the margin
+/// of a neighbouring cell. Without this check a few strays would replace the cell.
 fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
     let shrinks =
         |change: &&CellChange| (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64;

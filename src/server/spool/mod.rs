@@ -8,8 +8,9 @@
 //! <spool>/<id>.gone        a removed upload: freeing a large file takes a while
 //! ```
 //!
-//! The id is the digest: the same content is the same upload. An incomplete upload survives a restart,
-//! and can be continued.
+//! **The id is the digest**: the same content is the same upload. So an upload needs no state but its
+//! bytes: announcing it again finds it, whatever happened to the server or the client. An incomplete upload
+//! survives a restart, and can be continued.
 
 mod digest;
 mod upload;
