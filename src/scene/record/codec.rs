@@ -29,15 +29,16 @@ pub(super) enum Measure {
     Plain,
     /// `ln(value + THIN_M)`: for scales, where ratios matter, down to a size that no camera resolves.
     Logarithm,
-    /// `2^value`: for opacities, which a chunk holds as base-2 logarithms. Linear, since alpha is linear in it.
+    /// `2^value`: for opacities, which a chunk holds as base-2 logarithms. Linear, since alpha is linear in it;
+    /// up to the part's largest and not up to 1, since merged Gaussians may be above 1.
     Opacity,
     /// The signed square root: for SH coefficients, most of which are near zero.
     Root,
 }
 
 /// 10 µm, added to scales before the logarithm. Trainers flatten surfels to 1e-9 m and less, which would use up
-/// most of the range of a logarithm: even with a lower limit of exp(-12) m, 22 % of the scales of one capture were
-/// clamped.
+/// most of the range of a logarithm: even with a lower limit of exp(-12) m, 22 % of the scales of one capture (the
+/// skull) were clamped.
 const THIN_M: f32 = 1e-5;
 
 /// The grid of a part: value = (first + k) step.

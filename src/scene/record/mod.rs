@@ -4,8 +4,9 @@
 //! the table. A part of a section, up to [`PART_GAUSSIANS`] Gaussians, begins with the grids of its quantised
 //! fields (index of the first step as i32 and the step as f32, little-endian, in the order of the table). Byte
 //! planes follow: for each column, first the lowest byte of all values, then the next. Slowly changing bytes end
-//! up side by side, where zstd compresses them: of the 47 bytes per Gaussian of Q32, 19 remain on disk. No value
-//! shares a byte with another one, so decoding needs no shifts.
+//! up side by side, where zstd compresses them. No value shares a byte with another one, so decoding needs no
+//! shifts: the 32 bytes of a Q32 record become 47 whole bytes, of which 19 remain on disk, since zstd finds the
+//! empty high bits.
 //!
 //! Ranges are those of the part's own values. Every grid consists of multiples of its step, so zero is always
 //! on it: colours that are grey or independent of the direction, and surfaces flat on the ground, stay exactly
@@ -85,7 +86,9 @@ impl RecordFormat {
     ///
     /// Bits are spent where they affect an image most: each field alone has 60 dB or more. Means get the most,
     /// since the first visible artefact are surfels of one plane that change their order in depth: with 20 bits
-    /// (15 µm) instead of 23, the demo street had 61 dB, all of it from surfels of one facade.
+    /// (15 µm) instead of 23, the demo street had 61 dB, all of it from surfels of one facade. The three more
+    /// bits per axis are taken from the colour. A record has no bits for a level of detail or for flags,
+    /// since both are those of its section.
     fn fields(self, sh_degree: u8) -> Vec<Field> {
         let ([x, y, z], scale, quat, opacity, dc, bands) = match self {
             Self::F32 => (

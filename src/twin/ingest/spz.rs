@@ -1,7 +1,7 @@
 //! SPZ, Niantic's format: versions 2 and 3 in one gzip stream (or none), version 4 in zstd streams.
 //!
 //! Source: the format's description and headers in nianticlabs/spz. All versions hold the same
-//! attributes, each for all Gaussians, in the order of [`Payload`]: positions (3 x 24-bit fixed
+//! attributes, each for all Gaussians, in the order of `Header::attributes`: positions (3 x 24-bit fixed
 //! point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations and the
 //! higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green, blue).
 //! Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes

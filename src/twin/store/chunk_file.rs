@@ -5,7 +5,8 @@
 //! 4096   table of contents (bincode), zeros up to a multiple of 4096
 //! ...    sections, coarse levels first, so that the start of the object holds whole levels. A section is one
 //!        level of one block. One that fits into the rest of a page is placed there, any other
-//!        begins a page: no section touches more pages than it must.
+//!        begins a page: no section touches more pages than it must. Coarse levels of a sparse block
+//!        have 200 B, so a page for every section would be mostly zeros.
 //! ```
 //!
 //! A section is a sequence of parts of up to 65,536 Gaussians each: a length u32, and that many

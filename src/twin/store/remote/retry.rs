@@ -1,4 +1,5 @@
-//! Requests run on threads of their own, each with a time-out and a bounded number of retries.
+//! Requests run on threads of their own, each with a time-out and a bounded number of retries. This is the
+//! only place where requests are timed and retried: `object_store`'s own retries are off.
 //!
 //! The calling thread waits on a channel, because `block_on` panics on threads of another runtime.
 
