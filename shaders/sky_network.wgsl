@@ -2,8 +2,9 @@
 // `src/scene/sky/inference.rs`.
 //
 // The threads of a tile evaluate the network together for four pixels at a time, and each thread
-// computes outputs of each layer. One thread alone would need 9 KiB for its four pixels, which does not
-// fit registers.
+// computes outputs of each layer. Pixels whose background is hidden are skipped. One thread alone would
+// need 9 KiB of values for its four pixels, which does not fit registers; with these values in private
+// memory, lavapipe took 35 s to compile the shader.
 
 #import angle
 

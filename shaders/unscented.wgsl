@@ -121,7 +121,8 @@ fn project_point_at(view_index: u32, at_end_m: vec3f, fraction: f32) -> Projecte
 }
 
 // Depth of a centre in metres (z, or distance for wide lenses): exact and rounded once, except for the
-// part that a moving camera adds.
+// part that a camera with a rolling shutter adds by moving. That part is as exact as the row that sees
+// the centre: a millionth of the camera's motion during the exposure.
 fn depth(mean: vec3f, view: ChunkView, at_end_m: vec3f, fraction: f32) -> f32 {
     if lenses[view.view].by_distance != 0u {
         return exact_distance(mean, view, fraction * lenses[view.view].moved_world_m);

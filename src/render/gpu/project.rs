@@ -7,7 +7,8 @@
 //!
 //! Depth is computed in f32 together with its rounding errors, and rounded once (`exact_z` in
 //! `shaders/project.wgsl`). Thousands of surfels of one facade have equal depths; without compensation
-//! they would be blended in the order of rounding errors.
+//! they would be blended in the order of rounding errors. Distance, the depth of wide lenses, is computed
+//! in the same way (`depth` in `shaders/unscented.wgsl`).
 //!
 //! Static pinhole cameras have their own kernels, to the byte those of frames without other cameras. The
 //! kernels for lenses and rolling shutters are compiled with the first view that needs them.

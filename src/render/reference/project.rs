@@ -46,7 +46,7 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
 }
 
 /// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition,
-/// since backends sort 32 bits.
+/// since backends sort 32 bits: all of them round the exact depth once.
 pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }

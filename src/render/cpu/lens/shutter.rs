@@ -1,5 +1,5 @@
-//! Rolling shutters, 16 points at a time: [`crate::View::project_beyond`] as seen from the end of the
-//! exposure.
+//! Rolling shutters, 16 points at a time: [`crate::View::project_extrapolated`] as seen from the end of
+//! the exposure.
 //!
 //! Everything is relative to the camera's frame at the end of the exposure, so that f32 holds only the small
 //! motion during one exposure. "Remaining" is the fraction of the exposure that is still to come when a row

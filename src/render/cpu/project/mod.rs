@@ -3,7 +3,8 @@
 //! The method is EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian splatting (Kerbl et al. 2023). A
 //! static pinhole camera has its projection linearised at each centre ([`pinhole`]). Every other camera (lens
 //! distortion, windshield, rolling shutter while it moves) has six points of each Gaussian projected
-//! ([`unscented`]). Both produce the same kind of splat ([`splat_block`]).
+//! ([`unscented`]). Both produce the same kind of splat ([`splat_block`]). A static pinhole keeps its own
+//! path, to the byte: without other cameras in a frame nothing of the second path runs.
 //!
 //! # Layout
 //!
