@@ -1,7 +1,7 @@
 //! Why a report cannot be made.
 //!
 //! The `Display` text of an error says everything, down to the text of the operating system, and so errors
-//! of this project have no `source`: the cause is a field of the text, or the error passes it on as
+//! of this project have no `source`: the cause is a field named `cause`, or the error passes it on as
 //! `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then says each thing once.
 
 use wildcity_render::RenderError;
