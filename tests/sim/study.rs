@@ -1,6 +1,6 @@
 //! Error against run time of ways to integrate the same car, for BENCHMARKS.md: run by hand, as
-//! `cargo test --release --test session study -- --ignored --nocapture`. Writes `ego_integrators.csv` and
-//! the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or beside the built program.
+//! `cargo test --release -p wildcity-sim --test sim study -- --ignored --nocapture`. Writes
+//! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or beside the built program.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
