@@ -7,7 +7,7 @@ pub const TILE_PX: u32 = 16;
 /// more tightly than a row of 16 pixels does, which saves a third of the evaluations on a street.
 pub const BLOCK_PX: u32 = 4;
 
-/// Most (Gaussian, tile) pairs of a frame. On the gpu backend it is the most of each part of a frame, and
+/// Most (Gaussian, tile) pairs of a frame. On the gpu backend it is the most of each region of a frame, and
 /// also the most (splat, macro tile) pairs. 2^27 pairs of 4 B are 512 MiB, five times what 5 million visible
 /// Gaussians of a street take.
 pub const MAX_INSTANCES: u64 = 1 << 27;

@@ -3,12 +3,12 @@
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;
 
-/// Frames that a GPU has in hand at once: one is drawn, one is encoded, and one is ready to be drawn
+/// Frames that a GPU has in flight at once: one is drawn, one is encoded, and one is ready to be drawn
 /// the moment the first is done. Six JPEGs take longer than a fast GPU takes to draw them. Each
 /// holds its images, 27 MB of six full cameras.
 pub const GPU_FRAMES: usize = 3;
 
-/// Frames that did not fit a GPU at once, and are known in which parts they do: a few kB, for more
+/// Frames that did not fit a GPU at once, and are known in which regions they do: a few kB, for more
 /// rigs than drive at once.
 pub const PARTITION_CACHE_ENTRIES: usize = 64;
 

@@ -9,9 +9,10 @@
 //! ```
 //!
 //! The renderer writes depth, opacity, normals and raw colour straight into the message. JPEG and PNG files
-//! are appended, since their length is only known after encoding. Every image is encoded and hashed in the renderer's `finished` callback while other cameras are still rendered. The frame hash is the
-//! hash of the images' hashes, so that it needs no second pass over the pixels. `server` writes the header
-//! last. Floats come before bytes, so that every float tensor starts at a multiple of 4.
+//! are appended, since their length is only known after encoding. Every image is encoded and hashed in the
+//! renderer's `finished` callback while other cameras are still rendered. The frame hash is the hash of the
+//! images' hashes, so that it needs no second pass over the pixels. `server` writes the header last. Floats
+//! come before bytes, so that every float tensor starts at a multiple of 4.
 //!
 //! **Which frames are rendered** is a function of the clock alone ([`schedule`]): those that some decision
 //! of the agent shows. A frame that a later observation shows again is kept in the [`frame_history`] as it

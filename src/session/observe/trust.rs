@@ -8,8 +8,8 @@
 //! checks that a twin without training errors loses less than that.
 //!
 //! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while other
-//! cameras are still rendered. The nearest keyframe is found in an index of boxes
-//! of 64 keyframes ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one. An episode keeps
+//! cameras are still rendered. The nearest keyframe is found in an index of boxes of 64 keyframes
+//! ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one. An episode keeps
 //! the least trust of its observations, and ends as `off_model` if that was below
 //! [`limits::OFF_MODEL_TRUST`](crate::limits::OFF_MODEL_TRUST).
 

@@ -21,8 +21,8 @@
 //! interval is repeated.
 //!
 //! The study that compares integrators is a test and not a command: its reference is the implicit solver of
-//! another crate, which only the tests depend on, and the methods that it compares are used by no part of
-//! the server. An agent's machine needs neither.
+//! another crate, which only the tests depend on, and the other methods that it compares are used by no
+//! part of the server. An agent's machine needs neither.
 
 mod collocation;
 mod constant_speed;
