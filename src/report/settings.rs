@@ -2,7 +2,7 @@
 //!
 //! **Settings that cannot affect this twin are skipped**, and the page names them: `sky_error` without a
 //! sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is no setting either:
-//! see [`TILE_SIZE_REASON`]; BENCHMARKS.md has what was measured of it (rows or blocks of pixels, one level
+//! see `TILE_SIZE_REASON`; BENCHMARKS.md has what was measured of it (rows or blocks of pixels, one level
 //! of tiles or two).
 //!
 //! **Non-pinhole cameras have two references.** All settings are compared with splats, so that their own
