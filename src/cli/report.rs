@@ -236,7 +236,7 @@ impl Command {
         let feature_costs =
             feature_costs::count_features(&self.hardware.cpu()?, &|| self.open_device())?;
 
-        let column = |b: &Box<dyn Backend>| Column { backend: b.name(), detail: b.detail() };
+        let column = |b: &dyn Backend| Column { backend: b.name(), detail: b.detail() };
         Ok(Report {
             subject: Subject {
                 twin: manifest.twin.clone(),
@@ -249,7 +249,7 @@ impl Command {
                 cameras: points[0].views.len(),
                 repeat: self.repeat,
             },
-            backends: backends.iter().map(column).collect(),
+            backends: backends.iter().map(|backend| column(&**backend)).collect(),
             sampling,
             sample_points: points.iter().map(|point| point.name.clone()).collect(),
             reference_ms,

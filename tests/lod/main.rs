@@ -8,7 +8,6 @@ mod images;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]
-#[allow(dead_code, reason = "tests/render uses the rest of it")]
 mod streets;
 
 mod demand;

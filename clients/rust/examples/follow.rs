@@ -3,6 +3,8 @@
 //!
 //! `cargo run --release -p wildcity-client --example follow -- ws://127.0.0.1:8080/v1/session TWIN`
 
+#![allow(clippy::print_stdout, reason = "an example tells its reader what it does")]
+
 use wildcity_client::{
     Action, Client, Dynamics, DynamicsChoice, DynamicsModel, Movement, Observation, Open, Pose,
     TimedPose,

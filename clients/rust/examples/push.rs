@@ -5,6 +5,8 @@
 //! SCENE is a file of a format that `wildcity import` reads, for example a checkpoint that
 //! `python -m wildcity.convert` wrote as safetensors. The token is read from `WILDCITY_TOKEN`, if it is set.
 
+#![allow(clippy::print_stdout, reason = "an example tells its reader what it does")]
+
 use std::path::Path;
 
 use wildcity_client::{

@@ -138,7 +138,7 @@ impl LensProjection {
         let mut remaining = guess;
         let mut round = 0;
         loop {
-            let then_m = shutter.from_end_frame(simd, at_end_m, remaining);
+            let then_m = shutter.to_exposure_frame(simd, at_end_m, remaining);
             let pixels = self.project_static(simd, then_m);
             let next = shutter.remaining_at(simd, pixels.x_px, pixels.y_px);
             let converged = SimdShutter::converged(simd, next, remaining);

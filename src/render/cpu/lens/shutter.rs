@@ -66,7 +66,7 @@ impl SimdShutter {
     /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in
     /// metres.
     #[inline(always)]
-    pub(super) fn from_end_frame<S: Simd>(
+    pub(super) fn to_exposure_frame<S: Simd>(
         &self,
         simd: S,
         at_end_m: Vec3x16<S>,

@@ -74,8 +74,8 @@ impl SimdWindshield {
         for _ in 0..Self::ROUNDS {
             let off_phi = self.horizontal.at(simd, phi, theta) - inside_phi;
             let off_theta = self.vertical.at(simd, phi, theta) - inside_theta;
-            phi = phi - off_phi;
-            theta = theta - off_theta;
+            phi -= off_phi;
+            theta -= off_theta;
         }
         let x = sin(simd, phi);
         let y = sin(simd, theta);

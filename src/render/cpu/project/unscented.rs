@@ -180,8 +180,8 @@ fn project_lanes<S: Simd>(
             lens.project(simd, minus, remaining).pixels;
         margin = margin.min(a).min(b);
         pairs[axis] = [ax, ay, bx, by];
-        mean_x = mean_x + (ax + bx);
-        mean_y = mean_y + (ay + by);
+        mean_x += ax + bx;
+        mean_y += ay + by;
     }
     let sixth = splat(1.0 / 6.0);
     let mean_x = mean_x * sixth;
