@@ -11,8 +11,7 @@ use crate::source::rust_files;
 
 /// Words that mean persons. In this project something else is meant nearly always, and then "what", "which",
 /// "that" or the name of the thing reads at once.
-const PERSONS: &[&str] =
-    &["who", "whom", "whoever", "nobody", "somebody", "everybody", "anybody"];
+const PERSONS: &[&str] = &["who", "whom", "whoever", "nobody", "somebody", "everybody", "anybody"];
 
 /// Folders and files that people read.
 const READ: &[&str] = &[
