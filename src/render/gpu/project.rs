@@ -9,8 +9,8 @@
 //! `shaders/project.wgsl`). Thousands of surfels of one facade have equal depths; without compensation
 //! they would be blended in the order of rounding errors.
 //!
-//! Static pinhole cameras have their own kernels, to the byte those of frames without other cameras. The
-//! kernels for lenses and rolling shutters are compiled with the first view that needs them.
+//! Static pinhole cameras have their own kernels, which are identical to those of frames without other cameras.
+//! The kernels for lenses and rolling shutters are compiled with the first view that needs them.
 
 use std::ops::Range;
 use std::sync::Arc;
