@@ -208,7 +208,7 @@ async fn connections_above_the_limit_are_refused() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    tokio::time::timeout(support::PATIENCE, seated).await.expect("a free place");
+    tokio::time::timeout(support::TEST_TIMEOUT, seated).await.expect("a free place");
     server.still_serves().await;
     second.open(json!({})).await;
 }
