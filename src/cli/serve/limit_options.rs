@@ -45,13 +45,13 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
     idle_timeout_s: f64,
 
-    /// Seconds within which a client must read an answer; at most 30, because clients wait only a little
-    /// longer.
+    /// Seconds within which a client must read an answer; at most 30, because clients wait for an answer
+    /// for 90 s, of which a step may take 60.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
     send_timeout_s: f64,
 
     /// Seconds for one step, including the time that it waits for other sessions; at most 60, because
-    /// clients wait for an answer only a little longer.
+    /// clients wait for an answer for 90 s.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
     step_timeout_s: f64,
 
