@@ -31,7 +31,7 @@ pub(super) enum Occluder {
         /// Half length, half width and full height, in metres.
         size_m: DVec3,
     },
-    /// A tree's crown: lets some light through.
+    /// A tree's crown, which lets some light through.
     Crown {
         /// Middle, in metres.
         center_m: DVec3,

@@ -1,4 +1,4 @@
-//! How the twin would look: small images of the base and of what it would become, compared.
+//! The preview of a push: compares small images of the base and of the version that the push would make.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
