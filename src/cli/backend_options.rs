@@ -133,7 +133,7 @@ impl BackendOptions {
             }
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
             (_, Some(device)) => anyhow::bail!(
-                "--device {device:?} belongs to the gpu backend: add --backend gpu, or leave --device away"
+                "--device {device:?} belongs to the gpu backend: add --backend gpu, or omit --device"
             ),
             (BackendName::Cpu, None) => Ok(Box::new(self.hardware.cpu()?)),
             (BackendName::Reference, None) => Ok(Box::new(Reference)),

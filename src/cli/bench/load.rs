@@ -115,9 +115,8 @@ impl Load {
         let mut seconds = Vec::new();
         for _ in 0..self.repeat {
             if self.cold {
-                fs::write("/proc/sys/vm/drop_caches", "3").context(
-                    "--cold: cannot empty the page cache; run as root, or leave --cold away",
-                )?;
+                fs::write("/proc/sys/vm/drop_caches", "3")
+                    .context("--cold: cannot empty the page cache; run as root, or omit --cold")?;
             }
             let start = Instant::now();
             read()?;

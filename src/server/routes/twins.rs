@@ -41,7 +41,7 @@ pub(super) async fn show(
             // A twin that is not listed may be damaged: opening it gives the reason.
             let catalog = state.engine.catalog().clone();
             blocking(move || catalog.version(&name, None)).await?;
-            let reason = "the twin was made while it was looked for; ask again";
+            let reason = "the twin was created during this request; try again";
             Err(Fault::Internal(reason.to_owned()).into())
         }
     }
