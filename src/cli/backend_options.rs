@@ -19,8 +19,8 @@ pub(super) struct RendererOptions {
     backend: BackendOptions,
 
     /// Run the stages up to and including this one on the cpu backend, and the rest on --device, even if
-    /// that is software. If an image is wrong with --cpu-through project and right with --cpu-through sort,
-    /// the fault is in the GPU's sort. `wildcity bisect` tries all stages.
+    /// that device is software. If an image is wrong with --cpu-through project and right with --cpu-through
+    /// sort, the fault is in the GPU's sort stage. `wildcity bisect` tries all stages.
     #[arg(long, value_name = "STAGE", value_enum)]
     cpu_through: Option<StageName>,
 }
@@ -48,8 +48,8 @@ pub(super) struct HardwareOptions {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// GPU memory for Gaussians, in GiB. If they need more, those that were not drawn for longest are
-    /// evicted. Buffers of the render stages come in addition [default: all that the GPU has]
+    /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are evicted.
+    /// Buffers of the render stages come in addition [default: all that the GPU has]
     #[arg(long, value_name = "GIB", value_parser = gib)]
     gpu_memory_gib: Option<f64>,
 
@@ -133,7 +133,7 @@ impl BackendOptions {
             }
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
             (_, Some(device)) => anyhow::bail!(
-                "--device {device:?} belongs to the gpu backend: add --backend gpu, or leave --device away"
+                "--device {device:?} belongs to the gpu backend: add --backend gpu, or omit --device"
             ),
             (BackendName::Cpu, None) => Ok(Box::new(self.hardware.cpu()?)),
             (BackendName::Reference, None) => Ok(Box::new(Reference)),

@@ -94,8 +94,8 @@ fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
     }
 }
 
-/// A directory of the XDG base directory specification: from its variable, or below HOME. By hand, since
-/// it is shorter than the use of a crate.
+/// A directory of the XDG base directory specification: from its variable, or below HOME. Written by hand,
+/// because that is shorter than using a crate.
 fn xdg_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))

@@ -9,7 +9,7 @@ pub(super) const CACHE_GIB: u32 = 16;
 /// Versions that garbage collection keeps by default: two days of hourly pushes.
 pub(super) const GC_KEEP: u32 = 50;
 
-/// How long garbage stays by default: longer than the preparation of any commit.
+/// How long garbage is kept by default: longer than the preparation of any commit takes.
 pub(super) const GC_GRACE: &str = "24h";
 
 /// Largest rig or trajectory file: what fits into a manifest.

@@ -7,7 +7,7 @@ pub(super) fn bytes(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {bytes}/{total_bytes} {eta}")
 }
 
-/// A bar that counts other things.
+/// A bar that counts items.
 pub(super) fn count(label: &'static str) -> ProgressBar {
     bar(label, "{msg:10} {wide_bar} {human_pos}/{human_len} {eta}")
 }

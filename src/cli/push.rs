@@ -67,8 +67,8 @@ pub(super) struct Push {
     #[arg(long)]
     note: Option<String>,
 
-    /// Refuse the push if an image along the twin's trajectory has a lower PSNR than this against the
-    /// version before, in dB.
+    /// Refuse the push if the PSNR between the images before and after it, at any pose along the twin's
+    /// trajectory, is lower than this, in dB.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
 }
@@ -134,7 +134,7 @@ impl Push {
             files.push(PushFile { upload: upload.id, axes: self.axes.clone(), scale: self.scale });
         }
         let asked = NewPush {
-            // One id for this run: if an answer is lost, the client asks for the same push again.
+            // One id for this run: if an answer is lost, the client sends the same push again under this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
             files,
             base: self.base,
@@ -176,7 +176,7 @@ fn read_token(path: &Path) -> anyhow::Result<String> {
     Ok(String::from_utf8(text).with_context(cannot)?.trim().to_owned())
 }
 
-/// A cell, as `3,-1`.
+/// Parses a cell, for example `3,-1`.
 fn parse_cell(text: &str) -> anyhow::Result<[i32; 2]> {
     let parsed = text
         .split_once(',')

@@ -33,16 +33,16 @@ use super::{demo, output, progress};
 /// transmittance, the sky map, lenses, image scale and encoding with the f64 reference. Sample points lie
 /// on the recorded drive and 1, 3 and 5 m beside it, or around a twin without a drive. Windows of each
 /// image are compared at full focal length, and whole steps are timed. Settings that cannot affect this
-/// twin are skipped, and named. The report also has the trust in images beside the drive, the stress
-/// table, and what each feature of a scene costs.
+/// twin are skipped, and the report lists them. The report also has the trust of images beside the drive,
+/// the stress table, and what each feature of a scene costs.
 ///
-/// Writes report.html, which loads nothing else, report.json and report.csv.
+/// Writes report.html (a single self-contained file), report.json and report.csv.
 ///
 /// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points, verified at
 /// the others, and written as profile.json for `wildcity serve --profile`. If no setting can be
 /// recommended, the report says why, and the profile.json of an earlier report is removed. The decibels and
-/// milliseconds of a recommendation are of images before they are encoded, since a profile does not choose
-/// the encoding; the report says what encodings lose and take in addition.
+/// milliseconds of a recommendation apply to images before encoding, because a profile does not choose the
+/// encoding; the report lists the error and the time that each encoding adds.
 ///
 /// The reference renders the whole twin at full detail and without a draw distance: it must fit into memory.
 #[derive(Debug, clap::Args)]
@@ -65,7 +65,7 @@ pub(super) struct Command {
     #[arg(long, value_name = "DB", value_parser = at_least_db, allow_negative_numbers = true)]
     at_least_db: Option<Goal>,
 
-    /// Recommend the most exact setting with at most this 95th percentile of the step time, in
+    /// Recommend the most exact setting whose 95th percentile of the step time is at most this, in
     /// milliseconds, before images are encoded.
     #[arg(long, value_name = "MS", value_parser = at_most_ms, allow_negative_numbers = true)]
     #[arg(conflicts_with = "at_least_db")]
@@ -146,11 +146,11 @@ struct Compared {
     skipped: Vec<Skipped>,
     /// Time of a step of the reference, in milliseconds.
     reference_ms: f64,
-    /// The same with a ray for every pixel; none if every camera is a pinhole at rest.
+    /// The same with an exact ray for every pixel; `None` if every camera is a pinhole without motion.
     exact_rays_ms: Option<f64>,
 }
 
-/// The backends that are there, and the others with the reason.
+/// The backends that this machine has, and those that it does not have, with the reason.
 struct Backends {
     present: Vec<Box<dyn Backend>>,
     absent: Vec<Skipped>,
@@ -166,7 +166,7 @@ impl Command {
         }
         let report = self.measure()?;
         self.write(&report)?;
-        // The files have the measurements and the reason, but the command failed to do what was asked.
+        // The files are written and contain the reason, but without a recommendation the command has failed.
         report.unmet_reason.map_or(Ok(()), |reason| bail!(reason))
     }
 

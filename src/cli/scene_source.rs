@@ -38,7 +38,7 @@ pub(super) struct SceneSource {
     profile: ProfileOptions,
 }
 
-/// A scene and the shots of it that a rendering command takes.
+/// A scene and the images of it that a rendering command makes.
 pub(super) struct LoadedScene {
     source: Source,
     pub(super) shots: Vec<Shot>,

@@ -1,9 +1,9 @@
 //! `wildcity stress`.
 //!
 //! The stress table is part of the program and not of its tests, so that a faulty driver is found on the
-//! machine that has it. The reference is not compared with itself: its images must be finite, and hold the
-//! numbers that a case states. Each check has a planted fault that it must find, in the cpu backend and in
-//! the reference (`tests/stress/mutations.rs`).
+//! machine that has it. The reference is not compared with itself: its images must be finite, and have the
+//! values that a case states. For each check, `tests/stress/mutations.rs` plants a fault in the cpu backend
+//! and in the reference that the check must find.
 
 use std::io::{self, Write};
 
@@ -18,10 +18,10 @@ use super::progress;
 
 /// Render extreme scenes on every backend, and compare each with its bound.
 ///
-/// Needles of 10,000 px, depths from a centimetre to ten kilometres, 4,500 km from the origin, NaN, 70
-/// million keys: each has broken a published renderer. Prints one table, and fails if a bound is missed.
-/// The table names cases that cannot run here, with the reason, and cases that a device refuses, with how
-/// much fits.
+/// The scenes have needles of 10,000 px, depths from a centimetre to ten kilometres, places 4,500 km from
+/// the origin, NaN, or 70 million sort keys: each has broken a published renderer. Prints one table, and
+/// fails if a bound is exceeded. For a case that cannot run here, the table says why; for a case that
+/// exceeds a limit of the device, it says how much fits.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Stress {

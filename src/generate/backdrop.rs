@@ -1,4 +1,4 @@
-//! What closes the view below the sky: distant roofs, and the land around.
+//! The background between the street and the sky: distant roofs, and the surrounding land.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -8,10 +8,10 @@ use super::surface::{Paint, Painter};
 
 /// How far the land reaches, in metres.
 const LAND_TO_M: f64 = 560.0;
-/// Land nearer to the centre line than this is painted by others, in metres.
+/// Land nearer to the centre line than this is painted by other modules, in metres.
 const LAND_FROM_M: f64 = 27.0;
 
-/// Paints all of it around the middle of the street.
+/// Paints the whole background around the middle of the street.
 pub(super) fn paint(painter: &mut Painter, route: &Route, seed: u64) {
     let middle_m = route.at(0.5 * route.driven_m[1]).point_m;
     skyline(painter, middle_m, seed);

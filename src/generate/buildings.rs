@@ -1,4 +1,4 @@
-//! Houses: which stand where, and what is above and beside their facades.
+//! Houses: their positions, roofs and side walls.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -21,7 +21,7 @@ pub(super) struct Building {
     style: Style,
     /// Sides with windows, because they face a street: left and right as seen from the front.
     open_sides: [bool; 2],
-    /// Height of the neighbours, in metres: a side is seen above it.
+    /// Height of the neighbours, in metres: only the part of a side above it is visible.
     neighbours_m: [f64; 2],
     spacing: f64,
     random: Random,
@@ -108,7 +108,7 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
 }
 
 impl Building {
-    /// What stands in the sun's way.
+    /// The body that casts the house's shadow.
     pub(super) fn occluder(&self) -> Occluder {
         let Wall { width_m, right, .. } = self.front;
         let base_m = self.front.at(0.5 * width_m, 0.0, -0.5 * DEPTH_M);
@@ -157,7 +157,7 @@ impl Building {
         }
     }
 
-    /// The dark of the rooms, 1.6 m behind a wall: what is seen between its surfels.
+    /// A dark surface 1.6 m behind a wall, which is visible through gaps between its surfels.
     fn back(&self, painter: &mut Painter, wall: &Wall) {
         let (inset_m, top_m) = (1.6, self.style.height_m() - 1.6);
         let rotation = DQuat::from_mat3(&DMat3::from_cols(wall.right, DVec3::Z, wall.out));
@@ -225,7 +225,7 @@ impl Building {
     }
 }
 
-/// Break points of a row of fronts between two ends.
+/// Boundaries between the fronts of a row, from one end to the other.
 fn fronts(random: &mut Random, [from_m, to_m]: [f64; 2]) -> Vec<f64> {
     let mut breaks_m = vec![from_m];
     let mut at_m = from_m;
@@ -233,7 +233,7 @@ fn fronts(random: &mut Random, [from_m, to_m]: [f64; 2]) -> Vec<f64> {
         at_m += random.range(FRONTS_M[0], FRONTS_M[1]);
         breaks_m.push(at_m);
     }
-    // Stretch the row so that its last house ends where it must.
+    // Stretch the row so that its last house ends at the end of the row.
     if to_m - at_m > 0.5 * FRONTS_M[0] {
         at_m = to_m;
         breaks_m.push(at_m);

@@ -1,7 +1,7 @@
 //! A street of any number of Gaussians, for measuring: a road between two facades, closed at its ends.
 //!
-//! Smaller surfels for larger numbers, so that they cover the same surfaces as densely: what grows is
-//! detail, as in a larger capture.
+//! More Gaussians are smaller, so that they cover the same surfaces equally densely: a larger number gives
+//! more detail, as in a larger capture.
 
 use super::random::Random;
 use wildcity_scene::Gaussians;
@@ -10,12 +10,12 @@ use wildcity_scene::Gaussians;
 const HALF_M: [f64; 2] = [60.0, 8.0];
 /// Height of the facades, in metres: what a vehicle's cameras see of them.
 const HEIGHT_M: f64 = 6.0;
-/// How far surfels lie off their surface, either way, in metres.
+/// Largest distance of a surfel from its surface, to either side, in metres.
 const ROUGH_M: f64 = 0.05;
 
-/// Makes `count` Gaussians of SH degree 1 around the origin, the road along x at z = 0; tells
-/// `progress` how many are done of how many. The same count gives the same
-/// Gaussians, on another machine up to rounding: the logarithm is the system's.
+/// Makes `count` Gaussians of SH degree 1 around the origin, with the road along x at z = 0. Calls `progress`
+/// with the number of Gaussians that are done and the number of all. The same count gives the same Gaussians;
+/// between machines they may differ by rounding, because the logarithm is that of the system.
 pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
     let [half_length, half_width] = HALF_M;
     let areas_m2 =
@@ -33,7 +33,7 @@ pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
         let (z, off) = (random.range(0.0, HEIGHT_M), random.range(-ROUGH_M, ROUGH_M));
         let side = if random.chance(0.5) { -1.0 } else { 1.0 };
         let at = random.range(0.0, area_m2);
-        // The axis across the surface comes last in the choice of surface, and is the thin one.
+        // `across` is the axis that is perpendicular to the surface, along which the Gaussian is thin.
         let (mean_m, across, grey) = if at < areas_m2[0] {
             ([x, y, off], 2, 0.25)
         } else if at < areas_m2[0] + areas_m2[1] {

@@ -2,14 +2,14 @@
 
 /// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
 ///
-/// Every knot is (x, belt, top): where along the car, the height of the body's side and the height
-/// of the middle line, in metres. Between knots both run straight.
+/// Every knot is (x, belt, top): the position along the car as a fraction of its length, the height of the
+/// body's side, and the height of the middle line, both in metres. Heights are interpolated linearly.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Kind {
     pub(super) length_m: f64,
     pub(super) width_m: f64,
     knots: &'static [(f64, f64, f64)],
-    /// Glass of the sides, from tail to nose in parts of the length: between them stand pillars.
+    /// Side windows from tail to nose, as fractions of the length; pillars are between them.
     pub(super) side_glass: &'static [[f64; 2]],
     /// Rear window and windscreen, as [low end, high end] along the car.
     pub(super) rear_glass: [f64; 2],
@@ -17,7 +17,7 @@ pub(super) struct Kind {
 }
 
 impl Kind {
-    /// Height of the body's shoulder at a part of the length, in metres.
+    /// Height of the body's shoulder at a fraction `x` of the length, in metres.
     pub(super) fn belt_m(&self, x: f64) -> f64 {
         self.knotted(x, |knot| knot.1)
     }
@@ -27,7 +27,7 @@ impl Kind {
         self.knotted(x, |knot| knot.2)
     }
 
-    /// The parts of the length at which something begins or ends, in increasing order.
+    /// The fractions of the length at which a knot or a window lies, in increasing order.
     pub(super) fn features(&self) -> Vec<f64> {
         let mut features: Vec<f64> = self.knots.iter().map(|knot| knot.0).collect();
         features.extend(self.side_glass.iter().flatten());
@@ -38,7 +38,7 @@ impl Kind {
         features
     }
 
-    /// A column of the knots at `x`, straight between them.
+    /// A column of the knots at `x`, interpolated linearly.
     fn knotted(&self, x: f64, column: fn(&(f64, f64, f64)) -> f64) -> f64 {
         let last = self.knots.len() - 1;
         let after = self.knots.iter().position(|knot| knot.0 >= x).unwrap_or(last).max(1);

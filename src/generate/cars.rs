@@ -1,4 +1,4 @@
-//! Parked cars: one body, lofted through the outline of its kind.
+//! Parked cars: each body is a surface through the outline of its kind.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -29,7 +29,7 @@ pub(super) struct Car {
 impl Car {
     /// A car with its middle on `middle_m` that looks along `forward`.
     ///
-    /// `spacing` above 1 is for cars that are seen from afar only.
+    /// `spacing` is above 1 for cars that are only visible from far away.
     pub(super) fn new(middle_m: DVec3, forward: DVec3, spacing: f64, mut random: Random) -> Self {
         let kind = random.pick(&[&HATCHBACK, &HATCHBACK, &SEDAN, &SEDAN, &WAGON, &WAGON, &VAN]);
         let paint = random.pick(&[
@@ -47,7 +47,7 @@ impl Car {
         Self { kind, tail_m, forward, left, paint: paint.gloss(0.14), spacing }
     }
 
-    /// What stands in the sun's way: the body and the cabin, a little smaller than painted.
+    /// The bodies that cast the car's shadow: body and cabin, a little smaller than painted.
     pub(super) fn occluders(&self) -> [Occluder; 2] {
         let Kind { length_m, width_m, .. } = *self.kind;
         let block = |from: f64, to: f64, low_m: f64, high_m: f64, half_width_m: f64| {
@@ -87,7 +87,7 @@ impl Car {
         self.inside(painter);
     }
 
-    /// The dark inside: seats and shadow, what is seen between the surfels.
+    /// The dark interior, which is visible through gaps between the surfels.
     fn inside(&self, painter: &mut Painter) {
         let Kind { length_m, width_m, .. } = *self.kind;
         let rotation = DQuat::from_mat3(&DMat3::from_cols(self.forward, self.left, DVec3::Z));
@@ -132,7 +132,7 @@ impl Car {
             let z_m = SILL_M + v * (self.kind.belt_m(x) - SILL_M);
             self.place(x_m, side * belly * self.half_width_m(x), z_m)
         };
-        // Outwards is left × ... : on the left side u runs to the tail.
+        // The surface must face outwards (u × v), so u runs to the tail on the left side.
         let us = facing(xs, -side);
         let body = self.paint;
         painter.sheet(
@@ -242,7 +242,7 @@ impl Car {
         });
     }
 
-    /// Tyre, rim, and the dark of the arch behind them.
+    /// Tyre, rim, and the dark wheel arch behind them.
     fn wheel(&self, painter: &mut Painter, wheel: f64, side: f64) {
         let x_m = wheel * self.kind.length_m;
         let half_m = self.half_width_m(wheel);
@@ -306,7 +306,7 @@ impl Car {
         painter.sheet(&[-0.05, 0.05], &zs, outer, |_, _| Some(self.paint.times(0.85)));
     }
 
-    /// The dark between the wheels, 2 cm above the road.
+    /// The shaded ground between the wheels, 2 cm above the road.
     fn shade_below(&self, painter: &mut Painter) {
         let (half_m, length_m) = (0.5 * self.kind.width_m, self.kind.length_m);
         let xs = painter.even(0.02, length_m - 0.02, 0.26);

@@ -1,8 +1,8 @@
 //! A city: streets end to start along one route of any length, made cell by cell.
 //!
-//! The route runs east and swings up to 47° to both sides, so it never meets itself, and a line of
-//! constant x sweeps over it: a cell that lies west of everything to come is done. What is in memory
-//! is two or three streets, however long the route.
+//! The route runs east and bends by up to 47° to both sides, so it never crosses itself. Streets are made from
+//! west to east: a cell is complete once it lies west of all streets that are still to come. Only two or three
+//! streets are in memory at a time, for a route of any length.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -21,8 +21,8 @@ use super::street::Plan;
 use super::surface::Painter;
 use super::{CitySettings, GenerateError};
 
-/// Shortest and longest street but for the last two, in metres: room for side streets that do not
-/// meet behind the houses where the route bends.
+/// Shortest and longest street, except for the last two, in metres: long enough that side streets do not meet
+/// behind the houses where the route bends.
 const STREET_M: [f64; 2] = [150.0, 220.0];
 /// How far from its centre line a street reaches, in metres: the side street's 82, the house at its
 /// end, 13, and eaves.
@@ -32,7 +32,7 @@ const PAINTED_AT_ONCE: usize = 4;
 /// How far from both ends of the route the drive stays, in metres.
 const INDENT_M: f64 = 8.0;
 
-/// The Gaussians of one cell, all of them.
+/// All Gaussians of one cell.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
     /// Grid cell (x, y), as in [`wildcity_scene::Chunk::cell`].
@@ -41,16 +41,16 @@ pub struct Cell {
     pub gaussians: Gaussians,
 }
 
-/// A city in the making: its cells, each once, from west to east. The same settings give the same
-/// cells, on any number of threads.
+/// An iterator over the cells of a city from west to east, each once. The same settings give the same cells on
+/// any number of threads.
 #[derive(Debug)]
 pub struct City {
     settings: CitySettings,
     streets: Streets,
-    /// Streets that stand and are not painted; before the first, the one that was painted last.
+    /// Planned streets that are not painted yet, preceded by the one that was painted last.
     planned: VecDeque<Plan>,
     painted_any: bool,
-    /// Gaussians of cells that more may come to.
+    /// Gaussians of cells that are not complete yet.
     open: BTreeMap<[i32; 2], Gaussians>,
     done: VecDeque<Cell>,
 }
@@ -97,12 +97,12 @@ impl Iterator for City {
 }
 
 impl City {
-    /// Paints the next streets, and puts aside the cells that nothing further can touch. Whether there
-    /// was any street left.
+    /// Paints the next streets, and moves the cells that are complete to the output. Returns whether there was
+    /// a street left.
     fn paint(&mut self) -> bool {
         let count = rayon::current_num_threads().min(PAINTED_AT_ONCE);
         let first = usize::from(self.painted_any);
-        // A street's houses throw their shadows on the next one, and the other way round.
+        // Houses of neighbouring streets cast shadows on each other.
         while self.planned.len() < first + count + 1
             && let Some(site) = self.streets.next()
         {
@@ -144,7 +144,7 @@ impl City {
         }
     }
 
-    /// Puts the cells west of `x_m` aside.
+    /// Moves the cells west of `x_m`, which are complete, to the output.
     fn close(&mut self, x_m: f64) {
         let open = std::mem::take(&mut self.open).into_iter();
         let is_done = |cell: &[i32; 2]| CELL_M * (f64::from(cell[0]) + 0.5) < x_m;
@@ -163,7 +163,7 @@ fn paint(planned: &[Plan], at: usize, density: f64) -> Gaussians {
     painter.gaussians
 }
 
-/// Where a street of the city lies.
+/// The position of a street of the city along the route.
 #[derive(Debug)]
 struct Site {
     route: Route,
@@ -193,7 +193,7 @@ struct Streets {
 }
 
 impl Streets {
-    /// Bends of a city, and no streets yet.
+    /// The bends of a city's route, before any street is made.
     ///
     /// Together with the streets' own 0.30 rad the heading stays within 0.82 rad of east; the curvature
     /// within `2π (0.30 / 260 + 0.40 / 3100 + 0.12 / 1100)` = 0.0088 1/m, a radius of 114 m.

@@ -54,7 +54,7 @@ pub(super) struct Style {
     pub(super) accent: Paint,
     /// Floors above the ground floor.
     pub(super) upper_floors: usize,
-    /// Width of a window bay, about, in metres.
+    /// Approximate width of a window bay, in metres.
     pub(super) bay_m: f64,
     /// Height of a window, in metres.
     pub(super) window_m: f64,
@@ -64,7 +64,7 @@ pub(super) struct Style {
     pub(super) balconies: bool,
     /// What fills the ground floor.
     pub(super) ground_floor: GroundFloor,
-    /// Whether one can drive past: then the windows have all their parts.
+    /// Whether the drive passes the house; then its windows have all their parts.
     pub(super) near: bool,
 }
 
@@ -97,7 +97,7 @@ pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &
     }
     for floor in 0..style.upper_floors {
         let from_m = GROUND_FLOOR_M + FLOOR_M * floor as f64;
-        // What is higher is farther from every camera.
+        // Higher floors are farther from every camera.
         facade.painter.coarser(1.0 + 0.32 * floor as f64, |painter| {
             let mut facade = Facade { painter, ..facade };
             for bay in 0..count {
@@ -113,7 +113,7 @@ pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &
     facade.bands();
 }
 
-/// A wall while it is painted.
+/// A wall that is being painted.
 pub(super) struct Facade<'p, 'a, 'w> {
     pub(super) painter: &'p mut Painter<'a>,
     pub(super) wall: &'w Wall,
@@ -160,7 +160,7 @@ impl Facade<'_, '_, '_> {
         let style = *self.style;
         let at_m = self.wall.corner_m;
         self.rect(us, vs, 0.0, |u_m, v_m| {
-            // Stains run down, splashes from the pavement darken the foot.
+            // Stains are vertical, and splashes from the pavement darken the bottom of the wall.
             let seed = (at_m.x * 16.0) as i64 as u64;
             let stain = 0.030 * noise(seed, 1.3 * u_m, 0.25 * v_m)
                 + 0.025 * noise(seed.wrapping_add(1), 0.3 * u_m, 0.3 * v_m);
@@ -230,7 +230,7 @@ impl Facade<'_, '_, '_> {
             let vs = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
             self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
         }
-        // Some rooms are lit, some have curtains; the rest is dark with the sky in it.
+        // Some rooms are lit, some have curtains; all other panes are dark and reflect the sky.
         let curtain = random.chance(0.45);
         let drawn = random.range(0.1, 0.34);
         let tone = random.range(0.8, 1.25);

@@ -119,7 +119,7 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
     painter.sheet(&us, &vs, lid, |_, _| Some(paint));
 }
 
-/// A round plate that looks along `facing`; `paint` is asked by the part of the radius.
+/// A round plate that faces along `facing`. `paint` gives the colour at a fraction of the radius.
 fn disc(
     painter: &mut Painter,
     center_m: DVec3,

@@ -66,7 +66,7 @@ impl Facade<'_, '_, '_> {
             if mullion || v_m > head_m - 0.09 || v_m < plinth_m + 0.08 {
                 return frame;
             }
-            // Below the eyes goods stand on shelves, above is the lit room.
+            // Goods stand on shelves below eye height; above them is the lit room.
             let shelf = (v_m / 0.5).floor();
             let goods = |channel: u64| noise(seed + channel, 2.3 * at_m, 1.7 * shelf);
             let room = smooth((v_m - 1.5) / 0.5);
@@ -75,7 +75,7 @@ impl Facade<'_, '_, '_> {
             paint.rgb += (1.0 - room) * (hue + 0.12 * goods(3));
             paint
         });
-        // The sign, with blocks that pass for letters.
+        // The sign, with blocks in place of letters.
         let signs = self.painter.graded(head_m, sign_m, 0.09, 0.12);
         let letters = self.painter.even(u[0], u[1], 0.13);
         let lettering = if accent.rgb.element_sum() > 1.5 { 0.25 } else { 0.93 };

@@ -2,11 +2,11 @@
 //!
 //! Surfaces are tiled with flat Gaussians (`surface.rs`) whose colours carry the light of one sun
 //! (`light.rs`). World: ENU in metres, z up, the road at z = 0, the street running east from the
-//! origin. The same settings give the same bytes: there is no clock, no order of threads, and one stream
-//! of random numbers per thing (`random.rs`).
+//! origin. The same settings give the same bytes: nothing depends on a clock or on the order of threads, and
+//! each object has its own stream of random numbers (`random.rs`).
 //!
-//! Where the 439,000 Gaussians of the default settings go, and how far apart they are before
-//! [`StreetSettings::density`] (0.8: 12 % wider):
+//! The 439,000 Gaussians of the default settings, and their spacing at a [`StreetSettings::density`] of 1 (at
+//! the default of 0.8, spacings are 12 % wider):
 //!
 //! | what | thousands | spacing |
 //! |---|---|---|
@@ -15,7 +15,7 @@
 //! | 65 parked cars | 91 | 8 to 16 cm |
 //! | 44 trees | 59 | leaves of 6 cm |
 //! | lamps, lights, signs, bins, planters | 15 | 4 to 40 cm |
-//! | skyline, land | 6 | 4.5 m, and with the distance more |
+//! | skyline, land | 6 | 4.5 m, wider with the distance |
 //!
 //! Behind them is a sky of its own ([`SKY`]).
 
@@ -59,7 +59,8 @@ pub struct StreetSettings {
     pub length_m: f64,
     /// Where a side street crosses, in metres from the start: at least 40 from both ends.
     pub crossing_m: f64,
-    /// Gaussians per Gaussian of the spacings in the source, 0.1 to 4: spacing goes with its root.
+    /// Number of Gaussians as a multiple of that at the spacings in the source, 0.1 to 4. Spacings are divided by
+    /// its square root.
     pub density: f64,
 }
 
@@ -87,10 +88,10 @@ pub struct CitySettings {
     pub speed_m_s: f64,
 }
 
-/// Why nothing was made.
+/// Why a street or a city cannot be generated.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GenerateError {
-    /// A setting is outside what the generator was built for.
+    /// A setting is out of range.
     #[error("setting {field} is {value:?}; {must}")]
     Setting {
         /// The setting.
@@ -175,9 +176,10 @@ impl CitySettings {
         (self.millions_per_km * 1e3 * self.length_m) as u64
     }
 
-    /// What [`StreetSettings::density`] gives so many.
+    /// The [`StreetSettings::density`] that gives this number of Gaussians.
     fn spacing_density(&self) -> f64 {
-        // What was counted, in millions per km. Leaves and windows do not get fewer.
+        // Pairs of (counted millions of Gaussians per km, density). They are not proportional, because the numbers
+        // of leaves and windows do not depend on the density.
         let counted = [(0.826, 0.432), (2.200, 2.0), (4.419, 5.0), (9.261, 12.0)];
         let above = counted.iter().rposition(|(millions, _)| *millions <= self.millions_per_km);
         let from = above.unwrap_or(0).min(counted.len() - 2);

@@ -13,13 +13,13 @@ const TO_SUN: DVec3 = DVec3::new(-0.600, -0.400, 0.693);
 const SUN: DVec3 = DVec3::new(1.22, 1.11, 0.94);
 /// Light from the whole sky on a surface that faces up.
 const SKY: DVec3 = DVec3::new(0.50, 0.55, 0.63);
-/// Light that the ground throws back on a surface that faces down.
+/// Light that the ground reflects to a surface that faces down.
 const GROUND: DVec3 = DVec3::new(0.28, 0.27, 0.25);
 
 /// Side of a cell of the shadow grid, in metres.
 const CELL_M: f64 = 6.0;
 
-/// Something that throws a shadow.
+/// An object that casts a shadow.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Occluder {
     /// A box on the ground plan, turned about z.
@@ -31,7 +31,7 @@ pub(super) enum Occluder {
         /// Half length, half width and full height, in metres.
         size_m: DVec3,
     },
-    /// A tree's crown: lets some light through.
+    /// A tree's crown, which lets some light through.
     Crown {
         /// Middle, in metres.
         center_m: DVec3,
@@ -40,10 +40,10 @@ pub(super) enum Occluder {
     },
 }
 
-/// The sun, the sky, and what stands in the sun's way.
+/// The sun, the sky, and the objects that cast shadows.
 ///
-/// Occluders are filed by where their shadow falls on the plane z = 0, so that a point asks only
-/// those that can reach it.
+/// Occluders are stored in a grid by the area of their shadow on the plane z = 0, so that a point is tested only
+/// against those whose shadow can reach it.
 #[derive(Clone, Debug)]
 pub(super) struct Light {
     occluders: Vec<Occluder>,
@@ -53,7 +53,7 @@ pub(super) struct Light {
 }
 
 impl Light {
-    /// The light of a street on which these stand.
+    /// The light of a street with these occluders.
     pub(super) fn new(occluders: Vec<Occluder>) -> Self {
         let reaches: Vec<_> = occluders.iter().map(shadow_box_m).collect();
         let low_m = reaches.iter().fold(DVec2::INFINITY, |low, reach| low.min(reach[0]));
@@ -78,7 +78,7 @@ impl Light {
         Self { occluders, first_cell, columns, cells }
     }
 
-    /// Light that falls on a surface: multiply with the albedo.
+    /// Light that falls on a surface, to be multiplied by the albedo.
     pub(super) fn on(&self, point_m: DVec3, normal: DVec3) -> DVec3 {
         let facing = normal.dot(TO_SUN).max(0.0);
         let sun = if facing > 0.0 { facing * self.sun_at(point_m + 0.06 * normal) } else { 0.0 };
@@ -86,7 +86,7 @@ impl Light {
         sun * SUN + up * SKY + (1.0 - up) * GROUND
     }
 
-    /// How much of the sun a point sees, 0 to 1.
+    /// Share of the sunlight that reaches a point through all occluders, 0 to 1.
     fn sun_at(&self, point_m: DVec3) -> f64 {
         let shadow_m = on_ground(point_m);
         let cell = cell_of(shadow_m);
@@ -104,7 +104,7 @@ impl Light {
 }
 
 impl Occluder {
-    /// How much of the sun passes on its way to a point, 0 to 1.
+    /// Share of the sunlight that passes this occluder on its way to a point, 0 to 1.
     fn passes(&self, point_m: DVec3) -> f64 {
         match *self {
             Self::Block { base_m, along, size_m } => {

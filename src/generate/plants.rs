@@ -19,14 +19,14 @@ pub(super) struct Tree {
 impl Tree {
     /// A tree whose trunk stands at `foot_m`.
     ///
-    /// `near` is whether one can drive past: then it has all its leaves.
+    /// `near` says whether the drive passes the tree; then it has all its leaves.
     pub(super) fn new(foot_m: DVec3, near: bool, mut random: Random) -> Self {
         let trunk_m = random.range(3.1, 3.7);
         let crown_m = random.range(1.9, 2.5);
         Self { foot_m, trunk_m, crown_m, near, random }
     }
 
-    /// What stands in the sun's way.
+    /// The body that casts the tree's shadow.
     pub(super) fn occluder(&self) -> Occluder {
         Occluder::Crown { center_m: self.middle_m(), radius_m: 1.05 * self.crown_m }
     }
@@ -114,12 +114,12 @@ impl Foliage {
             let away = ball(random).normalize_or_zero();
             let depth = random.range(0.70, 1.08);
             let mean_m = middle_m + depth * away * radii_m;
-            // Leaves face anywhere, on the whole outwards and up.
+            // Leaves face in random directions, mostly outwards and up.
             let normal = (away + 0.9 * ball(random) + 0.4 * DVec3::Z).normalize_or(DVec3::Z);
             let tone = random.range(0.72, 1.28) * (0.5 + 0.5 * depth);
             let mut paint = green.times(tone);
             paint.rgb.x *= random.range(0.82, 1.18);
-            // What points down or lies deep in the crown sees little of the sky.
+            // Leaves that point down or lie deep in the crown get little light from the sky.
             let rgb = painter.shade(mean_m, normal, &paint.open(0.70 + 0.30 * away.z));
             let size_m = self.size_m * random.range(0.8, 1.5);
             let sigmas_m = DVec3::new(1.4 * size_m, size_m, 0.012);

@@ -5,14 +5,14 @@
 pub(super) struct Random(u64);
 
 impl Random {
-    /// The stream of one thing: every building, tree and car has its own, so that a change to one
-    /// leaves the others as they are.
+    /// The stream of one object: every building, tree and car has its own, so that a change to one does not
+    /// change the others.
     pub(super) fn new(seed: u64, what: &str, index: usize) -> Self {
         let named = what.bytes().fold(seed, |hash, byte| mix(hash ^ u64::from(byte)));
         Self(mix(named ^ mix(index as u64)))
     }
 
-    /// A seed of other streams.
+    /// A seed for other streams.
     pub(super) fn seed(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(GOLDEN);
         mix(self.0)
@@ -28,7 +28,7 @@ impl Random {
         low + (high - low) * self.unit()
     }
 
-    /// True once in `1 / probability` times.
+    /// True with this probability.
     pub(super) fn chance(&mut self, probability: f64) -> bool {
         self.unit() < probability
     }

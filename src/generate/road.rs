@@ -41,8 +41,8 @@ const STRIPE_M: f64 = 0.48;
 /// Pavement slabs are squares of this side, in metres.
 const SLAB_M: f64 = 0.90;
 
-/// Paints all ground along the street; `cross_s_m` is the middle of the crossing. `seed` is that of
-/// the grain, `covers_seed` that of what lies on the road.
+/// Paints all ground along the street; `cross_s_m` is the middle of the crossing. `seed` is that of the
+/// surface grain, `covers_seed` that of the manhole covers.
 pub(super) fn paint(
     painter: &mut Painter,
     route: &Route,
@@ -117,7 +117,7 @@ impl Ground<'_> {
         self.flat(painter, &ss, &ts, 0.0, |s_m, t_m| self.lane_paint(s_m, t_m));
     }
 
-    /// Where manholes are: one in 31 m, off the wheel tracks of one lane or the other.
+    /// Positions of manholes: one every 31 m, beside the wheel tracks of either lane.
     fn covers(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
         let (seed, cross_s_m, [from_m, to_m]) =
             (self.covers_seed, self.cross_s_m, self.route.driven_m);
@@ -193,7 +193,7 @@ impl Ground<'_> {
         let off_lane_m = t_m.abs() - LANE_T_M.abs();
         let track = 0.03 * (1.0 - smooth((off_lane_m.abs() - 0.8).abs() / 0.35));
         let oil = -0.05 * (1.0 - smooth(off_lane_m.abs() / 0.5));
-        // A trench was opened and closed again here and there.
+        // Some areas are repaired trenches.
         let trench = noise(self.seed + 6, (s_m / 9.0).floor(), (t_m / 1.8).floor());
         let patch = if trench > 0.72 { -0.15 } else { 0.0 };
         Paint::matt(0.400, 0.402, 0.412).times(1.0 + grain + track + oil + patch).gloss(0.10)

@@ -11,7 +11,7 @@ use wildcity_scene::trajectory::Keyframe;
 /// How far the street goes on beyond both ends of the drive, in metres.
 pub(super) const BEYOND_M: f64 = 80.0;
 
-/// Distance between keyframes, in metres.
+/// Spacing of keyframes, in metres.
 const KEYFRAME_M: f64 = 0.5;
 /// How fast the recorded drive of a street is, in m/s.
 const SPEED_M_S: f64 = 10.0;
@@ -21,18 +21,18 @@ const INDENT_M: f64 = 8.0;
 const SLACK_M: f64 = 40.0;
 /// Arc length between nodes of the table, in metres.
 const NODE_M: f64 = 0.25;
-/// The street swings this far to both sides of east, in radians (17°) ...
+/// Largest angle between the street and east, to both sides, in radians (17°).
 const SWING_RAD: f64 = 0.30;
-/// ... and is back after this length, in metres: the tightest radius is `260 / (2π 0.30)` = 138 m,
-/// which hides both ends of the street from nearly everywhere on it.
+/// Period of the street's bends, in metres: the smallest radius is `260 / (2π 0.30)` = 138 m, which hides both
+/// ends of the street from nearly every point of it.
 const SWING_PERIOD_M: f64 = 260.0;
 
 /// A street of constant width in the plane z = 0, by arc length `s` in metres.
 #[derive(Clone, Debug)]
 pub(super) struct Route {
-    /// From where to where it is driven, in metres.
+    /// Start and end of the part that is driven, in metres along the route.
     pub(super) driven_m: [f64; 2],
-    /// From where to where houses stand, in metres: as far as is driven, or beyond.
+    /// Start and end of the part with houses, in metres along the route: the driven part, or more.
     pub(super) ends_m: [f64; 2],
     /// Whether a house across the street closes the view at either end.
     pub(super) closed: [bool; 2],
@@ -41,22 +41,22 @@ pub(super) struct Route {
     nodes_m: Vec<DVec3>,
 }
 
-/// How a street bends. Its heading is `0.30 sin(2π s / 260)` rad from east, and what is added to
-/// that; its position is the integral.
+/// The bends of a street. Its heading from east is `0.30 sin(2π s / 260)` rad plus the additional waves; its
+/// position is the integral.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Bends {
-    /// Waves of the heading beside the street's own.
+    /// Additional waves of the heading.
     pub(super) wide: [Wave; 2],
 }
 
-/// A wave of the heading.
+/// A sine wave of the heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Wave {
-    /// How far it swings to both sides, in radians.
+    /// Amplitude, in radians.
     pub(super) swing_rad: f64,
-    /// After how long it is back, in metres.
+    /// Period, in metres.
     pub(super) period_m: f64,
-    /// Where in its period it is at s = 0, in radians.
+    /// Phase at s = 0, in radians.
     pub(super) phase_rad: f64,
 }
 
@@ -116,7 +116,7 @@ impl Route {
         Station { point_m, forward, left: DVec3::new(-forward.y, forward.x, 0.0) }
     }
 
-    /// How far beyond the driven part a station lies, in metres; 0 on it.
+    /// Distance of a station from the driven part, in metres; 0 within it.
     pub(super) fn beyond_m(&self, s_m: f64) -> f64 {
         (s_m - s_m.clamp(self.driven_m[0], self.driven_m[1])).abs()
     }
@@ -149,7 +149,7 @@ impl Route {
     }
 
     /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from a station to another
-    /// one, both in metres. Leaves the station of the pose after the last.
+    /// one, both in metres. Sets `station_m` to the station of the pose after the last.
     pub(super) fn poses(&self, t_m: f64, station_m: &mut f64, to_s_m: f64) -> Vec<Pose> {
         let mut poses = Vec::new();
         while *station_m <= to_s_m {
@@ -208,7 +208,7 @@ impl Wave {
 }
 
 impl Default for Wave {
-    /// Straight on.
+    /// A straight street.
     fn default() -> Self {
         Self { swing_rad: 0.0, period_m: 1.0, phase_rad: 0.0 }
     }

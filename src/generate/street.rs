@@ -1,4 +1,4 @@
-//! The plan of the street: what stands where, and the order of painting.
+//! The plan of the street: the positions of its objects, and the order of painting.
 
 use super::buildings::{self, Building};
 use super::cars::Car;
@@ -33,7 +33,7 @@ pub(super) fn build(settings: &StreetSettings) -> Street {
     Street { gaussians: painter.gaussians, trajectory }
 }
 
-/// What stands where.
+/// The objects of a street.
 #[derive(Debug)]
 pub(super) struct Plan {
     pub(super) route: Route,
@@ -46,8 +46,8 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// The street along `route` with a side street at station `crossing_m`. One seed is that of all
-    /// things, the other that of the ground's grain, which goes on where one street meets the next.
+    /// The street along `route` with a side street at station `crossing_m`. The first seed is that of all objects,
+    /// the second that of the ground's grain, which continues from one street to the next.
     pub(super) fn new(route: Route, crossing_m: f64, [seed, grain_seed]: [u64; 2]) -> Self {
         Self {
             buildings: buildings::plan(&route, crossing_m, seed),
@@ -60,7 +60,7 @@ impl Plan {
         }
     }
 
-    /// What throws shadows.
+    /// The bodies that cast shadows.
     pub(super) fn occluders(&self) -> impl Iterator<Item = Occluder> + '_ {
         let buildings = self.buildings.iter().map(Building::occluder);
         let cars = self.cars.iter().flat_map(Car::occluders);
@@ -82,7 +82,7 @@ impl Plan {
     }
 }
 
-/// Cars in two of three bays, looking the way their side drives.
+/// Cars in two of three bays, which face in the driving direction of their side.
 fn park(route: &Route, crossing_m: f64, seed: u64) -> Vec<Car> {
     let mut cars = Vec::new();
     for (side, name) in [(-1.0, "car, right"), (1.0, "car, left")] {
@@ -164,8 +164,8 @@ fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
     }
 }
 
-/// Stations along the whole street, `step_m` apart: clear of the houses that close its ends, and as
-/// far from open ends as the next street's are.
+/// Stations along the whole street, `step_m` apart. They keep clear of the houses that close its ends; at an
+/// open end, the distance to the next street's first station is the same.
 fn along(route: &Route, step_m: f64) -> impl Iterator<Item = f64> + use<> {
     let [clear, ends] = [[14.0, 10.0], route.ends_m];
     let clear_m = |end: usize| if route.closed[end] { clear[end] } else { 0.5 * step_m };

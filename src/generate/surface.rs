@@ -6,16 +6,16 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::light::Light;
 
-/// Standard deviation of a surfel as a part of its cell's edge: a smaller one shows the pattern of
-/// cells, a larger one blurs. At 0.66 four neighbours of opacity 0.97 cover their common corner,
-/// 0.5 / 0.66 = 0.76 sigma from each along both axes, to `1 - (1 - 0.97 exp(-0.76²))⁴` = 96 %, and
-/// the next ring of eight to 97.5 %.
+/// Standard deviation of a surfel as a fraction of its cell's edge: with a smaller one the pattern of cells is
+/// visible, with a larger one the image is blurred. At 0.66, the common corner of four neighbours of opacity
+/// 0.97 is 0.5 / 0.66 = 0.76 sigma from each along both axes. They cover it to `1 - (1 - 0.97 exp(-0.76²))⁴` =
+/// 96 %, and with the next ring of eight to 97.5 %.
 const OVERLAP: f64 = 0.66;
 
 /// Half thickness of a surfel, in metres.
 const THICKNESS_M: f64 = 0.004;
 
-/// Cells grow from an edge inwards by this factor: fine where colours meet, coarse between.
+/// Factor by which cells grow from an edge inwards: they are fine where colours meet and coarse in between.
 const GROWTH: f64 = 1.9;
 
 /// How a surface looks.
@@ -23,11 +23,11 @@ const GROWTH: f64 = 1.9;
 pub(super) struct Paint {
     /// Display colour of the material in white light, 0 to 1.
     pub(super) rgb: DVec3,
-    /// How much sky it mirrors: 0 matt, 0.08 asphalt, 0.3 glass.
+    /// Share of the sky that it reflects: 0 matt, 0.08 asphalt, 0.3 glass.
     pub(super) gloss: f64,
-    /// Part of the light that reaches it past its surroundings: 1 open, 0.5 a deep corner.
+    /// Share of the light that its surroundings do not block: 1 in the open, 0.5 in a deep corner.
     pub(super) open: f64,
-    /// Whether it shines by itself: the colour is taken as it is.
+    /// Whether it is a light source; then its colour does not depend on the light.
     pub(super) glows: bool,
 }
 
@@ -37,7 +37,7 @@ impl Paint {
         Self { rgb: DVec3::new(r, g, b), gloss: 0.0, open: 1.0, glows: false }
     }
 
-    /// The same, mirroring the sky.
+    /// The same, with a reflection of the sky.
     pub(super) const fn gloss(self, gloss: f64) -> Self {
         Self { gloss, ..self }
     }
@@ -47,7 +47,7 @@ impl Paint {
         Self { rgb: self.rgb * factor, ..self }
     }
 
-    /// The same, where surroundings take some of the light.
+    /// The same, where surroundings block some of the light.
     pub(super) fn open(self, open: f64) -> Self {
         Self { open: self.open * open, ..self }
     }
@@ -89,7 +89,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Paints what `draw` paints, with all spacings `factor` times as wide: for what is far away.
+    /// Paints what `draw` paints with all spacings `factor` times as wide: for distant objects.
     pub(super) fn coarser(&mut self, factor: f64, draw: impl FnOnce(&mut Self)) {
         let spacing = self.spacing;
         self.spacing *= factor;
@@ -125,8 +125,8 @@ impl<'a> Painter<'a> {
 
     /// Covers a curved sheet: one surfel per cell between the break points `us` and `vs`.
     ///
-    /// `place` maps (u, v) to the world, with the outward normal along `∂u x ∂v`; `paint` says how
-    /// the middle of a cell looks, or leaves a hole.
+    /// `place` maps (u, v) to the world, with the outward normal along `∂u x ∂v`; `paint` returns the paint at
+    /// the middle of a cell, or `None` for a hole.
     pub(super) fn sheet(
         &mut self,
         us: &[f64],
@@ -217,7 +217,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// A light bath for what has no normal, like leaves: the display colour of a point.
+    /// The display colour of a point without a surface of its own, such as a leaf.
     pub(super) fn shade(&self, point_m: DVec3, normal: DVec3, paint: &Paint) -> DVec3 {
         self.lit(point_m, normal, paint)
     }
@@ -228,8 +228,8 @@ const MIRRORED_SKY: DVec3 = DVec3::new(0.80, 0.90, 1.0);
 
 /// How the mirrored sky changes with the viewing direction `d`, as a vector to dot it with.
 ///
-/// A surface with normal n mirrors more at grazing angles, where d·n rises from -1 to 0; and the
-/// higher one looks up along it, the higher and brighter the mirrored sky.
+/// A surface with normal n reflects more at grazing angles, where d·n rises from -1 to 0. The more the
+/// viewing direction rises along the surface, the higher and brighter is the reflected part of the sky.
 fn mirror(normal: DVec3, gloss: f64) -> DVec3 {
     gloss * (0.6 * normal + 0.5 * (DVec3::Z - normal.z * normal))
 }

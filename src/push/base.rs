@@ -46,7 +46,7 @@ pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
     hasher.finalize().to_hex()[..32].to_owned()
 }
 
-/// The version that a push is made from; none if it makes a new twin.
+/// The base version of a push; `None` if the push makes a new twin.
 pub(crate) fn find_base(
     catalog: &Catalog,
     request: &PushRequest,

@@ -20,8 +20,8 @@ pub(crate) struct NewContent<'a> {
     pub(crate) options: &'a [String],
 }
 
-/// Writes the version. Some cells change the base and keep its settings; all cells replace the twin,
-/// and take the rig, the trajectories and the sky of the base along.
+/// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
+/// of all cells replaces the twin, but keeps the rig, the trajectories and the sky of the base.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,

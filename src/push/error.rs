@@ -36,7 +36,7 @@ pub enum PushError {
     Content {
         /// Why not.
         reason: String,
-        /// The cells (x, y) at fault, if cells are.
+        /// The cells (x, y) at fault; empty if the fault is not in cells.
         cells: Vec<[i32; 2]>,
     },
     /// There is no such push, or its status is no longer kept.
@@ -98,7 +98,8 @@ impl From<StoreError> for PushError {
     }
 }
 
-/// Whether a commit was refused for what it holds, or for the base that it was made from.
+/// Whether a commit was refused because of its content or its base, and not because of a fault of the
+/// store.
 fn is_refused_content(error: &StoreError) -> bool {
     match error {
         StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),

@@ -4,13 +4,13 @@
 //! request   what a push asks for, and the checks that need neither files nor twin
 //! base      the version that a push is made from, and conflicts with later versions
 //! queue     the pushes of a server: waiting, running, ended not long ago
-//! status    how far a push is
-//! source    reads scene files and converts them to the twin's axes; `wildcity import` reads so, too
+//! status    the progress of a push
+//! source    reads scene files and converts them to the twin's axes; `wildcity import` uses it, too
 //! read      joins the files of one push
 //! report    what the files hold, and which cells would change
 //! preview   compares small images before and after
 //! commit    writes the version
-//! publish   the pipeline: read, check, preview, commit, load ahead
+//! publish   the pipeline: read, check, preview, commit, preload
 //! ```
 //!
 //! Nothing of a push is visible before its version is committed. This package knows neither HTTP nor

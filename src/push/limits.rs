@@ -1,11 +1,11 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
-/// Pushes that wait or run, unless the operator says otherwise. Each holds its request, and nothing
-/// of its files.
+/// Default maximum of pushes that wait or run. A waiting push holds its request in memory, but not its
+/// files.
 pub const OPEN_PUSHES: usize = 16;
 
-/// Ended pushes that keep their status: a report of 100,000 cells takes 3 MB, and most
-/// reports have a hundred cells.
+/// Number of ended pushes whose status is kept. A report of 100,000 cells takes 3 MB, and most reports
+/// have about a hundred cells.
 pub const REMEMBERED_PUSHES: usize = 64;
 
 /// Files of one push.
@@ -25,6 +25,6 @@ pub const PREVIEW_GAUSSIANS: usize = 20_000_000;
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;
 
-/// A push that names no cells is refused if it leaves less than this share of the Gaussians of a cell:
-/// the few Gaussians that it has there are taken for stray ones of a neighbour's margin.
+/// A push that names no cells is refused if a cell would keep less than this share of its Gaussians: the few
+/// Gaussians that the push has there are assumed to be strays from the margin of a neighbouring cell.
 pub const SHRUNK_SHARE: f64 = 0.1;

@@ -1,4 +1,4 @@
-//! How the twin would look: small images of the base and of what it would become, compared.
+//! The preview of a push: compares small images of the base and of the version that the push would make.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -55,8 +55,8 @@ fn within(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64)
     Arc::new(gaussians.select((0..gaussians.len()).filter(is_within)))
 }
 
-/// Refuses a push that differs by more than the request allows, and one that was to be compared and
-/// cannot be.
+/// Refuses a push that differs by more than the request allows, or that cannot be compared although the
+/// request demands it.
 pub(crate) fn check_psnr(
     request: &PushRequest,
     gaussians: &Gaussians,

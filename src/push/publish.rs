@@ -1,3 +1,4 @@
+<<<<<<< HEAD
 //! The pipeline of a push: read, check, preview, commit, load ahead.
 //!
 //! A push is uploaded files and the cells that they replace. All cells are published by one record of the
@@ -10,6 +11,9 @@
 //! **A push needs no state that survives the server**, because its content is compared with the twin's. A
 //! client that got no answer sends its push again, and the same content as the latest version's is that
 //! version.
+=======
+//! The pipeline of a push: read, check, preview, commit, preload.
+>>>>>>> report
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -87,12 +91,12 @@ pub async fn publish(
     tracing::info!(twin = request.twin, version = version.number, "pushed");
 
     push.enter(State::Prefetching);
-    load_ahead(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
+    preload(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
     drop(held);
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// Finds what would change, and compares how it looks.
+/// Determines which cells would change, and compares images before and after.
 async fn check(
     engine: &Arc<Engine>,
     push: &Arc<Push>,
@@ -150,7 +154,7 @@ fn compare_cells(
 /// A committed version that is not yet opened as the latest.
 struct Committed {
     version: Version,
-    /// Keeps the version before as the latest until it is dropped.
+    /// Pins the previous version as the latest until it is dropped.
     held: Option<LatestPin>,
 }
 
@@ -161,8 +165,8 @@ fn commit_held(
     scene: &CheckedScene,
     base: Option<&Version>,
 ) -> Result<Committed, PushError> {
-    // Until the new version is ready, sessions that open the latest get the version that is the latest
-    // now; the preview took its time, so that it may be later than the base.
+    // Until the new version is ready, sessions that open the latest version get the one that is the latest
+    // now. It may be later than the base, because another version may have been committed during the preview.
     let held = pin_latest(engine, &request.twin)?;
     let content =
         NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
@@ -170,7 +174,7 @@ fn commit_held(
     Ok(Committed { version, held })
 }
 
-/// Keeps the version that is the latest now; none if the twin is new.
+/// Pins the version that is the latest now; `None` if the twin is new.
 fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
@@ -180,9 +184,9 @@ fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, Pus
     Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
-/// Loads the version where sessions drive on the twin now, so that those that switch need not wait.
-/// The version is committed and sound: what cannot be loaded now is loaded when it is opened.
-async fn load_ahead(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
+/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they
+/// switch. The version is already committed: what cannot be loaded now is loaded when it is opened.
+async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
     let prepared = engine.preload(twin, version, frames);
     match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}

@@ -55,9 +55,9 @@ impl PushQueue {
         self.entries.lock().open_count()
     }
 
-    /// The push of an id: a known one, or a new one of the files that `files` finds. A known push that
-    /// failed is begun again. `files` is only called for a new push: a known one may have outlived its
-    /// uploads.
+    /// The push of an id: a known one, or a new one with the files that `files` returns. A known push that
+    /// failed is begun again. `files` is only called for a new push, because the uploads of a known one may
+    /// have been removed.
     ///
     /// # Errors
     /// The id belongs to a push that asked for something else, too many pushes are open, or `files`
@@ -101,7 +101,7 @@ impl PushQueue {
 
     /// Waits for the turn of one push. Dropping the permit gives the turn to the next.
     pub(crate) async fn turn(&self) -> Result<SemaphorePermit<'_>, PushError> {
-        // The semaphore is closed by nothing but the end of the process.
+        // The semaphore is never closed while the process runs.
         self.turn.acquire().await.map_err(|_| PushError::ShuttingDown)
     }
 }

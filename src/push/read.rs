@@ -50,7 +50,7 @@ pub(crate) fn read(
     Ok(scene)
 }
 
-/// A file, and what the push says of it.
+/// A file, with its axes and unit from the request.
 struct RequestedSource<'a> {
     requested: &'a RequestedFile,
     file: &'a SourceFile,

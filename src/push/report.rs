@@ -25,7 +25,7 @@ pub struct PushReport {
     pub ranges: Option<Ranges>,
     /// Cells that are replaced, in order of (y, x).
     pub cells: Vec<CellChange>,
-    /// How alike the twin looks before and after, at each pose of the preview.
+    /// PSNR between the twin before and after, at each pose of the preview.
     pub preview: Vec<PsnrPreview>,
 }
 
@@ -49,7 +49,7 @@ pub struct FileReport {
     pub gaussians: u64,
     /// Gaussians with a number outside its bounds.
     pub bad: u64,
-    /// The first of those.
+    /// The first of these.
     pub first_bad: Vec<BadGaussian>,
 }
 

@@ -67,8 +67,8 @@ pub fn read_scene(
     Ok(SourceScene { gaussians, hash })
 }
 
-/// The provenance of a version made of some files, given their hashes. It has no time and no user, so
-/// that the same content is the same version.
+/// The provenance of a version that is made from files with these hashes. It contains no time and no user,
+/// so that the same content gives the same version.
 pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> Provenance {
     let source = match hashes {
         [one] => one.clone(),

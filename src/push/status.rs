@@ -1,4 +1,4 @@
-//! How far a push is.
+//! The progress of a push.
 
 use std::sync::Arc;
 
@@ -46,7 +46,7 @@ pub struct PushedVersion {
     pub hash: String,
 }
 
-/// Everything that a client may know of a push.
+/// The state of a push, as it is reported to clients.
 #[derive(Clone, Debug)]
 pub struct Status {
     /// The stage.
@@ -55,7 +55,7 @@ pub struct Status {
     pub progress: Progress,
     /// The version, once it is ready.
     pub version: Option<PushedVersion>,
-    /// What was found in the files, as far as it is known.
+    /// What was found in the files; `None` until they are read.
     pub report: Option<Arc<PushReport>>,
     /// Why it was refused or failed.
     pub error: Option<Arc<PushError>>,

@@ -12,9 +12,9 @@ pub const BLOCK_PX: u32 = 4;
 /// Gaussians of a street take.
 pub const MAX_INSTANCES: u64 = 1 << 27;
 
-/// What is added to a splat's extent when its tiles and blocks are chosen, in pixels, for rounding: the f32
-/// of a mean at 16,384 px is off by up to 1e-3 px. A tile that is chosen in vain changes no pixel, since
-/// alpha decides per pixel.
+/// Margin that is added to a splat's extent when its tiles and blocks are chosen, in pixels. It covers rounding:
+/// the f32 of a mean at 16,384 px is off by up to 1e-3 px. A tile that is chosen needlessly changes no pixel,
+/// because alpha decides per pixel.
 pub const EXTENT_SLACK_PX: f32 = 2e-3;
 
 /// How far beyond the image's edges the projection is still linearised at the centre itself, in half-widths

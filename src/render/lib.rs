@@ -193,7 +193,7 @@ pub enum RenderError {
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
-    /// The device failed. The next frame opens it anew.
+    /// The device failed. The next frame opens it again.
     #[error("{device} failed: {reason}")]
     Device {
         /// The device's name.
@@ -208,8 +208,7 @@ pub trait Backend: Send + Sync {
     /// The name, as in `--backend` and in observations.
     fn name(&self) -> &'static str;
 
-    /// What the last bit of a pixel depends on beside the backend: the instruction set or the device. May be
-    /// empty.
+    /// The instruction set or the device, on which the last bit of a pixel may depend. May be empty.
     fn detail(&self) -> String {
         String::new()
     }
@@ -219,8 +218,9 @@ pub trait Backend: Send + Sync {
         1
     }
 
-    /// Number of frames that it processes at once: so many concurrent callers of [`Backend::render`] are
-    /// faster than one, and more are not. It is 1 for a backend that uses the whole machine for one frame.
+    /// Number of frames that it processes at once: up to this number, more concurrent callers of
+    /// [`Backend::render`] increase the throughput. It is 1 for a backend that uses the whole machine for one
+    /// frame.
     fn frames_in_flight(&self) -> usize {
         1
     }

@@ -8,8 +8,8 @@
 //! Blending the Gaussians' own axes would take three more sums in every backend's inner loop. On a wall made
 //! of small discs, half of the pixels are within 0.2° behind a pinhole and 0.7° behind a fisheye.
 //!
-//! Two neighbours belong to one surface if 1/depth changes evenly, as it does on every plane, so that an edge
-//! is not taken for a slope.
+//! Two neighbours belong to one surface if 1/depth changes linearly, as it does on every plane. So an edge between
+//! two surfaces is not mistaken for a slope.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;

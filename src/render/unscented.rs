@@ -21,7 +21,7 @@
 //! the farthest corner. (From 8 on, where slopes rise by 65 per radian, a road below the camera was torn into
 //! splats that reached into the image: 42 dB behind a windshield and 28 dB with a shutter that rolls from the
 //! right; now 47 to 49 dB.) Pixels beyond the field are masked when the image is complete, since no bound
-//! on splats keeps them empty.
+//! on splats guarantees that they stay empty.
 
 use glam::{DMat3, DVec2, DVec3, Vec3};
 

@@ -1,7 +1,7 @@
 //! How a camera's image differs from the scene: its exposure, and an overlay of its own vehicle.
 //!
-//! An overlay is part of the rig, as a PNG in the rig's JSON. So it travels on the wire, in the manifest and
-//! in recordings without any extra mechanism, and it is cropped and scaled together with its camera.
+//! An overlay is part of the rig, as a PNG in the rig's JSON. So messages, manifests and recordings contain it
+//! without any extra mechanism, and it is cropped and scaled together with its camera.
 
 use std::io::Cursor;
 use std::sync::Arc;

@@ -1,10 +1,9 @@
 //! Chunks: Gaussians that share an origin, activated and laid out for the renderer.
 //!
 //! A chunk of a twin is one *section*: one level of detail of one block of 16 m x 16 m within a cell of
-//! 64 m x 64 m ([`crate::lod`]). It is read, decoded and drawn as a unit, so the renderer needs to know
-//! nothing of levels of detail. A chunk of a scene file is a whole cell. A sparse cell, such as one of a
-//! skyline, is a single block: as 3,000 blocks of three Gaussians each, the demo street's skyline took
-//! 9 ms of every frame.
+//! 64 m x 64 m ([`crate::lod`]). It is read, decoded and drawn as a unit, so the renderer does not deal with
+//! levels of detail. A chunk of a scene file is a whole cell. A sparse cell, such as one of a skyline, is a
+//! single block: as 3,000 blocks of three Gaussians each, the demo street's skyline took 9 ms of every frame.
 //!
 //! A chunk stores Gaussians in *lane groups* of 16: one column of 16 floats per parameter. A vector
 //! instruction processes 16 Gaussians at once, and Gaussians that are culled by their position cost only
@@ -333,7 +332,7 @@ fn log2_sigmoid(logit: f32) -> f32 {
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
 }
 
-/// An order of a file's Gaussians by cell, then by 16 m block, then by Morton code.
+/// The Gaussians of a file, sorted by cell, then by 16 m block, then by Morton code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Partition {
     /// Cells in order of (y, x).

@@ -144,7 +144,7 @@ impl Gaussians {
 mod tests {
     use super::*;
 
-    /// Gaussians whose every number names the Gaussian that it belongs to.
+    /// Gaussians in which every number identifies the Gaussian that it belongs to.
     fn numbered(sh_degree: u8, numbers: &[u8]) -> Gaussians {
         let mut gaussians = Gaussians::with_capacity(sh_degree, numbers.len());
         for &number in numbers {

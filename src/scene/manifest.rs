@@ -32,7 +32,7 @@ pub struct Manifest {
     /// The rig of the vehicle that recorded the twin, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<Rig>,
-    /// RoundTrip drives.
+    /// Recorded drives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trajectories: Vec<Trajectory>,
     /// The twin's sky, if it has one.

@@ -16,7 +16,7 @@ pub const LN_SCALE: [f32; 2] = [-30.0, 10.0];
 pub const MAX_LOGIT: f32 = 1e4;
 /// Largest magnitude of a colour coefficient: colours are about 1.
 pub const MAX_SH: f32 = sh::MAX_COEFFICIENT;
-/// Number of invalid Gaussians of one file that are named; further ones are only counted.
+/// Number of invalid Gaussians of one file that are listed individually; further ones are only counted.
 pub const NAMED_BAD_GAUSSIANS: usize = 16;
 
 /// Gaussians that one thread checks at a time.
@@ -99,7 +99,7 @@ pub fn check(
     gaussians: &Gaussians,
     name: &(dyn Fn(Field) -> String + Sync),
 ) -> Result<(), BadGaussians> {
-    // Sound files are the common case: all cores look for the first invalid Gaussian.
+    // Most files are valid, so all cores search for the first invalid Gaussian.
     let first = (0..gaussians.len())
         .into_par_iter()
         .by_uniform_blocks(BLOCK_GAUSSIANS)
@@ -140,8 +140,8 @@ struct Violation {
     must: &'static str,
 }
 
-/// The first number of a Gaussian that is outside its bounds. Every test is written as what must
-/// hold, so that NaN fails it.
+/// The first number of a Gaussian that is outside its bounds. Every condition states what must hold, so
+/// that NaN fails it.
 fn violation(gaussians: &Gaussians, index: usize) -> Option<Violation> {
     for (axis, &m) in gaussians.means_m[index].iter().enumerate() {
         let near = m.abs() <= Pose::MAX_COORDINATE_M;

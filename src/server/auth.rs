@@ -193,7 +193,7 @@ impl Grant {
         Err(Fault::Forbidden { reason: format!("it does not include twin {twin:?}") })
     }
 
-    /// Whether the token may use the twin. Other twins are not listed either.
+    /// Whether the token may use the twin. Lists of twins leave out those that it may not use.
     pub(crate) fn allows_twin(&self, twin: &str) -> bool {
         self.twins.as_ref().is_none_or(|twins| twins.contains(twin))
     }

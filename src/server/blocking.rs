@@ -1,4 +1,4 @@
-//! Work that blocks, beside the asynchronous tasks.
+//! Runs blocking work on threads of its own, so that it does not delay asynchronous tasks.
 
 use crate::fault::Fault;
 

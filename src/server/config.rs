@@ -1,4 +1,4 @@
-//! What a server is made of, and its limits.
+//! The configuration of a server, and its limits.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use wildcity_twin::store::DiskCacheSettings;
 use crate::auth::Tokens;
 use crate::limits;
 
-/// What a server is made of.
+/// The configuration of a server.
 #[derive(Clone)]
 pub struct Config {
     /// Address to listen on; port 0 takes a free one. It must be a loopback address if there are no
@@ -46,7 +46,7 @@ pub struct Limits {
     pub idle: Duration,
     /// Time-out for a client to read an answer.
     pub send: Duration,
-    /// Time-out for one step, waiting for other sessions included.
+    /// Time-out for one step, including the time that it waits for other sessions.
     pub step: Duration,
     /// How long a session without a connection waits to be resumed.
     pub resume_grace: Duration,

@@ -40,7 +40,7 @@ struct Connection {
     state: Arc<ServerState>,
     socket: Socket,
     grant: Arc<Grant>,
-    /// When `hello` must have come, whatever else comes before it.
+    /// Time by which `hello` must have arrived; other messages before it do not extend it.
     hello_deadline: Instant,
     hello_done: bool,
     /// Number of the last request answered, refusals included.
@@ -144,7 +144,7 @@ impl Connection {
             slot.update_view();
         }
         if is_resume {
-            // From here on requests are numbered as the session's.
+            // From here on, request numbers continue those of the session.
             self.last = self.slot.as_ref().and_then(|slot| slot.last.clone());
             self.answered_seq = self.slot.as_ref().map(|slot| slot.answered_seq);
         } else {

@@ -57,7 +57,7 @@ pub(crate) enum Fault {
         /// The client's versions.
         offered: Vec<String>,
     },
-    /// A session is open already on this connection, or none is.
+    /// The connection already has an open session, or it has none although the request needs one.
     #[error("{0}")]
     SessionState(&'static str),
     /// There is no session to resume.
@@ -80,7 +80,7 @@ pub(crate) enum Fault {
         /// The refused text.
         name: String,
     },
-    /// Numbers are not a pose.
+    /// The numbers of a pose are invalid.
     #[error("{field}: {cause}")]
     Pose {
         /// The pose, as `poses[3]`.
@@ -94,7 +94,7 @@ pub(crate) enum Fault {
         /// The number, as `pose.xyz[0]`.
         field: String,
     },
-    /// Numbers are not a camera.
+    /// The numbers of a camera are invalid.
     #[error("{field}: {cause}")]
     Camera {
         /// The camera, as `rig.cameras[2]`.
@@ -110,7 +110,7 @@ pub(crate) enum Fault {
         /// What is wrong with it.
         cause: AppearanceError,
     },
-    /// Cameras are not a rig.
+    /// The cameras do not form a valid rig.
     #[error("{cause}")]
     Rig {
         /// The field.
@@ -216,7 +216,7 @@ impl From<StoreError> for Fault {
 }
 
 impl Fault {
-    /// Whether the connection cannot go on.
+    /// Whether the connection must be closed after this fault.
     pub(crate) fn is_fatal(&self) -> bool {
         matches!(
             self,

@@ -1,12 +1,12 @@
 //! The WebSocket and HTTP server.
 //!
 //! ```text
-//! config         what a server is made of, and its limits
+//! config         the configuration of a server, and its limits
 //! start          starts a server
 //! shutdown       a running server, and stopping it without losing running steps
 //! state          what all connections share
 //! listen         accepts connections, a bounded number
-//! idle_deadline  ends HTTP connections that make no progress
+//! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles and twins
 //! spool          uploads on disk
@@ -15,7 +15,7 @@
 //! connection     one agent, in lock step: read a request, answer it
 //! sessions       the sessions of the server: connected, or waiting to be resumed
 //! fault          why a request is refused
-//! convert        wire to session and back; wire code and HTTP status of each fault
+//! convert        conversion between wire and session types; wire code and HTTP status of each fault
 //! ```
 //!
 //! The pipeline of pushes is the package `wildcity-push`; the routes only carry requests to it.

@@ -17,8 +17,8 @@ pub const RESUME_GRACE: Duration = Duration::from_secs(60);
 /// How long running steps may take to finish after SIGTERM.
 pub const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Connections beside [`CONNECTIONS`] that cannot become WebSockets, so that health checks and refusals
-/// are answered when all of those are in use.
+/// Connections in addition to [`CONNECTIONS`], which cannot become WebSockets. They are for health checks
+/// and refusals while all WebSocket connections are in use.
 pub const SPARE_CONNECTIONS: usize = 64;
 
 /// Bytes of pongs and of the close frame that a client has not read; each has at most 129 bytes.
@@ -28,7 +28,7 @@ pub const PONGS_BYTES: usize = 4 << 10;
 pub const LINGER: Duration = Duration::from_secs(2);
 
 /// Silence after which TCP probes whether the peer still exists. The peer's kernel answers, so an agent
-/// that thinks for minutes without reading its socket stays connected. With
+/// that computes for minutes without reading its socket stays connected. With
 /// [`KEEPALIVE_INTERVAL`] and [`KEEPALIVE_PROBES`] a dead peer is noticed after 20 + 3 x 5 = 35 s.
 pub const KEEPALIVE_IDLE: Duration = Duration::from_secs(20);
 
@@ -38,8 +38,8 @@ pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
 /// Unanswered probes that end the connection.
 pub const KEEPALIVE_PROBES: u32 = 3;
 
-/// Longer requests are read on a thread that may block: 16 KiB decompress to at most 17 MB of an overlay,
-/// in some 20 ms.
+/// Requests longer than this are parsed on a thread that may block: 16 KiB can decompress to an overlay of
+/// 17 MB, which takes about 20 ms.
 pub const INLINE_REQUEST_BYTES: usize = 16 << 10;
 
 /// Uploads that a server keeps, finished or not: the blocks of a city, each in a file.

@@ -53,7 +53,7 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
         let state = state.clone();
         tokio::spawn(async move {
             tokio::select! {
-                // Errors are the client's fault and not logged: it left, or sent no HTTP.
+                // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
                 _ = connection => {}
                 () = deadline.passed() => {}
                 () = state.stopped() => {}
@@ -62,7 +62,8 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
     }
 }
 
-/// Sends small messages at once, and has the kernel notice dead peers.
+/// Disables Nagle's algorithm, so that small messages are sent at once, and enables TCP keepalive, so that
+/// the kernel detects dead peers.
 fn set_options(stream: &TcpStream) {
     let keepalive = TcpKeepalive::new()
         .with_time(limits::KEEPALIVE_IDLE)

@@ -44,7 +44,7 @@ struct Parked {
     outcome: Outcome,
 }
 
-/// What the rest of the server knows of a session.
+/// The part of a session's state that is visible to the rest of the server.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SessionView {
     pub(crate) twin: String,
@@ -135,8 +135,8 @@ impl SessionRegistry {
         Ok(self.guard(name, release, guard))
     }
 
-    /// Takes the slot of a session, from its connection if that still holds it: after a network
-    /// failure the client knows long before the server that the old connection is dead.
+    /// Takes over the slot of a session, even if its old connection still holds it: after a network
+    /// failure, the client notices long before the server that the old connection is dead.
     ///
     /// # Errors
     /// There is no such session of this owner, or its last step runs for longer than `max_wait`.
@@ -263,7 +263,7 @@ impl SessionRegistry {
 }
 
 impl SlotGuard {
-    /// Updates what the rest of the server knows of the session.
+    /// Updates the part of the session's state that is visible to the rest of the server.
     pub(crate) fn update_view(&self) {
         let Some(session) = &self.slot.session else { return };
         let version = &session.resident().version;

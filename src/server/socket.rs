@@ -42,7 +42,7 @@ pub(crate) enum Disconnect {
 }
 
 impl Socket {
-    /// Takes over a connection from HTTP; `read_ahead` is what HTTP has read of it already.
+    /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read from it.
     pub(crate) async fn new(
         stream: TcpStream,
         read_ahead: Vec<u8>,
@@ -106,7 +106,7 @@ impl Socket {
     /// its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Disconnect> {
         let send = async {
-            // A pong may be waiting in the library's buffer; frames must not mix.
+            // A pong may still be in the library's buffer; it must be sent whole before this frame begins.
             self.stream.flush().await.map_err(io::Error::other)?;
             let header = frame_header(first_byte, payload.len());
             let stream = self.stream.get_mut();

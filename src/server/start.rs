@@ -23,7 +23,8 @@ use crate::state::ServerState;
 /// Why a server did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// Every machine of the network could drive, and read the twins.
+    /// The address is not a loopback address, and there are no tokens: any machine of the network could
+    /// open sessions and read the twins.
     #[error(
         "{address} is not a loopback address, and without tokens only 127.0.0.1 and [::1] are \
          safe: give --tokens FILE, or reach them from elsewhere through an SSH tunnel"

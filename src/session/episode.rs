@@ -1,4 +1,4 @@
-//! One episode: where the ego is, when, and how it got there. Pure: no clock, no I/O.
+//! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
 //! A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
 //! new one before it replaces the old, so that a step which fails on the way has not happened.
@@ -43,8 +43,8 @@ pub struct Episode {
 pub enum Outcome {
     /// The agent closed the session or terminated the episode.
     Completed,
-    /// The same, but the ego left what was recorded: the trust of an observation fell below
-    /// [`limits::OFF_MODEL_TRUST`]. Only where observations come with a trust.
+    /// As `Completed`, but the ego left the recorded area: the trust of an observation was below
+    /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations have a trust.
     OffModel,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
@@ -143,9 +143,9 @@ impl Episode {
 
     /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
     ///
-    /// With `in_motion`, a rolling shutter sees the ego's last motion, transferred to that pose: as if the
-    /// ego had come there the way it came to where it is. Otherwise the rig stands while the image is
-    /// exposed, as it does in a warm-up and at the start of an episode.
+    /// With `in_motion`, cameras with a rolling shutter move during the exposure: the ego's last motion is
+    /// transferred to that pose. Otherwise the rig stands still during the exposure, as in a warm-up and at
+    /// the start of an episode.
     pub(crate) fn views(
         &self,
         cameras: &[RigCamera],
@@ -199,8 +199,8 @@ impl Episode {
         self.terminated
     }
 
-    /// The summary so far. An episode that its agent terminated counts as completed, whatever `outcome`
-    /// the connection came to later.
+    /// The summary so far. An episode that its agent terminated counts as completed, even if `outcome` says
+    /// that the connection failed afterwards.
     pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
         let completed = self.terminated || outcome == Outcome::Completed;
         let off_model = self.least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);

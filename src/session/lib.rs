@@ -1,30 +1,30 @@
 //! Sessions of agents on city twins: open, reset, step, observe, record, replay.
 //!
 //! An [`Engine`] is shared by all sessions; a [`Session`] belongs to one agent. A request renders, is
-//! recorded, and only then changes the session: if anything fails on the way, nothing has happened, and the
+//! recorded, and only then changes the session: if any of this fails, the session is unchanged, and the
 //! client can repeat the request.
 //!
 //! | module | what it holds |
 //! |---|---|
 //! | `session` | a session: opening it, answering its requests |
 //! | `options`, `start` | what a client requests when it opens a session; where episodes start |
-//! | `episode` | where the ego is, when, and how it got there |
+//! | `episode` | the ego's pose, the simulated time, and the past poses |
 //! | `engine` | the twins in memory, the render queue, the budget for answers |
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
-//! | `prefetch` | what is loaded ahead of the ego |
-//! | `golden` | the preview of a push |
+//! | `prefetch` | loads what the next frames of the ego will need |
+//! | `preview` | the preview of a push |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
 mod engine;
 mod episode;
 mod error;
-mod golden;
 pub mod limits;
 mod observe;
 mod options;
 mod prefetch;
+mod preview;
 mod record;
 mod session;
 mod start;
@@ -35,7 +35,6 @@ pub use engine::twin_summaries::{TrajectorySummary, TwinSummary};
 pub use engine::{Engine, EngineSettings, LatestPin};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
-pub use golden::{ProposedChange, PsnrPreview};
 pub use observe::buffer::ObservationBuffer;
 pub use observe::encode::{Encoding, jpeg, png};
 pub use observe::layout::HEADER_PREFIX_BYTES;
@@ -44,6 +43,7 @@ pub use observe::observation::{
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
+pub use preview::{ProposedChange, PsnrPreview};
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;
 pub use record::format::{

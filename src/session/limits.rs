@@ -68,8 +68,8 @@ pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 /// depth and opacity (88 MB each), or for JPEGs to every session.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
-/// A render thread keeps the buffers of images up to this size for the next frame, in bytes of RGB: 3840x2160.
-/// 16 of them are 400 MB.
+/// A render thread keeps the buffers of images up to this size for the next frame, in bytes of RGB:
+/// 3840x2160. 16 of them are 400 MB.
 pub const SCRATCH_IMAGE_BYTES: usize = 3 * (8 << 20);
 
 /// Longest line of an episode's file after the first: 256 image hashes of an `observe` take 17 kB.
@@ -95,12 +95,12 @@ pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Durati
 /// How many of the next steps are prefetched at their exact poses: a second at 10 Hz.
 pub const IMMINENT_STEPS: usize = 10;
 
-/// Distance between two prefetched poses beyond those steps, in metres. Beside the path of the next steps
-/// a level of detail changes every 16 m or more.
+/// Distance between two prefetched poses beyond those steps, in metres. Along the path, the level of detail
+/// of a block at the side changes every 16 m or more.
 pub const PREFETCH_SPACING_M: f64 = 8.0;
 
-/// Poses that are prefetched after a step, and as many along the agent's hint: 512 m. Each costs 0.2 ms in
-/// a city.
+/// Number of poses that are prefetched after a step, and the same number along the agent's hint: 512 m. Each
+/// takes 0.2 ms in a city.
 pub const PREFETCH_PLACES: usize = 64;
 
 /// Poses of one `prefetch` request: 2 km of a polyline.
@@ -110,14 +110,14 @@ pub const PREFETCH_POSES: usize = 256;
 /// road.
 pub const ROUTE_NEAR_M: f64 = 15.0;
 
-/// The ego counts as standing if its last step was shorter, in metres.
+/// The ego counts as standing if its last step was shorter than this, in metres.
 pub const STANDSTILL_STEP_M: f64 = 0.01;
 
 /// How far along a recorded drive is prefetched for an ego that stands on it, in metres: five seconds at
 /// urban speed.
 pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
-/// Most steps that prefetching looks ahead, however much faster than real time they come.
+/// Most steps that prefetching looks ahead, even if the agent steps much faster than real time.
 pub const STEPS_AHEAD: usize = 256;
 
 /// Poses along the twin's trajectory at which a push is compared, unless the push names its own.
@@ -126,11 +126,12 @@ pub const PREVIEW_POSES: usize = 4;
 /// Longest side of the images that are compared, in pixels.
 pub const PREVIEW_SIDE_PX: u32 = 320;
 
-/// How long a push may load what its version changes where sessions drive. After that the version counts
-/// as ready all the same.
+/// How long a push may preload its version for the running sessions. After that the version counts as ready
+/// even if something is still missing.
 pub const PRELOAD_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Time between two checks whether that is loaded. Twenty checks a second add little to seconds of loading.
+/// Time between two checks whether the preload is complete. Twenty checks a second add little to seconds of
+/// loading.
 pub const PRELOAD_POLL: Duration = Duration::from_millis(50);
 
 // The largest answer fits the budget while no other session has one.

@@ -1,4 +1,4 @@
-//! From views of the renderer to the viewpoints that decide how much detail they need.
+//! Converts views of the renderer to viewpoints, which determine the levels of detail.
 
 use wildcity_render::View;
 use wildcity_twin::residency::Viewpoint;

@@ -161,8 +161,8 @@ impl<'a> CaseRun<'a> {
     }
 
     /// The backend's images of one view, after checks that every value is finite and that the reference
-    /// backend's images agree. The reference backend is not compared with itself; its images must satisfy
-    /// what a case states in numbers.
+    /// backend's images agree. The reference backend is not compared with itself; its images must have the
+    /// values that a case states.
     pub(super) fn render_and_compare(
         &mut self,
         what: impl Into<String>,

@@ -247,7 +247,7 @@ mod tests {
         (w0, mean_px, px2)
     }
 
-    /// How far a rule's mean and covariance are from those of 20,000 points: in pixels, and as a share of the
+    /// Errors of a rule's mean and covariance against those of 20,000 points: in pixels, and as a share of the
     /// size.
     fn off(mean_m: DVec3, [alpha, beta]: [f64; 2]) -> (f64, f64) {
         let (camera, gaussian) = fisheye_and_gaussian();

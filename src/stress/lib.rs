@@ -1,9 +1,9 @@
 //! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that every
-//! backend must keep. `wildcity stress` runs them and prints the table, and tests run them: a driver that is
-//! wrong on one machine is found on that machine.
+//! backend must keep. `wildcity stress` runs them and prints the table, so that a faulty driver is found on the
+//! machine that has it. Tests run them as well.
 //!
 //! ```text
-//! shapes     needles, dust, walls, Gaussians beside the view        T1 T2 T3 T13 T26
+//! shapes     needles, tiny Gaussians, walls, beside the view        T1 T2 T3 T13 T26
 //! places     centimetres away, behind, 4,500 km off, 10 km deep     T4 T5 T7 T9 T10
 //! order      equal depths, duplicates, popping, millions of keys    T6 T8 T20 T21 T27
 //! opacities  every opacity, NaN and infinity, the stop rule         T11 T12 T19 T28
@@ -12,8 +12,8 @@
 //! actors     colours that rotate with an actor                      T25
 //! ```
 //!
-//! The reference backend is not compared with itself: its images must be finite, and keep what a case states
-//! in numbers.
+//! The reference backend is not compared with itself: its images must be finite, and have the values that a case
+//! states.
 //!
 //! # How to add a case
 //!

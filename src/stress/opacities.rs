@@ -1,4 +1,5 @@
-//! The whole range of opacities, invalid values, the stop rule, and more layers than a driver counts.
+//! The whole range of opacities, invalid values, the stop rule, and more layers than the loop limit of a
+//! software device.
 
 use glam::DVec3;
 

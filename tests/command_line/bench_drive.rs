@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::city_twin::city;
 
 #[test]
-fn a_timed_drive_tells_of_every_kilometre_and_leaves_nothing() {
+fn a_timed_drive_reports_every_kilometre_and_leaves_no_files() {
     let dir = tempfile::tempdir().unwrap();
     let report = bench_drive(
         dir.path(),
@@ -32,12 +32,12 @@ fn a_timed_drive_tells_of_every_kilometre_and_leaves_nothing() {
     let csv = fs::read_to_string(dir.path().join("steps.csv")).unwrap();
     assert_eq!(csv.lines().count(), 1 + 60 + 5);
     assert_eq!(csv.lines().filter(|line| line.starts_with("teleport,")).count(), 5);
-    // The episode that a session writes is gone.
+    // The file of the recorded episode was removed.
     let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(left, ["steps.csv"]);
 }
 
-/// What `wildcity bench drive` says, with 5 teleports and a CSV file.
+/// The JSON output of `wildcity bench drive`, with 5 teleports and a CSV file.
 fn bench_drive(dir: &Path, arguments: &[&str]) -> Value {
     let output = Command::new(env!("CARGO_BIN_EXE_wildcity"))
         .args(["bench", "drive", "city", "--backend", "cpu", "--json", "--teleports", "5"])

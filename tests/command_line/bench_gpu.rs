@@ -1,4 +1,4 @@
-//! `wildcity bench gpu` in small: what its report says, not how fast anything is.
+//! `wildcity bench gpu` with small scenes: the content of its report, not the speed.
 
 use std::process::Command;
 

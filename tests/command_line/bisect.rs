@@ -1,4 +1,4 @@
-//! The switch that leaves the first stages to the cpu, as users find it.
+//! `--cpu-through` and `wildcity bisect` on the command line.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::gpu::assert_quiet;
 use crate::scene_files::{inria_columns, ply};
 use crate::streets::street;
 
-/// A street of the disk, and two cameras in it.
+/// A directory with a scene file of a street, and a list of two cameras in it.
 fn scene() -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     fs::write(dir.path().join("street.ply"), ply(&street(5_000, 1, 51), &inria_columns(1, true)))
@@ -38,7 +38,7 @@ fn said(output: &Output) -> String {
 }
 
 #[test]
-fn bisect_tells_of_every_camera() {
+fn bisect_reports_every_camera() {
     let dir = scene();
     let said = said(&run(dir.path(), &["bisect"]));
     let lines: Vec<Vec<&str>> =
@@ -73,7 +73,7 @@ fn a_step_can_begin_on_the_cpu() {
 }
 
 #[test]
-fn a_backend_without_a_gpu_has_nothing_to_hand_over_to() {
+fn cpu_through_requires_the_gpu_backend() {
     let dir = scene();
     let arguments = ["render", "--out", "half", "--backend", "cpu", "--cpu-through", "sort"];
     let output = run(dir.path(), &arguments);

@@ -1,4 +1,4 @@
-//! Small files that unpack to much.
+//! Decompression bombs: small files whose decompressed content is large.
 
 use std::io::Write;
 use std::process::Command;
@@ -6,16 +6,16 @@ use std::process::Command;
 use crate::format_files::{glb, gltf, sog, webp, zip_of};
 use crate::scene_files::gaussians;
 
-/// Gaussians of a sound file that becomes a bomb.
+/// Gaussians of the valid file that is turned into a decompression bomb.
 const COUNT: usize = 6;
 
-/// Bombs: little that unpacks to much. Refused by what they claim, or at the limit; and in a process
-/// of its own, in bounded memory.
+/// Decompression bombs are refused because of the sizes that they declare, or as soon as a limit is reached. Each
+/// is read by a process of its own, whose memory stays bounded.
 #[test]
-fn bombs_are_refused_in_bounded_memory() {
+fn decompression_bombs_are_refused_in_bounded_memory() {
     let dir = tempfile::tempdir().unwrap();
     let write = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
-    // 512 MiB of nothing in 0.5 MB: an honest header for it, and a header that promises nothing of it.
+    // 512 MiB of zeros in 0.5 MB: with a header that declares their size, and with one that declares none.
     let nothing = |start: &[u8]| {
         let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
         encoder.write_all(start).unwrap();
@@ -42,7 +42,7 @@ fn bombs_are_refused_in_bounded_memory() {
             true,
         ),
     );
-    // An image of 8,192 x 8,192 pixels, all alike: 256 MiB in some kB; and six of them.
+    // An image of 8,192 x 8,192 equal pixels: 256 MiB in a few kB; and six of them.
     let image = webp(&vec![[128, 128, 128, 255]; 8192 * 8192], 8192);
     assert!(image.len() < 1 << 20);
     let mut files = sog(&gaussians(COUNT, 0, 20.0, 1), 2);
@@ -50,7 +50,7 @@ fn bombs_are_refused_in_bounded_memory() {
     let meta = String::from_utf8(files[0].1.clone()).unwrap();
     files[0].1 = meta.replace(r#""count":6"#, r#""count":67108864"#).into_bytes();
     write("images.sog", &zip_of(&files, false));
-    // Two nodes of a thousand show one mesh.
+    // A thousand nodes show one mesh.
     let (json, buffer) = gltf(&gaussians(20_000, 3, 20.0, 1), "", "");
     let nodes = vec![r#"{"mesh":0}"#; 1000].join(",");
     let shown: Vec<String> = (0..1000).map(|node| node.to_string()).collect();

@@ -16,7 +16,7 @@ fn write_ply(path: &Path, n: usize, seed: u64) {
     fs::write(path, ply(&gaussians(n, 0, 220.0, seed), &inria_columns(0, false))).unwrap();
 }
 
-/// Names of the commits that are in the making, or were.
+/// Names of the staging directories of commits that run or were killed.
 fn unfinished(twins: &Path) -> Vec<String> {
     let entries = fs::read_dir(twins.join(".staging")).into_iter().flatten();
     let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
@@ -97,9 +97,9 @@ fn a_killed_import_leaves_the_old_version_or_the_new_one() {
     );
 }
 
-/// Wherever it is killed: the points are spread over the time that an import takes.
+/// The points at which the import is killed are spread over the time that it takes.
 #[test]
-fn killed_at_a_hundred_points_nothing_is_lost() {
+fn an_import_killed_at_a_hundred_points_loses_nothing() {
     const POINTS: u32 = 100;
     let dir = tempfile::tempdir().unwrap();
     let twins = dir.path().join("twins");
@@ -141,7 +141,7 @@ fn killed_at_a_hundred_points_nothing_is_lost() {
 }
 
 #[test]
-fn objects_that_a_killed_import_had_placed_are_swept() {
+fn objects_placed_by_a_killed_import_are_removed() {
     let dir = tempfile::tempdir().unwrap();
     let version = commit(dir.path(), street(&gaussians(1_000, 0, 100.0, 1))).unwrap();
     let before = files(&dir.path().join("street"));
@@ -155,8 +155,8 @@ fn objects_that_a_killed_import_had_placed_are_swept() {
     assert_eq!(catalog.version("street", None).unwrap(), version);
 }
 
-/// Without root no file system can be filled, but a file may be forbidden to grow, which fails in
-/// the same place: a write in the middle of an object.
+/// Without root, a test cannot fill a file system. A limit of the file size makes the same operation fail: a
+/// write in the middle of an object.
 #[test]
 fn a_full_disk_leaves_the_old_version_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();

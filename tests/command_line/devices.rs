@@ -1,11 +1,11 @@
-//! Devices by name and number, and what is said where there is none.
+//! Devices by name and number, and the errors where there is none.
 
 use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, devices};
 
 use crate::gpu::{gpu, gpu_on};
 
 #[test]
-fn a_device_goes_by_number_and_by_a_part_of_its_name() {
+fn a_device_is_selected_by_number_or_part_of_its_name() {
     let found = devices();
     assert!(!found.is_empty(), "no Vulkan driver: apt-get install mesa-vulkan-drivers");
     let name = found[0].name.clone();
@@ -16,7 +16,7 @@ fn a_device_goes_by_number_and_by_a_part_of_its_name() {
 }
 
 #[test]
-fn a_device_that_is_not_there_is_named() {
+fn an_unknown_device_is_named_in_the_error() {
     let choice = AdapterChoice::Named("no such card".to_owned());
     let error = Gpu::new(&choice, 1).unwrap_err();
     assert!(matches!(&error, GpuError::NoSuchAdapter { choice, .. } if choice == "no such card"));
@@ -34,9 +34,9 @@ fn software_is_not_taken_for_hardware() {
     }
 }
 
-/// Naming a device asks for the gpu backend: another backend is never used silently.
+/// `--device` requires the gpu backend: another backend is never used silently.
 #[test]
-fn a_device_is_for_the_gpu_backend() {
+fn device_requires_the_gpu_backend() {
     let directory = tempfile::tempdir().unwrap();
     let run = |arguments: &[&str]| {
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_wildcity"));
@@ -83,7 +83,7 @@ fn without_a_driver_it_is_an_ordinary_error() {
     assert!(passed && said.contains("1 passed"), "{said}");
 }
 
-/// What no test may hear must be heard.
+/// A warning of wgpu must make the test fail that caused it.
 #[test]
 fn a_warning_fails_its_test() {
     let output = std::process::Command::new(std::env::current_exe().unwrap())

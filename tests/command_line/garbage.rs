@@ -5,7 +5,7 @@ use crate::scene_files::gaussians;
 use crate::wildcity;
 
 #[test]
-fn commands_say_it() {
+fn gc_fsck_list_and_log_print_their_results() {
     let dir = tempfile::tempdir().unwrap();
     let place = Place::Directory(dir);
     let catalog = place.catalog();

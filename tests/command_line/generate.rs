@@ -11,8 +11,8 @@ use wildcity_twin::store::Catalog;
 fn memory_does_not_grow_with_the_route() {
     let dir = tempfile::tempdir().unwrap();
     let [one, five] = ["1", "5"].map(|km| peak_bytes(km, dir.path()));
-    // A longer route has fuller places; but the Gaussians of 4 km more, 104 bytes each, would take 420
-    // MB.
+    // A longer route may have denser parts, but holding all Gaussians of 4 km more, at 104 bytes each, would take
+    // 420 MB.
     assert!(five < one + (100 << 20), "{one} bytes at 1 km, {five} at 5 km");
 
     let version = Catalog::open(dir.path()).unwrap().version("km5", None).unwrap();
@@ -20,7 +20,7 @@ fn memory_does_not_grow_with_the_route() {
     assert!((version.manifest.trajectories[0].length_m() - 4_984.0).abs() < 10.0);
 }
 
-/// Most memory that making a city of so many km takes, in bytes.
+/// Peak memory of generating a city of this length, in bytes.
 fn peak_bytes(km: &str, twins: &Path) -> u64 {
     let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
         .args(["twin", "generate", "--twin", &format!("km{km}"), "--length-km", km])

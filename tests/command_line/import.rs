@@ -20,7 +20,7 @@ fn import(file: &str, name: &str, twins: &Path) -> Option<Version> {
 }
 
 #[test]
-fn the_small_skull_of_both_formats_makes_the_same_objects() {
+fn the_same_skull_in_two_formats_makes_the_same_objects() {
     let dir = tempfile::tempdir().unwrap();
     let Some(one) = import("conformance/skull_small.ply", "ply", dir.path()) else { return };
     let two = import("conformance/skull_small.safetensors", "tensors", dir.path()).unwrap();

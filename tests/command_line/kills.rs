@@ -52,7 +52,7 @@ impl Drop for Serving {
     }
 }
 
-/// Uploads and pushes a file under an id; gives the version.
+/// Uploads and pushes a file under an id, and returns the version.
 async fn push(client: HttpClient, path: std::path::PathBuf, id: String) -> u64 {
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
     let mut asked = push_of(&[&upload.id]);
@@ -77,7 +77,7 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
         let version = catalog.version("test", None).unwrap();
         (version.number, version.manifest.provenance.source)
     };
-    // How long it takes undisturbed, and that the test is not about nothing.
+    // Measure how long an undisturbed push takes.
     let mut serving = Serving::start(dir.path());
     let begun = Instant::now();
     push(serving.client.clone(), scene(KILLS), "first".to_owned()).await;

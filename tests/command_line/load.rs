@@ -1,4 +1,4 @@
-//! Many clients, slow clients, and what they leave behind.
+//! Many clients, slow clients, and the memory of the server after them.
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
@@ -146,18 +146,18 @@ async fn two_laps(steps: u64) {
     assert_eq!(laps[0], laps[1], "what is driven twice is the same");
     let (early, late) = (early_bytes.unwrap(), served.rss());
     eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
-    // Of 10,000 steps and more, 70 B each would be seen.
+    // A leak of 70 B per step would be detected over 10,000 steps.
     assert!(late < early + (1 << 20), "{early} bytes grew to {late}");
 }
 
 #[tokio::test]
-async fn a_lap_driven_twice_is_the_same_in_the_same_memory() {
+async fn two_identical_laps_take_the_same_memory() {
     two_laps(10_000).await;
 }
 
 #[tokio::test]
 #[ignore = "takes minutes"]
-async fn a_lap_of_50_000_steps_driven_twice_is_the_same_in_the_same_memory() {
+async fn two_identical_laps_of_50_000_steps_take_the_same_memory() {
     two_laps(50_000).await;
 }
 
@@ -187,7 +187,7 @@ async fn a_thousand_connections_at_once() {
 }
 
 #[tokio::test]
-async fn connections_above_the_limit_are_turned_away() {
+async fn connections_above_the_limit_are_refused() {
     let server = TestServer::with(Limits { connections: 2, ..Limits::default() }).await;
     let first = server.agent().await;
     let mut second = server.agent().await;
@@ -208,13 +208,13 @@ async fn connections_above_the_limit_are_turned_away() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    tokio::time::timeout(support::PATIENCE, seated).await.expect("a free place");
+    tokio::time::timeout(support::TEST_TIMEOUT, seated).await.expect("a free place");
     server.still_serves().await;
     second.open(json!({})).await;
 }
 
 /// A client with a small receive buffer that never reads: its megabytes do not fit anywhere.
-async fn one_that_does_not_read(server: &TestServer, name: &str) -> Agent {
+async fn client_that_never_reads(server: &TestServer, name: &str) -> Agent {
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4096).unwrap();
     let stream = socket.connect(server.address()).await.unwrap();
@@ -238,15 +238,15 @@ async fn one_that_does_not_read(server: &TestServer, name: &str) -> Agent {
 }
 
 #[tokio::test]
-async fn a_client_that_does_not_read_harms_only_itself() {
+async fn a_client_that_does_not_read_does_not_affect_others() {
     let (send, resume_grace) = (Duration::from_millis(500), Duration::from_millis(200));
     let server = TestServer::with(Limits { send, resume_grace, ..Limits::default() }).await;
-    let stuck = one_that_does_not_read(&server, "stuck").await;
+    let stuck = client_that_never_reads(&server, "stuck").await;
     let mut other = server.driver("other").await;
     for step in 0..50 {
         other.step(f64::from(step)).await;
     }
-    // It loses its connection, and as it does not come back, its session.
+    // It loses its connection, and, because it does not reconnect, its session.
     server.sessions_become(1).await;
     drop(stuck);
     assert_eq!(other.step(50.0).await.meta["step"], 51);
@@ -275,14 +275,14 @@ async fn many_sessions_take_turns() {
 }
 
 #[tokio::test]
-async fn reading_half_an_answer_is_no_problem_for_others() {
+async fn a_half_read_answer_does_not_affect_others() {
     let server = TestServer::start().await;
     let mut agents = Vec::new();
     for k in 0..8 {
-        agents.push(one_that_does_not_read(&server, &format!("slow{k}")).await);
+        agents.push(client_that_never_reads(&server, &format!("slow{k}")).await);
     }
     server.still_serves().await;
-    // They only were slow: once they read, they get everything.
+    // These clients are only slow: once they read, they get everything.
     for agent in &mut agents {
         let Reply::Binary(bytes) = agent.receive().await else { panic!("no observation") };
         assert!(bytes.len() > 36_000_000);

@@ -54,7 +54,7 @@ mod route;
 mod sky;
 mod twin;
 
-/// The support files name each other so in every test binary.
+/// The support files refer to each other by these paths in every test binary.
 mod support {
     pub(crate) use crate::server::*;
     pub(crate) use crate::store::*;

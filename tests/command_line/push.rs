@@ -34,7 +34,7 @@ async fn a_file_is_pushed_and_reported() {
     let err = String::from_utf8(done.stderr).unwrap();
     assert!(!done.status.success() && err.contains("(9, 9)"), "{err}");
     let done = tokio::task::block_in_place(|| run(&["--base", "1"]));
-    // What changed since is this very content: an answer may have been lost.
+    // The change since the base is this same content, as after a lost answer.
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let done = tokio::task::block_in_place(|| run(&["--cells", "x"]));
     assert!(!done.status.success());

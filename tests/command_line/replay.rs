@@ -35,7 +35,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let running = wildcity_server::start(config).await.unwrap();
     let mut agent = Agent::connect(running.address()).await;
     agent.hello().await;
-    // With a profile of its own: what was recorded is drawn, not what the twin says.
+    // The session overrides the profile: the replay must use the recorded profile and not the twin's.
     let own =
         json!({ "session": "a", "profile": { "blur": 4.0 }, "outputs": { "encoding": "raw" } });
     agent.open(own).await;
@@ -68,7 +68,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     }
     std::fs::write(&path, whole).unwrap();
 
-    // Another backend differs, and its pictures are wanted all the same.
+    // Another backend gives different images, and `--out` writes them nevertheless.
     let others = episodes.path().join("others");
     let arguments = ["--backend", "reference", "--out", others.to_str().unwrap()];
     tamper(&path, 2, 0);

@@ -1,4 +1,4 @@
-//! `wildcity rig`: every preset is shown, drawn, and true to its lenses.
+//! `wildcity rig`: every preset is shown, drawn, and checked.
 
 use std::process::{Command, Output};
 
@@ -54,16 +54,16 @@ fn the_surround_rig_looks_all_around() {
 }
 
 #[test]
-fn what_is_no_rig_is_refused() {
+fn invalid_rigs_are_refused() {
     let unknown = wildcity(&["check", "vehicle7"]);
     assert_eq!(unknown.status.code(), Some(1));
     let text = said(&unknown);
     assert!(text.contains("neither a file nor a preset") && text.contains("vehicle6"), "{text}");
 }
 
-/// The f-theta cameras of a real car, at full size and at that which a model reads.
+/// The f-theta cameras of a real car, at full size and at the size that a driving model reads.
 #[test]
-fn a_real_cars_points_land_where_its_lenses_say() {
+fn points_are_reprojected_through_the_lenses_of_a_real_car() {
     let cpu = cpu();
     for mounted in Rig::preset("alpamayo2").unwrap().cameras {
         let full = mounted.camera;
@@ -81,8 +81,8 @@ fn a_real_cars_points_land_where_its_lenses_say() {
 }
 
 #[test]
-fn a_camera_that_does_not_show_what_it_says_fails_the_check() {
-    // All around on 48 x 32 px: a point is as wide as its circle is round, and lands beside its middle.
+fn a_camera_with_reprojection_errors_fails_the_check() {
+    // A view all around on 48 x 32 px: the lens distorts the image of a point, so that its centroid is off.
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("rig.json");
     let place = r#""camera_to_rig": {"xyz": [0, 0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}"#;

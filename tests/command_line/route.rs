@@ -71,7 +71,7 @@ fn a_drive_is_measured_thinned_cut_and_matched() {
 }
 
 #[test]
-fn what_cannot_be_is_told_and_nothing_is_written() {
+fn invalid_requests_are_refused_and_nothing_is_written() {
     let dir = tempfile::tempdir().unwrap();
     let at = dir.path();
     fs::write(at.join("log.json"), serde_json::to_vec(&straight(10)).unwrap()).unwrap();

@@ -9,7 +9,7 @@ use crate::sky_network::tensors;
 use crate::wildcity;
 
 #[test]
-fn on_the_command_line() {
+fn skies_are_imported_replaced_and_removed() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let run = |arguments: &[&str]| {
@@ -31,7 +31,7 @@ fn on_the_command_line() {
     assert_eq!(code, Some(0), "{error}");
     let catalog = Catalog::open(&at("twins")).unwrap();
     let version = catalog.version("street", None).unwrap();
-    // A network has the axes of its scene: the world's z, up, is the file's -y.
+    // A sky network has the axes of its scene: z of the world (up) is -y of the file.
     let named = version.manifest.sky.clone().unwrap();
     assert_eq!(named.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
     let (_, said, _) = run(&["inspect", "street"]);

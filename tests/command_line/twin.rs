@@ -25,7 +25,7 @@ fn refusal(output: &Output) -> String {
 }
 
 #[test]
-fn import_inspect_and_verify_tell_what_is_there() {
+fn import_inspect_and_verify_print_the_contents() {
     let dir = tempfile::tempdir().unwrap();
     let scene = ply(&gaussians(3_000, 1, 100.0, 1), &inria_columns(1, true));
     let rig = r#"{"name": "car", "cameras": [{"name": "front",
@@ -215,7 +215,7 @@ fn an_absurd_number_of_threads_is_a_mistake_on_the_command_line() {
 }
 
 #[test]
-fn what_the_options_made_of_a_sound_file_is_said_to_be_their_doing() {
+fn errors_caused_by_the_options_name_the_options() {
     let dir = tempfile::tempdir().unwrap();
     let mut scene = gaussians(10, 0, 1.0, 1);
     scene.means_m[7][1] = 3e6;
@@ -229,7 +229,7 @@ fn what_the_options_made_of_a_sound_file_is_said_to_be_their_doing() {
 }
 
 #[test]
-fn help_teaches_with_examples() {
+fn help_has_examples() {
     for (command, wanted) in [
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
         ("import", "Memory: twice the uncompressed scene"),
@@ -245,7 +245,7 @@ fn help_teaches_with_examples() {
 }
 
 #[test]
-fn twins_lie_where_the_user_keeps_data() {
+fn twins_are_in_the_users_data_directory() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("scene.ply");
     fs::write(&source, ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false))).unwrap();
@@ -262,7 +262,7 @@ fn twins_lie_where_the_user_keeps_data() {
 }
 
 #[test]
-fn a_picture_that_cannot_be_written_is_an_error() {
+fn an_image_that_cannot_be_written_is_an_error() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name);
     fs::write(path("scene.ply"), ply(&gaussians(10, 0, 1.0, 1), &inria_columns(0, false))).unwrap();

@@ -8,7 +8,7 @@ use tokio::net::TcpStream;
 use wildcity_server::{Limits, SpoolLimits};
 
 use crate::http::{Reply, get, post, send};
-use crate::support::{PATIENCE, TestServer};
+use crate::support::{TEST_TIMEOUT, TestServer};
 
 fn content(size: usize) -> Vec<u8> {
     (0..size).map(|i| (i * i % 251) as u8).collect()
@@ -48,7 +48,7 @@ async fn reaches(server: &TestServer, path: &str, offset: u64) -> Value {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, reached).await.expect("the bytes arrive")
+    tokio::time::timeout(TEST_TIMEOUT, reached).await.expect("the bytes arrive")
 }
 
 #[tokio::test]
@@ -208,7 +208,7 @@ async fn an_upload_that_is_too_old_is_removed() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, gone).await.expect("it is removed");
+    tokio::time::timeout(TEST_TIMEOUT, gone).await.expect("it is removed");
 }
 
 /// The client reconnects while the server still waits for bytes on the old connection.
@@ -234,7 +234,7 @@ async fn a_new_connection_takes_the_upload_over() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    let offset = tokio::time::timeout(PATIENCE, reached).await.unwrap();
+    let offset = tokio::time::timeout(TEST_TIMEOUT, reached).await.unwrap();
     let end = append(&server, &path, offset, "", &content[offset as usize..]).await;
     assert_eq!(end.body["complete"], true, "{end:?}");
 }

@@ -18,7 +18,7 @@ use wildcity_twin::store::{Catalog, Retention};
 
 use crate::http::{get, in_cell, post, push};
 use crate::metrics::scrape;
-use crate::support::{Agent, PATIENCE, Seen, TestServer, commit_twin_of, pose, refused};
+use crate::support::{Agent, Seen, TEST_TIMEOUT, TestServer, commit_twin_of, pose, refused};
 
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;
@@ -171,7 +171,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
         cache: Cache::new(Catalog::open(server.twins.path()).unwrap()),
         episodes: episodes.path().to_owned(),
         backend: server.painter.clone(),
-        step_timeout: PATIENCE,
+        step_timeout: TEST_TIMEOUT,
     });
     let engine = engine.unwrap();
     let latest = async || {

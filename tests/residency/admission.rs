@@ -8,7 +8,7 @@ use wildcity_scene::Chunk;
 use wildcity_twin::residency::{Cache, ResidencyError, RigExtent, SectionRef};
 
 use crate::scene_files::{Random, gaussians};
-use crate::streaming::{PATIENCE, PROFILE, commit, demo, eyes, pixels, unlimited, views};
+use crate::streaming::{PROFILE, TEST_TIMEOUT, commit, demo, eyes, pixels, unlimited, views};
 
 const EXTENT: RigExtent = RigExtent { focal_px: 70.0, radius_m: 1.7 };
 
@@ -126,7 +126,7 @@ fn the_end_of_a_frame_makes_room_at_once() {
         std::thread::sleep(wildcity_twin::limits::ROOM_POLL / 4);
         let dropped = Instant::now();
         drop(first);
-        slowest = slowest.max(told.recv_timeout(PATIENCE).unwrap() - dropped);
+        slowest = slowest.max(told.recv_timeout(TEST_TIMEOUT).unwrap() - dropped);
         waiting.join().unwrap();
     }
     assert!(slowest < wildcity_twin::limits::ROOM_POLL / 4, "{slowest:?}");
@@ -156,7 +156,7 @@ fn race(resident: &Arc<wildcity_twin::residency::Resident>, threads: u64, admitt
     drop(tell);
     let began = Instant::now();
     for _ in 0..threads {
-        let left = (3 * PATIENCE).saturating_sub(began.elapsed());
+        let left = (3 * TEST_TIMEOUT).saturating_sub(began.elapsed());
         told.recv_timeout(left).expect("a frame was never drawn");
     }
 }

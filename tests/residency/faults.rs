@@ -10,7 +10,7 @@ use wildcity_twin::residency::{
 };
 
 use crate::source::{Fault, Faulty, Place};
-use crate::streaming::{PATIENCE, PROFILE, demo, eyes, pixels, unlimited, views};
+use crate::streaming::{PROFILE, TEST_TIMEOUT, demo, eyes, pixels, unlimited, views};
 
 /// A cache whose source can be broken, and a section that a frame at 300 m needs and one at 0 m
 /// does not.
@@ -105,7 +105,7 @@ fn a_section_that_fails_once_only_delays_the_frame() {
     let (_ticket, told) = broken.ask(300.0);
     broken.source.await_read(broken.place);
     broken.source.heal();
-    assert!(told.recv_timeout(PATIENCE).unwrap().is_ok());
+    assert!(told.recv_timeout(TEST_TIMEOUT).unwrap().is_ok());
     assert!(broken.cache.stats().retries >= 1);
 }
 
@@ -129,7 +129,7 @@ fn a_section_that_hangs_delays_only_frames_that_need_it() {
     // The load continues: the next frame does not start it again.
     let (_ticket, told) = broken.ask(300.0);
     broken.source.heal();
-    assert!(told.recv_timeout(PATIENCE).unwrap().is_ok());
+    assert!(told.recv_timeout(TEST_TIMEOUT).unwrap().is_ok());
     assert_eq!(broken.source.reads(broken.place), 1);
     broken.assert_draws(300.0);
 }

@@ -7,7 +7,7 @@ use tokio::net::TcpStream;
 use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits, ServerError};
 
-use crate::support::{PATIENCE, TestServer};
+use crate::support::{TEST_TIMEOUT, TestServer};
 
 /// Sends a request as it is, and reads until the server closes or the answer is there.
 async fn request(server: &TestServer, text: &str) -> (u16, String) {
@@ -70,7 +70,7 @@ async fn an_answer_that_is_not_read_is_given_up() {
     let mut stream = TcpStream::connect(server.address()).await.unwrap();
     let requests = "GET /v1/twins HTTP/1.1\r\nHost: localhost\r\n\r\n".repeat(1000);
     let asking = async { while stream.write_all(requests.as_bytes()).await.is_ok() {} };
-    tokio::time::timeout(PATIENCE / 2, asking).await.expect("the connection ends");
+    tokio::time::timeout(TEST_TIMEOUT / 2, asking).await.expect("the connection ends");
     server.still_serves().await;
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use wildcity_twin::store::{Catalog, Retention};
 
-use crate::support::{PATIENCE, TestServer, commit_twin_of};
+use crate::support::{TEST_TIMEOUT, TestServer, commit_twin_of};
 
 #[tokio::test]
 async fn a_version_that_a_session_sees_is_kept() {
@@ -24,5 +24,5 @@ async fn a_version_that_a_session_sees_is_kept() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, ended).await.expect("the lease ends");
+    tokio::time::timeout(TEST_TIMEOUT, ended).await.expect("the lease ends");
 }

@@ -113,7 +113,7 @@ async fn a_hint_is_loaded_before_the_ego_is_there() {
     let needed = resident.demand(&eyes(&views(there)), &PROFILE);
     let begun = || needed.iter().all(|&one| source.reads(place(&resident, one)) > 0);
     while !begun() || resident.stats().loads < source.all_reads() {
-        assert!(began.elapsed() < crate::streaming::PATIENCE);
+        assert!(began.elapsed() < crate::streaming::TEST_TIMEOUT);
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     let frame = session.step(there, false).await.unwrap();

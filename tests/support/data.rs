@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-/// A file of the real data; `None`, said on standard error, where the data is absent.
+/// A file of the real data; `None`, with a note on standard error, where the data is absent.
 ///
 /// # Panics
-/// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI beside the data; or if the
-/// data is there and the file is not: that is a mistake in the test.
+/// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI on a machine that has the data; or if the
+/// data exists without this file, which is a mistake in the test.
 pub(crate) fn real(file: &str) -> Option<PathBuf> {
     let beside = root().join("../shared/data");
     let root = std::env::var_os("WILDCITY_DATA").unwrap_or_else(|| beside.into());

@@ -1,4 +1,4 @@
-//! Recorded drives whose answers are known.
+//! Recorded drives with known properties.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -7,7 +7,7 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
 
-/// A drive through places, at times.
+/// A drive through these positions at these times.
 pub(crate) fn drive(poses: impl IntoIterator<Item = (i64, DVec3)>) -> Trajectory {
     let keyframe = |(time_us, position_m)| Keyframe {
         time_us,

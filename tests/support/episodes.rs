@@ -1,4 +1,4 @@
-//! A recorded episode, whole and tampered with.
+//! A recorded episode, intact or modified.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::support::{Agent, pose};
 
-/// An episode of ten steps, one look around, and a turn that no quaternion holds exactly.
+/// An episode of ten steps, one `observe`, and a rotation that no f64 quaternion represents exactly.
 pub(crate) async fn drive(agent: &mut Agent) {
     for step in 0..10 {
         agent.step(f64::from(step) * 0.7).await;

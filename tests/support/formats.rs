@@ -1,4 +1,4 @@
-//! Scenes as other tools write them: small writers of every outside format that is not PLY or
+//! Scenes in the formats of other tools: small writers of every external format except PLY and
 //! safetensors.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
@@ -27,7 +27,7 @@ fn rgba8(g: &Gaussians, i: usize) -> [u8; 4] {
     [dc(0), dc(1), dc(2), byte(opacity(g.logit_opacities[i]))]
 }
 
-/// Antimatter15's.
+/// A `.splat` file, the format of antimatter15.
 pub(crate) fn splat(g: &Gaussians) -> Vec<u8> {
     let mut file = Vec::new();
     for i in 0..g.len() {
@@ -83,7 +83,7 @@ fn spz_header(g: &Gaussians, version: u32, streams: u8) -> Vec<u8> {
     [&b"NGSP"[..], &version.to_le_bytes(), &count, &[g.sh_degree, 12, 0, streams]].concat()
 }
 
-/// Niantic's versions 2 and 3, without gzip.
+/// An SPZ file (Niantic) of version 2 or 3, without gzip.
 pub(crate) fn spz_plain(g: &Gaussians, version: u32) -> Vec<u8> {
     [spz_header(g, version, 0), spz_attributes(g, version).concat()].concat()
 }
@@ -94,7 +94,7 @@ pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// Niantic's version 4, with an extension that no reader knows.
+/// An SPZ file (Niantic) of version 4, with an extension that no reader knows.
 pub(crate) fn spz4(g: &Gaussians) -> Vec<u8> {
     let streams = spz_attributes(g, 4).into_iter().filter(|stream| !stream.is_empty());
     let streams: Vec<_> = streams.collect();
@@ -116,7 +116,8 @@ fn half(value: f64) -> [u8; 2] {
     half::f16::from_f64(value).to_le_bytes()
 }
 
-/// mkkellogg's, of a level: full buckets of 4 and one that is not, and room for one Gaussian more.
+/// A `.ksplat` file (mkkellogg) of a compression level: full buckets of 4 Gaussians and one partly filled bucket,
+/// with space for one more Gaussian than it has.
 pub(crate) fn ksplat(g: &Gaussians, level: u16) -> Vec<u8> {
     const BUCKET: usize = 4;
     let (full, rest) = (g.len() / BUCKET, g.len() % BUCKET);
@@ -211,7 +212,7 @@ fn gltf_attributes(g: &Gaussians) -> Vec<(String, usize, Vec<f32>)> {
     attributes
 }
 
-/// Document and buffer; `node` is the JSON inside of the only node, `uri` that of the buffer.
+/// A glTF document and its buffer. `node` is the JSON inside of the only node, `uri` the URI of the buffer.
 pub(crate) fn gltf(g: &Gaussians, node: &str, uri: &str) -> (String, Vec<u8>) {
     let (mut buffer, mut views, mut accessors, mut names) = (Vec::new(), vec![], vec![], vec![]);
     for (index, (name, width, values)) in gltf_attributes(g).into_iter().enumerate() {
@@ -239,7 +240,7 @@ pub(crate) fn gltf(g: &Gaussians, node: &str, uri: &str) -> (String, Vec<u8>) {
     (json, buffer)
 }
 
-/// A binary glTF file of the two.
+/// A binary glTF file of a document and its buffer.
 pub(crate) fn glb((json, mut buffer): (String, Vec<u8>)) -> Vec<u8> {
     let mut json = json.into_bytes();
     json.resize(json.len().next_multiple_of(4), b' ');
@@ -260,7 +261,7 @@ pub(crate) fn glb((json, mut buffer): (String, Vec<u8>)) -> Vec<u8> {
     parts.concat()
 }
 
-/// A lossless WebP image of four bytes a pixel, as wide as it must be.
+/// A lossless WebP image of four bytes per pixel, with this width and the smallest sufficient height.
 pub(crate) fn webp(pixels: &[[u8; 4]], width_px: usize) -> Vec<u8> {
     let height_px = pixels.len().div_ceil(width_px).max(1);
     let mut bytes = pixels.as_flattened().to_vec();
@@ -272,7 +273,7 @@ pub(crate) fn webp(pixels: &[[u8; 4]], width_px: usize) -> Vec<u8> {
     file
 }
 
-/// Files of a folder, the first of which names the others.
+/// The files of a folder; the first one refers to the others.
 pub(crate) type Files = Vec<(String, Vec<u8>)>;
 
 /// PlayCanvas' SOG: every Gaussian's colours of higher degrees are an entry of their own, so at most
@@ -399,7 +400,7 @@ pub(crate) fn zip_of(files: &[(String, Vec<u8>)], is_packed: bool) -> Vec<u8> {
     zip.finish().unwrap().into_inner()
 }
 
-/// The MessagePack within a NuRec payload; one more layer, of tracked cars, if wanted.
+/// The MessagePack within a NuRec payload; `with_cars` adds a layer of tracked cars.
 pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
     let text = |s: &str| [&[0xd9, s.len() as u8], s.as_bytes()].concat();
     let bytes = |b: Vec<u8>| [&[0xc6][..], &(b.len() as u32).to_be_bytes(), &b].concat();
@@ -454,7 +455,7 @@ pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
     map(vec![("nre_data", data)])
 }
 
-/// USDZ around a payload.
+/// A USDZ file with a payload.
 pub(crate) fn usdz(payload: Vec<u8>) -> Vec<u8> {
     let layer = b"#usda 1.0\n".to_vec();
     let files = [("default.usda".to_owned(), layer), ("scene.nurec".to_owned(), gzip(&payload))];

@@ -1,4 +1,4 @@
-//! A directory and an object store, in which the same tests run.
+//! A directory and an object store, on which the same tests run.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 

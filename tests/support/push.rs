@@ -14,7 +14,7 @@ use wildcity_scene::Gaussians;
 use crate::scene_files::{self, inria_columns, ply};
 use crate::support::{self, TestServer};
 
-/// An answer of HTTP: its status, its header lines, and its body as JSON where it is.
+/// An HTTP answer: its status, its header lines, and its body if that is JSON.
 #[derive(Debug)]
 pub(crate) struct Reply {
     pub(crate) status: u16,
@@ -43,7 +43,7 @@ pub(crate) async fn send(address: SocketAddr, head: &str, body: &[u8]) -> Reply 
     let _ = stream.write_all(body).await;
     let mut answer = Vec::new();
     let read = stream.read_to_end(&mut answer);
-    let read = tokio::time::timeout(support::PATIENCE, read).await.expect("an answer in time");
+    let read = tokio::time::timeout(support::TEST_TIMEOUT, read).await.expect("an answer in time");
     read.unwrap();
     let text = String::from_utf8(answer).unwrap();
     let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
@@ -67,7 +67,7 @@ pub(crate) fn client(server: &TestServer) -> HttpClient {
     HttpClient::new(&format!("http://{}", server.address()), &ConnectOptions::default()).unwrap()
 }
 
-/// Writes Gaussians as a PLY file of INRIA's.
+/// Writes Gaussians as a PLY file with INRIA's columns.
 pub(crate) fn write(dir: &Path, name: &str, gaussians: &Gaussians) -> PathBuf {
     let path = dir.join(name);
     let columns = inria_columns(gaussians.sh_degree, false);

@@ -1,4 +1,4 @@
-//! An S3 server on loopback that can be told to fail.
+//! An S3 server on loopback with configurable faults.
 //!
 //! The server is s3s-fs, within the process of the tests, so that neither Python nor a download is
 //! needed. It honours `If-None-Match`, but does not put atomically if absent: puts are serialised here.
@@ -24,20 +24,20 @@ use wildcity_twin::store::{Catalog, DiskCacheSettings, RetryPolicy, StoreError};
 const KEYS: [&str; 2] = ["test", "secret"];
 const BUCKET: &str = "bucket";
 
-/// What a request meets with instead of its answer.
+/// A fault that a request encounters.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Fault {
-    /// This status, and nothing is done.
+    /// The request is answered with this status and not executed.
     Status(u16),
-    /// It is done, but the connection breaks before the answer.
+    /// The request is executed, but the connection breaks before the answer.
     AnswerLost,
-    /// It is done, and answered with this status.
+    /// The request is executed, but answered with this status.
     Denied(u16),
-    /// It is not done, and never answered.
+    /// The request is neither executed nor answered.
     Silence,
-    /// The answer ends half-way through.
+    /// The answer is truncated in the middle.
     Short,
-    /// One bit of the answer is another.
+    /// One bit of the answer is flipped.
     Flipped,
 }
 
@@ -59,7 +59,7 @@ pub(crate) struct S3 {
 
 impl S3 {
     pub(crate) fn start() -> Self {
-        // Another test may have said so before.
+        // Another test may have installed a provider before.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join(BUCKET)).unwrap();
@@ -119,7 +119,7 @@ impl S3 {
         Catalog::over(self.store(), &Self::url(), "twins", cache, quick())
     }
 
-    /// What a process needs to know of the server.
+    /// Sets the environment variables with which a process finds the server.
     pub(crate) fn environment<'a>(&self, command: &'a mut Command) -> &'a mut Command {
         command
             .env("AWS_ENDPOINT", format!("http://127.0.0.1:{}", self.port))
@@ -130,13 +130,13 @@ impl S3 {
     }
 }
 
-/// The patience of tests.
+/// Short time-outs and few retries, for tests.
 pub(crate) fn quick() -> RetryPolicy {
     let (timeout, backoff) = (Duration::from_secs(3), Duration::from_millis(10));
     RetryPolicy { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
 }
 
-/// All files below a folder that are objects of the server: it keeps notes of its own beside them.
+/// All files below a folder that are objects of the server, without the server's own metadata files.
 pub(crate) fn keys(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(dir).into_iter().flatten() {

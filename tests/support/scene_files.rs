@@ -1,4 +1,4 @@
-//! Gaussians made of nothing, and the files that a trainer would make of them.
+//! Synthetic Gaussians, and the files that a trainer would write for them.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -89,7 +89,7 @@ pub(crate) fn ply_header(count: usize, columns: &[Column]) -> String {
     header + "end_header\n"
 }
 
-/// The number that a PLY file has under a name; what is not a Gaussian's is 0.25.
+/// The value of a Gaussian for a column name of a PLY file; 0.25 for columns that are not of Gaussians.
 fn value(g: &Gaussians, index: usize, name: &str) -> f64 {
     let (stem, number) = match name.rsplit_once('_') {
         Some((stem, digits)) => (stem, digits.parse::<usize>().unwrap()),

@@ -1,4 +1,4 @@
-//! A server with a painted world, and an agent that speaks raw WebSocket.
+//! A server with a synthetic renderer, and a client of raw WebSocket messages.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -28,7 +28,7 @@ use wildcity_server::{Config, Limits, Running};
 use wildcity_twin::store::{Catalog, NewVersion};
 
 /// How long a test waits for anything before it fails.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A backend that paints a pattern that depends on the pose of the camera alone.
 #[derive(Debug, Default)]
@@ -37,7 +37,7 @@ pub(crate) struct Painter {
     pub(crate) slow_ms: AtomicU64,
     /// Whether the next frame crashes.
     pub(crate) crash: AtomicBool,
-    /// Whether the next frame has too much in it.
+    /// Whether the next frame fails with `RenderError::TooMany`.
     pub(crate) too_many: AtomicBool,
     /// Frames begun.
     pub(crate) begun: AtomicU64,
@@ -53,7 +53,7 @@ impl Painter {
         (mixed >> 56) as u8
     }
 
-    /// What the image of a camera must be.
+    /// The expected image of a camera.
     pub(crate) fn image(world_from_camera: &Pose, camera: &Camera) -> Vec<u8> {
         (0..3 * camera.pixels()).map(|index| Self::paint(world_from_camera, index)).collect()
     }
@@ -110,7 +110,7 @@ pub(crate) fn commit_twin(dir: &Path) {
     commit_twin_of(dir, 2.0);
 }
 
-/// The same with Gaussians of some opacity, given before the sigmoid: another opacity is another version.
+/// As [`commit_twin`], with Gaussians of this opacity before the sigmoid: another opacity makes another version.
 pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
     let gaussians = Gaussians {
         sh_degree: 0,
@@ -193,21 +193,21 @@ impl TestServer {
         self.running.address()
     }
 
-    /// Connected, welcomed.
+    /// A client that has connected and received `welcome`.
     pub(crate) async fn agent(&self) -> Agent {
         let mut agent = Agent::connect(self.address()).await;
         agent.hello().await;
         agent
     }
 
-    /// Connected, welcomed, with a session of that name; raw images.
+    /// A client that has connected and opened a session of that name, with raw images.
     pub(crate) async fn driver(&self, name: &str) -> Agent {
         let mut agent = self.agent().await;
         agent.open(json!({ "session": name, "outputs": { "encoding": "raw" } })).await;
         agent
     }
 
-    /// Checks that the server still serves: a whole session of a new client.
+    /// Checks that the server still works, with a whole session of a new client.
     pub(crate) async fn still_serves(&self) {
         let mut agent = self.driver("still-serves").await;
         assert_eq!(agent.step(3.0).await.meta["step"], 1);
@@ -230,7 +230,7 @@ impl TestServer {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
-        let waited = tokio::time::timeout(PATIENCE, reached).await;
+        let waited = tokio::time::timeout(TEST_TIMEOUT, reached).await;
         assert!(waited.is_ok(), "{} sessions, not {count}", self.running.sessions());
     }
 }
@@ -330,7 +330,7 @@ impl Agent {
     }
 
     pub(crate) async fn receive(&mut self) -> Reply {
-        let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+        let next = tokio::time::timeout(TEST_TIMEOUT, self.socket.next()).await;
         match next.expect("an answer in time") {
             Some(Ok(Message::Text(text))) => {
                 Reply::Text(serde_json::from_str(&text).expect("JSON"))

@@ -1,4 +1,4 @@
-//! Sections that fail, come late or come wrong, as the test says.
+//! A source of sections with configurable faults: sections that fail, are late or are damaged.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -12,25 +12,25 @@ use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_twin::residency::SectionSource;
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
-use crate::streaming::PATIENCE;
+use crate::streaming::TEST_TIMEOUT;
 
 /// A section by cell, block and level.
 pub(crate) type Place = ([i32; 2], u8, u8);
 
-/// What is wrong with a section.
+/// The fault of a section.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Fault {
     /// It cannot be read.
     Unreadable,
-    /// It is not what was committed.
+    /// Its bytes differ from what was committed.
     Damaged,
-    /// Reading it is a defect of the program.
+    /// Reading it panics.
     Crash,
-    /// It does not come before the fault is lifted.
+    /// Reading it blocks until the fault is removed.
     Hangs,
 }
 
-/// A catalog with faults, which counts what is read of it.
+/// A catalog with faults, which counts the reads of each section.
 pub(crate) struct Faulty {
     catalog: Catalog,
     state: Mutex<State>,
@@ -62,12 +62,12 @@ impl Faulty {
         self.state.lock().unwrap().reads.get(&place).copied().unwrap_or(0)
     }
 
-    /// How often any was read.
+    /// Number of reads of all sections.
     pub(crate) fn all_reads(&self) -> u64 {
         self.state.lock().unwrap().reads.values().map(|&reads| u64::from(reads)).sum()
     }
 
-    /// The most that any section was read.
+    /// Number of reads of the section that was read most often.
     pub(crate) fn most_reads(&self) -> u32 {
         self.state.lock().unwrap().reads.values().copied().max().unwrap_or(0)
     }
@@ -76,7 +76,7 @@ impl Faulty {
     pub(crate) fn await_read(&self, place: Place) {
         let began = Instant::now();
         while self.reads(place) == 0 {
-            assert!(began.elapsed() < PATIENCE, "{place:?} was never read");
+            assert!(began.elapsed() < TEST_TIMEOUT, "{place:?} was never read");
             std::thread::yield_now();
         }
     }

@@ -1,4 +1,4 @@
-//! Versions of a small twin, and what lies on disk of it.
+//! Versions of a small twin, and its files on disk.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -34,7 +34,7 @@ pub(crate) fn files(dir: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// The turn to publish versions of twin "street" in a directory, until it is dropped.
+/// Takes the publish lock of twin "street" in a directory, until the file is dropped.
 pub(crate) fn turn(dir: &Path) -> std::fs::File {
     let turn =
         std::fs::File::options().append(true).open(dir.join(".staging/street.lock")).unwrap();

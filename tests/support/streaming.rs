@@ -1,4 +1,4 @@
-//! A sparse demo street of 600 m, of which a frame draws 120 m, so that a drive needs ever other parts.
+//! A sparse demo street of 600 m, of which a frame draws 120 m, so that a drive needs different parts over time.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -18,9 +18,9 @@ use wildcity_twin::store::{Catalog, NewVersion, Version};
 use crate::images::{cpu, render, view_along};
 
 /// How long a test waits for anything before it fails.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// What a frame of the twin draws of it: within 120 m, so that a drive needs ever other parts.
+/// The profile: a frame draws what is within 120 m, so that a drive needs different parts over time.
 pub(crate) const PROFILE: RenderProfile =
     RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT };
 
@@ -47,7 +47,7 @@ impl Demo {
         Catalog::open(self.dir.path()).unwrap()
     }
 
-    /// The place of the car so many metres down the street.
+    /// The pose of the car at a distance along the street, in metres.
     pub(crate) fn at(&self, station_m: f64) -> Pose {
         self.trajectory.at_station(station_m)
     }
@@ -99,7 +99,7 @@ pub(crate) fn need_bytes(resident: &Resident, world_from_rig: Pose) -> u64 {
     bytes(resident, &resident.demand(&eyes(&views(world_from_rig)), &PROFILE))
 }
 
-/// A cache with all the room that it wants.
+/// A cache without a memory limit.
 pub(crate) fn unlimited() -> Cache {
     Cache::new(demo().catalog())
 }

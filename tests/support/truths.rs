@@ -1,4 +1,4 @@
-//! Images of the same Gaussians by other renderers.
+//! Ground truth: images of the same Gaussians by other renderers.
 
 use std::path::Path;
 

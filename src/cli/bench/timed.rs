@@ -1,4 +1,4 @@
-//! Frames that are rendered several times, and how long each took.
+//! Renders a frame several times and measures how long each run takes.
 
 use std::time::Instant;
 

@@ -58,11 +58,11 @@ Examples:
 pub(super) const TWIN: &str = "demo";
 /// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
 const EXACT_TWIN: &str = "demo-f32";
-/// Start of the provenance of the demo street, in every revision of the generator.
+/// Prefix of the provenance of the demo street, in every revision of the generator.
 const STREET: &str = "street ";
 /// Speed of the agent, in m/s.
 const SPEED_M_PER_S: f64 = 8.0;
-/// A mosaic is written for every so many steps.
+/// Number of steps between two mosaics.
 const MOSAIC_STEPS: u64 = 10;
 
 impl Demo {

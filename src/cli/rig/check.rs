@@ -8,9 +8,9 @@ use wildcity_render::compare::reprojection::ReprojectionErrors;
 
 /// Render points at known pixels, and check that each camera of a rig shows them there.
 ///
-/// A grid of small Gaussians stands before each camera, on the rays of the middles of pixels. The centroids
-/// of their images are compared with those pixels. Prints the largest distance for each camera; the exit
-/// code is 1 if one is above 0.1 px.
+/// Places a grid of small Gaussians in front of each camera, on rays through the centres of pixels, and
+/// compares the centroids of their images with those pixel centres. Prints the largest distance for each
+/// camera; the exit code is 1 if one is above 0.1 px.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

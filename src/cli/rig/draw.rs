@@ -14,8 +14,8 @@ use wildcity_scene::rig::RigCamera;
 
 /// Draw the cameras of a rig from above, as an SVG file.
 ///
-/// The rig's front is at the top; a square of the grid is a metre. Each camera is drawn with the horizontal
-/// field of view of its middle row.
+/// The rig's front is at the top; grid squares have a side of one metre. Each camera is drawn with the
+/// horizontal field of view of its middle row.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Example:\n  wildcity rig draw vehicle6 --out vehicle6.svg")]
 pub(super) struct Draw {

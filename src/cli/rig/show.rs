@@ -10,9 +10,9 @@ use wildcity_scene::Rig;
 
 /// Print the cameras of a rig; without RIG, the names of the presets.
 ///
-/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is to the left of straight
-/// ahead and pitch is above the horizon, in degrees. Fields of view, in degrees, lie between the middles of
-/// opposite edges; `-` where the lens shows nothing there.
+/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is positive to the left of
+/// straight ahead and pitch is positive above the horizon, both in degrees. A field of view is the angle
+/// between the rays of the midpoints of opposite edges, in degrees, or `-` if the lens shows nothing there.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Examples:\n  wildcity rig show\n  wildcity rig show vehicle6")]
 pub(super) struct Show {

@@ -1,9 +1,9 @@
 //! `--config FILE.toml`: the options of `wildcity serve` in a file, and `--print-config`.
 //!
 //! Every option of the command line is a key of the file: `--memory-gib` is `memory_gib`, and the options
-//! under the heading *Limits* are in the table `[limits]`. The file becomes arguments that stand before
-//! those of the command line, where the last one counts: a flag overrides the file, and the file a
-//! default. So each option has one description, one check and one default.
+//! under the heading *Limits* are in the table `[limits]`. The file is converted to arguments, which are
+//! put before those of the command line. The last value of an option counts, so a flag overrides the file
+//! and the file overrides a default. Each option has one description, one check and one default.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -23,7 +23,7 @@ use super::limit_options::HEADING;
 /// Name of the table of the options under [`HEADING`].
 const LIMITS: &str = "limits";
 
-/// Options that are no keys of a configuration file.
+/// Options that cannot be keys of a configuration file.
 const NOT_KEYS: [&str; 3] = ["config", "print_config", "help"];
 
 /// The options of one run.
@@ -123,7 +123,8 @@ fn flattened(table: Table) -> anyhow::Result<Vec<(String, Value)>> {
     Ok(values)
 }
 
-/// The key that is most like a wrong one: fewest edits of the name, then the right table.
+/// The key that is most similar to a wrong one: the one with the fewest edits of the name, and of several
+/// such keys the one in the right table.
 fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
     let name = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
     let wrong_name = name(wrong);
@@ -186,7 +187,7 @@ impl Resolved {
     }
 }
 
-/// A text as a value of TOML: a number or a truth value where it reads as one, else a string.
+/// A text as a TOML value: a number or a Boolean if it parses as one, otherwise a string.
 fn literal(text: &str) -> String {
     let parsed: Option<Table> = format!("x = {text}").parse().ok();
     let is_scalar = parsed.is_some_and(|table| {

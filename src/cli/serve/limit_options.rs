@@ -45,11 +45,13 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
     idle_timeout_s: f64,
 
-    /// Seconds within which a client must read an answer; at most 30, since clients give up later.
+    /// Seconds within which a client must read an answer; at most 30, because clients wait for an answer
+    /// for 90 s, of which a step may take 60.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
     send_timeout_s: f64,
 
-    /// Seconds for one step, waiting for other sessions included; at most 60, since clients give up later.
+    /// Seconds for one step, including the time that it waits for other sessions; at most 60, because
+    /// clients wait for an answer for 90 s.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
     step_timeout_s: f64,
 
@@ -103,7 +105,7 @@ impl LimitOptions {
     }
 }
 
-/// GiB of so many bytes.
+/// Converts bytes to GiB.
 pub(super) fn gib_of(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 30)
 }

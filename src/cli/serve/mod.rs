@@ -26,8 +26,8 @@ use super::profile_options::read_profile;
 /// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
 /// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
 ///
-/// Every option can stand in a TOML file as well: --memory-gib is memory_gib there, and the options
-/// under Limits are in the table [limits]. A flag overrides the file, and the file a default.
+/// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options under
+/// Limits are in the table [limits]. A flag overrides the file, and the file overrides a default.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Serve {
@@ -58,21 +58,21 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Memory that the Gaussians of all twins may take, in GiB, as 2 or 0.5 [default: three quarters of
-    /// the machine's]. A session is refused if its largest frame does not fit beside those of other
-    /// sessions; the rest of the memory caches what later frames may need.
+    /// Memory that the Gaussians of all twins may take, in GiB, for example 2 or 0.5 [default: three
+    /// quarters of the machine's]. A session is refused if its largest frame does not fit into memory
+    /// together with those of the other sessions; the rest of the memory is a cache for later frames.
     #[arg(long, value_name = "N", value_parser = gib)]
     memory_gib: Option<f64>,
 
-    /// JSON file of fields of the render profile that every session gets instead of its twin's, as
-    /// `wildcity report` writes it: {"tau_px": 2.0}. A session may ask for others.
+    /// JSON file of render profile fields that replace those of every twin, for example {"tau_px": 2.0};
+    /// `wildcity report` writes such files. A session may request other values.
     #[arg(long, value_name = "FILE")]
     profile: Option<PathBuf>,
 
     #[command(flatten)]
     backend: BackendOptions,
 
-    /// What to log, as `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
+    /// What to log, for example `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
 

@@ -9,8 +9,8 @@ use wildcity_twin::store::Retention;
 
 /// Remove objects of a twin that none of the kept versions refers to.
 ///
-/// This takes two runs: the first one notes the garbage, and a run after the grace period removes it. So run
-/// the command every day. Versions that running servers use are kept, however old they are.
+/// This takes two runs: the first one records which objects are garbage, and a run after the grace period
+/// removes them. Run the command every day. Versions that running servers use are kept, however old they are.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -15,7 +15,7 @@ use wildcity_twin::store::{CommitKind, StorageOptions, VersionSettings};
 
 /// Generate a twin of a procedural city: a route between houses, cars and trees.
 ///
-/// The route bends and runs east, through streets that each have a crossing and different objects. Its
+/// The route winds eastwards through streets that each have a crossing and different objects. Its
 /// trajectory `log` has a keyframe every 0.5 m. The same options give the same bytes. Each cell is written
 /// as soon as it is complete, so a long route needs no more memory than a short one.
 #[derive(Debug, clap::Args)]

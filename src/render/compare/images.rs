@@ -1,4 +1,4 @@
-//! All images of a view by a backend, parts of them, and whether two backends drew the same.
+//! All images of a view by a backend, parts of images, and whether the images of two backends agree.
 
 use glam::{DMat3, DQuat, DVec3};
 

@@ -1,9 +1,9 @@
 //! The background of a frame (sky or one colour), added where it shows through the Gaussians: the first part
 //! of stage resolve, for frames that have one.
 //!
-//! **Where less than 1/255 of the background shows it is left out, in every backend.** It would add at most
-//! one step of 8 bits, and most pixels of a street are such. Alpha remains that of the Gaussians. A background
-//! of one colour is a sky of one colour.
+//! **Every backend omits the background where less than 1/255 of it shows through.** It would add at most one
+//! step of 8 bits, and most pixels of a street are of this kind. Alpha remains that of the Gaussians. A
+//! background of one colour is treated as a sky of one colour.
 
 use std::sync::Arc;
 
@@ -70,7 +70,7 @@ impl Background {
         }
     }
 
-    /// Adds what shows through a tile with its top left pixel at `at_px`.
+    /// Adds the background that shows through a tile with its top left pixel at `at_px`.
     #[inline(always)]
     pub(super) fn add<S: Simd>(
         &self,

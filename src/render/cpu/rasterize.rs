@@ -206,7 +206,7 @@ fn match_batch<S: Simd>(
         let dy = block_y - splat(mean_px[1] - tile_y);
         let u = dx.mul_add(splat(*l0), dy * splat(*l1));
         let v = dy * splat(*l2);
-        // √power, and what u changes by within half a block, each a little more than f32 rounds.
+        // √power, and the change of u within half a block, both increased by more than the rounding error of f32.
         let reach_u = (log2_opacity - input.cutoffs.log2_alpha_cut).sqrt() * (1.0 + 1e-5)
             + (half_px + 2e-3) * (l0.abs() + l1.abs());
         let touches = dx.abs().simd_le(splat(extent_px[0] + half_px))
@@ -246,10 +246,10 @@ fn match_batch<S: Simd>(
 /// transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A pixel stops before the splat
 /// that would bring T to the stop or below.
 ///
-/// **The transmittance that decides about stopping continues to fall after a pixel has stopped.** It only
-/// falls, so that the test `after > stop` stays false by itself, and the dependency from one iteration to the
-/// next is one multiply-add. The transmittance of the image is kept beside it, and changes only where the
-/// test holds.
+/// **The transmittance that decides about stopping continues to fall after a pixel has stopped.** It never
+/// rises, so that the test `after > stop` remains false without a mask, and each iteration depends on the one
+/// before by a single multiply-add. The transmittance of the image is a separate value, which changes only
+/// where the test holds.
 #[inline(always)]
 fn blend<S: Simd, const DEPTH: bool>(
     simd: S,

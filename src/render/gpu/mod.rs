@@ -101,7 +101,7 @@ pub struct GpuUsage {
     pub mirror_bytes: u64,
     /// Bytes of all buffers, if the allocator counts them.
     pub allocated_bytes: Option<u64>,
-    /// Attempts that drew nothing since buffers were too small.
+    /// Attempts that drew nothing because buffers were too small.
     pub retries: u64,
     /// Regions that were drawn: one for each frame that fits at once.
     pub regions: u64,
@@ -321,7 +321,8 @@ impl Gpu {
     }
 }
 
-/// Drops a device that has failed, in a thread of its own: a driver that hangs would block all callers.
+/// Drops a device that has failed, in a thread of its own, because a driver that hangs would otherwise block
+/// all callers.
 fn discard(chain: Chain) {
     std::thread::spawn(move || drop(chain));
 }

@@ -10,9 +10,9 @@
 //! regions. The next frame of the same kind starts with the regions that fitted. If a single row of tiles
 //! exceeds the device, drawing is an error.
 //!
-//! The alternative, splats and lists in several pages, would make a splat's index a page and an index in
-//! every stage, and a radix sort over pages would scatter into all of them at once. A region costs nothing
-//! when the frame fits. The Gaussians and the pixels do lie in pages, since stages only stream through them.
+//! The alternative would be splats and lists in several pages. Then a splat's index would be a page and an
+//! index in every stage, and a radix sort would scatter into all pages at once. Regions cost nothing when the
+//! frame fits. Gaussians and pixels are in pages nevertheless, because stages only stream through them.
 
 use std::ops::Range;
 

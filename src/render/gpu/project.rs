@@ -10,8 +10,8 @@
 //! they would be blended in the order of rounding errors. Distance, the depth of wide lenses, is computed
 //! in the same way (`depth` in `shaders/unscented.wgsl`).
 //!
-//! Static pinhole cameras have their own kernels, to the byte those of frames without other cameras. The
-//! kernels for lenses and rolling shutters are compiled with the first view that needs them.
+//! Static pinhole cameras have their own kernels, which are identical to those of frames without other cameras.
+//! The kernels for lenses and rolling shutters are compiled with the first view that needs them.
 
 use std::ops::Range;
 use std::sync::Arc;

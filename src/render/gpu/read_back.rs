@@ -21,8 +21,8 @@ const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 /// Offset of the timestamps after the counters, in bytes.
 pub(super) const TIMESTAMP_OFFSET: u64 = 256;
 
-/// The read-back buffers of one frame. The images of a step are copied out of one while the device fills
-/// another one with the next step.
+/// The read-back buffers of one frame. The host copies the images of a step out of one set while the device
+/// fills another set with those of the next step.
 #[derive(Debug)]
 pub(super) struct ReadBack {
     /// Counters, then timestamps.

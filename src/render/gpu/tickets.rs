@@ -14,7 +14,7 @@ pub(super) struct TicketQueue {
 struct Counts {
     /// Tickets given out.
     issued: u64,
-    /// Tickets whose turn has ended: the number of the ticket that is served now.
+    /// Number of tickets whose turn has ended, which is also the number of the ticket that is served now.
     served: u64,
 }
 

@@ -163,7 +163,7 @@ mod tests {
         let mut merged = joined(&ball(-1.0, 0.5, 0.8), &ball(1.0, 0.5, 0.8));
         merged.diagonalise();
         assert!((merged.mean_m - DVec3::ZERO).length() < 1e-15);
-        // 0.25 m² of each, and a displacement of 1 m along x.
+        // A variance of 0.25 m² of each, and a displacement of 1 m along x.
         let wanted = DVec3::new(1.25_f64.sqrt(), 0.5, 0.5);
         assert!((merged.scale_m - wanted).length() < 1e-12, "{}", merged.scale_m);
         assert!((merged.weight - 2.0 * 0.8 * 0.75).abs() < 1e-12);

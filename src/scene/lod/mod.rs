@@ -6,9 +6,9 @@
 //!
 //! Levels are merged under a limit of the error and not by halving: limits rise by √2 from 1 mm, each block
 //! merges the pairs below the limit, cheapest first, and a level is kept if it has a third fewer Gaussians than
-//! the previously kept one. So no pair that is far apart spoils the error of a whole level, and the error of a
-//! level is close to its limit. There are no random numbers, no threads and no hashing: the same block gives the
-//! same levels.
+//! the previously kept one. So a single pair that is far apart does not increase the error of a whole level, and
+//! the error of a level is close to its limit. There are no random numbers, no threads and no hashing: the same
+//! block gives the same levels.
 
 mod merge;
 
@@ -50,7 +50,8 @@ const MOST_COST: f64 = 0.02;
 /// Variance that the renderer adds on the screen, in px²: differences that this blur hides have no cost.
 const BLUR_PX2: f64 = 0.3;
 
-/// The levels above 0 of a block, coarser and coarser; none if merging does not pay.
+/// The levels of a block above level 0, each coarser than the one before; none if merging reduces the number of
+/// Gaussians too little.
 pub fn levels(block: &Chunk) -> Vec<Level> {
     let mut merging = Merging::new(block);
     let mut kept = Vec::new();

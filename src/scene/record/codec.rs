@@ -259,10 +259,10 @@ impl Code {
 }
 
 impl Grid {
-    /// The finest one that spans all values with the numbers 0 to 2^bits - 1.
+    /// The finest grid that covers all values with the numbers 0 to 2^bits - 1.
     ///
-    /// Multiples of the step, so that zero is on it: where it begins is rounded down to one, which
-    /// costs one of the steps. A step of 2^-30 of the largest value is below f32's own.
+    /// The grid consists of multiples of its step, so that zero is on it: its start is rounded down to a
+    /// multiple, which uses one of the steps. A step of 2^-30 of the largest value is finer than f32.
     fn over(values: &[f32], bits: u32, binary: bool) -> Self {
         let fold = |from: f64, pick: fn(f64, f64) -> f64| {
             values.iter().fold(from, |all, &value| pick(all, f64::from(value)))
@@ -273,7 +273,7 @@ impl Grid {
         let step = ((high - low) / steps).max(finest);
         let spans = step > 1e-30;
         if !spans {
-            // All zero, or none.
+            // All values are zero, or there are none.
             return Self { first: 0, step: 1.0 };
         }
         // Rounded up, so that the last number still reaches the largest value.

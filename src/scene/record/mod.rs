@@ -8,11 +8,12 @@
 //! shifts: the 32 bytes of a Q32 record become 47 whole bytes, of which 19 remain on disk, since zstd finds the
 //! empty high bits.
 //!
-//! Ranges are those of the part's own values. Every grid consists of multiples of its step, so zero is always
-//! on it: colours that are grey or independent of the direction, and surfaces flat on the ground, stay exactly
-//! so. The steps of means are powers of two, so that neighbouring blocks share their grid. Opacity is stored
-//! linearly and not as a logarithm, because alpha is linear in it. SH coefficients are stored as signed square
-//! roots, so that one coefficient of 3 does not reduce the resolution of a thousand near 0.
+//! Ranges are those of the part's own values. Every grid consists of multiples of its step, so zero is
+//! always on it: grey colours, colours that do not depend on the direction, and surfaces flat on the ground
+//! keep these properties exactly. The steps of means are powers of two, so that neighbouring blocks share
+//! their grid. Opacity is stored linearly and not as a logarithm, because alpha is linear in it. SH
+//! coefficients are stored as signed square roots, so that one coefficient of 3 does not reduce the
+//! resolution of a thousand near 0.
 
 mod codec;
 mod round_trip;

@@ -1,4 +1,4 @@
-//! Encoding a scene in a record format and decoding it again, to measure size and loss.
+//! Encodes a scene in a record format and decodes it again, to measure size and error.
 
 use std::sync::Arc;
 

@@ -14,8 +14,8 @@ pub struct BoxIndex {
     items: usize,
 }
 
-/// Number of items per box. The square root of 168,000 would balance boxes and items; it is less than half of
-/// that because testing an item costs more than testing a box.
+/// Number of items per box. The square root of 168,000, 410, would balance the numbers of boxes and items. It is
+/// smaller because testing an item takes longer than testing a box.
 const BOX_ITEMS: usize = 64;
 
 impl BoxIndex {
@@ -43,7 +43,7 @@ impl BoxIndex {
                 }
             }
         };
-        // Start with the nearest box: it usually holds the answer, and then most others are skipped.
+        // Start with the nearest box: it usually contains the result, and then most others are skipped.
         search_box(nearest, &mut best);
         for (place, bounds) in self.bounds.iter().enumerate() {
             let may_be_less = |(_, least)| bounds.distance_m(point_m) <= least;

@@ -30,7 +30,8 @@ impl CubeMap {
     /// Largest number of values along an edge of a baked map: 50 MB; a texel is 0.09° at the centre of a face.
     pub const MAX_EDGE: usize = 1025;
 
-    /// Largest width of a face of images: 113 MB of texels, within the 128 MiB that any GPU allows per binding.
+    /// Largest width of a face that is read from an image: 113 MB of texels, within the 128 MiB that any GPU allows
+    /// per binding.
     pub const MAX_SIDE_PX: usize = 1536;
 
     /// Largest rounding error of a value in 16 bits.
@@ -86,7 +87,7 @@ impl CubeMap {
         Ok(Self { edge, scale: side_px as f64, offset: 0.5, error: 0.0, texels })
     }
 
-    /// The same colour everywhere.
+    /// A map with the same colour everywhere.
     pub fn uniform(rgb: DVec3) -> Self {
         let texels = vec![packed(rgb); FACES * 4];
         Self { edge: 2, scale: 1.0, offset: 0.0, error: Self::STEP, texels }

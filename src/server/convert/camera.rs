@@ -1,4 +1,4 @@
-//! Lenses, windshields, shutters and exposures, both ways.
+//! Lenses, windshields, shutters and exposures, to and from the wire.
 
 use wildcity_protocol::camera as wire;
 use wildcity_scene::appearance::{Appearance, AppearanceError, Exposure};
@@ -43,7 +43,7 @@ pub(super) fn appearance_of(
     Appearance::new(exposure.transpose()?, overlay, size_px)
 }
 
-/// An exposure to the wire.
+/// Converts an exposure to the wire.
 pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposure {
     wire::Exposure { matrix: Some(matrix), gain: None, offset }
 }
@@ -61,7 +61,7 @@ pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError>
     shutter.check().map(|()| shutter)
 }
 
-/// The lens and the windshield of a camera to the wire; a pinhole has neither.
+/// Converts the lens and the windshield of a camera to the wire; a pinhole has neither.
 pub(super) fn lens_and_windshield_to(
     camera: &Camera,
 ) -> (Option<wire::Lens>, Option<wire::Windshield>) {
@@ -69,7 +69,7 @@ pub(super) fn lens_and_windshield_to(
     (lens.map(lens_to), windshield.map(windshield_to))
 }
 
-/// A shutter to the wire.
+/// Converts a shutter to the wire.
 pub(super) fn shutter_to(shutter: Shutter) -> wire::Shutter {
     let Shutter { direction, duration_us } = shutter;
     let direction = match direction {

@@ -67,7 +67,7 @@ pub(crate) fn refusal_body(fault: &Fault) -> Value {
     serde_json::json!(Refusal { code, message: fault.to_string(), field, cells, offset })
 }
 
-/// The cells at fault in a push, if cells are.
+/// The cells at fault in a push; empty if the fault is not in cells.
 pub(super) fn cells_of_push(error: &PushError) -> &[[i32; 2]] {
     match error {
         PushError::Content { cells, .. } => cells,
@@ -83,8 +83,8 @@ fn cells_of_session(error: &SessionError) -> &[[i32; 2]] {
     }
 }
 
-/// The HTTP status of a code. Codes that only occur over WebSocket have one too, so that none can be
-/// forgotten when a route begins to give it.
+/// The HTTP status of a code. Codes that only occur over WebSocket have a status as well, so that a new
+/// HTTP route can answer with any code.
 fn status_of(code: Code) -> StatusCode {
     match code {
         Code::MalformedJson
@@ -158,7 +158,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
             at(code, &format!("{field}.{}", cause.field()))
         }
         Fault::NotFinite { field } => {
-            // The list of codes is closed, and has none for a number of an action.
+            // The protocol's list of codes is fixed, and has no code for an invalid number of an action.
             let is_action = field.starts_with("action");
             at(if is_action { Code::OutOfRange } else { Code::PoseNotFinite }, field)
         }

@@ -16,8 +16,8 @@ pub(super) fn pose_of(field: &str, pose: &message::Pose) -> Result<Pose, Fault> 
     Pose::checked(pose.xyz, pose.q).map_err(|cause| Fault::Pose { field: field.into(), cause })
 }
 
-/// The poses of a list. One more than `limit` is read, from which the receiver sees that there are too
-/// many; the rest of a long list is not.
+/// The poses of a list. At most `limit` + 1 poses are read, which is enough for the receiver to refuse the
+/// list; the rest of a long list is skipped.
 pub(super) fn poses_of(
     field: &str,
     poses: &[message::Pose],

@@ -1,4 +1,4 @@
-//! Bodies of HTTP, both ways.
+//! Bodies of HTTP requests and answers.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -53,7 +53,7 @@ pub(crate) fn upload(upload: &Upload) -> Value {
 /// The body of `POST /v1/twins/{twin}/pushes`, checked as far as it can be without the files.
 pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> {
     let body: http::NewPush = parse(body)?;
-    // The hash is of what was understood: white space makes no other push.
+    // The hash is computed from the parsed body, so that white space does not make it a different push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
     let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
     let files = files.into_iter().enumerate();

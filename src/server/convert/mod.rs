@@ -1,13 +1,13 @@
 //! Conversion between the wire and the session: no other module of the server names the protocol's types.
 //!
 //! ```text
-//! request      text frames to commands
+//! request      parses text frames as commands
 //! rig          rigs of requests
 //! non_finite   NaN and infinity in requests, which JSON cannot express
 //! answer       answers other than observations
 //! observation  observations
-//! camera       lenses, windshields, shutters and exposures, both ways
-//! http         bodies of HTTP, both ways
+//! camera       lenses, windshields, shutters and exposures, to and from the wire
+//! http         bodies of HTTP requests and answers
 //! fault        the wire code and the HTTP status of each fault
 //! ```
 

@@ -1,7 +1,7 @@
 //! NaN and infinity in requests.
 //!
-//! JSON cannot express them, but agents that divide by zero send them all the same: Python writes `NaN`,
-//! JavaScript `null`, others `1e999`. They deserve a better answer than "not JSON".
+//! JSON cannot represent them, but agents that divide by zero send them nevertheless: Python writes `NaN`,
+//! JavaScript `null`, others `1e999`. The answer to them names the field instead of saying "not JSON".
 
 /// A number of a request that is not finite.
 #[derive(Debug, PartialEq, Eq)]

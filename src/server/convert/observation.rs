@@ -14,8 +14,8 @@ use wildcity_session::{DType, HEADER_PREFIX_BYTES, PastImageInfo, Session, Tenso
 
 use super::answer::{camera, encoding, pose, text};
 
-/// Completes an observation: writes the header, which names the tensors and has the metadata, into the
-/// room that the frame reserved for it.
+/// Completes an observation: writes the header, which has the names of the tensors and the metadata, into
+/// the space that is reserved for it in the buffer.
 pub(crate) fn observation(
     seq: u64,
     session: &Session,
@@ -44,7 +44,7 @@ pub(crate) fn observation(
     header.metadata.insert("observation", observation);
     let header = text(&header)?;
 
-    // A safetensors file begins with the length of its header; spaces fill the reserved room.
+    // A safetensors file begins with the length of its header; the header is padded with spaces.
     let room = frame.buffer.header_mut();
     let (prefix, room) = room.split_at_mut(HEADER_PREFIX_BYTES);
     if header.len() > room.len() {

@@ -1,4 +1,4 @@
-//! Text frames to commands.
+//! Parses text frames as commands.
 
 use std::time::Duration;
 
@@ -289,7 +289,7 @@ fn movement_of(
     match (pose, trajectory, action) {
         (Some(pose), None, None) => pose_of("pose", &pose).map(wildcity_sim::Command::Pose),
         (None, Some(poses), None) => {
-            // One pose more than the maximum is read, from which the check sees that there are too many.
+            // Reads at most one pose more than the maximum, which is enough for the check to refuse the list.
             let poses = poses.iter().take(wildcity_sim::limits::PATH_POSES + 1).enumerate();
             let timed = |(index, timed): (usize, &message::TimedPose)| {
                 let start_from_rig = pose_of(&format!("trajectory[{index}].pose"), &timed.pose)?;

@@ -12,10 +12,10 @@ use super::field::{name_of, pose_of};
 pub(super) fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
     let fault = |cause| Fault::Rig { field: "rig.cameras".to_owned(), cause };
     let mut cameras = Vec::new();
-    // One camera more than the maximum is read, from which the check sees that there are too many.
+    // Reads at most one camera more than the maximum, which is enough for the check to refuse the rig.
     for (index, camera) in rig.cameras.into_iter().take(Rig::MAX_CAMERAS + 1).enumerate() {
         cameras.push(camera_of(&format!("rig.cameras[{index}]"), camera)?);
-        // Before the next overlay is decompressed.
+        // Checked before the next overlay is decompressed.
         check_overlays(&cameras).map_err(fault)?;
     }
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };

@@ -55,7 +55,7 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .with_state(state)
 }
 
-/// Refuses requests without a valid token, and gives the routes what the token allows.
+/// Refuses requests without a valid token, and passes the token's [`Grant`] to the routes.
 async fn authorize(
     State(state): State<Arc<ServerState>>,
     mut request: Request,
@@ -73,8 +73,8 @@ async fn authorize(
     Ok(next.run(request).await)
 }
 
-/// Refuses requests of web pages from elsewhere: any page may try to reach 127.0.0.1. Browsers always
-/// send `Origin` with such requests; agents do not send it.
+/// Refuses requests from web pages of other hosts, because a page of any site can send requests to
+/// 127.0.0.1. Browsers always send `Origin` with such requests; agents do not send it.
 fn check_origin(headers: &HeaderMap) -> Result<(), Fault> {
     match headers.get(header::ORIGIN) {
         Some(origin) if !origin.to_str().is_ok_and(is_local) => {

@@ -1,4 +1,4 @@
-//! Pushes over HTTP: requests are carried to the package `wildcity-push`, and its status is answered.
+//! Pushes over HTTP: passes requests to the package `wildcity-push`, and answers with the push's status.
 
 use std::sync::Arc;
 
@@ -58,7 +58,7 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
-/// Carries out a push, and ends it.
+/// Runs a push to its end and records the result.
 async fn run(
     state: Arc<ServerState>,
     push: Arc<Push>,

@@ -38,10 +38,10 @@ pub(super) async fn show(
     match twins.iter().find(|twin| twin.name == name) {
         Some(twin) => Ok(Json(convert::twin(twin)).into_response()),
         None => {
-            // SessionOptions it gives the reason why it is not listed.
+            // A twin that is not listed may be damaged: opening it gives the reason.
             let catalog = state.engine.catalog().clone();
             blocking(move || catalog.version(&name, None)).await?;
-            let reason = "the twin was made while it was looked for; ask again";
+            let reason = "the twin was created during this request; try again";
             Err(Fault::Internal(reason.to_owned()).into())
         }
     }
@@ -57,7 +57,7 @@ pub(super) async fn versions(
     let engine = state.engine.clone();
     let listed = blocking(move || {
         let versions = engine.catalog().versions(&name)?;
-        // Read after the log: a push holds the latest version before it commits the next.
+        // Read after the log: a push pins the latest version before it commits the next one.
         let held = engine.pinned_latest(&name);
         Ok::<_, StoreError>((versions, held))
     });
@@ -78,7 +78,8 @@ pub(super) async fn rollback(
     let engine = state.engine.clone();
     let version = blocking(move || {
         let version = engine.catalog().rollback(&name, number)?;
-        // A push that is being made ready must not keep the rollback from being the latest.
+        // A push that is still loading its version has pinned the one before; move that pin, so that
+        // the rollback becomes the latest at once.
         engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok::<_, StoreError>(version)

@@ -104,7 +104,7 @@ pub(super) async fn append(
     }
 
     let received = receive(&state, &upload, writer, &deadline, body).await?;
-    // A large upload is hashed for a while after its last byte, and no byte comes meanwhile.
+    // Hashing a large upload after its last byte takes a while, in which no bytes arrive.
     let finished = blocking(move || {
         let Received { mut writer, sha256 } = received;
         check_content_digest(&mut writer, start, announced_sha256, sha256)?;

@@ -65,7 +65,7 @@ impl Spool {
         Ok(spool)
     }
 
-    /// The upload of a file, which is begun if it is new. Old uploads make room for it.
+    /// The upload of a file, which is begun if it is new. Old uploads are removed to make room for it.
     ///
     /// # Errors
     /// The upload is too large, there is no room, the disk fails, or the digest was announced with another

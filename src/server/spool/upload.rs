@@ -49,7 +49,7 @@ impl Upload {
         Self::with(dir, announced, 0, SystemTime::now())
     }
 
-    /// The upload of an id that an earlier server left in the directory, if its files are sound.
+    /// The upload of an id that an earlier server left in the directory, if its files are valid.
     pub(super) fn found(dir: &Path, id: &str) -> Option<Self> {
         let path = |kind: &str| dir.join(format!("{id}.{kind}"));
         let metadata = |kind: &str| fs::metadata(path(kind)).ok();
@@ -192,7 +192,7 @@ impl Writer {
                 Ok(())
             }
             Err(cause) => {
-                // The first error is reported; one of the clean-up would only hide it.
+                // The first error is the one to report; an error of this clean-up would only hide it.
                 let _ = self.file().and_then(|file| file.set_len(start));
                 Err(io_fault("write to", cause))
             }

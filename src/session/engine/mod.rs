@@ -28,7 +28,7 @@ use crate::blocking::run_blocking;
 use crate::error::SessionError;
 use crate::limits;
 
-/// What an [`Engine`] is made of.
+/// The parts and settings of an [`Engine`].
 pub struct EngineSettings {
     /// The twins that can be opened, and the memory for them.
     pub cache: Cache,
@@ -139,8 +139,8 @@ impl Engine {
         }
     }
 
-    /// Opens a version and loads what some frames of it need, so that sessions which switch to it there
-    /// need not wait. `frames` has the viewpoints of each frame.
+    /// Opens a version and loads what some frames of it need, so that sessions at these viewpoints need not
+    /// wait when they switch to it. `frames` has the viewpoints of each frame.
     ///
     /// Loads only what fits beside the sections that sessions need now or soon, which go first, and
     /// returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.

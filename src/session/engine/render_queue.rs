@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(scratch, [vec![0; 1000]]);
     }
 
-    /// Renders nothing, so many frames at once.
+    /// Renders nothing, and reports a given number of frames in flight.
     struct IdleBackend {
         frames_in_flight: usize,
     }

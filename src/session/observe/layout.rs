@@ -73,7 +73,7 @@ pub(super) struct InPlaceBytes {
 
 /// A frame of the history that an observation shows.
 pub(super) struct EarlierFrame<'a> {
-    /// How many frames of its camera ago, from 1.
+    /// Age in frames of its camera: 1 is the frame before the newest.
     pub(super) back: usize,
     pub(super) frame: &'a PastFrame,
 }
@@ -123,9 +123,9 @@ impl ObservationLayout {
         &self.schedule
     }
 
-    /// What to render for an observation at the end of an episode: the frames that this observation or a
-    /// later one shows and that the history lacks. One capture per time; the last is of now, and may have
-    /// no cameras.
+    /// What to render for an observation of the present time of an episode: the frames that this observation
+    /// or a later one contains and that are not in the history. One capture per time; the last one is that of
+    /// the present time, and may have no cameras.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
         let now_us = episode.time_us();
         let mut cameras_by_time = BTreeMap::from([(now_us, Vec::new())]);
@@ -177,10 +177,10 @@ impl ObservationLayout {
         Ok(())
     }
 
-    /// Room for the header of an observation of some captures, its length prefix included.
+    /// Bytes to reserve for the header of an observation of some captures, including its length prefix.
     pub(super) fn header_bytes(&self, captures: &[RigCapture]) -> usize {
         let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
-        // Of several frames per camera, an observation shows more than it renders.
+        // With several frames per camera, an observation contains more images than it renders.
         let images = rendered.max(self.schedule.frames() * self.cameras.len());
         HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES
     }

@@ -34,9 +34,9 @@ pub struct ResidencyStats {
     pub held_bytes: u64,
     /// The most bytes of Gaussians that may be in memory.
     pub limit_bytes: u64,
-    /// Sections that were not in memory when they were requested.
+    /// Number of sections that were not in memory when they were requested.
     pub waited_for: usize,
-    /// How long it took until they were.
+    /// How long the request waited for them.
     pub waited: Duration,
 }
 
@@ -60,7 +60,7 @@ pub struct ImageInfo {
 pub struct PastImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
-    /// How many frames of this camera ago, from 1.
+    /// Age in frames of this camera: 1 is the frame before the newest.
     pub back: usize,
     /// When it was taken, in microseconds since the episode's start.
     pub time_us: i64,

@@ -1,8 +1,8 @@
 //! Which frames are rendered: those that an observation shows, and no others.
 //!
 //! A camera takes a frame at every multiple of its period. The agent decides at every multiple of its own
-//! period, and is then shown the last frames of each camera. No frame between these is rendered. All times
-//! are in microseconds since the episode's start.
+//! period, and then gets the last frames of each camera. Frames that no decision gets are not rendered. All
+//! times are in microseconds since the episode's start.
 
 use std::collections::BTreeMap;
 

@@ -1,11 +1,11 @@
-//! Trust: how far an image can be believed, from 1 (as recorded) to 0 (nothing is known).
+//! Trust: confidence in an image, from 1 (as recorded) to 0 (nothing is known).
 //!
-//! A twin looks right where it was recorded. Two factors of the trust are measured in the image or on the
-//! map, as shares: pixels that look down at the ground and have low opacity, and rays to ground outside of
-//! the twin. The third cannot be measured in any image: from other places than the recorded ones, what was
-//! trained may look wrong, and no recorded image can tell. It decays exponentially with the distance and
-//! the turn from the nearest recorded pose. The rate is a convention of this project; `tests/session/trust.rs`
-//! checks that a twin without training errors loses less than that.
+//! A twin looks right from the poses where it was recorded. The trust is a product of three factors. Two of
+//! them are one minus a measured share: of pixels that look down at the ground and have low opacity, and of
+//! rays to the ground that leave the twin. The third cannot be measured: from other poses, errors of the
+//! training become visible, and there is no recorded image to compare with. It decays exponentially with the
+//! distance and the rotation from the nearest recorded pose. The rate is a convention of this project;
+//! `tests/session/trust.rs` checks that a twin without training errors loses less than that.
 //!
 //! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while other
 //! cameras are still rendered. The nearest keyframe is found in an index of boxes of 64 keyframes
@@ -31,29 +31,28 @@ const DECAY_M: f64 = 5.0;
 /// its other cameras have recorded, so this is slow.
 const DECAY_RAD: f64 = 12.0;
 
-/// A turn of one radian counts as this distance, in metres, when the nearest of several recorded poses is
-/// sought.
+/// In the search for the nearest recorded pose, a rotation of one radian counts as this distance, in metres.
 const METRES_PER_RAD: f64 = DECAY_M / DECAY_RAD;
 
-/// Distance of sampled pixels, in rows and in columns: of 1440 x 928 these are 5,220, one of 16 x 16 each,
-/// so that a share is right within 0.7 %.
+/// Distance between sampled pixels, in rows and in columns. An image of 1440 x 928 px has 5,220 samples, one
+/// per 16 x 16 px, so that a share has a standard error of at most 0.7 %.
 const PIXEL_STRIDE: usize = 16;
 
-/// Every fourth of these samples, in rows and in columns, has its ray followed through the map: of
-/// 1440 x 928 these are 345, one of 64 x 64 px each.
+/// The rays of every fourth of these samples, in rows and in columns, are followed through the map. An image
+/// of 1440 x 928 px has 345 of them, one per 64 x 64 px.
 const RAY_STRIDE: usize = 4;
 
 /// How far a ray is followed, in metres: through 13 blocks.
 const RAY_M: f64 = 200.0;
 
-/// A ray that descends less than this per metre counts as looking at the horizon, not at the ground: from
-/// 1.6 m above a road it meets it beyond 80 m.
+/// A ray that descends less than this per metre counts as looking at the horizon and not at the ground: from
+/// 1.6 m above a road, it meets the road at a distance of more than 80 m.
 const MIN_DESCENT: f64 = 0.02;
 
 /// A pixel with less opacity is a hole.
 const HOLE_OPACITY: f32 = 0.5;
 
-/// How far an image can be believed, and why.
+/// Confidence in an image, and the values that it is computed from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trust {
     /// 1 where and as it was recorded, 0 where nothing is known.
@@ -154,7 +153,7 @@ impl TrainingCoverage {
         let mut holes = 0_u64;
         let mut rays = 0_u64;
         let mut outside = 0_u64;
-        // Samples begin in the middle of the first stride, so that small images have one, too.
+        // Samples begin in the middle of the first stride, so that even a small image has one.
         let samples = |side: usize| (PIXEL_STRIDE.min(side) / 2..side).step_by(PIXEL_STRIDE);
         for (sample_row, row) in samples(height).enumerate() {
             for (sample_column, column) in samples(width).enumerate() {

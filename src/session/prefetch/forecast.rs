@@ -8,7 +8,7 @@ use wildcity_twin::residency::Urgency;
 use super::recorded_drive::RecordedDrive;
 use crate::limits;
 
-/// What is known about the ego's way.
+/// The data from which the ego's future poses are predicted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct EgoForecast<'a> {
     /// Where the ego is now.
@@ -19,7 +19,7 @@ pub(crate) struct EgoForecast<'a> {
     pub(crate) steps: usize,
     /// The recorded drive that the ego may follow.
     pub(crate) drive: Option<&'a RecordedDrive>,
-    /// Where the agent says that it goes next: poses (`world_from_rig`), in order.
+    /// The agent's announced path (`prefetch`): poses (`world_from_rig`), in order.
     pub(crate) hint: &'a [Pose],
 }
 

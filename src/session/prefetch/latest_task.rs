@@ -1,11 +1,11 @@
-//! Runs tasks in the background, one at a time, and of those that wait only the latest.
+//! Runs tasks in the background, one at a time. Only the latest task waits; a new one replaces it.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
 
-/// Runs one task after the other beside its owner, which never waits for them.
+/// Runs one task after the other in the background; its owner never waits for them.
 #[derive(Debug, Default)]
 pub(crate) struct LatestTask(Arc<Mutex<State>>);
 

@@ -1,4 +1,4 @@
-//! One agent's session: its state, and what it says about itself.
+//! One agent's session: its state, and accessors to it.
 //!
 //! | file | what the session does |
 //! |---|---|
@@ -72,11 +72,11 @@ pub struct Session {
     version_switched: bool,
     /// The recorded drive that the ego may follow.
     drive: Option<Arc<RecordedDrive>>,
-    /// Where the agent says that it goes next: poses (`world_from_rig`), in order.
+    /// The agent's announced path (`prefetch`): poses (`world_from_rig`), in order.
     hint: Vec<Pose>,
     /// Where the twin was recorded; only if images come with their trust.
     coverage: Option<Arc<TrainingCoverage>>,
-    /// When the last frame was ready, and how long after the one before.
+    /// When the last frame was ready, and the time between it and the frame before.
     last_frame_at: Instant,
     frame_interval: Duration,
 }

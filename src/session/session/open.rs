@@ -1,4 +1,4 @@
-//! Opening a session, from top to bottom; and switching it to another version of the twin.
+//! Opening a session, and switching it to another version of the twin.
 
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -81,7 +81,7 @@ impl Session {
         let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
 
-        // How it is rendered, and the sky that this needs.
+        // The render profile, and the sky map that it requires.
         let profile = options.profile.apply(manifest.profile)?;
         Engine::bake_sky(resident.clone(), profile).await?;
 
@@ -255,7 +255,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
     Ok(rig)
 }
 
-/// What of a rig decides how much memory its frames need.
+/// The properties of a rig that determine how much memory its frames need.
 fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
     let viewpoints = viewpoints(&View::of_rig(cameras, Pose::IDENTITY));
     RigExtent {

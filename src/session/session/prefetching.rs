@@ -13,9 +13,9 @@ use crate::prefetch::forecast::{EgoForecast, remaining_hint};
 use crate::viewpoint::viewpoints;
 
 impl Session {
-    /// Takes a hint where the agent goes next: from 1 to [`limits::PREFETCH_POSES`] poses
-    /// (`world_from_rig`), in order. Loads what is seen from these poses and from between them, as far as
-    /// memory allows. Does not wait for it.
+    /// Accepts the path that the agent announces: from 1 to [`limits::PREFETCH_POSES`] poses
+    /// (`world_from_rig`), in order. Loads what is visible from these poses and from points between them, as
+    /// far as memory allows. Does not wait for the loads.
     ///
     /// # Errors
     /// The number of poses is out of range.

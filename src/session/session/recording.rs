@@ -58,7 +58,7 @@ impl Session {
         }
     }
 
-    /// The line that says that what follows was rendered from another version of the twin.
+    /// The line after which frames are rendered from another version of the twin.
     fn version_line(&self) -> Line {
         let version = &self.resident().version;
         Line::Version(RecordedVersion {

@@ -136,7 +136,7 @@ mod tests {
             let rolls = speed * 0.3 / car.wheelbase_m;
             assert!((z.y - rolls).abs() <= 1e-7 * rolls.abs(), "{speed}: {z}");
             assert!((z.x - rolls * car.rear_to_cg_m).abs() <= 1e-6 * rolls.abs(), "{speed}: {z}");
-            // What was sliding has stopped within |v| / 178 s.
+            // Lateral sliding has decayed within |v| / 178 s.
             assert!((turned - 0.1 * rolls).abs() <= 0.02 * speed.abs(), "{speed}: {turned}");
         }
     }

@@ -67,7 +67,7 @@ mod tests {
         for (length_m, curvature) in [(3.0, 0.2), (-3.0, 0.2), (6.0, -1e-3), (1.0, 1.99e-4)] {
             let (way_m, turned) = arc(length_m, curvature);
             let angle: f64 = length_m * curvature;
-            // 1 - cos as 2 sin², which loses nothing.
+            // 1 - cos as 2 sin², which does not cancel.
             let aside = 2.0 * (0.5 * angle).sin().powi(2) / curvature;
             assert!((way_m - DVec2::new(angle.sin() / curvature, aside)).length() < 1e-12);
             assert!((turned - angle).abs() < 1e-15);

@@ -12,7 +12,7 @@
 //! equations are solved instead of stepped. At constant speed the solution is a matrix exponential
 //! (`constant_speed.rs`). While speed changes there is no closed form, and a collocation polynomial that satisfies
 //! the equations at five points takes its place (`collocation.rs`, Radau IIA of order 9). Both forms are
-//! multiplied by |v|, so that nothing is divided by v: at standstill they say that nothing slides. Steering and
+//! multiplied by |v|, so that nothing is divided by v: at standstill they give zero lateral slip. Steering and
 //! drive lag exponentially, and bounds of speed are reached at their exact times. The result is exact at constant
 //! speed and has an error of 1e-9 otherwise, from standstill to the largest speed, without another model.
 //!

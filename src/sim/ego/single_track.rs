@@ -36,17 +36,17 @@ pub struct Setpoint {
 }
 
 /// Ratio of the lengths of consecutive intervals. A transient that decays at a rate λ has fallen to `e^(-2 x)` of
-/// its initial value when an interval is x / λ long, and collocation at five points leaves an error of at most
-/// 7e-9 of that (at x = 5).
+/// its initial value when an interval is x / λ long, and collocation at five points has an error of at most
+/// 7e-9 of that value (at x = 5).
 const GROWTH: f64 = 1.5;
 
-/// Largest length of an interval, as a fraction of the lag: the exponential of the lag is then a polynomial
-/// with a relative error of 1e-15.
-const LONGEST_LAGS: f64 = 0.25;
+/// Largest length of an interval, as a fraction of the lag: over such an interval, a polynomial approximates
+/// the exponential of the lag with a relative error of 1e-15.
+const MAX_INTERVAL_LAGS: f64 = 0.25;
 
-/// Below this speed, in m/s, intervals get no shorter. The lateral velocity after a change of steering is at
-/// most `v² δ' / 178²`, 3e-9 m/s, for 6 µs.
-const CRAWL_M_S: f64 = 1e-3;
+/// Below this speed, in m/s, intervals do not become shorter. There, the lateral velocity after a change of
+/// steering is at most `v² δ' / 178²` = 3e-9 m/s, and lasts for 6 µs.
+const MIN_INTERVAL_SPEED_M_S: f64 = 1e-3;
 
 impl SingleTrackState {
     /// The state after a step of `step_s` seconds. The speed stays within `bounds_m_s` (smallest and largest,
@@ -93,8 +93,9 @@ impl SingleTrackState {
         phase: &Phase,
         steering: Steering,
     ) -> Self {
-        let fastest_1_s = tyres.stiffness_m_s2() / phase.drive.speed_m_s.abs().max(CRAWL_M_S);
-        let longest_s = LONGEST_LAGS * car.lag_s;
+        let fastest_1_s =
+            tyres.stiffness_m_s2() / phase.drive.speed_m_s.abs().max(MIN_INTERVAL_SPEED_M_S);
+        let longest_s = MAX_INTERVAL_LAGS * car.lag_s;
         let (mut begun_s, mut piece_s) = (0.0, (1.0 / fastest_1_s).min(longest_s));
         while begun_s < phase.duration_s {
             let left_s = phase.duration_s - begun_s;

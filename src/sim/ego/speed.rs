@@ -82,8 +82,8 @@ impl Drive {
         opposed.then(|| self.lag_s * ratio.ln()).filter(|time_s| *time_s > 0.0)
     }
 
-    /// Time until speed, which is monotone for `most_s`, reaches a bound or 0, at most `most_s`; and the speed
-    /// then.
+    /// Time until speed reaches a bound or 0, at most `most_s`, and the speed at that time. Speed must be
+    /// monotone for `most_s`.
     fn free(&self, most_s: f64, bounds_m_s: [f64; 2]) -> (f64, f64) {
         let end_m_s = self.speed_after(most_s);
         let [low, high] = bounds_m_s;

@@ -13,14 +13,15 @@ use super::vehicle::Vehicle;
 /// slower than what the drive's lag allows before the loop oscillates.
 const LONGITUDINAL_GAIN_1_S: f64 = 2.0;
 
-/// Length over which a lateral error decays, in seconds of driving at the present speed, ...
+/// Length over which a lateral error decays, in seconds of driving at the present speed, but at least
+/// [`LATERAL_DECAY_M`].
 const LATERAL_DECAY_S: f64 = 0.6;
 
-/// ... and at least this length, in metres, at low speed.
+/// Smallest length over which a lateral error decays, in metres; it applies at low speed.
 const LATERAL_DECAY_M: f64 = 4.0;
 
-/// Below this speed, in m/s, changes of the reference's heading are taken for noise and not for a curve.
-const TURNS_M_S: f64 = 0.1;
+/// Below this speed, in m/s, changes of the reference's heading count as noise and not as a curve.
+const MIN_CURVE_SPEED_M_S: f64 = 0.1;
 
 /// Acceleration and curvature for a car at a time of the reference, in seconds. The feedforward part is taken
 /// `lag_s` ahead, to compensate the actuators' lag.
@@ -56,13 +57,17 @@ pub(super) fn track(
 }
 
 fn curvature(wanted: &ReferenceState) -> f64 {
-    if wanted.speed_m_s.abs() < TURNS_M_S { 0.0 } else { wanted.yaw_rate_rad_s / wanted.speed_m_s }
+    if wanted.speed_m_s.abs() < MIN_CURVE_SPEED_M_S {
+        0.0
+    } else {
+        wanted.yaw_rate_rad_s / wanted.speed_m_s
+    }
 }
 
 /// Slip angle of the rear axle, in radians: direction of motion minus heading, positive to the left.
 fn drift_rad(car: &SingleTrackState) -> f64 {
     let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
-    if car.speed_m_s.abs() < TURNS_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }
+    if car.speed_m_s.abs() < MIN_CURVE_SPEED_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }
 }
 
 /// Direction of motion, 1 or -1; at rest that of the reference.

@@ -1,4 +1,4 @@
-//! How much memory twins may take together, and which sessions reserved how much of it.
+//! The memory that all twins may take together, and the share of it that each session has reserved.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,4 +1,4 @@
-//! What decides which level of detail of a block a frame draws.
+//! The inputs that determine which level of detail of a block a frame draws.
 
 use glam::DVec3;
 

@@ -1,4 +1,4 @@
-//! Why a twin, or a section that a frame needs, is not in memory.
+//! Why a twin cannot be opened, or the sections of a frame cannot be brought into memory.
 
 use std::time::Duration;
 

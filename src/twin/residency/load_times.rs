@@ -1,4 +1,4 @@
-//! How long the last loads took.
+//! Durations of the last loads.
 
 use std::time::Duration;
 

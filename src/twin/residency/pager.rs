@@ -3,7 +3,7 @@
 //!
 //! A frame that waits holds no memory, so frames cannot block each other; only older frames may
 //! evict the sections that it waits for ([`super::table::Requester`]). The pager has threads of its
-//! own for loading, because reading blocks. All other threads wait here for the lock at most.
+//! own for loading, because reading blocks. All other threads wait for nothing but the lock.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;

@@ -20,9 +20,8 @@ pub struct Reservation {
     prefetcher: Arc<Prefetcher>,
 }
 
-/// Loads sections of a version ahead of the frames that will need them. It is shared with the task
-/// that works out what those are, which takes a while; it ends with its [`Reservation`]
-/// nevertheless.
+/// Loads sections of a version before the frames that will need them. It is shared with the background task
+/// that determines these sections. It ends with its [`Reservation`] even if that task still runs.
 #[derive(Debug)]
 pub struct Prefetcher {
     resident: Arc<Resident>,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use wildcity_scene::Chunk;
 
-/// A hash of everything that a section's chunk depends on. Versions that share a section share its
+/// A hash of everything that a section's chunk depends on. Versions that have a section in common share its
 /// memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Key(pub(super) [u8; 16]);

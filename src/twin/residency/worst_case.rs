@@ -21,11 +21,11 @@ pub struct RigExtent {
 
 /// An upper bound, in bytes, of the sections that a frame of a rig anywhere needs at once.
 ///
-/// No place in a square is nearer to a block than the square itself is. So the levels chosen by the
-/// distance of the square add up to bytes that no frame in the square exceeds. The square with the
-/// highest bound is halved again and again until it is as small as a cell; then no place anywhere
-/// needs more than its bound. Each place outside of the bounding box needs no more than the nearest
-/// place in the box, which is nearer to everything.
+/// No point in a square is nearer to a block than the square itself is. So the levels that are chosen by the
+/// distance of the square add up to bytes that no frame in the square exceeds. The square with the highest
+/// bound is halved repeatedly until it is as small as a cell; then no point anywhere needs more than its
+/// bound. A point outside of the bounding box needs no more than the nearest point in the box, which is
+/// nearer to everything.
 pub(super) fn worst_case_bytes(
     index: &BlockIndex,
     manifest: &Manifest,

@@ -1,4 +1,4 @@
-//! What the store needs of a directory or an object store.
+//! The interface of the store to a directory or an object store.
 
 use std::collections::BTreeSet;
 use std::fmt::Debug;
@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use super::StoreError;
 use super::layout::{object_key, record_key};
 
-/// A directory or an object store with twins. Callers have checked all names of twins and all
-/// hashes.
+/// A directory or an object store with twins. Callers must check names of twins and hashes before they
+/// pass them.
 pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The directory, or the URL.
     fn root(&self) -> &Path;
@@ -62,7 +62,7 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Names of the twins with a commit that has begun and not ended: it runs, or it was killed.
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError>;
 
-    /// Removes what killed commits of a twin left: their staging, and objects that they placed and
+    /// Removes the remains of killed commits of a twin: their staging, and objects that they placed and
     /// that `named` does not contain. Running commits are not affected.
     fn remove_abandoned(
         &self,
@@ -135,8 +135,8 @@ pub(super) trait Staging: Debug + Send {
         record: &[u8],
     ) -> Result<(), StoreError>;
 
-    /// Puts objects in the place of those of an existing version, which repairs damaged and missing
-    /// ones, and makes its record durable. The caller has called [`Staging::lock_publishing`].
+    /// Replaces objects of an existing version, which repairs damaged and missing ones, and syncs its
+    /// record to the disk. The caller has called [`Staging::lock_publishing`].
     fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError>;
 
     /// Where its objects lie, for messages.

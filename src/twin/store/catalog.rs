@@ -58,12 +58,12 @@ pub struct Version {
 }
 
 impl Catalog {
-    /// Opens a directory of twins, which need not exist yet, and removes what killed commits left;
+    /// Opens a directory of twins, which need not exist yet, and removes the remains of killed commits;
     /// or opens the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
     /// credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed, or what a killed commit left cannot be removed;
+    /// The directory cannot be listed, or the remains of a killed commit cannot be removed;
     /// [`StoreError::Url`].
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         Self::open_cached(dir, None)
@@ -230,8 +230,8 @@ impl Catalog {
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
-        // The hash is compared first: its error says more than what a damaged table of contents
-        // leads to.
+        // The hash is compared first, because its error is clearer than one that follows from a damaged
+        // table of contents.
         let start = self.objects.read_start(name, &chunk.object, most)?;
         let path = self.objects.object_path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)
@@ -288,7 +288,7 @@ impl Catalog {
         let path = self.objects.object_path(name, hash);
         let bytes = self.objects.read_object(name, hash, limits::MANIFEST_BYTES)?;
         let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
-        // The format comes first: nothing else is known of a later one.
+        // The format is read first: the other fields of a later format are unknown.
         let Format { format } =
             serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
         if format != Manifest::FORMAT {

@@ -20,8 +20,8 @@
 //!
 //! What is read, decoded, and drawn as one unit is a section: one level of detail of one block of
 //! 16 m, within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer knows nothing of
-//! levels. A sparse cell, such as a skyline, is one block: 3,000 blocks of three Gaussians
-//! each took 9 ms of every frame of the demo street.
+//! levels. A sparse cell, such as one of a skyline, is a single block: as 3,000 blocks of three Gaussians
+//! each, the demo street's skyline took 9 ms of every frame.
 
 use std::io::{self, Write};
 
@@ -40,7 +40,7 @@ const MAGIC: [u8; 8] = *b"WILDCHNK";
 pub(super) const FORMAT: u32 = 1;
 /// Sections that start on pages can be memory-mapped, or read with direct I/O.
 pub(super) const PAGE_BYTES: usize = 4096;
-/// Higher compression levels gain nothing on columns of noise and trends.
+/// Higher compression levels do not make these columns smaller: they are noise around slow trends.
 const ZSTD_LEVEL: i32 = 1;
 
 /// A section that has no offset yet.
@@ -65,7 +65,7 @@ pub(super) struct ChunkHeader {
 pub(super) struct LevelOfBlock {
     pub(super) block: u8,
     pub(super) level: u8,
-    /// How far it is from level 0, in metres.
+    /// Upper bound of its geometric error against level 0, in metres.
     pub(super) error_m: f32,
 }
 
@@ -191,7 +191,8 @@ fn place(end: u64, bytes: u32) -> u64 {
 /// Decodes a section. The caller has compared its bytes with their hash.
 ///
 /// # Errors
-/// Says what is wrong with it. Memory is allocated part by part, as far as there are bytes for it.
+/// Says what is wrong with it. Memory is allocated part by part, so that a short input with a large count
+/// allocates little.
 pub(super) fn unpack(
     bytes: &[u8],
     chunk: &ChunkEntry,
@@ -212,7 +213,7 @@ pub(super) fn unpack(
         let raw = zstd::bulk::decompress(part, record.part_bytes(sh_degree, here));
         let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
         let first = lanes.len();
-        // Exactly, because growth in larger steps would take memory that no budget counts.
+        // Exactly this much, because growth in larger steps would take memory that the budget does not count.
         lanes.reserve_exact(here.div_ceil(LANES) * width);
         lanes.resize(first + here.div_ceil(LANES) * width, Lanes([0.0; LANES]));
         record.decode(&raw, sh_degree, here, &mut lanes[first..])?;
@@ -303,7 +304,7 @@ pub(super) fn check_start(start: &[u8], chunk: &ChunkEntry) -> Result<(), String
 fn check_levels(chunk: &ChunkEntry) -> Result<(), String> {
     for block in chunk.sections.chunk_by(|a, b| a.block == b.block) {
         let numbered = block.iter().enumerate().all(|(k, section)| usize::from(section.level) == k);
-        // Each condition says what must hold, so that NaN fails it.
+        // Each condition states what must hold, so that NaN fails it.
         let rising = block.is_sorted_by(|a, b| a.error_m <= b.error_m) && block[0].error_m == 0.0;
         let finite = block.iter().all(|section| {
             section.min_m.iter().chain(&section.max_m).all(|m| m.is_finite())
@@ -434,7 +435,7 @@ mod tests {
         let (_, entry) = object();
         let table = table(std::slice::from_ref(&entry), 0, RecordFormat::Q32).unwrap();
         assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
-        // A row is 78 bytes: the limit of config has room for 29 levels of 16 blocks.
+        // A row is 78 bytes: `limits::CHUNK_TABLE_BYTES` has room for 29 levels of 16 blocks.
         assert_eq!(table.len(), 42 + 2 * 78);
         const { assert!(42 + 16 * 29 * 78 < limits::CHUNK_TABLE_BYTES) };
         for cut in 0..table.len() {
@@ -506,7 +507,7 @@ mod tests {
         for at in 0..own.len() {
             let mut own = own.to_vec();
             own[at] ^= 0x40;
-            // The hash is looked at before: here it only must not panic.
+            // The caller compares the hash before, so here it is enough that damaged bytes cause no panic.
             let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32);
         }
     }

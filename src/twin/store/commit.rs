@@ -245,9 +245,9 @@ impl Commit {
         Ok(manifest)
     }
 
-    /// Checks that the `new` manifest reverts nothing that others changed from the base to the
-    /// latest version. Where both made the same change, nothing is lost; the other may have been
-    /// this commit's own first attempt.
+    /// Checks that the `new` manifest reverts nothing that other commits changed from the base to the
+    /// latest version. The same change on both sides is not a conflict; the other one may be this commit's
+    /// own first attempt.
     fn check_overlap(
         &self,
         base: &Version,
@@ -304,7 +304,7 @@ impl Commit {
             let named = [manifest.table.object.as_str(), hash.as_str()];
             let objects = own.chain(sky).chain(named).collect();
 
-            // The same content as the latest version's is that version.
+            // With the same content as the latest version, that version is the result.
             if let Some(number) = latest
                 && let Ok(record) = self.catalog.record(&self.name, number)
                 && record.manifest == hash
@@ -313,7 +313,7 @@ impl Commit {
                 return Ok(Version { number, hash, created_us: record.created_us, manifest });
             }
 
-            // Otherwise a new one.
+            // Otherwise publish a new version.
             let number = latest.unwrap_or(0) + 1;
             let record = LogRecord::new(hash.clone(), &self.id, parent, self.kind);
             let created_us = record.created_us;

@@ -60,7 +60,7 @@ pub enum StoreError {
         /// The requested version.
         number: u64,
     },
-    /// A version was leased at the moment when garbage collection was about to remove its objects.
+    /// A version was leased while garbage collection was about to remove its objects.
     #[error(
         "version {number} of twin {name:?} has just come into use: nothing was removed; try again"
     )]
@@ -86,7 +86,7 @@ pub enum StoreError {
     Format {
         /// The file.
         path: PathBuf,
-        /// The format it says it has.
+        /// The format that the file states.
         found: u32,
         /// The format that can be read.
         supported: u32,

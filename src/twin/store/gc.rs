@@ -4,9 +4,9 @@
 //! The first run notes them as candidates. A later run, after the grace period, removes the
 //! candidates that are still garbage and were not written since. So a process that reads a version
 //! at the first run has that long to lease it, and a commit that needs an object again has written
-//! it again. In a directory, publishing is locked while objects are removed. In an object store, a
-//! commit that puts an object again in the seconds of its removal loses it: collect there only
-//! while no push can bring back what has been garbage for a day.
+//! it again. In a directory, publishing is locked while objects are removed. In an object store there is no
+//! lock: if a commit writes an object again in the very seconds in which it is removed, the object is lost.
+//! So run garbage collection there only while no push can need an object that has been garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -20,7 +20,7 @@ use super::lease::LeaseRecord;
 use super::log::now_us;
 use super::{Catalog, StoreError};
 
-/// Which versions are kept, and for how long garbage is.
+/// Which versions are kept, and how long garbage is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Retention {
     /// Number of latest versions that are kept, at least 1.
@@ -58,7 +58,7 @@ const CANDIDATES: &str = "gc/candidates";
 /// The side file with the versions that were removed.
 const COLLECTED: &str = "gc/collected";
 
-/// What a run does.
+/// The decisions of one run.
 #[derive(Debug, Default)]
 struct CollectionPlan {
     report: CollectionReport,
@@ -69,8 +69,8 @@ struct CollectionPlan {
 }
 
 impl Catalog {
-    /// Removes what has been garbage for the grace period, and notes what is garbage now. With
-    /// `dry_run`, nothing is removed or noted.
+    /// Removes objects that have been garbage for the grace period, and records objects that are garbage now.
+    /// With `dry_run`, nothing is removed or recorded.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read.

@@ -1,5 +1,5 @@
-//! Where the parts of a twin lie below the root of a directory or an object store, and what their
-//! names may be.
+//! Paths of the parts of a twin below the root of a directory or an object store, and rules for their
+//! names.
 
 use std::path::PathBuf;
 

@@ -1,5 +1,4 @@
-//! A twin's log: for each version the hash of its manifest, when it was committed, and how it came
-//! about.
+//! A twin's log: for each version the hash of its manifest, the time of its commit, and how it was made.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -19,11 +18,11 @@ pub struct LogEntry {
     /// The version that it was made from: the base of a push, or the version that a rollback
     /// restored.
     pub parent: Option<u64>,
-    /// How it came about.
+    /// How it was made.
     pub kind: CommitKind,
 }
 
-/// How a version came about.
+/// How a version was made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CommitKind {
@@ -46,8 +45,8 @@ impl std::fmt::Display for CommitKind {
     }
 }
 
-/// A record of the log, stored as JSON. How a version came about is here and not in the manifest,
-/// because the hash of a manifest depends on the content of the version alone.
+/// A record of the log, stored as JSON. How a version was made is stored here and not in the manifest,
+/// so that the hash of a manifest depends on the content of the version alone.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LogRecord {

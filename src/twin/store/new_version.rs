@@ -1,4 +1,4 @@
-//! A whole version in one call, for scenes that are in memory anyway.
+//! Commits a whole version in one call, for scenes that are in memory.
 
 use crate::ingest::IngestError;
 use wildcity_scene::manifest::Provenance;

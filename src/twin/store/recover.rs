@@ -1,4 +1,4 @@
-//! Removing what killed commits left.
+//! Removes the remains of killed commits.
 
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind};
@@ -6,7 +6,7 @@ use std::io::{self, ErrorKind};
 use super::{Catalog, StoreError};
 
 impl Catalog {
-    /// Removes what killed commits left: their staging, and objects that they placed without a
+    /// Removes the remains of killed commits: their staging, and objects that they placed without a
     /// record.
     ///
     /// A process with read-only access leaves this to processes that may write.

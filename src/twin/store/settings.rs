@@ -1,4 +1,4 @@
-//! What a version consists of beside its cells.
+//! The parts of a version other than its cells.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use wildcity_scene::{RenderProfile, Rig, Trajectory};
 use super::StoreError;
 use super::sky::NewSky;
 
-/// What a version consists of beside its cells.
+/// The parts of a version other than its cells.
 #[derive(Clone, Debug)]
 pub struct VersionSettings {
     /// How it must be rendered.
@@ -23,7 +23,8 @@ pub struct VersionSettings {
     pub provenance: Provenance,
 }
 
-/// What a change replaces of a version beside cells. A field that is `None` keeps the base's value.
+/// The parts of a version, other than cells, that a change replaces. A field that is `None` keeps the base's
+/// value.
 #[derive(Clone, Debug)]
 pub struct VersionChange {
     /// How it must be rendered.

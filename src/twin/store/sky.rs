@@ -21,7 +21,7 @@ pub enum NewSky {
     Put(SkyBytes),
 }
 
-/// A sky as stored, and how to look at it.
+/// A sky as stored, with its appearance and orientation.
 #[derive(Clone, Debug)]
 pub struct SkyBytes {
     /// The bytes that [`sky::decode`] reads.

@@ -151,7 +151,7 @@ class Client:
     async def _run(self, exchange: Exchange[T]) -> T:
         # May raise ValueError. Nothing has been sent or changed then.
         request = next(exchange)
-        # The connection is taken away during a call, so a second call at the same time fails.
+        # `_connection` is None during a call, so a second call at the same time fails.
         connection = self._connection
         self._connection = None
         if connection is None:

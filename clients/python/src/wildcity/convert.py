@@ -4,8 +4,9 @@
     python -m wildcity.convert checkpoint_final.pth street.safetensors --model Background
 
 A checkpoint's sky network is written to the same file: `wildcity import street.safetensors --sky
-street.safetensors` reads both. Supported are gsplat (`splats`), drivestudio (`models`, of which one is converted),
-nerfstudio's splatfacto and INRIA's tuple. Conversion needs numpy but not PyTorch, and runs no code from the file.
+street.safetensors` reads both. Supported are the checkpoints of gsplat (`splats`), drivestudio (`models`, of which
+one is converted), nerfstudio's splatfacto and INRIA (a tuple). Conversion needs numpy but not PyTorch, and runs no
+code from the file.
 """
 
 from __future__ import annotations

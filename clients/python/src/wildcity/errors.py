@@ -72,7 +72,7 @@ class BadFrame(ProtocolError):
 class Refused(WildCityError):
     """The server refused the request. Nothing changed, and the request can be sent again.
 
-    `field` names the field at fault, if one field is. If `fatal`, the server also closed the connection.
+    `field` is the name of the invalid field, or None. If `fatal`, the server also closed the connection.
     """
 
     def __init__(self, code: Code, message: str, field: str | None, fatal: bool) -> None:

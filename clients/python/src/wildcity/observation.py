@@ -86,8 +86,8 @@ class Observation:
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
-        They are as many as `Outputs.frames` asked for, and fewer at the start of an episode. `frame_infos` has
-        their times. Raises `KeyError` if there are none.
+        There are `Outputs.frames` of them, or fewer at the start of an episode. `frame_infos` has their times.
+        Raises `KeyError` if there are none.
         """
         frames = [_decode_image(self, image) for image in self.frame_infos(camera)]
         if not frames:

@@ -146,7 +146,7 @@ class Camera:
 
     `camera_to_rig` transforms camera coordinates (x right, y down, z forward) to the rig frame. The polynomial of
     an f-theta lens determines its focal lengths: leave fx and fy None there. `overlay` is the part of the own
-    car that the camera sees: `png_data_uri(bytes)` of a PNG with opacity, of the image's size. Answers omit it.
+    car that the camera sees: `png_data_uri(bytes)` of a PNG with alpha, of the image's size. Answers omit it.
     """
 
     name: str
@@ -184,9 +184,9 @@ class ImagePart:
 class Outputs:
     """What each observation holds: the cameras (all if None), their encoding, and additional tensors.
 
-    `images` has crops and sizes that differ from the rig's, by camera name. `frames` is the number of last frames
-    of each camera, 1 if None. `period_us` is the time between two frames of a camera, by name, for cameras that do
-    not take one with every step. `trust` adds a confidence to each image.
+    `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
+    frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
+    name, for cameras that do not take one with every step. `trust` adds a confidence to each image.
     """
 
     cameras: tuple[str, ...] | None = None

@@ -46,7 +46,7 @@ Exchange = Generator[str, Message, T]
 
 
 class SessionProtocol:
-    """State of one client. A request uses its number up only if its answer came and is not an error."""
+    """State of one client. A request consumes its number only if its answer arrives and is not an error."""
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -26,9 +26,10 @@ use step::DriveStep;
 
 /// Time a drive along a twin's first trajectory, in a session without a network.
 ///
-/// Drives ten steps per second at a constant speed. A step that finishes early waits for its time, as an
-/// agent in real time would. Prints for every kilometre how long the steps took, how many waited for the
-/// disk and how long, and how much memory was in use.
+/// Drives at a constant speed with ten steps per second. Each step starts 0.1 s after the one before, or
+/// as soon as that one is done if it took longer, like an agent that runs in real time. For every
+/// kilometre, prints how long the steps took, how many of them waited for the disk and for how long, and
+/// how much memory was in use.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
@@ -50,16 +51,16 @@ pub(super) struct Drive {
     #[arg(long, value_name = "M_PER_S", default_value_t = 30.0, value_parser = speed)]
     speed_m_s: f64,
 
-    /// Start on the trajectory, in metres.
+    /// Distance along the trajectory at which the drive starts, in metres.
     #[arg(long, value_name = "M", default_value_t = 0.0, value_parser = distance)]
     from_m: f64,
 
-    /// Steps, of 0.1 s each [default: to the end of the trajectory]
+    /// Number of steps, of 0.1 s each [default: to the end of the trajectory]
     #[arg(long, value_name = "N")]
     steps: Option<u32>,
 
-    /// Divide the width and height of every camera by N and keep the middle of its image. The same Gaussians
-    /// are needed in memory as for whole images, with less to render.
+    /// Divide the width and height of every camera by N and render only the middle of its image. The same
+    /// Gaussians must be in memory as for whole images, but there is less to render.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     crop: u32,
 
@@ -67,7 +68,7 @@ pub(super) struct Drive {
     #[arg(long)]
     unpaced: bool,
 
-    /// Jumps to scattered places of the trajectory after the drive.
+    /// Number of jumps to scattered places of the trajectory after the drive.
     #[arg(long, value_name = "N", default_value_t = 0)]
     teleports: u32,
 

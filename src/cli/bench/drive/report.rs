@@ -10,7 +10,7 @@ use super::step::DriveStep;
 use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Stats;
 
-/// Steps before a drive counts as warm: 3 s, in which the cache learns how fast the rig moves.
+/// Number of steps before a drive counts as warm: 3 s, in which the prefetcher measures the rig's speed.
 const WARM_UP: usize = 30;
 
 /// A drive, and the jumps after it.
@@ -22,7 +22,7 @@ pub(super) struct Report {
     pub(super) backend: &'static str,
     /// Names and sizes of the cameras.
     pub(super) cameras: String,
-    /// Memory that is reserved for the worst frame.
+    /// Memory that is reserved for the frame that needs the most.
     pub(super) reserved_bytes: u64,
     /// Time to open the session.
     pub(super) open: Duration,

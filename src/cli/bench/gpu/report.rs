@@ -35,10 +35,10 @@ pub(super) struct SceneReport {
     pub(super) evaluations: u64,
     /// Frames that were timed.
     pub(super) frames: u32,
-    /// Regions in which all of them were drawn.
+    /// Number of regions that these frames were divided into, in total.
     #[serde(rename = "parts")]
     pub(super) regions: u64,
-    /// Attempts among them that drew nothing since buffers were too small.
+    /// How many of those regions had to be drawn again because a buffer was too small.
     pub(super) retries: u64,
     /// Empty for a device without a clock.
     pub(super) stages: Vec<StageReport>,

@@ -5,8 +5,8 @@
 //! image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's polynomial leads.
 //! 8 to 14 Chebyshev terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel
 //! to its ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within
-//! 8e-4 px of f64, with a rolling shutter too. Before, a step of a real six-camera rig spent four fifths of
-//! its time in Newton's method.
+//! 8e-4 px of f64, also with a rolling shutter. With Newton's method instead, a step of a real six-camera rig
+//! spent four fifths of its time in it.
 //!
 //! Three kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field,
 //! those for which the search finds no row, and those of cameras that this module does not describe.
@@ -28,7 +28,7 @@ pub(super) use rays::LensRays;
 use shutter::SimdShutter;
 use windshield::{Refracted, SimdWindshield};
 
-/// What a series may be off, in pixels: a tenth of the resolution of f32 away from the middle of an image.
+/// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of an image.
 const MAX_SERIES_ERROR_PX: f64 = 1e-5;
 
 /// The projection of a view that is not a static pinhole, ready for many points.
@@ -219,7 +219,7 @@ impl LensProjection {
     }
 }
 
-/// The share of a field, in the unit of its limit, that is within it whatever f32 rounds.
+/// The share of a field's limit up to which a point is within the field in spite of f32 rounding.
 const INSIDE: f32 = 1.0 - 1e-5;
 
 impl Model {

@@ -12,7 +12,7 @@ use crate::cpu::lanes::Vec3x16;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::Lens;
 
-/// What the series of `tan(θ/2)` may be off: the resolution of f32.
+/// Largest error of the series of `tan(θ/2)`: the resolution of f32.
 const MAX_TANGENT_ERROR: f64 = 5e-8;
 
 /// Viewing directions of the pixels of a pinhole or of a lens that is round about its axis.

@@ -1,4 +1,4 @@
-//! Windshields that refract rays as they come in, 16 at a time.
+//! Refraction of incoming rays by a windshield, 16 at a time.
 
 use fearless_simd::{f32x16, prelude::*};
 use glam::DVec3;
@@ -9,8 +9,8 @@ use crate::cpu::math::{asin, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield with polynomials that lead from the outside to the inside, at angles where it refracts in
-/// full. At large angles [`Windshield`] fades the refraction out; this type does not.
+/// A windshield with polynomials from outside angles to inside angles. It is valid at angles where the
+/// refraction is complete: at large angles [`Windshield`] fades the refraction out, and this type does not.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
     horizontal: Polynomial2,
@@ -27,7 +27,7 @@ struct Polynomial2(Vec<Vec<f32>>);
 pub(super) struct Refracted<S: Simd> {
     /// Unit directions inside.
     pub(super) direction: Vec3x16<S>,
-    /// Not below 0 where the windshield refracts in full.
+    /// Not below 0 where the refraction is complete.
     pub(super) margin: f32x16<S>,
 }
 
@@ -83,19 +83,19 @@ impl SimdWindshield {
     }
 }
 
-/// Whether the image shows directions at which the windshield refracts less than in full.
+/// Whether the image shows directions at which the refraction fades out.
 pub(super) fn fades_within_image(camera: &Camera) -> bool {
     let bare = Camera { windshield: None, ..*camera };
     let (sin, cos) = (max_seen_rad(camera) * (1.0 - 1e-9)).sin_cos();
     let [_, full_z] = Windshield::FADES_Z;
-    // Test 32 directions around the edge of what is seen.
+    // Test 32 directions around the edge of the visible field.
     (0..32).any(|k| {
         let (y, x) = (f64::from(k) * std::f64::consts::TAU / 32.0).sin_cos();
         let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
         let in_full = at_px.is_some_and(|at_px| {
             camera.unproject(at_px).is_some_and(|outside| {
                 let found = camera.project_extrapolated(outside).distance(at_px) < 1e-6;
-                // The margin of 0.02 covers what lies between two of the 32.
+                // The margin of 0.02 covers directions between two of the 32.
                 found && outside.z >= full_z + 0.02
             })
         });

@@ -218,8 +218,8 @@ fn project_lanes<S: Simd>(
     (splats, in_range.to_bitmask() & !inside.to_bitmask())
 }
 
-/// Which Gaussians surely miss the image: the test of [`CullBound`] in f32, with bounds for the angles that
-/// are loose by what the approximations here are off.
+/// Which Gaussians certainly miss the image: the test of [`CullBound`] in f32. Its bounds of the angles are
+/// widened by the errors of the approximations here.
 #[inline(always)]
 fn surely_unseen<S: Simd>(
     simd: S,
@@ -268,9 +268,9 @@ fn add<S: Simd>((low, high): F64x16<S>, more: f32x16<S>) -> F64x16<S> {
 /// Depth of centres, in metres: computed in f64 and rounded to f32 once, since splats are blended in order of
 /// it.
 ///
-/// `at_end_m` and `center` are the same centres, in the camera's frame at the end of the exposure. A centre
-/// that is seen while a fraction of the exposure remains has the depth of the moment: it is farther by what
-/// the camera has yet to move.
+/// `at_end_m` and `center` are the same centres, in the camera's frame at the end of the exposure. The depth of
+/// a centre that is exposed earlier is that at its own moment: it is larger by the distance that the camera
+/// still moves until the end.
 #[inline(always)]
 fn depth<S: Simd>(
     simd: S,

@@ -60,7 +60,7 @@ pub(super) struct Chain {
     /// The largest needs of any region so far.
     high_water: Capacity,
     partitions: PartitionCache,
-    /// Number of attempts that drew nothing since buffers were too small.
+    /// Number of attempts that drew nothing because buffers were too small.
     pub(super) retries: u64,
     /// Number of regions that were drawn, one for each frame that fits at once.
     pub(super) regions: u64,
@@ -105,11 +105,11 @@ struct CurrentFrame {
     stats: FrameStats,
 }
 
-/// What became of a region.
+/// The outcome of drawing a region.
 #[derive(Debug)]
 enum RegionOutcome {
     /// It was drawn, and needed this much.
-    DrawableSky(Capacity),
+    Drawn(Capacity),
     /// It does not fit the device. These regions must be drawn instead.
     Split(Vec<Region>),
 }
@@ -174,7 +174,7 @@ impl Chain {
         let mut drawn = Vec::with_capacity(remaining.len());
         while let Some(region) = remaining.pop() {
             match self.draw_or_split(frame, &rows, &region, cull, &mut current)? {
-                RegionOutcome::DrawableSky(needs) => {
+                RegionOutcome::Drawn(needs) => {
                     drawn.push((region, needs));
                     if !remaining.is_empty() {
                         current.read_back.unmap();
@@ -232,7 +232,7 @@ impl Chain {
         let needs = self.draw_region(Source::Gaussians(&work), tiles, current)?;
         let count = needs.min_regions(self.limit());
         if count <= 1 {
-            return Ok(RegionOutcome::DrawableSky(needs));
+            return Ok(RegionOutcome::Drawn(needs));
         }
         let regions = rows.split(region, count).ok_or_else(|| self.too_many(needs))?;
         current.read_back.unmap();
@@ -260,9 +260,8 @@ impl Chain {
         Ok(MappedFrame { read_back, pool: self.read_backs.clone(), pages, views, stats })
     }
 
-    /// Draws some tiles, again in larger buffers as long as those were too small: the device never omits
-    /// what does not fit, it draws nothing then. Returns what the region needs. If that exceeds the limit,
-    /// the pixels are not valid.
+    /// Draws some tiles. If the buffers are too small, the device draws nothing, and the host tries again with
+    /// larger ones. Returns what the region needs. If that exceeds the limit, the pixels are not valid.
     fn draw_region(
         &mut self,
         source: Source<'_>,
@@ -284,7 +283,7 @@ impl Chain {
             let elapsed = submitted.elapsed();
             self.add_stage_times(&mut current.stats, &stages, &timestamps, elapsed);
 
-            // Did it fit?
+            // Check whether it fitted.
             let (needs, fits) = self.evaluate(&counters, &current.parameters);
             if fits {
                 let limit = self.device.max_tile_splats(self.rasterize.background_iterations());

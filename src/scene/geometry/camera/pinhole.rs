@@ -19,7 +19,7 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// Larger focal lengths and principal points are taken for mistakes. They would also lose precision in
+    /// Larger focal lengths and principal points are refused as mistakes. They would also lose precision in
     /// f32.
     const MAX_PX: f64 = 1e6;
 

@@ -1,4 +1,4 @@
-//! The directory of twins: where its parts lie, and the locks on them.
+//! The directory of twins: the paths of its parts, and the locks on them.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
@@ -10,7 +10,7 @@ use crate::store::layout::{object_key, record_key};
 
 use super::files::{create_dirs, entries};
 
-/// Name of the directory of what is being committed.
+/// Name of the directory for commits in preparation.
 pub(super) const STAGING: &str = ".staging";
 /// Separates the twin's name from the commit's in the name of a staging directory. Neither contains
 /// it.

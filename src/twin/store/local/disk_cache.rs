@@ -24,9 +24,9 @@ use super::files::{WRITING, create_dirs, entries};
 
 /// A part gets a new modification time when it is used and the old one is older than this.
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
-/// Age after which an unfinished file is taken for one that a killed process left.
+/// Age after which an unfinished file counts as left behind by a killed process.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);
-/// Each process makes room once it has written one part in this many of the limit, so that several
+/// Each process makes room whenever it has written this fraction (1 / `SLACK`) of the limit, so that several
 /// processes together stay close to the limit.
 const SLACK: u64 = 16;
 
@@ -112,7 +112,7 @@ impl DiskCache {
         self.dir.join(&hash[..2]).join(hash)
     }
 
-    /// Removes the least recently used parts until there is room for what is written before the
+    /// Removes the least recently used parts until there is room for everything that is written before the
     /// next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");

@@ -1,4 +1,4 @@
-//! Files and directories, written so that they last through a power cut.
+//! Files and directories, synced so that they survive a power cut.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read, Write};

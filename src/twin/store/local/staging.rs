@@ -129,7 +129,7 @@ impl Staging for LocalStaging {
 }
 
 impl Drop for LocalStaging {
-    /// What cannot be removed here is removed by the next start, so failures are ignored.
+    /// Failures are ignored, because the next start removes whatever remains.
     fn drop(&mut self) {
         if self.publish_lock.is_some() {
             for path in &self.placed {

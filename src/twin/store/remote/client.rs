@@ -21,7 +21,7 @@ use super::url;
 pub(in crate::store) struct Remote {
     /// The URL.
     pub(super) root: PathBuf,
-    /// What every key begins with.
+    /// Prefix of every key.
     pub(super) prefix: Key,
     pub(super) store: Arc<dyn ObjectStore>,
     pub(super) runner: Arc<RequestRunner>,
@@ -125,8 +125,8 @@ impl Remote {
         read
     }
 
-    /// Reads until the bytes have their hash, a bounded number of times: bytes damaged in transit
-    /// are not damaged in the store.
+    /// Reads until the bytes match their hash, a bounded number of times, because they may have been damaged
+    /// in transit and not in the store.
     pub(super) fn read_verified(
         &self,
         key: &str,

@@ -2,7 +2,7 @@
 //! catalog can be opened over a store that is open already.
 //!
 //! Objects are uploaded to their final keys, under their hashes. No reader sees them before a log
-//! record names a manifest that names them. What a killed commit left is removed by garbage
+//! record names a manifest that names them. The remains of a killed commit are removed by garbage
 //! collection alone.
 
 mod client;
@@ -92,7 +92,7 @@ impl ObjectBackend for Remote {
                 }
             })
         };
-        // Bytes damaged in transit are not damaged in the store: read once more.
+        // The bytes may have been damaged in transit and not in the store: read once more.
         let (mut start, mut found) = read()?;
         if found.as_str() != hash {
             (start, found) = read()?;

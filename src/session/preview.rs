@@ -45,9 +45,10 @@ pub struct ProposedChange {
 type LoadedSections = BTreeMap<SectionRef, Arc<Chunk>>;
 
 impl Engine {
-    /// Renders small images of a version and of what it would become, each in its turn among the
-    /// sessions' frames, and compares them. Without `poses`, at some poses along the first trajectory, near
-    /// the change. Calls `progress` with the number of poses done and in all.
+    /// Renders small images of a version before and after a proposed change, and compares them. The frames wait
+    /// in the render queue with those of the sessions. Without `poses`, the images are taken from some poses along
+    /// the first trajectory, near the change. Calls `progress` with the number of poses that are done and the
+    /// number of all poses.
     ///
     /// # Errors
     /// The version cannot be read, or the backend refuses a frame.
@@ -81,7 +82,7 @@ impl Engine {
             progress(done, total);
             let views = View::of_rig(&cameras, world_from_rig);
 
-            // Both scenes; the new Gaussians and the sections read so far go through the blocking thread.
+            // Read both scenes on a blocking thread, which gets the new Gaussians and the sections read so far.
             let scenes = {
                 let mut reader = SceneReader {
                     catalog: self.catalog().clone(),
@@ -138,7 +139,7 @@ impl Engine {
     }
 }
 
-/// The scenes of one pose, and what the next pose needs again.
+/// The scenes before and after the change at one pose, and the sections to reuse for the next pose.
 struct BothScenes {
     before: Result<Scene, SessionError>,
     after: Result<Scene, SessionError>,
@@ -155,8 +156,8 @@ struct SceneReader {
 }
 
 impl SceneReader {
-    /// What the views show of the version, without some of its cells. Sections that were read before are
-    /// not read again.
+    /// The part of the version that the views show, without some of its cells. Sections that were read
+    /// before are not read again.
     fn read(
         &mut self,
         without: &BTreeSet<[i32; 2]>,
