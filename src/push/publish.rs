@@ -1,5 +1,4 @@
-<<<<<<< HEAD
-//! The pipeline of a push: read, check, preview, commit, load ahead.
+//! The pipeline of a push: read, check, preview, commit, preload.
 //!
 //! A push is uploaded files and the cells that they replace. All cells are published by one record of the
 //! twin's log.
@@ -11,9 +10,6 @@
 //! **A push needs no state that survives the server**, because its content is compared with the twin's. A
 //! client that got no answer sends its push again, and the same content as the latest version's is that
 //! version.
-=======
-//! The pipeline of a push: read, check, preview, commit, preload.
->>>>>>> report
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -3,15 +3,6 @@
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;
 
-<<<<<<< HEAD
-/// Frames that a GPU has in flight at once: one is drawn, one is encoded, and one is ready to be drawn
-/// the moment the first is done. Six JPEGs take longer than a fast GPU takes to draw them. Each
-/// holds its images, 27 MB of six full cameras.
-pub const GPU_FRAMES: usize = 3;
-
-/// Frames that did not fit a GPU at once, and are known in which regions they do: a few kB, for more
-/// rigs than drive at once.
-=======
 /// Frames that are in flight on a GPU at once: one is drawn, one is encoded, and one is ready to be drawn as
 /// soon as the first is done. Encoding six JPEGs takes longer than a fast GPU needs to draw the images. Each
 /// frame holds its images, 27 MB for six full cameras.
@@ -19,7 +10,6 @@ pub const GPU_FRAMES: usize = 3;
 
 /// Number of frames, among those that did not fit a GPU at once, whose regions are remembered: a few kB in all,
 /// for more rigs than are used at the same time.
->>>>>>> report
 pub const PARTITION_CACHE_ENTRIES: usize = 64;
 
 /// Smallest limit of a binding that the gpu backend supports: one cluster of SH degree 3 takes 34 kB.

@@ -6,15 +6,9 @@
 //! Since a sky depends on the direction alone, a network of 12,000 multiplications per pixel is baked into a
 //! cube map of at most 50 MB when a twin is opened (`bake.rs`). The field `sky_error` of the render profile
 //! bounds the error of the map in any direction; 0 evaluates the network for every pixel, in f32. The
-<<<<<<< HEAD
-//! reference backend always evaluates the network, in f64. Maps have one of four resolutions, so sessions
-//! that request different errors share at most four maps, 67 MB together, and none is baked twice. A session
-//! whose `sky_error` is below the error of the finest map is refused when it opens.
-=======
 //! reference backend always evaluates the network, in f64. A sky has at most four maps, one per resolution,
 //! 67 MB together. Sessions share them, so none is baked twice. A session whose `sky_error` is below the error
 //! of the finest map is refused when it opens.
->>>>>>> report
 //!
 //! Images become the faces of a cube map at import and are not baked. Baked grids have values on the very
 //! edges of the faces, which neighbouring faces share; images have a border of one value that is looked up

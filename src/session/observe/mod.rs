@@ -10,16 +10,10 @@
 //!
 //! The renderer writes depth, opacity, normals and raw colour straight into the message. JPEG and PNG files
 //! are appended, since their length is only known after encoding. Every image is encoded and hashed in the
-<<<<<<< HEAD
-//! renderer's `finished` callback while other cameras are still rendered. The frame hash is the hash of the
-//! images' hashes, so that it needs no second pass over the pixels. `server` writes the header last. Floats
-//! come before bytes, so that every float tensor starts at a multiple of 4.
-=======
 //! renderer's [`OnViewDone`](wildcity_render::OnViewDone) callback, while other cameras are still rendered.
 //! The frame hash is the hash of the images' hashes, so that it needs no second pass over the pixels.
 //! `server` writes the header last. Floats come before bytes, so that every float tensor starts at a
 //! multiple of 4.
->>>>>>> report
 //!
 //! **Which frames are rendered** depends on the simulated time alone ([`schedule`]): only those that the
 //! observation of some decision contains. A frame that a later observation contains again is kept in the
