@@ -296,7 +296,7 @@ impl Chunk {
         3.0 * DVec3::new(rows.x_axis.length(), rows.y_axis.length(), rows.z_axis.length())
     }
 
-    /// One parameter of one Gaussian; `column` is an index as in [`column`].
+    /// One parameter of one Gaussian; `column` is an index as in [`mod@column`].
     pub fn value(&self, index: usize, column: usize) -> f32 {
         self.lane_group(index / LANES)[column].0[index % LANES]
     }
