@@ -7,7 +7,6 @@ import io
 import json
 import os
 import queue
-import re
 import subprocess
 import threading
 import time
@@ -149,25 +148,13 @@ def test_drives_a_car(connect: Connect, server: Server) -> None:
                 session.step(Pose())
 
 
-def test_the_example_of_the_front_page_runs(server: Server) -> None:
-    page = (Path(__file__).resolve().parents[3] / "README.md").read_text()
-    example, bundles = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    example = example.replace("ws://127.0.0.1:8080/v1/session", server.url)
-    example = example.replace('client.open("demo")', "client.open('corridor')")
-    example = example.replace("range(100)", "range(3)")
-    shapes = []
-
-    def my_agent(front: Any, seen: Observation) -> Pose:
-        shapes.append(front.shape)
-        x, y, z = seen.ego.pose.xyz
-        return Pose((x + 0.5, y, z), seen.ego.pose.q)
-
-    exec(example, {"my_agent": my_agent})
-    assert shapes == [(928, 1440, 3)] * 3
+def test_a_model_reads_four_frames_at_each_decision(server: Server) -> None:
+    outputs = wildcity.Outputs(frames=4, trust=True)
     with wildcity.connect(server.url) as client:
-        names: dict[str, Any] = {"client": client, "wildcity": wildcity}
-        exec(bundles.replace('client.open("demo"', 'client.open("corridor"'), names)
-        opened = names["session"].opened
+        session = client.open(
+            "corridor", outputs=outputs, decision_us=1_000_000, warm_up_us=1_600_000
+        )
+        opened = session.opened
         assert (opened.outputs.frames, opened.outputs.trust, opened.decision_us) == (4, True, 10**6)
         assert opened.start.xyz == pytest.approx((8.0, 0.0, 0.0))
 
