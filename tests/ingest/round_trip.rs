@@ -139,7 +139,7 @@ fn the_format_does_not_depend_on_the_name_of_a_file() {
     let text = refusal(b"x y z 1.0 2.0 3.0\n");
     assert!(
         text.contains("starts with \"x y z 1.0\"")
-            && text.contains("no format does that is read: PLY"),
+            && text.contains("none of the formats that can be read: PLY"),
         "{text}"
     );
     assert!(refusal(b"").contains("starts with \"\""));

@@ -448,7 +448,7 @@ mod tests {
             let table = super::table(&[other], 0, RecordFormat::Q32).unwrap();
             filled(&entry, &table).unwrap_err()
         };
-        assert!(refused(&|e| e.cell[0] += 1).contains("something else of cell"));
+        assert!(refused(&|e| e.cell[0] += 1).contains("differs from the manifest in cell"));
         assert!(refused(&|e| e.sections[0].count = 7).contains("it has 7 Gaussians of 300"));
         for change in [
             (|e| e.sections[1].level = 2) as fn(&mut ChunkEntry),
