@@ -152,7 +152,10 @@ fn an_error_in_a_ply_header_names_the_line() {
     let changed = |from: &str, to: &str| refusal(good.replacen(from, to, 1).as_bytes());
     let cases = [
         (changed("binary_little", "binary_big"), "line 2: \"format binary_big_endian 1.0\" must"),
-        (changed("float y", "list uchar int y"), "line 6: \"property list uchar int y\": Gaussians"),
+        (
+            changed("float y", "list uchar int y"),
+            "line 6: \"property list uchar int y\": Gaussians",
+        ),
         (changed("float y", "half y"), "line 6: \"half\" is not a type"),
         (changed("float y", "float x"), "line 6: property x occurs twice"),
         (changed("float y", "float y y"), "line 6: \"property float y y\" is unknown in a header"),

@@ -291,7 +291,10 @@ fn errors_of_archives_and_payloads_say_what_is_missing() {
             with(b"street.rotations.shape", b"street.rotations.shade"),
             "rotations.shape: is not two numbers",
         ),
-        (with(&[0xce, 0, 0, 0, 6], &[0xce, 0xff, 0xff, 0xff, 6]), "positions: 36 bytes, which is not the size of 128849"),
+        (
+            with(&[0xce, 0, 0, 0, 6], &[0xce, 0xff, 0xff, 0xff, 6]),
+            "positions: 36 bytes, which is not the size of 128849",
+        ),
         (with(&[0xde, 0, 1], &[0xde, 0, 9]), "MessagePack: byte "),
         (with(&[0xde, 0, 1], &[0xc1, 0, 1]), "MessagePack: byte 0: 0xc1 begins no value"),
     ] {

@@ -52,7 +52,7 @@ fn deny() -> Deny {
 /// Dependencies on the platforms that the project is tested on.
 fn dependencies() -> Vec<Dependency> {
     let output = Command::new(env!("CARGO"))
-        .args(["metadata", "--locked", "--offline", "--format-version", "1"])
+        .args(["metadata", "--locked", "--format-version", "1"])
         .args(["--filter-platform", "x86_64-unknown-linux-gnu"])
         .current_dir(root())
         .output()
