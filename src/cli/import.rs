@@ -51,11 +51,13 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// JSON file of the vehicle's cameras (see below). They become the twin's default rig.
+    /// JSON file of the vehicle's cameras (see below). They become the twin's default rig. A version that is
+    /// imported without this option has no default rig, even if the version before had one.
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
 
-    /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given again.
+    /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given again. A version
+    /// has only the drives that its own import names.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 

@@ -24,7 +24,9 @@ pub enum PushError {
         reason: String,
     },
     /// A field of the request is not a name.
-    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
+    #[error(
+        "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+    )]
     InvalidName {
         /// The field, as it is called on the wire.
         field: &'static str,

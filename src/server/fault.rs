@@ -73,7 +73,9 @@ pub(crate) enum Fault {
         name: String,
     },
     /// A text is not a name.
-    #[error("{name:?} is not a name: 1 to 64 of a-z 0-9 . _ - are, not starting with .")]
+    #[error(
+        "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+    )]
     InvalidName {
         /// The field.
         field: String,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use wildcity_twin::store::{Catalog, ObjectTotals};
 
 use crate::scene_files::{gaussians, inria_columns, ply};
-use crate::support::{commit, files, street};
+use crate::versions::{commit, files, street};
 use crate::wildcity;
 
 /// Writes a PLY of `n` Gaussians in about 50 cells.

@@ -7,7 +7,7 @@ use std::process::Output;
 use wildcity_twin::store::Catalog;
 
 use crate::scene_files::gaussians;
-use crate::support::{commit, street};
+use crate::versions::{commit, street};
 use crate::wildcity;
 
 fn demo(dir: &Path) -> Output {

@@ -20,18 +20,20 @@ mod images;
 mod places;
 #[path = "../support/reported.rs"]
 mod reported;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/s3.rs"]
 mod s3;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
-#[path = "../support/server.rs"]
-mod server;
 #[path = "../support/sky_network.rs"]
 mod sky_network;
-#[path = "../support/store.rs"]
-mod store;
 #[path = "../support/streets.rs"]
 mod streets;
+#[path = "../support/server.rs"]
+mod support;
+#[path = "../support/versions.rs"]
+mod versions;
 
 mod bench_drive;
 mod bench_gpu;
@@ -53,12 +55,6 @@ mod rig;
 mod route;
 mod sky;
 mod twin;
-
-/// The support files refer to each other by these paths in every test binary.
-mod support {
-    pub(crate) use crate::server::*;
-    pub(crate) use crate::store::*;
-}
 
 use std::process::Command;
 

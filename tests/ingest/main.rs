@@ -7,6 +7,8 @@ mod data;
 mod format_files;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 

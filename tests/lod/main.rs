@@ -5,6 +5,8 @@
 mod data;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/streets.rs"]

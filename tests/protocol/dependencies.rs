@@ -11,7 +11,7 @@ fn the_client_has_few_dependencies() {
     let output = Command::new(env!("CARGO"))
         .args(["tree", "--offline", "--locked", "--package", "wildcity-client"])
         .args(["--edges", "normal", "--prefix", "none", "--format", "{p}"])
-        .current_dir(super::root())
+        .current_dir(crate::root::root())
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

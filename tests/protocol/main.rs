@@ -4,6 +4,9 @@
 //! Schemas and vectors are generated from the types by these tests. After a change of the types run
 //! `WILDCITY_BLESS=1 cargo test -p wildcity-client --test protocol`, and review the difference.
 
+#[path = "../support/root.rs"]
+mod root;
+
 mod client;
 mod damaged;
 mod dependencies;
@@ -20,7 +23,7 @@ use std::path::PathBuf;
 
 /// A file of the project's `protocol` folder.
 fn protocol_path(name: &str) -> PathBuf {
-    root().join("protocol").join(name)
+    root::root().join("protocol").join(name)
 }
 
 /// Whether the tests write the files instead of comparing them.
@@ -55,14 +58,4 @@ fn check_json(name: &str, value: &impl serde::Serialize) {
     let mut text = serde_json::to_string_pretty(value).unwrap();
     text.push('\n');
     check_file(name, text.as_bytes());
-}
-
-/// The repository.
-fn root() -> PathBuf {
-    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut above = package.ancestors();
-    above
-        .find(|dir| dir.join("Cargo.lock").is_file())
-        .expect("a package within the repository")
-        .to_owned()
 }

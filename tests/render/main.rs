@@ -6,6 +6,8 @@ mod data;
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/skies.rs"]

@@ -8,6 +8,8 @@ mod gpu;
 mod images;
 #[path = "../support/reported.rs"]
 mod reported;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 #[path = "../support/skies.rs"]

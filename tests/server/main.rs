@@ -2,6 +2,8 @@
 
 #[path = "../support/episodes.rs"]
 mod episodes;
+#[path = "../support/root.rs"]
+mod root;
 #[path = "../support/server.rs"]
 mod support;
 

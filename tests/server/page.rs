@@ -70,15 +70,5 @@ fn limits_are_those_of_the_configuration() {
 }
 
 fn page() -> String {
-    std::fs::read_to_string(root().join("protocol/README.md")).unwrap()
-}
-
-/// The repository.
-fn root() -> std::path::PathBuf {
-    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut above = package.ancestors();
-    above
-        .find(|dir| dir.join("Cargo.lock").is_file())
-        .expect("a package within the repository")
-        .to_owned()
+    std::fs::read_to_string(crate::root::root().join("protocol/README.md")).unwrap()
 }

@@ -9,7 +9,7 @@ use wildcity_twin::store::{
 };
 
 use crate::scene_files::gaussians;
-use crate::support::{commit, files, street, turn};
+use crate::versions::{commit, files, street, turn};
 
 const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels: false };
 

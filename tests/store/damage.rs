@@ -10,7 +10,7 @@ use wildcity_twin::residency::{Cache, PinnedScene, ResidencyError, Viewpoint};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::scene_files::gaussians;
-use crate::support::{commit, street};
+use crate::versions::{commit, street};
 
 struct Twin {
     dir: tempfile::TempDir,

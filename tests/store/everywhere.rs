@@ -7,7 +7,7 @@ use wildcity_twin::store::{Catalog, CommitKind, NewVersion, StoreError, Version,
 use crate::places::{cells_alone, change, commit, everywhere, whole};
 use crate::s3::S3;
 use crate::scene_files::gaussians;
-use crate::support::street;
+use crate::versions::street;
 
 fn read_all(catalog: &Catalog, version: &Version) -> u64 {
     let mut gaussians = 0;

@@ -6,7 +6,7 @@ use wildcity_twin::store::{Catalog, ObjectTotals, Retention, StoreError};
 
 use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
-use crate::support::turn;
+use crate::versions::turn;
 
 const NOW: Duration = Duration::ZERO;
 const DAY: Duration = Duration::from_secs(86_400);

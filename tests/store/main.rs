@@ -8,8 +8,8 @@ mod s3;
 mod scene_files;
 #[path = "../support/sky_network.rs"]
 mod sky_network;
-#[path = "../support/store.rs"]
-mod support;
+#[path = "../support/versions.rs"]
+mod versions;
 
 mod commits;
 mod damage;

@@ -11,7 +11,7 @@ use wildcity_twin::store::{
 use crate::places::{cells_alone, change};
 use crate::s3::{Fault, S3, quick};
 use crate::scene_files::gaussians;
-use crate::support::street;
+use crate::versions::street;
 
 fn commit(catalog: &Catalog, scene: &Gaussians) -> Result<Version, StoreError> {
     let new = NewVersion { storage: StorageOptions::default(), ..street(scene) };

@@ -7,7 +7,7 @@ use wildcity_twin::residency::{Cache, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, StoreError, TwinListing};
 
 use crate::scene_files::gaussians;
-use crate::support::{commit, files, street};
+use crate::versions::{commit, files, street};
 
 #[test]
 fn what_is_committed_is_read_back_bit_by_bit() {

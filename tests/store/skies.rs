@@ -15,7 +15,7 @@ use wildcity_twin::store::{
 use crate::places::{cells_alone, everywhere};
 use crate::scene_files::{gaussians, safetensors};
 use crate::sky_network::tensors;
-use crate::support::{commit, street};
+use crate::versions::{commit, street};
 
 fn sky_bytes(seed: usize) -> SkyBytes {
     let read = ingest::sky::read_bytes(&safetensors(&tensors(seed), &[]), None).unwrap();
@@ -151,7 +151,7 @@ fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
         let error = commit(dir.path(), new).unwrap_err().to_string();
         assert!(error.contains(wanted), "{error}");
         assert_eq!(
-            crate::support::files(&dir.path().join("street")),
+            crate::versions::files(&dir.path().join("street")),
             Vec::<std::path::PathBuf>::new()
         );
     }

@@ -5,6 +5,5 @@ mod gpu;
 #[path = "../support/images.rs"]
 mod images;
 
-#[path = "gpu.rs"]
 mod device;
 mod mutations;

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 /// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI on a machine that has the data; or if the
 /// data exists without this file, which is a mistake in the test.
 pub(crate) fn real(file: &str) -> Option<PathBuf> {
-    let beside = root().join("../shared/data");
+    let beside = crate::root::root().join("../shared/data");
     let root = std::env::var_os("WILDCITY_DATA").unwrap_or_else(|| beside.into());
     let root = PathBuf::from(root);
     if !root.is_dir() {
@@ -24,14 +24,4 @@ pub(crate) fn real(file: &str) -> Option<PathBuf> {
     let path = root.join(file);
     assert!(path.is_file(), "{} is missing from the real data", path.display());
     Some(path)
-}
-
-/// The repository.
-fn root() -> PathBuf {
-    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut above = package.ancestors();
-    above
-        .find(|dir| dir.join("Cargo.lock").is_file())
-        .expect("a package within the repository")
-        .to_owned()
 }

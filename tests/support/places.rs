@@ -11,7 +11,7 @@ use wildcity_twin::store::{
 
 use crate::s3::{S3, keys};
 use crate::scene_files::gaussians;
-use crate::support::{files, street};
+use crate::versions::{files, street};
 
 pub(crate) fn whole(scene: &Gaussians) -> NewVersion<'_> {
     NewVersion { storage: StorageOptions::default(), ..street(scene) }

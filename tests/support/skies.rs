@@ -25,7 +25,7 @@ pub(crate) const SKY_FROM_WORLD: DMat3 = DMat3::from_cols(
 
 /// The demo twin's sky.
 pub(crate) fn demo_sky() -> PathBuf {
-    root().join("scenes/sky.safetensors")
+    crate::root::root().join("scenes/sky.safetensors")
 }
 
 /// The demo twin's sky with the appearance of one image, or the mean appearance.
@@ -106,14 +106,4 @@ pub(crate) fn draw_seen(
     let frame = Frame { scene, profile: &RenderProfile::DEFAULT, views: &[view] };
     backend.render(&frame, &mut [target], &|_, _| {}).unwrap();
     image
-}
-
-/// The repository.
-fn root() -> PathBuf {
-    let package = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut above = package.ancestors();
-    above
-        .find(|dir| dir.join("Cargo.lock").is_file())
-        .expect("a package within the repository")
-        .to_owned()
 }
