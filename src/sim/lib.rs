@@ -7,6 +7,7 @@ pub mod contact;
 pub mod ego;
 pub mod ground;
 pub mod limits;
+pub mod traffic;
 
 pub use ego::{Command, Dynamics, Ego, EgoError, EgoModel};
 pub use ground::Ground;
