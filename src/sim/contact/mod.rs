@@ -19,9 +19,9 @@ mod footprint;
 mod solid;
 mod sweep;
 
-pub use body::{Body, BodySize};
-pub use detector::{ActorMotion, Contact, Detector, EgoMotion, MAX_SWEPT_SPEED_MPS};
-pub use fault::{CollisionType, FaultInput, LanePosition, is_ego_at_fault};
+pub use body::Body;
+pub use detector::{Contact, Detector, MAX_SWEPT_SPEED_MPS};
+pub use fault::{BEHIND_RAD, CollisionType, FaultInput, LanePosition, STANDING_MPS, is_ego_at_fault};
 pub use footprint::{Footprint, TOUCH_M};
 pub use solid::{SolidPoint, StaticLimit, solid_area_m2};
 pub use sweep::{Moving, overlap_s, time_to_contact_s};
