@@ -107,9 +107,8 @@ impl NavigationRoute {
         speed_mps: f64,
     ) -> RouteView {
         let rig_from_world = world_from_rig.inverse();
-        let in_rig_m = |station_m: f64| {
-            rig_from_world.transform_point(self.course.point_m(station_m))
-        };
+        let in_rig_m =
+            |station_m: f64| rig_from_world.transform_point(self.course.point_m(station_m));
         let length_m = self.course.length_m();
         let stations_m = (0..limits::ROUTE_POINTS)
             .map(|point| progress.station_m + f64::from(point) * POINT_SPACING_M);
@@ -180,10 +179,7 @@ mod tests {
     }
 
     fn at(x_m: f64, y_m: f64, yaw_rad: f64) -> Pose {
-        Pose {
-            position_m: DVec3::new(x_m, y_m, 0.0),
-            rotation: DQuat::from_rotation_z(yaw_rad),
-        }
+        Pose { position_m: DVec3::new(x_m, y_m, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) }
     }
 
     #[test]

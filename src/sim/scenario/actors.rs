@@ -19,8 +19,8 @@ use super::pose::pose_of;
 use super::resolve::{AssetInfo, EgoStart, Surroundings, drive_named, points_of};
 use super::tracks::{TrackSection, box_of};
 use crate::traffic::{
-    Action, Actor, ActorSpec, After, Attack, Behaviour, Condition, Course, Follow, Idm, Near, Track,
-    TrackKeyframe, Trigger,
+    Action, Actor, ActorSpec, After, Attack, Behaviour, Condition, Course, Follow, Idm, Near,
+    Track, TrackKeyframe, Trigger,
 };
 use crate::{Ground, limits};
 
@@ -128,7 +128,8 @@ pub(super) fn actors_of(
         let path = format!("actors[{index}].name");
         named(&path, &section.name)?;
         if indices.insert(section.name.clone(), recorded_count + index).is_some() {
-            let message = format!("{:?} is there twice; give each actor its own name", section.name);
+            let message =
+                format!("{:?} is there twice; give each actor its own name", section.name);
             return Err(FileError::new(path, message));
         }
     }
@@ -191,11 +192,7 @@ fn start_time_us(around: &Surroundings<'_>, start: Option<&EgoStart>) -> i64 {
     route.map_or(0, |route| route.at(*station_m).time_us)
 }
 
-fn asset_of(
-    path: &str,
-    name: &str,
-    around: &Surroundings<'_>,
-) -> Result<AssetInfo, FileError> {
+fn asset_of(path: &str, name: &str, around: &Surroundings<'_>) -> Result<AssetInfo, FileError> {
     (around.asset)(name).ok_or_else(|| {
         let message = format!(
             "there is no asset {name:?}; write the hash of one that `wildcity actor list` shows, or leave it out"
@@ -238,7 +235,10 @@ fn actor_of(
     let along_rad = section.jitter.and_then(|jitter| jitter.along_rad);
     let behaviour = if let Some(log) = &section.log {
         if section.jitter.is_some() {
-            return Err(FileError::new("jitter", "is not for log; use collide to displace a track"));
+            return Err(FileError::new(
+                "jitter",
+                "is not for log; use collide to displace a track",
+            ));
         }
         let track = track_named(&log.track, around)?;
         track_class = Some(track.class);
@@ -263,7 +263,8 @@ fn actor_of(
     };
     let is_follow = matches!(behaviour, Behaviour::Follow(_));
     if is_follow && (drawn.yaw_rad != 0.0 || along_rad.is_some()) {
-        let message = "yaw_rad and along_rad are for collide, attack and stand: a course has its own heading";
+        let message =
+            "yaw_rad and along_rad are for collide, attack and stand: a course has its own heading";
         return Err(FileError::new("jitter", message));
     }
     let class = class.or(track_class).unwrap_or(ActorClass::Vehicle);
@@ -273,12 +274,7 @@ fn actor_of(
         (None, None) => usual_box(class),
     };
     let mut actor = Actor {
-        spec: ActorSpec {
-            name: section.name.clone(),
-            class,
-            box_,
-            asset: section.asset.clone(),
-        },
+        spec: ActorSpec { name: section.name.clone(), class, box_, asset: section.asset.clone() },
         behaviour,
         script: Vec::new(),
         present: section.present.unwrap_or(true),
@@ -297,10 +293,7 @@ fn usual_box(class: ActorClass) -> ActorBox {
     }
 }
 
-fn track_named<'a>(
-    id: &str,
-    around: &Surroundings<'a>,
-) -> Result<&'a TrackSection, FileError> {
+fn track_named<'a>(id: &str, around: &Surroundings<'a>) -> Result<&'a TrackSection, FileError> {
     let Some(tracks) = around.tracks else {
         let message = "needs a tracks file: write \"tracks\": {\"file\": ..}";
         return Err(FileError::new("log.track", message));
@@ -429,8 +422,9 @@ fn through_positions(
             return Err(FileError::new(format!("{path}.time_s"), message));
         }
         times_us.push(time_us);
-        let pose = Pose::checked(position.xyz, [1.0, 0.0, 0.0, 0.0])
-            .map_err(|error| FileError::new(format!("{path}.{}", error.field()), error.to_string()))?;
+        let pose = Pose::checked(position.xyz, [1.0, 0.0, 0.0, 0.0]).map_err(|error| {
+            FileError::new(format!("{path}.{}", error.field()), error.to_string())
+        })?;
         points_m.push(pose.position_m);
     }
     let yaw_rad = section.yaw_rad.unwrap_or(0.0);
@@ -439,13 +433,14 @@ fn through_positions(
     let shift_m = displacement_m(drawn, along_rad.unwrap_or(first_rad));
     let ground = Ground::from_drives(around.drives);
     let mut heading_rad = first_rad;
-    let keyframes = points_m.iter().zip(&times_us).enumerate().map(|(index, (point_m, time_us))| {
-        // An actor that stands keeps its heading; the first one has the given heading.
-        heading_rad = facing_rad(&points_m, index).unwrap_or(heading_rad);
-        let rotation = DQuat::from_rotation_z(heading_rad + drawn.yaw_rad);
-        let pose = Pose { position_m: *point_m + shift_m, rotation };
-        TrackKeyframe { time_us: *time_us, world_from_actor: ground.place(pose) }
-    });
+    let keyframes =
+        points_m.iter().zip(&times_us).enumerate().map(|(index, (point_m, time_us))| {
+            // An actor that stands keeps its heading; the first one has the given heading.
+            heading_rad = facing_rad(&points_m, index).unwrap_or(heading_rad);
+            let rotation = DQuat::from_rotation_z(heading_rad + drawn.yaw_rad);
+            let pose = Pose { position_m: *point_m + shift_m, rotation };
+            TrackKeyframe { time_us: *time_us, world_from_actor: ground.place(pose) }
+        });
     track_of(keyframes.collect())
 }
 
@@ -607,11 +602,7 @@ fn condition_of(
 }
 
 /// A trigger by `TRIGGER` or `ACTOR/TRIGGER`.
-fn trigger_named(
-    text: &str,
-    own: usize,
-    references: &References<'_>,
-) -> Result<After, FileError> {
+fn trigger_named(text: &str, own: usize, references: &References<'_>) -> Result<After, FileError> {
     let missing = || {
         let message = format!("there is no trigger {text:?}; write TRIGGER or ACTOR/TRIGGER");
         FileError::new("after", message)

@@ -171,7 +171,8 @@ fn replace_names(
         Value::String(text) => {
             if let Some(name) = sweep_name(text) {
                 let Some(chosen) = values.get(name) else {
-                    let message = format!("\"${name}\" has no value: give one, or a sweep over {name:?}");
+                    let message =
+                        format!("\"${name}\" has no value: give one, or a sweep over {name:?}");
                     return Err(FileError::new(path.trim_start_matches('.'), message));
                 };
                 *value = chosen.clone();

@@ -81,7 +81,8 @@ impl EndRules {
         let is_slow = input.velocity_mps.length() < limits::STUCK_M_S;
         stuck.since_us = is_slow.then(|| stuck.since_us.unwrap_or(input.time_us));
         let slow_us = stuck.since_us.map_or(-1, |since_us| input.time_us - since_us);
-        let off_route = self.off_route_m.zip(input.off_route_m).is_some_and(|(most, off)| off > most);
+        let off_route =
+            self.off_route_m.zip(input.off_route_m).is_some_and(|(most, off)| off > most);
         let holds = [
             (EndReason::Contact, self.contact.is_some() && input.has_contact),
             (EndReason::OffRoute, off_route),

@@ -47,8 +47,9 @@ pub(crate) fn json(
         let message = format!("{} bytes; at most {limit_bytes} are accepted", bytes.len());
         return Err(FileError::new(root, message));
     }
-    serde_json::from_slice(bytes)
-        .map_err(|error| FileError::new(root, format!("not JSON: {error}; correct the syntax there")))
+    serde_json::from_slice(bytes).map_err(|error| {
+        FileError::new(root, format!("not JSON: {error}; correct the syntax there"))
+    })
 }
 
 /// Checks that a number is within bounds; NaN is not.

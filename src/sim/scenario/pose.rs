@@ -24,6 +24,5 @@ pub(super) fn pose_of(path: &str, section: &PoseSection) -> Result<Pose, FileErr
             [rotation.w, rotation.x, rotation.y, rotation.z]
         }
     };
-    Pose::checked(section.xyz, q_wxyz)
-        .map_err(|error| refused(error.field(), error.to_string()))
+    Pose::checked(section.xyz, q_wxyz).map_err(|error| refused(error.field(), error.to_string()))
 }

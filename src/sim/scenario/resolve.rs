@@ -83,10 +83,8 @@ pub enum EgoStart {
 }
 
 /// The ego's box unless a scenario says otherwise: AlpaSim's vehicle.
-const EGO_BOX: EgoBox = EgoBox {
-    box_: ActorBox { length_m: 5.393, width_m: 2.109, height_m: 1.503 },
-    center_x_m: 1.3,
-};
+const EGO_BOX: EgoBox =
+    EgoBox { box_: ActorBox { length_m: 5.393, width_m: 2.109, height_m: 1.503 }, center_x_m: 1.3 };
 
 /// A frame of NeuroNCAP, by which a start is shifted, in microseconds.
 const START_FRAME_US: i64 = 500_000;
@@ -129,7 +127,8 @@ impl Scenario {
             }
             None => default_route(start.as_ref(), &mut courses),
         };
-        let (actors, trigger_names) = actors_of(&mut file, seed, around, start.as_ref(), &mut courses)?;
+        let (actors, trigger_names) =
+            actors_of(&mut file, seed, around, start.as_ref(), &mut courses)?;
         let end = end_of(&file.end, route.is_some()).map_err(|error| error.within("end"))?;
         if let Some(progress) = file.verdict.progress {
             in_range("verdict.progress", progress, [0.0, 1.0])?;

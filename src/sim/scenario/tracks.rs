@@ -122,7 +122,10 @@ impl TrackSection {
 }
 
 /// A box of length, width and height.
-pub(super) fn box_of(path: &str, [length_m, width_m, height_m]: [f64; 3]) -> Result<ActorBox, FileError> {
+pub(super) fn box_of(
+    path: &str,
+    [length_m, width_m, height_m]: [f64; 3],
+) -> Result<ActorBox, FileError> {
     let box_ = ActorBox { length_m, width_m, height_m };
     box_.check().map_err(|error| FileError::new(path, error.to_string()))?;
     Ok(box_)

@@ -122,8 +122,7 @@ pub fn candidates(speed_mps: f64) -> Vec<Spline> {
             let end_mps = speed_mps + acceleration * PLAN_S;
             for heading_rad in HEADINGS_RAD {
                 let direction = DVec2::from_angle(end_m.to_angle() + heading_rad);
-                let spline =
-                    Spline { begin_mps: speed_mps, end_m, end_mps: end_mps * direction };
+                let spline = Spline { begin_mps: speed_mps, end_m, end_mps: end_mps * direction };
                 if spline.is_drivable() {
                     kept.push(spline);
                 }

@@ -231,7 +231,11 @@ mod tests {
         assert!((beside.left_m - 2.0).abs() < 1e-2 && beside.distance_m >= 1.99, "{beside:?}");
         let back = arc.reversed();
         assert!((back.at(0.0).position_m - arc.at(arc.length_m()).position_m).length() < 1e-9);
-        assert!((back.at(3.0).rotation * DVec3::X + arc.at(arc.length_m() - 3.0).rotation * DVec3::X).length() < 1e-9);
+        assert!(
+            (back.at(3.0).rotation * DVec3::X + arc.at(arc.length_m() - 3.0).rotation * DVec3::X)
+                .length()
+                < 1e-9
+        );
         assert!((back.curvature_1_m(12.0) + 0.05).abs() < 1e-5);
     }
 

@@ -151,7 +151,8 @@ impl Follow {
             edges_m: [offset_m.min(target_m) - half_width_m, offset_m.max(target_m) + half_width_m],
             half_length_m: 0.5 * box_.length_m,
             height_m: box_.height_m,
-            ahead_m: (limits::LEAD_GAPS * idm.desired_gap_m(now.speed_mps, 0.0)).clamp(least_m, most_m),
+            ahead_m: (limits::LEAD_GAPS * idm.desired_gap_m(now.speed_mps, 0.0))
+                .clamp(least_m, most_m),
         };
         let body = lead_ahead(course, &corridor, own, bodies);
         if self.leaves {

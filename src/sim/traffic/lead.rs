@@ -98,9 +98,8 @@ pub(super) fn lead_ahead(
             continue;
         }
         let Some(found) = found_in(course, corridor, body, reach_m, to_m) else { continue };
-        let is_nearer = lead.is_none_or(|lead| {
-            (found.gap_m, found.speed_mps) < (lead.gap_m, lead.speed_mps)
-        });
+        let is_nearer =
+            lead.is_none_or(|lead| (found.gap_m, found.speed_mps) < (lead.gap_m, lead.speed_mps));
         if is_nearer {
             lead = Some(found);
         }
@@ -134,7 +133,8 @@ fn found_in(
     let half_along_m = body.half_length_m * cos + body.half_width_m * sin;
     let half_across_m = body.half_length_m * sin + body.half_width_m * cos;
     let [right_m, left_m] = corridor.edges_m;
-    let is_inside = beside.left_m - half_across_m < left_m && beside.left_m + half_across_m > right_m;
+    let is_inside =
+        beside.left_m - half_across_m < left_m && beside.left_m + half_across_m > right_m;
     is_inside.then(|| Lead {
         gap_m: beside.station_m - half_along_m - corridor.station_m - corridor.half_length_m,
         speed_mps: body.velocity_mps.dot(ahead),

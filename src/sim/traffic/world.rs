@@ -190,7 +190,8 @@ impl World {
     fn bodies(&self, ego: &EgoState) -> Vec<Body> {
         let present = self.states.iter().filter(|state| state.present);
         let actors = &self.traffic.actors;
-        let boxes = present.map(|state| Body::of_actor(&actors[usize::from(state.index)].spec, state));
+        let boxes =
+            present.map(|state| Body::of_actor(&actors[usize::from(state.index)].spec, state));
         std::iter::once(Body::of_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
     }
 
@@ -238,7 +239,11 @@ impl World {
         // An actor that has not appeared yet waits where it will: distances to it count.
         let own_m = match state.present {
             true => state.world_from_actor.position_m,
-            false => run.state(index, &traffic.actors[index], self.time_us, None).world_from_actor.position_m,
+            false => {
+                run.state(index, &traffic.actors[index], self.time_us, None)
+                    .world_from_actor
+                    .position_m
+            }
         };
         let near = |near: Near| {
             let other_m = match near.actor {
@@ -284,8 +289,7 @@ impl World {
                 run.advance(traffic, actor, state, bodies, [begin_us, end_us]);
                 match run.there {
                     true => {
-                        let before =
-                            state.present.then_some((state.world_from_actor, duration_s));
+                        let before = state.present.then_some((state.world_from_actor, duration_s));
                         run.state(index, actor, end_us, before)
                     }
                     false => absent(index),
@@ -316,10 +320,11 @@ impl EgoMotion {
             let dt_s = dt_us as f64 * 1e-6;
             // Hermite's cubic: the ends' positions and velocities. On an arc its error is
             // (v dt)⁴ κ³ / 384: 0.1 mm at 10 m/s, 0.5 s and 0.05 1/m.
-            pose.position_m = (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t) * from.world_from_rig.position_m
-                + t * t * (3.0 - 2.0 * t) * to.world_from_rig.position_m
-                + dt_s * t * (1.0 - t) * (1.0 - t) * from.velocity_mps
-                - dt_s * t * t * (1.0 - t) * to.velocity_mps;
+            pose.position_m =
+                (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t) * from.world_from_rig.position_m
+                    + t * t * (3.0 - 2.0 * t) * to.world_from_rig.position_m
+                    + dt_s * t * (1.0 - t) * (1.0 - t) * from.velocity_mps
+                    - dt_s * t * t * (1.0 - t) * to.velocity_mps;
         }
         let velocity_mps = match self.smooth {
             true => from.velocity_mps.lerp(to.velocity_mps, t),
@@ -379,7 +384,14 @@ impl Run {
                 let is_first = now.plans == 0;
                 let is_due = begin_us.saturating_sub(now.begin_us) >= attack.plan_us;
                 if before.present && (is_first || is_due) {
-                    *now = now.planned(traffic.seed, attack, &actor.spec.name, before, bodies, begin_us);
+                    *now = now.planned(
+                        traffic.seed,
+                        attack,
+                        &actor.spec.name,
+                        before,
+                        bodies,
+                        begin_us,
+                    );
                 } else if !before.present {
                     now.begin_us = begin_us;
                 }
@@ -407,7 +419,9 @@ impl Run {
                     present: true,
                 },
             },
-            (Behaviour::Follow(follow), Mode::Follow(now)) => follow.state(index as u16, now, before),
+            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+                follow.state(index as u16, now, before)
+            }
             (Behaviour::Attack { .. }, Mode::Attack(now)) => now.state(index, time_us, before),
             _ => absent(index),
         }
@@ -469,7 +483,13 @@ impl Attacking {
         let yaw_rate_radps = before.map_or(0.0, |(before, duration_s)| {
             turned_rad(before.rotation, pose.rotation) / duration_s
         });
-        ActorState { index: index as u16, world_from_actor: pose, velocity_mps, yaw_rate_radps, present: true }
+        ActorState {
+            index: index as u16,
+            world_from_actor: pose,
+            velocity_mps,
+            yaw_rate_radps,
+            present: true,
+        }
     }
 }
 

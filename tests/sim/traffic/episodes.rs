@@ -46,8 +46,7 @@ fn follow(course: &Arc<Course>, station_m: f64, speed_mps: f64, idm: Option<Idm>
 }
 
 fn actor(name: &str, behaviour: Behaviour, script: Vec<Trigger>) -> Actor {
-    let spec =
-        ActorSpec { name: name.into(), class: ActorClass::Vehicle, box_: CAR, asset: None };
+    let spec = ActorSpec { name: name.into(), class: ActorClass::Vehicle, box_: CAR, asset: None };
     Actor { spec, behaviour, script, present: true }
 }
 
@@ -82,7 +81,11 @@ fn an_idm_car_comes_to_rest_before_a_wall() {
         for (second, expected) in case.expected["at_s"].as_object().unwrap() {
             let second: i64 = second.parse().unwrap();
             // The map's keys are not in order of time.
-            let mut world = if second == 5 { world.clone() } else { World::new(Arc::new(world.traffic().clone())) };
+            let mut world = if second == 5 {
+                world.clone()
+            } else {
+                World::new(Arc::new(world.traffic().clone()))
+            };
             while world.time_us() < second * 1_000_000 {
                 world.step(step_us, &away(), &mut |_| {});
             }
@@ -97,7 +100,8 @@ fn an_idm_car_comes_to_rest_before_a_wall() {
 
 #[test]
 fn sub_steps_are_at_most_ten_milliseconds_and_cover_the_step() {
-    let mut world = World::new(traffic(vec![actor("a", follow(&straight(99.0), 5.0, 3.0, None), vec![])]));
+    let mut world =
+        World::new(traffic(vec![actor("a", follow(&straight(99.0), 5.0, 3.0, None), vec![])]));
     let mut ends = vec![0];
     world.step(25_000, &away(), &mut |sub_step| {
         assert_eq!(sub_step.begin_us, *ends.last().unwrap());
@@ -202,7 +206,8 @@ fn an_attacker_reaches_an_ego_that_does_nothing() {
     for _ in 0..80 {
         world.step(100_000, &at_rest(DVec3::ZERO), &mut |sub_step| {
             let state = sub_step.after[0];
-            let way_m = state.world_from_actor.position_m - state_before.world_from_actor.position_m;
+            let way_m =
+                state.world_from_actor.position_m - state_before.world_from_actor.position_m;
             assert!(way_m.length() < 0.5, "no jump between plans: {way_m}");
             state_before = state;
         });
