@@ -13,6 +13,7 @@
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
+//! | `scenario` | scenarios by name, and the files beside them |
 //! | `preview` | the preview of a push |
 //! | [`limits`] | limits and defaults |
 
@@ -26,6 +27,7 @@ mod options;
 mod prefetch;
 mod preview;
 mod record;
+mod scenario;
 mod session;
 mod start;
 mod viewpoint;
@@ -53,5 +55,6 @@ pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
+pub use scenario::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
 pub use session::Session;
 pub use viewpoint::viewpoints;
