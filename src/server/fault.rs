@@ -66,6 +66,14 @@ pub(crate) enum Fault {
         /// The name asked for.
         name: String,
     },
+    /// There is no session of that name to open another one from.
+    #[error("there is no session {name:?} of this token; it ended, or was never opened")]
+    NoSuchSession {
+        /// The field of the request that names it.
+        field: &'static str,
+        /// The name asked for.
+        name: String,
+    },
     /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {

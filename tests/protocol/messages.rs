@@ -185,6 +185,9 @@ fn requests() -> Vec<(&'static str, Request)> {
     let start = Start::Pose { pose: there };
     let client = ClientInfo { name: "golden".into(), version: "0.1.0".into() };
     let protocols = vec![PROTOCOL.to_owned()];
+    let taken =
+        BranchPoint::Snapshot { session: "run-17".into(), snapshot: "before-junction".into() };
+    let recorded = BranchPoint::Recorded { episode: "run-17-1".into(), step: 40 };
     vec![
         ("hello", Request::Hello { seq: 0, client, protocols }),
         ("open", Request::Open(Box::new(open))),
@@ -202,6 +205,10 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
         ("switch_version", Request::SwitchVersion { seq: 8, version: Some(4) }),
         ("switch_latest", Request::SwitchVersion { seq: 8, version: None }),
+        ("snapshot", Request::Snapshot { seq: 9, name: "before-junction".into() }),
+        ("restore", Request::Restore { seq: 10, name: "before-junction".into() }),
+        ("branch", Request::Branch(Branch { seq: 1, from: taken, session: Some("run-18".into()) })),
+        ("branch_recorded", Request::Branch(Branch { seq: 1, from: recorded, session: None })),
         ("close", Request::Close { seq: 8 }),
         ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
     ]

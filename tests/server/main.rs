@@ -8,6 +8,7 @@ mod root;
 mod support;
 
 mod appearance;
+mod branches;
 mod bundles;
 mod ego;
 mod http;

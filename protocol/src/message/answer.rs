@@ -26,7 +26,7 @@ pub enum Answer {
         /// Twins that can be opened.
         twins: Vec<TwinInfo>,
     },
-    /// Answer to `open`: every setting of the session, defaults included.
+    /// Answer to `open` and to `branch`: every setting of the session, defaults included.
     Opened(Box<Opened>),
     /// Answer to `resume`.
     Resumed {
@@ -42,7 +42,7 @@ pub enum Answer {
         /// Simulated time, in microseconds.
         time_us: i64,
     },
-    /// Answer to `prefetch`.
+    /// Answer to `prefetch` and to `snapshot`.
     Ok {
         /// Number of the request.
         seq: u64,
@@ -166,7 +166,7 @@ pub struct Opened {
     pub backend: String,
     /// Seed of the first episode.
     pub seed: u64,
-    /// `world_from_rig` at time zero.
+    /// `world_from_rig` at time zero; after `branch`, where a `reset` without a start begins.
     pub start: Pose,
     /// How the ego moves.
     pub dynamics: Dynamics,

@@ -6,11 +6,13 @@
 //! Unknown fields of answers are ignored, because answers may gain fields.
 
 mod answer;
+mod branch;
 mod open;
 mod pose;
 mod request;
 
 pub use answer::{Answer, Limits, Opened, Outcome, ServerInfo, Summary, TrajectoryInfo, TwinInfo};
+pub use branch::{Branch, BranchPoint};
 pub use open::{
     Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, Rig, RigCamera,
     RigChoice, Start,

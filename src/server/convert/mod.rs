@@ -25,7 +25,7 @@ pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welc
 pub(crate) use fault::{WireCode, code, http_status, refusal_body, refused};
 pub(crate) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
 pub(crate) use observation::observation;
-pub(crate) use request::{Command, Parsed, parse};
+pub(crate) use request::{BranchPoint, Command, Parsed, parse};
 
 /// The WebSocket subprotocol.
 pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;

@@ -92,6 +92,22 @@ class Station:
 
 
 @dataclass(frozen=True)
+class SnapshotPoint:
+    """A snapshot of a session that still exists, on any connection with the same token."""
+
+    session: str
+    snapshot: str
+
+
+@dataclass(frozen=True)
+class RecordedPoint:
+    """A step of an episode that the server has recorded; `episode` is the name of its file, without `.jsonl`."""
+
+    episode: str
+    step: int
+
+
+@dataclass(frozen=True)
 class Lens:
     """A lens model other than the pinhole. Each model has its own fields; the others are None.
 
@@ -317,7 +333,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Ok:
-    """Answer to `prefetch`."""
+    """Answer to `prefetch` and to `snapshot`."""
 
     seq: int
 

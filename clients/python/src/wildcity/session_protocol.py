@@ -28,9 +28,11 @@ from .protocol import (
     Opened,
     Outputs,
     Pose,
+    RecordedPoint,
     Refusal,
     Resumed,
     Rig,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -120,6 +122,23 @@ class SessionProtocol:
         if start is not None:
             fields["start"] = _start(start)
         return (yield from self._next("reset", Observation, fields))
+
+    def branch(self, point: SnapshotPoint | RecordedPoint, session: str | None) -> Exchange[Opened]:
+        """Opens a session in a state of another episode."""
+        fields = {"from": encode(point)}
+        if session is not None:
+            fields["session"] = session
+        opened = yield from self._next("branch", Opened, fields)
+        self.session = opened.session
+        return opened
+
+    def snapshot(self, name: str) -> Exchange[None]:
+        """Stores the state of the episode under a name."""
+        yield from self._next("snapshot", Ok, {"name": name})
+
+    def restore(self, name: str) -> Exchange[Observation]:
+        """Returns to a snapshot."""
+        return (yield from self._next("restore", Observation, {"name": name}))
 
     def switch_version(self, version: int | None) -> Exchange[Switched]:
         """Shows another version of the twin."""
