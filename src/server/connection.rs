@@ -12,7 +12,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
 
 use crate::auth::Grant;
-use crate::convert::{self, BranchPoint, Command, Parsed};
+use crate::convert::{self, BranchPoint, Command, DriveRequest, Parsed};
 use crate::fault::Fault;
 use crate::limits;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
@@ -180,7 +180,7 @@ impl Connection {
             {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, opening } => self.open(seq, name, *opening).await,
+            Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
             Command::Branch { name, from } => self.branch(seq, name, from).await,
             Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
             Command::Step { movement, terminate } => {
@@ -249,13 +249,14 @@ impl Connection {
         seq: u64,
         name: Option<String>,
         mut opening: SessionOptions,
+        drive: Option<DriveRequest>,
     ) -> Result<Answer, Fault> {
         opening.profile = opening.profile.or(&self.state.profile);
         self.grant.require_twin(&opening.twin)?;
         let name = name.unwrap_or_else(new_session_name);
         let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
         let opened = Session::open(self.state.engine.clone(), name, opening);
-        self.fill(seq, slot, opened).await
+        self.fill(seq, slot, drive, opened).await
     }
 
     /// Opens a session in a state of another episode.
@@ -273,13 +274,13 @@ impl Connection {
                 let from = snapshots.find("from.snapshot", &snapshot)?;
                 self.grant.require_twin(from.twin())?;
                 let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, Session::branch(engine, name, &from)).await
+                self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
             }
             BranchPoint::Recorded { episode, step } => {
                 let from = Session::recorded(&engine, &episode, step).await?;
                 self.grant.require_twin(from.twin())?;
                 let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, Session::continued(engine, name, from)).await
+                self.fill(seq, slot, None, Session::continued(engine, name, from)).await
             }
         }
     }
@@ -289,11 +290,12 @@ impl Connection {
         &mut self,
         seq: u64,
         mut slot: SlotGuard,
+        drive: Option<DriveRequest>,
         opening: impl Future<Output = Result<Session, SessionError>>,
     ) -> Result<Answer, Fault> {
         let opened = timeout(self.state.limits.step, opening).await;
         let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
-        let text = convert::opened(seq, &session)?;
+        let text = convert::opened(seq, &session, drive.as_ref())?;
         tracing::info!(session = session.name(), "opened");
         slot.share_snapshots(&session);
         slot.session = Some(session);

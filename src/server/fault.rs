@@ -74,6 +74,16 @@ pub(crate) enum Fault {
         /// The name asked for.
         name: String,
     },
+    /// The twin has no trajectory of this name.
+    #[error("the twin has no trajectory {name:?}; it has {}", known.join(", "))]
+    UnknownTrajectory {
+        /// The field of the request that names it.
+        field: String,
+        /// The name asked for.
+        name: String,
+        /// The names of the twin's trajectories.
+        known: Vec<String>,
+    },
     /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {

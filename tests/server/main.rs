@@ -10,6 +10,7 @@ mod support;
 mod appearance;
 mod branches;
 mod bundles;
+mod drives;
 mod ego;
 mod http;
 mod leases;

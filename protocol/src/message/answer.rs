@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::Drive;
 use super::open::{Dynamics, Outputs, RigCamera};
 use super::pose::Pose;
 use crate::error::Code;
@@ -186,6 +187,9 @@ pub struct Opened {
     pub trajectories: Vec<TrajectoryInfo>,
     /// Memory of the server that is reserved for the largest frame of the session, in bytes.
     pub reserved_bytes: u64,
+    /// The part of a recorded drive that `open` asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<Drive>,
 }
 
 /// Summary of an episode.

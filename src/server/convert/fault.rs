@@ -150,6 +150,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::SessionState(_) | Fault::Replaced => plain(Code::SessionState),
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
         Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
+        Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {

@@ -16,6 +16,7 @@ use wildcity_session::{
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
+use super::drive::DriveRequest;
 use super::field::{name_of, pose_of, poses_of};
 use super::non_finite::{NonFinite, find_non_finite};
 use super::rig::rig_of;
@@ -48,6 +49,8 @@ pub(crate) enum Command {
         name: Option<String>,
         /// What is opened.
         opening: Box<SessionOptions>,
+        /// The part of a recorded drive that the answer is to have.
+        drive: Option<DriveRequest>,
     },
     /// Carries out a step.
     Step {
@@ -309,7 +312,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         decision_us: open.decision_us,
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
-    Ok(Command::Open { name, opening: Box::new(opening) })
+    Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
 }
 
 fn branch_command(branch: message::Branch) -> Result<Command, Fault> {

@@ -21,6 +21,9 @@ from .observation import Observation, View
 from .protocol import (
     Action,
     Camera,
+    Drive,
+    DrivePose,
+    DriveSection,
     Dynamics,
     Ego,
     Exposure,
@@ -48,7 +51,7 @@ from .protocol import (
     Windshield,
     png_data_uri,
 )
-from .pushing import Push, PushProgress, push, rollback
+from .pushing import Push, PushProgress, push, recorded_drive, rollback
 from .sync import Client, Session, connect
 
 __version__ = _version("wildcity")
@@ -61,6 +64,9 @@ __all__ = [
     "Code",
     "ConnectFailed",
     "Disconnected",
+    "Drive",
+    "DrivePose",
+    "DriveSection",
     "Dynamics",
     "Ego",
     "Exposure",
@@ -99,5 +105,6 @@ __all__ = [
     "connect",
     "png_data_uri",
     "push",
+    "recorded_drive",
     "rollback",
 ]

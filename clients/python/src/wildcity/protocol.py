@@ -92,6 +92,39 @@ class Station:
 
 
 @dataclass(frozen=True)
+class DriveSection:
+    """A part of a recorded drive: from `from_m` (0) to `to_m` (its end), with a pose every `every_m` metres.
+
+    Without `every_m` the poses are the recorded keyframes.
+    """
+
+    name: str
+    from_m: float | None = None
+    to_m: float | None = None
+    every_m: float | None = None
+
+
+@dataclass(frozen=True)
+class DrivePose:
+    """A pose of a recorded drive (`world_from_rig`), its distance from the start and its time on the drive's clock."""
+
+    station_m: float
+    time_us: int
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Poses of a recorded drive, in driving order; `length_m` is that of the whole drive."""
+
+    name: str
+    version: int
+    version_hash: str
+    length_m: float
+    poses: tuple[DrivePose, ...]
+
+
+@dataclass(frozen=True)
 class SnapshotPoint:
     """A snapshot of a session that still exists, on any connection with the same token."""
 
@@ -294,6 +327,7 @@ class Opened:
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
+    trajectory: Drive | None = None
 
 
 @dataclass(frozen=True)

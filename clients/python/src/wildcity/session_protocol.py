@@ -22,6 +22,7 @@ from .protocol import (
     PROTOCOL,
     Action,
     Closed,
+    DriveSection,
     Dynamics,
     Model,
     Ok,
@@ -83,6 +84,7 @@ class SessionProtocol:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
         optional = {
@@ -96,6 +98,7 @@ class SessionProtocol:
             "deadline_ms": deadline_ms,
             "decision_us": decision_us,
             "warm_up_us": warm_up_us,
+            "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}
         fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}

@@ -27,6 +27,7 @@ from .observation import Observation
 from .protocol import (
     PROTOCOL,
     Action,
+    DriveSection,
     Dynamics,
     Model,
     Opened,
@@ -91,6 +92,7 @@ class Client:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
 
@@ -111,6 +113,7 @@ class Client:
                 deadline_ms=deadline_ms,
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
+                trajectory=trajectory,
             )
         )
         return Session(self, opened)
