@@ -7,7 +7,9 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use crate::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
+use crate::message::{
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start,
+};
 
 /// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
 ///
@@ -55,6 +57,28 @@ impl<'de> Deserialize<'de> for Start {
                 Ok(Self::Station { trajectory, station_m: station_m.unwrap_or_default() })
             }
             _ => Err(D::Error::custom("a start has either pose, or trajectory and station_m")),
+        }
+    }
+}
+
+/// Decided by the fields that are present.
+impl<'de> Deserialize<'de> for BranchPoint {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Either {
+            session: Option<String>,
+            snapshot: Option<String>,
+            episode: Option<String>,
+            step: Option<u64>,
+        }
+        let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
+        match (session, snapshot, episode, step) {
+            (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),
+            (None, None, Some(episode), Some(step)) => Ok(Self::Recorded { episode, step }),
+            _ => Err(D::Error::custom(
+                "a branch is from either session and snapshot, or episode and step",
+            )),
         }
     }
 }

@@ -38,6 +38,8 @@ pub enum Code {
     UnknownTrajectory,
     /// There is no session of this name that can be resumed.
     UnknownSession,
+    /// There is no such snapshot or recorded episode, or the recorded episode cannot be continued.
+    UnknownState,
     /// A session of this name already exists.
     SessionExists,
     /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.

@@ -1,6 +1,7 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues
+//! exactly as the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
 //! new one before it replaces the old, so that a step which fails on the way has not happened.
 
 use std::collections::VecDeque;
@@ -20,7 +21,8 @@ use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
 
 /// The state of an episode.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Episode {
     seed: u64,
     dt_us: i64,
@@ -34,6 +36,7 @@ pub struct Episode {
     /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     begin_us: i64,
     /// The least mean trust of an observation, of those that came with a trust.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     least_trust: Option<f64>,
 }
 
@@ -162,6 +165,31 @@ impl Episode {
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         });
         selected.iter().map(|&camera| all[camera]).collect()
+    }
+
+    /// Checks a state that was read from a file. Returns what is wrong with it otherwise.
+    pub(crate) fn check(&self) -> Result<(), &'static str> {
+        let rising = self.track.iter().is_sorted_by(|a, b| a.time_us < b.time_us);
+        match self.track.back() {
+            None => Err("a state without a pose"),
+            Some(_) if !rising => Err("a state whose times do not rise"),
+            Some(_) if self.dt_us <= 0 => Err("a state whose steps take no time"),
+            Some(now) if now.world_from_rig != self.world_from_rig() => {
+                Err("a state whose last pose is not the ego's")
+            }
+            Some(_) => Ok(()),
+        }
+    }
+
+    /// The poses before its start, if it is still there.
+    pub(crate) fn warm_up(&self) -> Vec<Keyframe> {
+        let before = self.track.iter().filter(|key| self.step == 0 && key.time_us < 0);
+        before.copied().collect()
+    }
+
+    /// Whether it has its start alone: no step was made, and there is no warm-up before the start.
+    pub(crate) fn is_start_alone(&self) -> bool {
+        self.step == 0 && self.begin_us == 0
     }
 
     /// Seed of the episode.

@@ -27,6 +27,10 @@ pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 /// Sessions at once, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
 
+/// Snapshots of one session. A snapshot holds the last frames of a bundle, which count against
+/// [`ANSWERS_BYTES`], and the poses of 1.5 s.
+pub const SNAPSHOTS: usize = 64;
+
 /// Poses of one `observe` request.
 pub const OBSERVE_POSES: usize = 16;
 

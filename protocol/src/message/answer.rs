@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::Drive;
 use super::open::{Dynamics, Outputs, RigCamera};
 use super::pose::Pose;
 use crate::error::Code;
@@ -26,7 +27,7 @@ pub enum Answer {
         /// Twins that can be opened.
         twins: Vec<TwinInfo>,
     },
-    /// Answer to `open`: every setting of the session, defaults included.
+    /// Answer to `open` and to `branch`: every setting of the session, defaults included.
     Opened(Box<Opened>),
     /// Answer to `resume`.
     Resumed {
@@ -42,7 +43,7 @@ pub enum Answer {
         /// Simulated time, in microseconds.
         time_us: i64,
     },
-    /// Answer to `prefetch`.
+    /// Answer to `prefetch` and to `snapshot`.
     Ok {
         /// Number of the request.
         seq: u64,
@@ -166,7 +167,7 @@ pub struct Opened {
     pub backend: String,
     /// Seed of the first episode.
     pub seed: u64,
-    /// `world_from_rig` at time zero.
+    /// `world_from_rig` at time zero; after `branch`, where a `reset` without a start begins.
     pub start: Pose,
     /// How the ego moves.
     pub dynamics: Dynamics,
@@ -186,6 +187,9 @@ pub struct Opened {
     pub trajectories: Vec<TrajectoryInfo>,
     /// Memory of the server that is reserved for the largest frame of the session, in bytes.
     pub reserved_bytes: u64,
+    /// The part of a recorded drive that `open` asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<Drive>,
 }
 
 /// Summary of an episode.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::DriveSection;
 use super::pose::Pose;
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
 
@@ -83,6 +84,9 @@ pub struct Open {
     /// its frames are in the first bundle. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warm_up_us: Option<i64>,
+    /// A part of a recorded drive that the answer is to have.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<DriveSection>,
 }
 
 impl Open {
@@ -114,6 +118,7 @@ impl Open {
             deadline_ms: None,
             decision_us: None,
             warm_up_us: None,
+            trajectory: None,
         }
     }
 }

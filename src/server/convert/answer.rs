@@ -19,6 +19,7 @@ use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
+use super::drive::{DriveRequest, drive};
 
 /// Name of the server in `welcome`.
 const SERVER_NAME: &str = "wildcity";
@@ -52,10 +53,15 @@ pub(crate) fn welcome(
     })
 }
 
-/// The answer to `open`.
-pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
+/// The answer to `open`, with a part of a recorded drive if the client asked for one.
+pub(crate) fn opened(
+    seq: u64,
+    session: &Session,
+    section: Option<&DriveRequest>,
+) -> Result<String, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
+    let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let PixelMaps { depth, opacity, normals } = session.maps();
@@ -98,6 +104,7 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
+        trajectory: trajectory.transpose()?,
     })))
 }
 

@@ -104,6 +104,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::UnknownCamera
         | Code::UnknownTrajectory
         | Code::UnknownSession
+        | Code::UnknownState
         | Code::UnknownUpload
         | Code::UnknownPush => StatusCode::NOT_FOUND,
         Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
@@ -148,6 +149,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnsupportedProtocol { .. } => at(Code::UnsupportedProtocol, "protocols"),
         Fault::SessionState(_) | Fault::Replaced => plain(Code::SessionState),
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
+        Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
+        Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
@@ -215,6 +218,9 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::CameraTwice { index, .. } => {
             at(Code::OutOfRange, &format!("outputs.cameras[{index}]"))
         }
+        SessionError::UnknownSnapshot { field, .. } => at(Code::UnknownState, field),
+        SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
+        SessionError::Branch(_) => at(Code::UnknownState, "from"),
         SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
         SessionError::Profile(_) | SessionError::Sky(_) => at(Code::OutOfRange, "profile"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),

@@ -9,12 +9,14 @@ use wildcity_protocol::message::{self, Request};
 use wildcity_protocol::{PROTOCOL, unknown_field};
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
+use wildcity_session::is_episode_name;
 use wildcity_session::{
     Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
+use super::drive::DriveRequest;
 use super::field::{name_of, pose_of, poses_of};
 use super::non_finite::{NonFinite, find_non_finite};
 use super::rig::rig_of;
@@ -47,6 +49,8 @@ pub(crate) enum Command {
         name: Option<String>,
         /// What is opened.
         opening: Box<SessionOptions>,
+        /// The part of a recorded drive that the answer is to have.
+        drive: Option<DriveRequest>,
     },
     /// Carries out a step.
     Step {
@@ -77,6 +81,23 @@ pub(crate) enum Command {
         /// The version; the latest if there is none.
         version: Option<u64>,
     },
+    /// Stores the state of the episode.
+    Snapshot {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Returns to a snapshot.
+    Restore {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Opens a session in a state of another episode.
+    Branch {
+        /// Its name, if the client chose one.
+        name: Option<String>,
+        /// The state.
+        from: BranchPoint,
+    },
     /// Ends the session.
     Close,
     /// Takes over a session of an earlier connection.
@@ -85,6 +106,25 @@ pub(crate) enum Command {
         session: String,
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
+    },
+}
+
+/// A state of an episode, with names that are checked.
+#[derive(Debug)]
+pub(crate) enum BranchPoint {
+    /// A snapshot of a session.
+    Snapshot {
+        /// The session.
+        session: String,
+        /// The snapshot.
+        snapshot: String,
+    },
+    /// A step of a recorded episode.
+    Recorded {
+        /// The episode.
+        episode: String,
+        /// Steps done.
+        step: u64,
     },
 }
 
@@ -170,6 +210,8 @@ struct Fields {
     pose: Option<message::Pose>,
     trajectory: Option<Vec<message::TimedPose>>,
     action: Option<message::Action>,
+    name: Option<String>,
+    from: Option<message::BranchPoint>,
     dynamics: Option<message::DynamicsChoice>,
     poses: Option<Vec<message::Pose>>,
     terminate: Option<bool>,
@@ -205,6 +247,13 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, start.map(|start| Command::Reset { seed, start }))
         }
         Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
+        Request::Snapshot { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Snapshot { name }))
+        }
+        Request::Restore { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Restore { name }))
+        }
+        Request::Branch(branch) => (branch.seq, branch_command(branch)),
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
             let command =
@@ -263,7 +312,24 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         decision_us: open.decision_us,
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
-    Ok(Command::Open { name, opening: Box::new(opening) })
+    Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
+}
+
+fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
+    let name = branch.session.map(|name| name_of("session", name)).transpose()?;
+    let from = match branch.from {
+        message::BranchPoint::Snapshot { session, snapshot } => BranchPoint::Snapshot {
+            session: name_of("from.session", session)?,
+            snapshot: name_of("from.snapshot", snapshot)?,
+        },
+        message::BranchPoint::Recorded { episode, step } => {
+            if !is_episode_name(&episode) {
+                return Err(Fault::InvalidName { field: "from.episode".into(), name: episode });
+            }
+            BranchPoint::Recorded { episode, step }
+        }
+    };
+    Ok(Command::Branch { name, from })
 }
 
 fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {

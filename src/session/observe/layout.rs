@@ -127,11 +127,21 @@ impl ObservationLayout {
     /// or a later one contains and that are not in the history. One capture per time; the last one is that of
     /// the present time, and may have no cameras.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
+        self.captures_beside(episode, &|camera, time_us| history.find(camera, time_us).is_some())
+    }
+
+    /// As [`Self::captures`], with a history of the frames of which `is_kept` (camera, time in microseconds) is
+    /// true.
+    pub(crate) fn captures_beside(
+        &self,
+        episode: &Episode,
+        is_kept: &dyn Fn(usize, i64) -> bool,
+    ) -> Vec<RigCapture> {
         let now_us = episode.time_us();
         let mut cameras_by_time = BTreeMap::from([(now_us, Vec::new())]);
         for camera in 0..self.cameras.len() {
             for time_us in self.schedule.due(camera, now_us) {
-                if time_us >= episode.begin_us() && history.find(camera, time_us).is_none() {
+                if time_us >= episode.begin_us() && !is_kept(camera, time_us) {
                     cameras_by_time.entry(time_us).or_default().push(camera);
                 }
             }
@@ -199,7 +209,7 @@ impl ObservationLayout {
     }
 
     /// Whether a later observation shows a camera's image of a capture.
-    pub(super) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
+    pub(crate) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
         !capture.shown || self.schedule.is_shown_after(camera, capture.time_us, capture.time_us)
     }
 

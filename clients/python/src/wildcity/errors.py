@@ -20,6 +20,7 @@ Code = Literal[
     "unknown_camera",
     "unknown_trajectory",
     "unknown_session",
+    "unknown_state",
     "session_exists",
     "invalid_name",
     "pose_not_finite",

@@ -92,6 +92,55 @@ class Station:
 
 
 @dataclass(frozen=True)
+class DriveSection:
+    """A part of a recorded drive: from `from_m` (0) to `to_m` (its end), with a pose every `every_m` metres.
+
+    Without `every_m` the poses are the recorded keyframes.
+    """
+
+    name: str
+    from_m: float | None = None
+    to_m: float | None = None
+    every_m: float | None = None
+
+
+@dataclass(frozen=True)
+class DrivePose:
+    """A pose of a recorded drive (`world_from_rig`), its distance from the start and its time on the drive's clock."""
+
+    station_m: float
+    time_us: int
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Poses of a recorded drive, in driving order; `length_m` is that of the whole drive."""
+
+    name: str
+    version: int
+    version_hash: str
+    length_m: float
+    poses: tuple[DrivePose, ...]
+
+
+@dataclass(frozen=True)
+class SnapshotPoint:
+    """A snapshot of a session that still exists, on any connection with the same token."""
+
+    session: str
+    snapshot: str
+
+
+@dataclass(frozen=True)
+class RecordedPoint:
+    """A step of an episode that the server has recorded; `episode` is the name of its file, without `.jsonl`."""
+
+    episode: str
+    step: int
+
+
+@dataclass(frozen=True)
 class Lens:
     """A lens model other than the pinhole. Each model has its own fields; the others are None.
 
@@ -278,6 +327,7 @@ class Opened:
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
+    trajectory: Drive | None = None
 
 
 @dataclass(frozen=True)
@@ -317,7 +367,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Ok:
-    """Answer to `prefetch`."""
+    """Answer to `prefetch` and to `snapshot`."""
 
     seq: int
 
