@@ -8,7 +8,8 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use crate::message::{
-    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start,
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, ScenarioChoice,
+    Start,
 };
 
 /// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
@@ -80,6 +81,42 @@ impl<'de> Deserialize<'de> for BranchPoint {
                 "a branch is from either session and snapshot, or episode and step",
             )),
         }
+    }
+}
+
+/// A string is a name; an object is the scenario if it has a format, and else a name with values.
+impl<'de> Deserialize<'de> for ScenarioChoice {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Values {
+            name: String,
+            #[serde(default)]
+            values: serde_json::Map<String, serde_json::Value>,
+        }
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = ScenarioChoice;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("the name of a scenario, an object with name and values, or a scenario")
+            }
+
+            fn visit_str<E: Error>(self, name: &str) -> Result<ScenarioChoice, E> {
+                Ok(ScenarioChoice::Name(name.to_owned()))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<ScenarioChoice, A::Error> {
+                let map = serde_json::Map::deserialize(MapAccessDeserializer::new(map))?;
+                if map.contains_key("format") {
+                    return Ok(ScenarioChoice::Inline(map));
+                }
+                let Values { name, values } =
+                    serde_json::from_value(map.into()).map_err(A::Error::custom)?;
+                Ok(ScenarioChoice::Values { name, values })
+            }
+        }
+        deserializer.deserialize_any(Either)
     }
 }
 

@@ -40,6 +40,10 @@ pub enum Code {
     UnknownSession,
     /// There is no such snapshot or recorded episode, or the recorded episode cannot be continued.
     UnknownState,
+    /// The server has no scenario of this name.
+    UnknownScenario,
+    /// The scenario is malformed, does not fit the twin, or a hash that it names differs.
+    ScenarioInvalid,
     /// A session of this name already exists.
     SessionExists,
     /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.

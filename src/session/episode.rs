@@ -12,6 +12,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::Keyframe;
+use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
@@ -38,6 +39,13 @@ pub struct Episode {
     /// The least mean trust of an observation, of those that came with a trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     least_trust: Option<f64>,
+    /// Whether a rule of the scenario ended it because the ego failed.
+    #[serde(default, skip_serializing_if = "is_false")]
+    failed: bool,
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// Why an episode ended.
@@ -49,6 +57,8 @@ pub enum Outcome {
     /// As `Completed`, but the ego left the recorded area: the trust of an observation was below
     /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations have a trust.
     OffModel,
+    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    DrivingFailure,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
     /// The agent was silent for too long.
@@ -109,6 +119,7 @@ impl Episode {
             track,
             begin_us,
             least_trust: None,
+            failed: false,
         }
     }
 
@@ -232,10 +243,11 @@ impl Episode {
     pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
         let completed = self.terminated || outcome == Outcome::Completed;
         let off_model = self.least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
-        let outcome = match (completed, off_model) {
-            (true, true) => Outcome::OffModel,
-            (true, false) => Outcome::Completed,
-            (false, _) => outcome,
+        let outcome = match (completed, off_model, self.failed) {
+            (true, true, _) => Outcome::OffModel,
+            (true, false, true) => Outcome::DrivingFailure,
+            (true, false, false) => Outcome::Completed,
+            (false, ..) => outcome,
         };
         EpisodeSummary {
             outcome,
@@ -244,6 +256,12 @@ impl Episode {
             distance_m: self.distance_m,
             least_trust: self.least_trust,
         }
+    }
+
+    /// Ends the episode by a rule of the scenario.
+    pub(crate) fn end(&mut self, reason: EndReason) {
+        self.terminated = true;
+        self.failed = reason.is_failure();
     }
 
     /// Takes the trusts of an observation's images, 0 to 1 each, into account; there may be none.

@@ -9,6 +9,7 @@ use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
 use crate::record::error::{BranchError, RecordError};
+use crate::scenario::ScenarioError;
 
 /// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]
@@ -19,6 +20,9 @@ pub enum SessionError {
     /// What a frame needs does not fit into memory, or could not be loaded.
     #[error(transparent)]
     Residency(ResidencyError),
+    /// The scenario does not exist, is malformed, or does not fit the twin.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {

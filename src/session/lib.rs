@@ -47,7 +47,9 @@ pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{TrainingCoverage, Trust};
-pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
+pub use options::{
+    ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, SessionOptions, Start,
+};
 pub use preview::{ProposedChange, PsnrPreview};
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
@@ -60,7 +62,9 @@ pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
-pub use scenario::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
+pub use scenario::{
+    EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
+};
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};
 pub use viewpoint::viewpoints;

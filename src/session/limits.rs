@@ -2,6 +2,16 @@
 
 use std::time::Duration;
 
+/// Most events of one observation.
+pub const EVENTS: usize = 64;
+
+/// Room in the header of an observation for its events and the route: 64 events of at most 600 bytes, 20 points of 80,
+/// and a text of a command of at most 1,000 bytes, each twice at worst, since the metadata is a text within JSON.
+pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
+
+/// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
+pub const ACTOR_HEADER_BYTES: usize = 640;
+
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 

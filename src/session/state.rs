@@ -14,6 +14,7 @@ use crate::observe::layout::ObservationLayout;
 use crate::observe::trust::TrainingCoverage;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
+use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 
 /// What `open` determines. Sessions that are branches of another one share its settings.
@@ -33,6 +34,10 @@ pub(crate) struct SessionSettings {
     pub(crate) deadline: Duration,
     /// The recorded drive that the ego may follow.
     pub(crate) drive: Option<Arc<RecordedDrive>>,
+    /// The scenario of every episode.
+    pub(crate) scenario: Option<SessionScenario>,
+    /// Whether observations tell where the actors are.
+    pub(crate) tells_actors: bool,
 }
 
 /// The version of the twin that a session shows, and how.
@@ -53,6 +58,8 @@ pub(crate) struct EpisodeState {
     pub(crate) episode: Episode,
     /// The episode's frames that later observations show again.
     pub(crate) frame_history: FrameHistory,
+    /// The actors; only with a scenario.
+    pub(crate) traffic: Option<EpisodeTraffic>,
 }
 
 impl PinnedVersion {
@@ -74,6 +81,6 @@ impl PinnedVersion {
 impl EpisodeState {
     /// The state at the start of an episode.
     pub(crate) fn at_start(episode: Episode) -> Self {
-        Self { episode, frame_history: FrameHistory::default() }
+        Self { episode, frame_history: FrameHistory::default(), traffic: None }
     }
 }

@@ -156,6 +156,7 @@ fn requests() -> Vec<(&'static str, Request)> {
             normals: Some(true),
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("rear".to_owned(), 200_000)].into()),
         },
         dt_us: Some(100_000),
@@ -289,11 +290,13 @@ fn answers() -> Vec<(&'static str, Answer)> {
             opacity: true,
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("front".to_owned(), 100_000), ("rear".to_owned(), 200_000)].into()),
             ..Outputs::default()
         },
         trajectories: vec![trajectory],
         reserved_bytes: 36_000_000,
+        scenario: None,
         trajectory: Some(drive()),
     };
     let switched = Answer::Switched {

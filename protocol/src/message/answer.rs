@@ -187,9 +187,24 @@ pub struct Opened {
     pub trajectories: Vec<TrajectoryInfo>,
     /// Memory of the server that is reserved for the largest frame of the session, in bytes.
     pub reserved_bytes: u64,
+    /// The scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<OpenedScenario>,
     /// The part of a recorded drive that `open` asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<Drive>,
+}
+
+/// The scenario of a session.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct OpenedScenario {
+    /// Its name.
+    pub name: String,
+    /// BLAKE3 of the scenario with the first episode's seed, all values and all hashes: what that episode is.
+    pub hash: String,
+    /// Number of actors.
+    pub actors: u64,
 }
 
 /// Summary of an episode.
@@ -219,6 +234,8 @@ pub enum Outcome {
     /// As `completed`, but the images of a reset or a step had a mean confidence below 0.1: the agent left
     /// the recorded area. Only with `outputs.trust`.
     OffModel,
+    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    DrivingFailure,
     /// The agent violated the protocol in a way that ended the connection.
     AgentError,
     /// The agent sent nothing, or did not read, for too long.

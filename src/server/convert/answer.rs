@@ -13,7 +13,8 @@ use wildcity_protocol::message::{
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    Encoding, EpisodeSummary, Outcome, PixelMaps, Session, TrajectorySummary, TwinSummary,
+    Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session, TrajectorySummary,
+    TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
@@ -75,6 +76,7 @@ pub(crate) fn opened(
         normals: Some(normals),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
+        actors: session.tells_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
         images: BTreeMap::new(),
@@ -104,8 +106,17 @@ pub(crate) fn opened(
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
+        scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })))
+}
+
+fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
+    message::OpenedScenario {
+        name: traffic.loaded().scenario.file.name.clone(),
+        hash: traffic.loaded().hash.clone(),
+        actors: traffic.specs().len() as u64,
+    }
 }
 
 /// The answer to `resume`.
@@ -143,6 +154,7 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
         Outcome::OffModel => message::Outcome::OffModel,
+        Outcome::DrivingFailure => message::Outcome::DrivingFailure,
         Outcome::AgentError => message::Outcome::AgentError,
         Outcome::AgentTimeout => message::Outcome::AgentTimeout,
         Outcome::AgentLost => message::Outcome::AgentLost,

@@ -12,7 +12,7 @@ use wildcity_push::PushError;
 use wildcity_render::RenderError;
 use wildcity_scene::geometry::PoseError;
 use wildcity_scene::rig::RigError;
-use wildcity_session::SessionError;
+use wildcity_session::{ScenarioError, SessionError};
 use wildcity_sim::EgoError;
 use wildcity_twin::ingest::IngestError;
 use wildcity_twin::residency::ResidencyError;
@@ -95,6 +95,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::PoseNotFinite
         | Code::PoseInvalid
         | Code::CameraInvalid
+        | Code::ScenarioInvalid
         | Code::OutOfRange => StatusCode::BAD_REQUEST,
         Code::Unauthorized => StatusCode::UNAUTHORIZED,
         Code::Forbidden => StatusCode::FORBIDDEN,
@@ -105,6 +106,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::UnknownTrajectory
         | Code::UnknownSession
         | Code::UnknownState
+        | Code::UnknownScenario
         | Code::UnknownUpload
         | Code::UnknownPush => StatusCode::NOT_FOUND,
         Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
@@ -213,6 +215,10 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Twin(error) => of_store(error),
         SessionError::Residency(error) => of_residency(error),
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
+        SessionError::Scenario(error) => match error {
+            ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
+            _ => at(Code::ScenarioInvalid, error.field()),
+        },
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {

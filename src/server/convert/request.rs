@@ -1,8 +1,10 @@
 //! Parses text frames as commands.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::fault::Fault;
 use wildcity_protocol::message::{self, Request};
@@ -11,7 +13,8 @@ use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, ScenarioSource,
+    SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
@@ -213,6 +216,7 @@ struct Fields {
     name: Option<String>,
     from: Option<message::BranchPoint>,
     dynamics: Option<message::DynamicsChoice>,
+    scenario: Option<message::ScenarioChoice>,
     poses: Option<Vec<message::Pose>>,
     terminate: Option<bool>,
     last_seq: Option<u64>,
@@ -280,6 +284,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         normals,
         frames,
         trust,
+        actors,
         period_us,
     } = open.outputs;
     let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
@@ -306,6 +311,16 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             trust: trust.unwrap_or(false),
             periods_us: period_us.unwrap_or_default(),
         },
+        scenario: open.scenario.map(|choice| {
+            let (source, values) = scenario_of(choice);
+            ScenarioOptions {
+                source,
+                values,
+                dynamics: open.dynamics.is_none(),
+                warm_up: open.warm_up_us.is_none(),
+                actors: actors.unwrap_or(false),
+            }
+        }),
         dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
@@ -313,6 +328,18 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
     Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
+}
+
+fn scenario_of(choice: message::ScenarioChoice) -> (ScenarioSource, BTreeMap<String, Value>) {
+    match choice {
+        message::ScenarioChoice::Name(name) => (ScenarioSource::Named(name), BTreeMap::new()),
+        message::ScenarioChoice::Values { name, values } => {
+            (ScenarioSource::Named(name), values.into_iter().collect())
+        }
+        message::ScenarioChoice::Inline(scenario) => {
+            (ScenarioSource::Inline(Value::Object(scenario)), BTreeMap::new())
+        }
+    }
 }
 
 fn branch_command(branch: message::Branch) -> Result<Command, Fault> {

@@ -31,6 +31,11 @@ pub enum BranchError {
         /// The hash now.
         now: String,
     },
+    /// The episode had a scenario.
+    #[error(
+        "the episode drove a scenario, whose traffic a record does not restore: branch from a snapshot"
+    )]
+    Scenario,
     /// Driving the recorded commands leads elsewhere, or to other frames.
     #[error("{0}")]
     Diverged(String),

@@ -71,6 +71,9 @@ pub struct EpisodeHeader {
     /// The recorded episode that this one is a branch of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub origin: Option<RecordedOrigin>,
+    /// BLAKE3 of the resolved scenario, in hex; absent without a scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
 }
 
 /// Settings of a session that images do not depend on, but bundles, later versions and later episodes do.

@@ -7,6 +7,7 @@ use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
 use super::open::{rig_extent, training_coverage};
+use super::recording::scenario_hash;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::episode::Outcome;
@@ -73,7 +74,8 @@ impl Session {
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
         let line = Line::Frame(record);
-        let file = self.create_file(version, origin.clone(), &episode, line).await?;
+        let scenario = scenario_hash(state.traffic.as_ref());
+        let file = self.create_file(version, origin.clone(), scenario, &episode, line).await?;
         if let Some(bytes) = bytes
             && let Err(error) = self.reservation.exchange(version.resident.clone(), bytes)
         {
@@ -87,7 +89,7 @@ impl Session {
         self.begin(file, origin.clone());
         // After a switch of version, the frames of the present are as the original has them.
         let frame_history = state.frame_history.clone().or(&rendered.frame_history);
-        self.state = EpisodeState { episode, frame_history };
+        self.state = EpisodeState { episode, frame_history, traffic: state.traffic.clone() };
         self.look_ahead();
         Ok(rendered.observation)
     }
@@ -149,6 +151,9 @@ impl Session {
 
         // The settings of the recorded session.
         let header = continuation.header().clone();
+        if header.scenario.is_some() {
+            return Err(BranchError::Scenario.into());
+        }
         let cameras = header.rig.cameras;
         let recorded = match header.settings {
             Some(settings) => settings,
@@ -173,6 +178,8 @@ impl Session {
             dt_us: header.dt_us,
             deadline,
             drive: None,
+            scenario: None,
+            tells_actors: false,
         };
 
         // The state after the step, and the frames that coming observations show again.

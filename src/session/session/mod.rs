@@ -33,6 +33,7 @@ use crate::options::PixelMaps;
 use crate::prefetch::latest_task::LatestTask;
 use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
+use crate::scenario::EpisodeTraffic;
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
@@ -171,6 +172,16 @@ impl Session {
     /// Its snapshots. They stay usable after the session ends, as long as this copy exists.
     pub fn snapshots(&self) -> &Snapshots {
         &self.snapshots
+    }
+
+    /// The actors and the route of the current episode; only with a scenario.
+    pub fn traffic(&self) -> Option<&EpisodeTraffic> {
+        self.state.traffic.as_ref()
+    }
+
+    /// Whether observations tell where the actors are.
+    pub fn tells_actors(&self) -> bool {
+        self.settings.tells_actors
     }
 
     /// The current episode.

@@ -23,6 +23,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::scenario::{EpisodeTraffic, ScenarioError, SessionScenario};
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -45,6 +46,36 @@ impl Session {
         // The version of the twin. Its Gaussians are loaded frame by frame.
         let resident = engine.open_version(options.twin, options.version).await?;
         let manifest = &resident.version.manifest;
+
+        // The scenario, whose ego section fills in what the request leaves open.
+        let mut options = options;
+        let scenario = options.scenario.take();
+        let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
+        let mut loaded = None;
+        let scenario = match scenario {
+            None => None,
+            Some(asked) => {
+                let scenarios = engine.scenarios().clone();
+                let version = resident.version.clone();
+                let seed = options.seed;
+                let (asked, scenario, found) = run_blocking(move || {
+                    let read = SessionScenario::read(scenarios, &asked.source, &asked.values);
+                    let scenario = read?;
+                    let found = scenario.of_episode(seed, &version)?;
+                    Ok::<_, ScenarioError>((asked, scenario, found))
+                })
+                .await??;
+                options.start = options.start.or_else(|| found.start());
+                if let (true, Some(dynamics)) = (asked.dynamics, found.scenario.dynamics) {
+                    options.dynamics = dynamics;
+                }
+                if let (true, Some(warm_up_us)) = (asked.warm_up, found.scenario.warm_up_us) {
+                    options.warm_up_us = warm_up_us;
+                }
+                loaded = Some(found);
+                Some(scenario)
+            }
+        };
 
         // The cameras. Scaling their overlays takes a second at worst.
         let outputs = options.outputs;
@@ -69,7 +100,12 @@ impl Session {
             &outputs.periods_us,
             options.decision_us,
         )?;
-        let layout = ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+        let mut layout =
+            ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+        if let Some(loaded) = &loaded {
+            let actors = loaded.scenario.traffic.actors.len();
+            layout.reserve_header(if tells_actors { actors } else { 0 })?;
+        }
 
         // Where episodes start, and the recorded drive that the ego may follow from there.
         let start = EpisodeStart::resolve(
@@ -106,9 +142,12 @@ impl Session {
             dt_us,
             deadline,
             drive,
+            scenario,
+            tells_actors,
         };
         let version = PinnedVersion::new(resident, profile, coverage);
-        let state = EpisodeState::at_start(episode);
+        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, episode.ego()));
+        let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
         Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))
     }
 

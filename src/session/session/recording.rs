@@ -13,6 +13,7 @@ use crate::record::format::{
     RecordedSettings, RecordedVersion,
 };
 use crate::record::recorder::{NewFile, Recorder};
+use crate::scenario::EpisodeTraffic;
 use crate::state::PinnedVersion;
 
 impl Session {
@@ -25,8 +26,10 @@ impl Session {
                 append(recorder, version.into_iter().chain([frame]).collect()).await?;
             }
             None => {
+                let scenario = scenario_hash(self.state.traffic.as_ref());
+                let origin = self.origin.clone();
                 let file = self
-                    .create_file(&self.version, self.origin.clone(), &self.state.episode, frame)
+                    .create_file(&self.version, origin, scenario, &self.state.episode, frame)
                     .await?;
                 self.recorder = Some(file.recorder);
                 self.episode_number = file.number;
@@ -80,6 +83,7 @@ impl Session {
         &self,
         pinned: &PinnedVersion,
         origin: Option<RecordedOrigin>,
+        scenario: Option<String>,
         episode: &Episode,
         first_frame: Line,
     ) -> Result<NewFile, SessionError> {
@@ -112,6 +116,7 @@ impl Session {
             settings: RecordedSettings::of(settings, pinned.coverage.is_some()),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
+            scenario,
         };
         let dir = self.engine.episodes().to_owned();
         let name = self.name.clone();
@@ -131,6 +136,11 @@ impl Session {
             tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
     }
+}
+
+/// BLAKE3 of an episode's scenario, in hex.
+pub(super) fn scenario_hash(traffic: Option<&EpisodeTraffic>) -> Option<String> {
+    traffic.map(|traffic| traffic.loaded().hash.clone())
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {

@@ -12,6 +12,7 @@ use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
+use super::recording::scenario_hash;
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::Scratch;
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -25,6 +26,7 @@ use crate::observe::observation::Observation;
 use crate::options::Start;
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
+use crate::scenario::EpisodeTraffic;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -43,6 +45,12 @@ impl Session {
         let command = command.into();
         let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
         let mut next = self.state.episode.stepped(&command, &ground, terminate)?;
+        let traffic = self.state.traffic.as_ref().map(|traffic| {
+            traffic.stepped(self.state.episode.ego(), next.ego(), self.settings.dt_us)
+        });
+        if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
+            next.end(reason);
+        }
 
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
@@ -53,7 +61,8 @@ impl Session {
         self.record(record).await?;
 
         next.add_trusts(rendered.trusts());
-        self.state = EpisodeState { episode: next, frame_history: rendered.frame_history };
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
         Ok(rendered.observation)
     }
@@ -83,6 +92,16 @@ impl Session {
         seed: u64,
         start: Option<Start>,
     ) -> Result<Observation, SessionError> {
+        // With a scenario, the seed decides jitter, and perhaps the start.
+        let loaded = match &self.settings.scenario {
+            None => None,
+            Some(scenario) => {
+                let scenario = scenario.clone();
+                let version = self.resident().version.clone();
+                Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
+            }
+        };
+        let start = start.or_else(|| loaded.as_ref().and_then(|loaded| loaded.start()));
         let start = match &start {
             Some(_) => EpisodeStart::resolve(
                 &self.resident().version.manifest,
@@ -93,18 +112,22 @@ impl Session {
             None => self.settings.start.clone(),
         };
         let mut next = start.episode(seed, self.settings.dynamics, self.settings.dt_us);
+        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
         let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let file = self.create_file(&self.version, None, &next, Line::Frame(record)).await?;
+        let scenario = scenario_hash(traffic.as_ref());
+        let line = Line::Frame(record);
+        let file = self.create_file(&self.version, None, scenario, &next, line).await?;
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
         self.begin(file, None);
-        self.state = EpisodeState { episode: next, frame_history: rendered.frame_history };
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
         Ok(rendered.observation)
     }
