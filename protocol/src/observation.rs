@@ -173,7 +173,7 @@ pub struct Actor {
     /// Name within the scenario.
     pub name: String,
     /// `vehicle`, `pedestrian`, `bicycle` or `object`.
-    pub class: String,
+    pub kind: String,
     /// Length, width and height of its box, in metres.
     pub size: [f64; 3],
     /// `world_from_actor`: the box's origin is on the ground under its middle, x forward, z up.

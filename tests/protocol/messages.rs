@@ -162,6 +162,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         dt_us: Some(100_000),
         deadline_ms: Some(20_000),
         decision_us: Some(500_000),
+        scenario: None,
         warm_up_us: Some(1_600_000),
         trajectory: Some(section),
         ..Open::twin("street")

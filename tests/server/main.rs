@@ -21,4 +21,5 @@ mod record;
 mod refused;
 mod replay;
 mod resume;
+mod scenarios;
 mod shutdown;

@@ -256,7 +256,7 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
             let ActorBox { length_m, width_m, height_m } = spec.box_;
             Actor {
                 name: spec.name.clone(),
-                class: spec.class.name().to_owned(),
+                kind: spec.class.name().to_owned(),
                 size: [length_m, width_m, height_m],
                 pose: pose(&state.world_from_actor),
                 velocity: state.velocity_mps.to_array(),

@@ -37,18 +37,17 @@ impl Session {
     pub async fn open(
         engine: Arc<Engine>,
         name: String,
-        options: SessionOptions,
+        mut options: SessionOptions,
     ) -> Result<Self, SessionError> {
         // How long a step takes in simulated time, and an answer in real time.
         let dt_us = check_dt(options.dt_us)?;
         let deadline = check_deadline(options.deadline, engine.step_timeout())?;
 
         // The version of the twin. Its Gaussians are loaded frame by frame.
-        let resident = engine.open_version(options.twin, options.version).await?;
+        let resident = engine.open_version(options.twin.clone(), options.version).await?;
         let manifest = &resident.version.manifest;
 
         // The scenario, whose ego section fills in what the request leaves open.
-        let mut options = options;
         let scenario = options.scenario.take();
         let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
         let mut loaded = None;

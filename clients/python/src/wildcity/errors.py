@@ -21,6 +21,8 @@ Code = Literal[
     "unknown_trajectory",
     "unknown_session",
     "unknown_state",
+    "unknown_scenario",
+    "scenario_invalid",
     "session_exists",
     "invalid_name",
     "pose_not_finite",

@@ -235,7 +235,8 @@ class Outputs:
 
     `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
     frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
-    name, for cameras that do not take one with every step. `trust` adds a confidence to each image.
+    name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` tells
+    where the actors of the scenario are.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -247,6 +248,7 @@ class Outputs:
     images: dict[str, ImagePart] | None = None
     frames: int | None = None
     trust: bool | None = None
+    actors: bool | None = None
     period_us: dict[str, int] | None = None
 
 
@@ -305,6 +307,15 @@ class Welcome:
 
 
 @dataclass(frozen=True)
+class OpenedScenario:
+    """The scenario of a session. `hash` is what its first episode is: the scenario with seed, values and hashes."""
+
+    name: str
+    hash: str
+    actors: int
+
+
+@dataclass(frozen=True)
 class Opened:
     """Answer to `open`: every setting of the session, defaults included."""
 
@@ -327,6 +338,7 @@ class Opened:
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
+    scenario: OpenedScenario | None = None
     trajectory: Drive | None = None
 
 
@@ -357,7 +369,13 @@ class Summary:
     """Summary of an episode."""
 
     outcome: Literal[
-        "completed", "off_model", "agent_error", "agent_timeout", "agent_lost", "server_error"
+        "completed",
+        "off_model",
+        "driving_failure",
+        "agent_error",
+        "agent_timeout",
+        "agent_lost",
+        "server_error",
     ]
     steps: int
     time_us: int
@@ -484,6 +502,42 @@ class Residency:
 
 
 @dataclass(frozen=True)
+class Event:
+    """Something that happened in a scenario since the observation before."""
+
+    time_us: int
+    kind: Literal["contact", "trigger", "appeared", "left", "end"]
+    actor: str | None = None
+    name: str | None = None
+    at_fault: bool | None = None
+    impact: float | None = None
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where to drive: points in the rig's frame (metres), what to do next, and where the ego is on the route."""
+
+    points: tuple[Vector, ...]
+    command: Literal["left", "right", "straight"]
+    station_m: float
+    off_m: float
+    length_m: float
+    text: str | None = None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height."""
+
+    name: str
+    kind: str
+    size: Vector
+    pose: Pose
+    velocity: Vector
+    yaw_rate: float
+
+
+@dataclass(frozen=True)
 class Metadata:
     """Everything that an observation holds beside its tensors."""
 
@@ -504,6 +558,9 @@ class Metadata:
     timings: Timings
     residency: Residency
     history: tuple[ImageInfo, ...] = ()
+    events: tuple[Event, ...] = ()
+    route: Route | None = None
+    actors: tuple[Actor, ...] | None = None
 
 
 ANSWERS: dict[str, type[Any]] = {

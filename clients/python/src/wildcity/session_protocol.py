@@ -84,6 +84,7 @@ class SessionProtocol:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
         trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
@@ -98,6 +99,7 @@ class SessionProtocol:
             "deadline_ms": deadline_ms,
             "decision_us": decision_us,
             "warm_up_us": warm_up_us,
+            "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
             "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}

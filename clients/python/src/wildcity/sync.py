@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
@@ -92,9 +92,12 @@ class Client:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
         trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
+
+        `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
 
         Raises `Refused` if the server refuses.
         """
@@ -113,6 +116,7 @@ class Client:
                 deadline_ms=deadline_ms,
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
+                scenario=scenario,
                 trajectory=trajectory,
             )
         )
