@@ -9,7 +9,7 @@
 //! | [`wildcity_client`] | the Rust client of the protocol | protocol |
 //! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
-//! | [`wildcity_generate`] | procedural streets and cities | scene |
+//! | [`wildcity_generate`] | procedural streets and cities, and their maps | scene, sim |
 //! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | scene |
 //! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |

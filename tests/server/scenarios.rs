@@ -39,7 +39,7 @@ fn outputs() -> Value {
 
 /// The metadata of a step to a place on the drive.
 async fn to(agent: &mut Agent, x_m: f64) -> Value {
-    agent.look(json!({ "type": "step", "pose": pose(x_m) })).await.metadata
+    agent.look(json!({ "type": "step", "pose": pose(x_m) })).await.meta
 }
 
 #[tokio::test]
@@ -52,7 +52,7 @@ async fn an_episode_tells_actors_route_events_and_its_end() {
     assert_eq!(opened["scenario"]["actors"], 3);
     assert_eq!(opened["start"], pose(0.0));
 
-    let first = agent.look(json!({ "type": "reset", "seed": 3 })).await.metadata;
+    let first = agent.look(json!({ "type": "reset", "seed": 3 })).await.meta;
     assert_eq!(first.get("events"), None);
     let names = |metadata: &Value| -> Vec<String> {
         let actors = metadata["actors"].as_array().unwrap().iter();
