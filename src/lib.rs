@@ -12,6 +12,7 @@
 //! | [`wildcity_generate`] | procedural streets and cities | scene |
 //! | [`wildcity_sim`] | what moves: the dynamics of the ego vehicle | scene |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
+//! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | render, scene, sim, twin |
