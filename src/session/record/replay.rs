@@ -14,6 +14,7 @@ use super::recorded_episode::RecordedEpisode;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
+use super::values;
 use crate::viewpoint::viewpoints;
 
 /// Opens a version of the episode's twin, by its number.
@@ -44,12 +45,18 @@ impl RecordedEpisode {
             }
             replay.drive(frame, index)?;
             if until == ReplayUntil::FirstDifference && replay.report.diverged.is_some() {
-                break;
+                return Ok(replay.report);
             }
+            replay.check_values(frame, index);
             replay.render(frame, index, until, visit)?;
             if until == ReplayUntil::FirstDifference && replay.report.difference.is_some() {
-                break;
+                return Ok(replay.report);
             }
+        }
+        if let Some(end) = &self.end {
+            let line = self.frames.len() + replay.first_line;
+            let wrong = values::wrong_in_end(end, replay.ego.episode(), line);
+            replay.report.wrong_value = replay.report.wrong_value.or(wrong);
         }
         Ok(replay.report)
     }
@@ -100,7 +107,13 @@ impl<'a> Replay<'a> {
             ego: EgoReplay::new(header),
             first_line: 2,
             pixels: cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect(),
-            report: ReplayReport { images: 0, changes, diverged: None, difference: None },
+            report: ReplayReport {
+                images: 0,
+                changes,
+                diverged: None,
+                difference: None,
+                wrong_value: None,
+            },
         }
     }
 
@@ -124,6 +137,15 @@ impl<'a> Replay<'a> {
             self.report.diverged = diverged;
         }
         Ok(())
+    }
+
+    /// Compares what a frame says beside poses and images.
+    fn check_values(&mut self, frame: &FrameRecord, index: usize) {
+        let line = index + self.first_line;
+        let wrong = values::wrong_in_frame(frame, self.ego.episode(), self.cameras.len(), line);
+        if self.report.wrong_value.is_none() {
+            self.report.wrong_value = wrong;
+        }
     }
 
     /// Renders the poses of a frame, shows each image to `visit` and compares it.
