@@ -17,6 +17,7 @@ mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod episode;
 mod import;
 mod input_files;
 mod inspect;
@@ -66,6 +67,7 @@ enum Command {
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
+    Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
     Bench(bench::Bench),
@@ -89,6 +91,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
