@@ -1,5 +1,5 @@
 //! Motion in a city twin: the dynamics of the ego vehicle under an agent's commands, the ground it stands
-//! on, and contact with other boxes.
+//! on, the traffic around it, contact with its boxes, and the scenarios, maps and routes that describe it.
 //!
 //! Everything here is pure: the same state and the same command give the same bytes.
 
@@ -7,6 +7,9 @@ pub mod contact;
 pub mod ego;
 pub mod ground;
 pub mod limits;
+pub mod map;
+pub mod route;
+pub mod scenario;
 pub mod traffic;
 
 pub use ego::{Command, Dynamics, Ego, EgoError, EgoModel};

@@ -110,10 +110,8 @@ fn a_nanometre_decides_alike_at_any_origin() {
 }
 
 const CAR: ActorBox = ActorBox { length_m: 4.0, width_m: 2.0, height_m: 1.5 };
-const EGO: EgoBox = EgoBox {
-    box_: ActorBox { length_m: 5.0, width_m: 2.0, height_m: 1.5 },
-    center_x_m: 1.4,
-};
+const EGO: EgoBox =
+    EgoBox { box_: ActorBox { length_m: 5.0, width_m: 2.0, height_m: 1.5 }, center_x_m: 1.4 };
 
 fn spec(class: ActorClass, box_: ActorBox) -> ActorSpec {
     ActorSpec { name: "other".to_owned(), class, box_, asset: None }
@@ -125,10 +123,8 @@ fn state(position_m: DVec3, yaw_rad: f64, velocity_mps: DVec3) -> ActorState {
 }
 
 fn ego_at(x_m: f64, y_m: f64, yaw_rad: f64, velocity_mps: DVec3) -> EgoState {
-    let world_from_rig = Pose {
-        position_m: DVec3::new(x_m, y_m, 0.0),
-        rotation: DQuat::from_rotation_z(yaw_rad),
-    };
+    let world_from_rig =
+        Pose { position_m: DVec3::new(x_m, y_m, 0.0), rotation: DQuat::from_rotation_z(yaw_rad) };
     EgoState { world_from_rig, velocity_mps, yaw_rate_radps: 0.0 }
 }
 
@@ -233,15 +229,15 @@ fn an_overlap_at_the_start_is_said_once_and_marked() {
 
 #[test]
 fn two_contacts_of_a_sub_step_are_both_found() {
-    let specs = [spec(ActorClass::Vehicle, CAR), spec(ActorClass::Pedestrian, ActorBox::PEDESTRIAN)];
+    let specs =
+        [spec(ActorClass::Vehicle, CAR), spec(ActorClass::Pedestrian, ActorBox::PEDESTRIAN)];
     let ego = [0.0, 0.1].map(|x_m| ego_at(x_m, 0.0, 0.0, 10.0 * DVec3::X));
     let car = state(DVec3::new(5.95, 0.9, 0.0), 0.0, DVec3::ZERO);
     let person = ActorState { index: 1, ..state(DVec3::new(4.25, -0.5, 0.0), 0.0, DVec3::ZERO) };
     let actors = [car, person];
     let (mut detector, at_start) = Detector::at_start(EGO, &specs, &ego[0], &actors);
     assert_eq!(at_start, []);
-    let sub_step =
-        SubStep { begin_us: 0, end_us: 10_000, ego, before: &actors, after: &actors };
+    let sub_step = SubStep { begin_us: 0, end_us: 10_000, ego, before: &actors, after: &actors };
     let found = detector.advance(&sub_step, &specs, None);
     assert_eq!(found.iter().map(|contact| contact.actor).collect::<Vec<_>>(), [0, 1]);
     assert!(found.iter().all(|contact| contact.ego_at_fault && !contact.at_start));

@@ -1,4 +1,4 @@
-//! The ego's dynamics, against solvers of its equations; contacts, against vectors.
+//! The ego's dynamics, against solvers of its equations; contacts and traffic, against vectors.
 
 #[path = "../support/data.rs"]
 mod data;
@@ -11,3 +11,4 @@ mod contact;
 mod driving;
 mod integrators;
 mod study;
+mod traffic;

@@ -66,13 +66,8 @@ impl Detector {
     ) -> (Self, Vec<Contact>) {
         let mut detector = Self { ego_box, touching: Vec::new() };
         // A sub-step without length, before which nothing touched.
-        let instant = SubStep {
-            begin_us: 0,
-            end_us: 0,
-            ego: [*ego, *ego],
-            before: actors,
-            after: actors,
-        };
+        let instant =
+            SubStep { begin_us: 0, end_us: 0, ego: [*ego, *ego], before: actors, after: actors };
         let mut contacts = detector.advance(&instant, specs, None);
         for contact in &mut contacts {
             contact.at_start = true;
@@ -91,9 +86,9 @@ impl Detector {
         specs: &[ActorSpec],
         lanes: Option<LanePosition>,
     ) -> Vec<Contact> {
-        let ego = sub_step.ego.map(|ego| {
-            Body::new(&ego.world_from_rig, &self.ego_box.box_, self.ego_box.center_x_m)
-        });
+        let ego = sub_step
+            .ego
+            .map(|ego| Body::new(&ego.world_from_rig, &self.ego_box.box_, self.ego_box.center_x_m));
         let mut touching = Vec::new();
         let mut begun = Vec::new();
         for (before, after) in sub_step.before.iter().zip(sub_step.after) {

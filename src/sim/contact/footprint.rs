@@ -48,7 +48,12 @@ impl Footprint {
         let ahead = 0.5 * self.length_m * self.forward;
         let aside = 0.5 * self.width_m * self.left();
         let center = self.center_m;
-        [center + ahead + aside, center - ahead + aside, center - ahead - aside, center + ahead - aside]
+        [
+            center + ahead + aside,
+            center - ahead + aside,
+            center - ahead - aside,
+            center + ahead - aside,
+        ]
     }
 
     /// The front line as a box without length.

@@ -21,7 +21,9 @@ mod sweep;
 
 pub use body::Body;
 pub use detector::{Contact, Detector, MAX_SWEPT_SPEED_MPS};
-pub use fault::{BEHIND_RAD, CollisionType, FaultInput, LanePosition, STANDING_MPS, is_ego_at_fault};
+pub use fault::{
+    BEHIND_RAD, CollisionType, FaultInput, LanePosition, STANDING_MPS, is_ego_at_fault,
+};
 pub use footprint::{Footprint, TOUCH_M};
 pub use solid::{
     FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit, solid_area_m2,
