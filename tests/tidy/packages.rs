@@ -29,6 +29,7 @@ const FILES: &[&str] = &[
     "src/twin/ingest",
     "src/session/record",
     "src/episode",
+    "src/suite",
     "src/server/start.rs",
     "src/server/spool",
     "clients/rust/src/upload.rs",
