@@ -1,7 +1,8 @@
-//! `wildcity episode`: recorded episodes.
+//! `wildcity episode`: suites of scenarios, and recorded episodes.
 
 mod diff;
 mod list;
+mod run;
 mod score;
 mod show;
 
@@ -13,7 +14,7 @@ use wildcity_episode::EpisodeFile;
 
 use super::directories::Episodes;
 
-/// List, score and compare recorded episodes.
+/// Drive suites of scenarios; list, score and compare recorded episodes.
 #[derive(Debug, clap::Args)]
 pub(super) struct Episode {
     #[command(subcommand)]
@@ -22,6 +23,7 @@ pub(super) struct Episode {
 
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Run(Box<run::Run>),
     List(list::List),
     Show(show::Show),
     Score(score::Score),
@@ -31,6 +33,7 @@ enum Command {
 impl Episode {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.command {
+            Command::Run(command) => command.run(),
             Command::List(command) => command.run(),
             Command::Show(command) => command.run(),
             Command::Score(command) => command.run(),
