@@ -4,8 +4,8 @@ use glam::{DVec2, DVec3};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact, Track,
-    TrackSample,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
+    Track, TrackSample,
 };
 use wildcity_sim::contact::Body;
 use wildcity_sim::ego::EgoModel;

@@ -101,7 +101,8 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
 /// The mean of distances between successive plans, weighted by exp(-decay k); `None` of none.
 pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
     let weight = |k: usize| (-decay * k as f64).exp();
-    let sum: f64 = distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
+    let sum: f64 =
+        distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
     let weights: f64 = (0..distances_m.len()).map(weight).sum();
     (weights > 0.0).then(|| sum / weights)
 }
@@ -109,7 +110,8 @@ pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
 /// The scene score of an episode. Without a map off-road counts as 0, as AlpaSim fills it in.
 pub fn scene(record: &DriveRecord) -> Score {
     let rollout = rollout(record);
-    let value: Measured = rollout.as_ref().map(|(rollout, _)| scene_score(rollout)).map_err(Clone::clone);
+    let value: Measured =
+        rollout.as_ref().map(|(rollout, _)| scene_score(rollout)).map_err(Clone::clone);
     let part = |value: &dyn Fn(&Rollout) -> f64| rollout.as_ref().ok().map(|(r, _)| value(r));
     let parts = [
         ("progress_clipped_rel", part(&|rollout| rollout.progress)),

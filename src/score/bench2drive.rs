@@ -124,8 +124,10 @@ pub fn smooth_segments(samples: &[MotionSample]) -> Option<Vec<bool>> {
 fn is_smooth(samples: &[MotionSample]) -> bool {
     let (window, order) = FILTER;
     let window = window.min(samples.len());
-    let values = |value: &dyn Fn(&MotionSample) -> f64| samples.iter().map(value).collect::<Vec<_>>();
-    let smoothed = |value: &dyn Fn(&MotionSample) -> f64| savgol(&values(value), window, order, 0, 1.0);
+    let values =
+        |value: &dyn Fn(&MotionSample) -> f64| samples.iter().map(value).collect::<Vec<_>>();
+    let smoothed =
+        |value: &dyn Fn(&MotionSample) -> f64| savgol(&values(value), window, order, 0, 1.0);
     let slope = |values: &[f64]| savgol(values, window, order, 1, 0.1);
 
     let longitudinal = smoothed(&|sample| sample.acceleration_mps2.dot(sample.forward));

@@ -108,14 +108,16 @@ impl HugsimBox {
 /// Judges one decision.
 pub fn decision(decision: &Decision<'_>) -> DecisionScore {
     let ego = PlanPose { position_m: decision.ego.footprint.center_m, yaw_rad: decision.yaw_rad };
-    let mut plan: Vec<PlanPose> = std::iter::once(ego).chain(decision.plan.iter().copied()).collect();
+    let mut plan: Vec<PlanPose> =
+        std::iter::once(ego).chain(decision.plan.iter().copied()).collect();
     if plan[plan.len() - 1].position_m.distance(ego.position_m) < SHORT_PLAN_M {
         for pose in &mut plan {
             pose.yaw_rad = ego.yaw_rad;
         }
     }
     let nc = if collides(decision, &plan) { 0.0 } else { 1.0 };
-    let ttc = if [0.5, 1.0].iter().any(|&s| collides(decision, &moved_on(&plan, s))) { 0.0 } else { 1.0 };
+    let ttc =
+        if [0.5, 1.0].iter().any(|&s| collides(decision, &moved_on(&plan, s))) { 0.0 } else { 1.0 };
     let dac = drivable(decision.ground_m, &plan, &decision.ego.footprint);
     DecisionScore { nc, dac, ttc, c: comfort(&plan, &ego) }
 }

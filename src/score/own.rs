@@ -196,7 +196,8 @@ fn least_ttc_s(record: &DriveRecord) -> Option<f64> {
     let tracks = record.tracks.as_deref()?;
     let at = |step: usize| {
         let ego = record.ego[step];
-        let own = Moving { footprint: shape.footprint(&ego), velocity_mps: ego.world_velocity_mps() };
+        let own =
+            Moving { footprint: shape.footprint(&ego), velocity_mps: ego.world_velocity_mps() };
         tracks.iter().filter_map(move |track: &Track| {
             let other = track.samples.get(step).copied().flatten()?;
             let other = Moving { footprint: other.footprint, velocity_mps: other.velocity_mps };

@@ -157,8 +157,7 @@ impl DriveRecord {
         let line = &self.reference.as_ref()?.line;
         let mut station_m = 0.0;
         let project = |sample: &EgoSample| {
-            let found =
-                line.project_between(sample.origin_m, station_m - 5.0, station_m + 50.0);
+            let found = line.project_between(sample.origin_m, station_m - 5.0, station_m + 50.0);
             station_m = found.station_m;
             (found.station_m, found.distance_m)
         };

@@ -8,7 +8,13 @@
 ///
 /// # Panics
 /// If `window` is not above `order`, or there are fewer samples than `window`.
-pub fn savgol(values: &[f64], window: usize, order: usize, derivative: usize, delta: f64) -> Vec<f64> {
+pub fn savgol(
+    values: &[f64],
+    window: usize,
+    order: usize,
+    derivative: usize,
+    delta: f64,
+) -> Vec<f64> {
     assert!(order < window && window <= values.len(), "a window from order + 1 to all samples");
     let half = window / 2;
     let inner = weights(window, 0.5 * (window - 1) as f64, order, derivative);
@@ -48,8 +54,10 @@ fn weights(window: usize, at: f64, order: usize, derivative: usize) -> Vec<f64> 
     let mut system: Vec<Vec<f64>> = (0..terms)
         .map(|i| {
             let row = (0..terms).map(|j| powers.iter().map(|x| x[i] * x[j]).sum());
-            row.chain([derivative_of_power(i, derivative, position(at)) / unit.powi(derivative as i32)])
-                .collect()
+            row.chain([
+                derivative_of_power(i, derivative, position(at)) / unit.powi(derivative as i32)
+            ])
+            .collect()
         })
         .collect();
     let solution = solve(&mut system);

@@ -89,7 +89,8 @@ mod tests {
 
     #[test]
     fn quantiles_are_those_of_tables() {
-        let table = [(1, 12.706_204_736), (2, 4.302_652_730), (3, 3.182_446_305), (10, 2.228_138_852)];
+        let table =
+            [(1, 12.706_204_736), (2, 4.302_652_730), (3, 3.182_446_305), (10, 2.228_138_852)];
         for (degrees, t) in table {
             assert!((student_t(degrees) - t).abs() < 1e-8, "{degrees}: {}", student_t(degrees));
         }

@@ -206,8 +206,13 @@ impl Episode {
     }
 
     /// The summary of an episode whose images had another least trust: that of a record, for a replay.
-    pub(crate) fn summary_with(&self, outcome: Outcome, least_trust: Option<f64>) -> EpisodeSummary {
-        let completed = self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel);
+    pub(crate) fn summary_with(
+        &self,
+        outcome: Outcome,
+        least_trust: Option<f64>,
+    ) -> EpisodeSummary {
+        let completed =
+            self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel);
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model) {
             (true, true) => Outcome::OffModel,

@@ -11,9 +11,7 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::route::Route;
 use wildcity_session::{Encoding, ImagePart, Outputs, SessionOptions, Start, limits as session};
 use wildcity_sim::map::{Map, MapFile};
-use wildcity_sim::scenario::{
-    EgoStart, FileError, FilePin, Scenario, Surroundings, TracksFile,
-};
+use wildcity_sim::scenario::{EgoStart, FileError, FilePin, Scenario, Surroundings, TracksFile};
 use wildcity_twin::store::{Catalog, Version};
 
 use crate::error::SuiteError;
@@ -89,7 +87,11 @@ pub fn cases(
             if !names.insert(name.clone()) {
                 return Err(SuiteError::SameName { name });
             }
-            let around = Around::read(&scenario.path, file.tracks.as_ref().map(|t| &t.file), file.map.as_ref())?;
+            let around = Around::read(
+                &scenario.path,
+                file.tracks.as_ref().map(|t| &t.file),
+                file.map.as_ref(),
+            )?;
             let resolved = Scenario::resolve(
                 file,
                 case.seed,
@@ -101,7 +103,10 @@ pub fn cases(
                 },
             )
             .map_err(wrong)?;
-            cases.push(Case::new(suite, name, case.seed, case.values, resolved, &version).map_err(wrong)?);
+            cases.push(
+                Case::new(suite, name, case.seed, case.values, resolved, &version)
+                    .map_err(wrong)?,
+            );
             if cases.len() > limits::EPISODES {
                 return Err(SuiteError::TooMany { count: cases.len() });
             }
@@ -225,7 +230,12 @@ impl Case {
             hash: blake3::hash(file.to_string().as_bytes()).to_hex().to_string(),
             scenario: file,
             ego: EgoLine::new(&resolved.traffic.ego_box),
-            actors: resolved.traffic.actors.iter().map(|actor| ActorLine::new(&actor.spec)).collect(),
+            actors: resolved
+                .traffic
+                .actors
+                .iter()
+                .map(|actor| ActorLine::new(&actor.spec))
+                .collect(),
             route,
             limit_us,
             least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),

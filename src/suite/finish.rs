@@ -89,7 +89,10 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
         ("seed", header.seed != case.seed),
         ("dynamics", header.dynamics != options.dynamics),
         ("dt_us", header.dt_us != dt_us),
-        ("start", case.start().is_some_and(|start_m| header.start.position_m.distance(start_m) > 1.0)),
+        (
+            "start",
+            case.start().is_some_and(|start_m| header.start.position_m.distance(start_m) > 1.0),
+        ),
     ];
     match wrong.into_iter().find(|(_, wrong)| *wrong) {
         None => Ok(()),

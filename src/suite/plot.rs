@@ -108,7 +108,10 @@ fn line(svg: &mut String, frame: &Frame, points: &[DVec2], color: &str, width: f
     if points.len() < 2 {
         return;
     }
-    let _ = write!(svg, "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" points=\"");
+    let _ = write!(
+        svg,
+        "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" points=\""
+    );
     for point in points {
         let DVec2 { x, y } = frame.at(*point);
         let _ = write!(svg, "{x:.1},{y:.1} ");

@@ -203,7 +203,12 @@ impl Shared {
             match finished {
                 Ok(finished) => return EpisodeEntry::driven(case, finished, errors),
                 Err(technical) => {
-                    tracing::warn!(episode = case.name, "{}: {}", technical.kind, technical.message);
+                    tracing::warn!(
+                        episode = case.name,
+                        "{}: {}",
+                        technical.kind,
+                        technical.message
+                    );
                     errors.push(technical);
                 }
             }
@@ -224,7 +229,8 @@ impl Shared {
                 drive(engine.clone(), case, session, *agent).await?;
             }
             (Host::Server { url, .. }, AgentChoice::Command(command)) => {
-                let dialled = Dialled { command, url, session: &session, timeout: self.agent_timeout };
+                let dialled =
+                    Dialled { command, url, session: &session, timeout: self.agent_timeout };
                 dial_in::drive(&dialled, case, &record).await?;
             }
             _ => return Err(Technical::server("the host does not fit the agent")),
@@ -241,8 +247,7 @@ async fn drive(
     agent: BuiltIn,
 ) -> Result<(), Technical> {
     let failed = |error: wildcity_session::SessionError| Technical::server(error.to_string());
-    let mut session =
-        Session::open(engine, session, case.options.clone()).await.map_err(failed)?;
+    let mut session = Session::open(engine, session, case.options.clone()).await.map_err(failed)?;
     let driven = steps(&mut session, case, agent).await;
     let outcome = if driven.is_ok() { Outcome::Completed } else { Outcome::ServerError };
     session.close(outcome).await;

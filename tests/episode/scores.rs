@@ -74,7 +74,10 @@ fn speeds_and_turns_come_from_the_poses() {
 fn a_record_of_thirty_seconds_is_read_and_scored_in_50_ms() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("long-1.jsonl");
-    written::write(&path, &Made { steps: 300, actors: 30, speed_mps: 0.3, ..Made::default() }.lines());
+    written::write(
+        &path,
+        &Made { steps: 300, actors: 30, speed_mps: 0.3, ..Made::default() }.lines(),
+    );
     // The best of five: other tests run beside this one.
     let took = (0..5).map(|_| {
         let start = std::time::Instant::now();

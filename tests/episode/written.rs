@@ -58,7 +58,10 @@ impl Made {
     /// The lines of the file.
     pub(crate) fn lines(&self) -> Vec<Value> {
         let car = ActorBox { length_m: 4.2, width_m: 1.8, height_m: 1.5 };
-        let ego = EgoBox { box_: ActorBox { length_m: 5.0, width_m: 2.0, height_m: 1.5 }, center_x_m: 1.3 };
+        let ego = EgoBox {
+            box_: ActorBox { length_m: 5.0, width_m: 2.0, height_m: 1.5 },
+            center_x_m: 1.3,
+        };
         let spec = |index: u16| ActorSpec {
             name: format!("car{index}"),
             class: ActorClass::Vehicle,
@@ -85,7 +88,9 @@ impl Made {
             let time_us = step as i64 * 100_000;
             lines.push(tagged("actors", &ActorsLine::new(step, time_us, &states)));
             let due = self.contacts.iter().filter(|(at, _)| *at == step);
-            lines.extend(due.map(|(_, contact)| tagged("event", &EventLine::contact(step, contact))));
+            lines.extend(
+                due.map(|(_, contact)| tagged("event", &EventLine::contact(step, contact))),
+            );
             lines.push(frame(step, &ego_at(0.1 * self.speed_mps * step as f64)));
         }
         if let Some(outcome) = self.outcome {

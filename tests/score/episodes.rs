@@ -95,7 +95,10 @@ fn contacts_fail_by_fault_and_pedestrians_always() {
     };
     let at_fault = with(ActorClass::Vehicle, contact(2_000_000, 10.0, true));
     assert_eq!(at_fault.judgement, Judgement::Failed);
-    assert_eq!((at_fault.faults[0].fault, at_fault.impact_mps), (Fault::ContactAtFault, Some(10.0)));
+    assert_eq!(
+        (at_fault.faults[0].fault, at_fault.impact_mps),
+        (Fault::ContactAtFault, Some(10.0))
+    );
     let run_into = with(ActorClass::Vehicle, contact(2_000_000, 10.0, false));
     assert_eq!(run_into.judgement, Judgement::Passed);
     let person = with(ActorClass::Pedestrian, contact(2_000_000, 10.0, false));

@@ -49,7 +49,8 @@ fn drivable_areas_are_as_in_the_vectors() {
     let Some(cases) = cases("hugsim", "drivable") else { return };
     for case in cases {
         let ego = box_of(&case.input["box"]).footprint;
-        let found = drivable(&points2(&case.input["ground"]), &plan(&case.input["trajectory"]), &ego);
+        let found =
+            drivable(&points2(&case.input["ground"]), &plan(&case.input["trajectory"]), &ego);
         assert_near(found, &case.expected["dac"], &case.name);
     }
 }
@@ -60,7 +61,9 @@ fn decisions_are_as_in_the_vectors() {
     for case in cases {
         let frames = case.input["objects"].as_array().unwrap().iter();
         let objects: Vec<Vec<Footprint>> = frames
-            .map(|frame| frame.as_array().unwrap().iter().map(|row| footprint(&numbers(row))).collect())
+            .map(|frame| {
+                frame.as_array().unwrap().iter().map(|row| footprint(&numbers(row))).collect()
+            })
             .collect();
         let found = decision(&Decision {
             ego: box_of(&case.input["box"]),

@@ -113,12 +113,16 @@ fn rules_are_as_in_the_vectors() {
             assert_near(value, &expected[key], &format!("{}: {key}", case.name));
         }
         let step = |step: Option<usize>| step.map_or(Value::Null, Value::from);
-        assert_eq!(step(found.first_at_fault_step), expected["first_at_fault_step"], "{}", case.name);
+        assert_eq!(
+            step(found.first_at_fault_step),
+            expected["first_at_fault_step"],
+            "{}",
+            case.name
+        );
         assert_eq!(step(found.first_ttc_step), expected["first_ttc_step"], "{}", case.name);
         let kinds = found.collision_types.iter().enumerate();
-        let kinds: serde_json::Map<String, Value> = kinds
-            .filter_map(|(k, kind)| Some((k.to_string(), (*kind)?.name().into())))
-            .collect();
+        let kinds: serde_json::Map<String, Value> =
+            kinds.filter_map(|(k, kind)| Some((k.to_string(), (*kind)?.name().into()))).collect();
         assert_eq!(Value::Object(kinds), expected["collision_types"], "{}", case.name);
     }
 }
@@ -151,7 +155,8 @@ fn comfort_is_as_in_the_vectors() {
             let at: usize = at.parse().unwrap();
             assert_near(signals.longitudinal_mps2[at], wanted, &format!("{} at {at}", case.name));
         }
-        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
+        let largest =
+            |values: &[f64]| values.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
         assert_near(largest(&signals.jerk_mps3), &expected["jerk_max"], &case.name);
         assert_near(largest(&signals.yaw_rate_radps), &expected["yaw_rate_max"], &case.name);
     }

@@ -13,8 +13,10 @@ fn a_suite_is_its_scenarios_times_its_seeds() {
     let case = &cases[0];
     assert_eq!((case.seed, case.steps, case.drive_start_us), (3, 20, 2_000_000));
     // The recorded drive from 20 m on for two seconds, in keyframes of 0.5 s.
-    let route: Vec<(i64, f64)> = case.line.route.iter().map(|point| (point.0, point.1[0])).collect();
-    let wanted = [(0, 20.0), (500_000, 25.0), (1_000_000, 30.0), (1_500_000, 35.0), (2_000_000, 40.0)];
+    let route: Vec<(i64, f64)> =
+        case.line.route.iter().map(|point| (point.0, point.1[0])).collect();
+    let wanted =
+        [(0, 20.0), (500_000, 25.0), (1_000_000, 30.0), (1_500_000, 35.0), (2_000_000, 40.0)];
     assert_eq!(route, wanted);
     assert_ne!(cases[0].line.hash, cases[1].line.hash, "the seed is part of the identity");
     assert_eq!(bench.cases(&bench.path("rails.json")).unwrap().len(), 1, "a scenario alone");
@@ -36,7 +38,8 @@ fn a_sweep_makes_a_case_of_each_combination() {
 fn mistakes_name_the_file_and_the_place() {
     let bench = Bench::new();
     let suite = |change: &dyn Fn(&mut serde_json::Value)| {
-        let mut value = json!({ "format": "wildcity.suite/1", "name": "a", "scenarios": ["rails.json"] });
+        let mut value =
+            json!({ "format": "wildcity.suite/1", "name": "a", "scenarios": ["rails.json"] });
         change(&mut value);
         bench.suite();
         bench.cases(&bench.write("changed.json", &value)).unwrap_err().to_string()
@@ -79,7 +82,8 @@ fn two_episodes_of_one_name_are_refused() {
     let bench = Bench::new();
     bench.write("a.json", &scenario("rails", &json!({ "model": "teleport" })));
     bench.write("b.json", &scenario("rails", &json!({ "model": "teleport" })));
-    let suite = json!({ "format": "wildcity.suite/1", "name": "a", "scenarios": ["a.json", "b.json"] });
+    let suite =
+        json!({ "format": "wildcity.suite/1", "name": "a", "scenarios": ["a.json", "b.json"] });
     let error = bench.cases(&bench.write("suite.json", &suite)).unwrap_err().to_string();
     assert!(error.contains("\"rails-0\""), "{error}");
 }

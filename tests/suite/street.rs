@@ -10,12 +10,12 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::Gaussians;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_scene::Gaussians;
 use wildcity_suite::{
     AgentChoice, BuiltIn, Case, RunSettings, SuiteError, SuiteFile, SuiteResult, cases, run,
 };
@@ -48,14 +48,18 @@ impl Bench {
                 rotation: DQuat::IDENTITY,
             },
         };
-        let log = Trajectory { name: "log".to_owned(), keyframes: (0..=40).map(keyframe).collect() };
+        let log =
+            Trajectory { name: "log".to_owned(), keyframes: (0..=40).map(keyframe).collect() };
         let camera = |name: &str, yaw_rad: f64| {
             let pinhole = Pinhole { fx: 20.0, fy: 20.0, cx: 16.0, cy: 12.0 };
             // A camera looks along its z axis; the rig drives along x.
-            let rotation = DQuat::from_rotation_z(yaw_rad)
-                * DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
+            let rotation = DQuat::from_rotation_z(yaw_rad) * DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
             let position_m = DVec3::new(1.5, 0.0, 1.6);
-            RigCamera::new(name, Camera::from_pinhole(32, 24, pinhole), Pose { position_m, rotation })
+            RigCamera::new(
+                name,
+                Camera::from_pinhole(32, 24, pinhole),
+                Pose { position_m, rotation },
+            )
         };
         let rig = Rig {
             name: "pair".to_owned(),

@@ -55,7 +55,7 @@ fn file_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
 /// Reads an episode.
 fn read(episode: &Path, episodes: &Episodes) -> anyhow::Result<EpisodeFile> {
     let path = file_of(episode, episodes)?;
-    EpisodeFile::read(&path).with_context(|| {
-        "give the path of an episode's file, or its name as `wildcity episode list` prints it"
-    })
+    EpisodeFile::read(&path).with_context(
+        || "give the path of an episode's file, or its name as `wildcity episode list` prints it",
+    )
 }

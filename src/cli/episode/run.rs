@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    AgentChoice, BuiltIn, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit, page, pictures,
+    AgentChoice, BuiltIn, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit, page,
+    pictures,
 };
 use wildcity_twin::store::Catalog;
 
@@ -115,12 +116,13 @@ impl Run {
             progress: Box::new(move |_| counted.inc(1)),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        let result = runtime.block_on(wildcity_suite::run(settings, cases)).map_err(|error| {
-            match error {
-                error @ wildcity_suite::SuiteError::NotEmpty { .. } => usage(error),
-                error => exit(ExitCode::Technical, error),
-            }
-        })?;
+        let result =
+            runtime.block_on(wildcity_suite::run(settings, cases)).map_err(
+                |error| match error {
+                    error @ wildcity_suite::SuiteError::NotEmpty { .. } => usage(error),
+                    error => exit(ExitCode::Technical, error),
+                },
+            )?;
         bar.finish_and_clear();
         self.write(&result, &episodes, &catalog, &*backend)?;
         self.verified(&result, &episodes, &catalog, &*backend)?;
@@ -147,23 +149,26 @@ impl Run {
     ) -> anyhow::Result<()> {
         let pictures = pictures(result, episodes, catalog, backend);
         let html = page(result, &pictures, episodes);
-        for (name, text) in [
-            ("result.json", result.to_json()),
-            ("junit.xml", junit(result)),
-            ("report.html", html),
-        ] {
+        for (name, text) in
+            [("result.json", result.to_json()), ("junit.xml", junit(result)), ("report.html", html)]
+        {
             output::write(&self.out.join(name), text.as_bytes())?;
         }
         let mut out = io::stdout().lock();
         for episode in &result.episodes {
             let why: Vec<&str> = episode.faults.iter().map(|fault| &*fault.fault).collect();
-            let error = episode.errors.last().map(|error| format!("{}: {}", error.kind, error.message));
+            let error =
+                episode.errors.last().map(|error| format!("{}: {}", error.kind, error.message));
             let why = why.join(", ") + &error.unwrap_or_default();
             writeln!(out, "{:<12} {:<32} {why}", episode.status.name(), episode.name)?;
         }
         let rate = &result.pass_rate;
         let [low, high] = rate.interval.map(|end| 100.0 * end);
-        writeln!(out, "passed      {} of {} (95 %: {low:.1} to {high:.1} %)", rate.passed, rate.runs)?;
+        writeln!(
+            out,
+            "passed      {} of {} (95 %: {low:.1} to {high:.1} %)",
+            rate.passed, rate.runs
+        )?;
         writeln!(out, "report      {}", self.out.join("report.html").display())?;
         Ok(())
     }

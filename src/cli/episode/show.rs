@@ -43,7 +43,10 @@ impl Show {
                 end.distance_m
             )?,
             None => {
-                writeln!(out, "end         not recorded: the episode still runs, or was interrupted")?;
+                writeln!(
+                    out,
+                    "end         not recorded: the episode still runs, or was interrupted"
+                )?;
             }
         }
         if let Some(cut) = &episode.cut {
@@ -72,7 +75,11 @@ fn head(out: &mut impl Write, episode: &EpisodeFile) -> io::Result<()> {
         for actor in &scenario.actors {
             let [length_m, width_m, height_m] = actor.size;
             let class = actor.class.name();
-            writeln!(out, "actor       {}: {class}, {length_m} x {width_m} x {height_m} m", actor.name)?;
+            writeln!(
+                out,
+                "actor       {}: {class}, {length_m} x {width_m} x {height_m} m",
+                actor.name
+            )?;
         }
     }
     Ok(())
@@ -90,7 +97,11 @@ fn text(event: &Event, episode: &EpisodeFile) -> String {
                 (false, true) => "the ego is at fault",
                 (false, false) => "the ego is not at fault",
             };
-            format!("contact with {} at {:.2} m/s: {fault}", name(contact.actor), contact.impact_mps)
+            format!(
+                "contact with {} at {:.2} m/s: {fault}",
+                name(contact.actor),
+                contact.impact_mps
+            )
         }
         Event::StaticContact { area_m2, impact_mps } => {
             format!("contact with the twin at {impact_mps:.2} m/s, {area_m2:.3} m²")

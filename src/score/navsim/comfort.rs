@@ -65,7 +65,9 @@ pub fn comfort_signals(ego: &[EgoSample], step_s: f64, center_x_m: f64) -> Optio
     let collect = |value: &dyn Fn(&EgoSample) -> f64| ego.iter().map(value).collect::<Vec<f64>>();
     let longitudinal = collect(&|ego| {
         let rate = ego.yaw_rate_radps;
-        ego.acceleration_mps2.x + center_x_m * rate * rate + center_x_m * ego.yaw_acceleration_radps2
+        ego.acceleration_mps2.x
+            + center_x_m * rate * rate
+            + center_x_m * ego.yaw_acceleration_radps2
     });
     let lateral = collect(&|ego| ego.acceleration_mps2.y);
     let length = collect(&|ego| ego.acceleration_mps2.length());

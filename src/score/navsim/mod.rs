@@ -99,8 +99,17 @@ pub struct Submetrics {
 
 impl Submetrics {
     /// All ones.
-    pub const PERFECT: Self =
-        Self { nc: 1.0, dac: 1.0, ddc: 1.0, tlc: 1.0, ep: 1.0, ttc: 1.0, lk: 1.0, hc: 1.0, ec: 1.0 };
+    pub const PERFECT: Self = Self {
+        nc: 1.0,
+        dac: 1.0,
+        ddc: 1.0,
+        tlc: 1.0,
+        ep: 1.0,
+        ttc: 1.0,
+        lk: 1.0,
+        hc: 1.0,
+        ec: 1.0,
+    };
 }
 
 /// The score: the product of the rules that must hold, times the weighted mean of the others.

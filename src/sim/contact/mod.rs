@@ -26,6 +26,7 @@ pub use fault::{
 };
 pub use footprint::{Footprint, TOUCH_M};
 pub use solid::{
-    FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit, solid_area_m2,
+    FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit,
+    solid_area_m2,
 };
 pub use sweep::{Moving, overlap_s, time_to_contact_s};
