@@ -11,8 +11,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
 use crate::limits;
-use crate::lines::{ActorsLine, EventLine, ScenarioLine};
-use crate::outcome::EpisodeResult;
+use crate::lines::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 
 /// What an episode was driven with: the fields of its first line that need no renderer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

@@ -25,8 +25,8 @@ pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
 pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
 pub use lines::{
-    ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, Event, EventLine,
-    LaneLine, RoutePoint, ScenarioLine,
+    ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
+    EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
 pub use listing::{Listed, list};
-pub use outcome::{EpisodeResult, FaultLine, ScoreLine, result};
+pub use outcome::result;

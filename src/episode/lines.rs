@@ -9,6 +9,8 @@
 //!
 //! A session without a scenario writes none of them.
 
+use std::collections::BTreeMap;
+
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -181,6 +183,44 @@ pub enum Collision {
     ActiveRear,
     ActiveFront,
     ActiveLateral,
+}
+
+/// Verdict and scores of an episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeResult {
+    /// `passed`, `failed`, `off_model` or `not_judged`.
+    pub verdict: String,
+    /// The faults, by time.
+    pub faults: Vec<FaultLine>,
+    /// What was not judged, and why.
+    pub not_judged: Vec<String>,
+    /// The scores, each with its name and version.
+    pub scores: BTreeMap<String, ScoreLine>,
+}
+
+/// A fault of the ego.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FaultLine {
+    /// Its name, as `contact.at_fault`.
+    pub fault: String,
+    /// When, in microseconds.
+    pub time_us: i64,
+    /// Name of the actor, for a contact with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actor: Option<String>,
+}
+
+/// A score: its value, or null and the reason.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScoreLine {
+    /// The value.
+    pub value: Option<f64>,
+    /// Why there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// What it was computed from; null what it lacks.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub parts: BTreeMap<String, Option<f64>>,
 }
 
 impl From<CollisionType> for Collision {

@@ -1,52 +1,11 @@
 //! The result of an episode: verdict and scores.
 
-use std::collections::BTreeMap;
-
-use serde::{Deserialize, Serialize};
-
 use wildcity_score::own::{self, Judgement};
 use wildcity_score::score;
 
 use crate::drive::drive_record;
 use crate::file::EpisodeFile;
-
-/// Verdict and scores of an episode.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct EpisodeResult {
-    /// `passed`, `failed`, `off_model` or `not_judged`.
-    pub verdict: String,
-    /// The faults, by time.
-    pub faults: Vec<FaultLine>,
-    /// What was not judged, and why.
-    pub not_judged: Vec<String>,
-    /// The scores, each with its name and version.
-    pub scores: BTreeMap<String, ScoreLine>,
-}
-
-/// A fault of the ego.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FaultLine {
-    /// Its name, as `contact.at_fault`.
-    pub fault: String,
-    /// When, in microseconds.
-    pub time_us: i64,
-    /// Name of the actor, for a contact with one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub actor: Option<String>,
-}
-
-/// A score: its value, or null and the reason.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ScoreLine {
-    /// The value.
-    pub value: Option<f64>,
-    /// Why there is none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub reason: Option<String>,
-    /// What it was computed from; null what it lacks.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub parts: BTreeMap<String, Option<f64>>,
-}
+use crate::lines::{EpisodeResult, FaultLine, ScoreLine};
 
 /// Judges an episode and scores it. `None` if it has no frame.
 ///

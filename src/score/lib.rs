@@ -17,6 +17,7 @@
 //! | `map`, `polyline` | lanes and lines on the ground |
 //! | `savgol` | the Savitzky-Golay filter of the comfort scores |
 
+mod all;
 pub mod alpasim;
 pub mod bench2drive;
 pub mod hugsim;
@@ -30,10 +31,11 @@ mod savgol;
 mod scored;
 pub mod statistics;
 
+pub use all::score;
 pub use map::{Lane, LaneMap, RedArea};
 pub use polyline::Polyline;
 pub use record::{
     DriveRecord, EgoSample, EgoShape, ReferenceDrive, StaticContact, Track, TrackSample,
 };
 pub use savgol::savgol;
-pub use scored::{Measured, Missing, Score, score};
+pub use scored::{Measured, Missing, Score};

@@ -4,9 +4,6 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::record::DriveRecord;
-use super::{alpasim, bench2drive, hugsim, navsim, neuroncap, own};
-
 /// Why a score has no value: what it needs and the record lacks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Missing {
@@ -55,14 +52,4 @@ impl Score {
         let parts = parts.into_iter().map(|(name, part)| (name, finite(part))).collect();
         Self { name, value: value.ok(), reason, parts }
     }
-}
-
-/// All scores of an episode, in a fixed order.
-pub fn score(record: &DriveRecord) -> Vec<Score> {
-    let mut scores = vec![own::verdict(record).score(), alpasim::scene(record)];
-    scores.push(navsim::pdm(record));
-    scores.push(hugsim::hd(record));
-    scores.push(neuroncap::ncap(record));
-    scores.extend(bench2drive::scores(record));
-    scores
 }

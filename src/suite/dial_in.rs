@@ -12,7 +12,7 @@ use wildcity_session::Start;
 
 use crate::case::Case;
 use crate::limits;
-use crate::run::Technical;
+use crate::technical::Technical;
 
 /// A command that is started.
 pub(crate) struct Dialled<'a> {

@@ -9,7 +9,7 @@ use serde::Serialize;
 use wildcity_episode::{EndLine, EpisodeFile, EpisodeResult, result};
 
 use crate::case::Case;
-use crate::run::Technical;
+use crate::technical::Technical;
 
 /// A driven episode.
 #[derive(Clone, Debug, PartialEq)]

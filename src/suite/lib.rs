@@ -13,6 +13,7 @@
 //! | `run` | drives all cases, some at once, technical failures once more |
 //! | `finish` | writes scenario and result into the record of an episode |
 //! | `verify` | renders all episodes again |
+//! | `technical` | failures that are not driving |
 //! | `result` | `result.json`: episodes, rates, means, exit code |
 //! | `junit`, `page` | `junit.xml`, `report.html` |
 //! | `picture` | the picture of a fault |
@@ -31,6 +32,7 @@ mod picture;
 mod plot;
 mod result;
 mod run;
+mod technical;
 mod verify;
 
 pub use case::{Case, cases};

@@ -11,7 +11,7 @@ use wildcity_score::statistics::{Mean, wilson};
 use crate::case::Case;
 use crate::finish::Finished;
 use crate::limits;
-use crate::run::Technical;
+use crate::technical::Technical;
 
 /// All episodes of a run, and what they say together. It has no times of the clock: the same drives give the same
 /// bytes.

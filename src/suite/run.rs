@@ -18,9 +18,10 @@ use crate::case::Case;
 use crate::dial_in::{self, Dialled};
 use crate::driver::BuiltIn;
 use crate::error::SuiteError;
-use crate::finish::{Finished, finish};
+use crate::finish::finish;
 use crate::limits;
 use crate::result::{EpisodeEntry, SuiteResult};
+use crate::technical::Technical;
 
 /// What drives.
 #[derive(Clone, Debug, PartialEq)]
@@ -77,15 +78,6 @@ enum Host {
     Engine(Arc<Engine>),
     /// A server on a free port of the loopback interface.
     Server { running: Option<Running>, url: String },
-}
-
-/// Why an attempt failed for a reason that is not driving. The names are those of outcomes.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Technical {
-    /// `server_error`, `agent_error`, `agent_timeout`, `agent_lost`.
-    pub(crate) kind: &'static str,
-    /// What happened.
-    pub(crate) message: String,
 }
 
 impl std::fmt::Debug for RunSettings {
@@ -201,7 +193,7 @@ impl Shared {
                 Err(technical) => Err(technical),
             };
             match finished {
-                Ok(finished) => return EpisodeEntry::driven(case, finished, errors),
+                Ok(finished) => return EpisodeEntry::new(case, Some(finished), errors),
                 Err(technical) => {
                     tracing::warn!(
                         episode = case.name,
@@ -213,7 +205,7 @@ impl Shared {
                 }
             }
         }
-        EpisodeEntry::not_driven(case, errors)
+        EpisodeEntry::new(case, None, errors)
     }
 
     /// Drives a case. Returns the file of its record.
@@ -262,20 +254,4 @@ async fn steps(session: &mut Session, case: &Case, agent: BuiltIn) -> Result<(),
         session.step(command, step == case.steps).await.map_err(failed)?;
     }
     Ok(())
-}
-
-impl Technical {
-    pub(crate) fn server(message: impl Into<String>) -> Self {
-        Self { kind: "server_error", message: message.into() }
-    }
-}
-
-impl EpisodeEntry {
-    fn driven(case: &Case, finished: Finished, errors: Vec<Technical>) -> Self {
-        Self::new(case, Some(finished), errors)
-    }
-
-    fn not_driven(case: &Case, errors: Vec<Technical>) -> Self {
-        Self::new(case, None, errors)
-    }
 }
