@@ -61,6 +61,7 @@ pub use record::format::{
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
+    WrongValue,
 };
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,

@@ -25,5 +25,8 @@ pub use fault::{
     BEHIND_RAD, CollisionType, FaultInput, LanePosition, STANDING_MPS, is_ego_at_fault,
 };
 pub use footprint::{Footprint, TOUCH_M};
-pub use solid::{SolidPoint, StaticLimit, solid_area_m2};
+pub use solid::{
+    FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit,
+    solid_area_m2,
+};
 pub use sweep::{Moving, overlap_s, time_to_contact_s};

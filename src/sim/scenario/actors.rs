@@ -9,6 +9,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{ActorBox, ActorClass};
 
+use super::around::{AssetInfo, EgoStart, Surroundings, drive_named, points_of};
 use super::error::{FileError, in_range, listed, named};
 use super::file::{
     ActionSection, ActorSection, AttackSection, CollideSection, ConditionSection, IdmModel,
@@ -16,7 +17,6 @@ use super::file::{
 };
 use super::jitter::{displaced, displacement_m, drawn, heading_rad};
 use super::pose::pose_of;
-use super::resolve::{AssetInfo, EgoStart, Surroundings, drive_named, points_of};
 use super::tracks::{TrackSection, box_of};
 use crate::traffic::{
     Action, Actor, ActorSpec, After, Attack, Behaviour, Condition, Course, Follow, Idm, Near,

@@ -4,11 +4,12 @@
 //! |---|---|
 //! | `file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
 //! | `document` | reads a scenario, and puts in the values of its sweep |
-//! | `resolve`, `actors`, `jitter` | checks a scenario against its twin, and sets up its traffic |
+//! | `resolve`, `around`, `actors`, `jitter` | checks a scenario against its twin, and sets up its traffic |
 //! | `end` | the rules that end an episode |
 //! | `error` | mistakes, with their place in the file |
 
 mod actors;
+mod around;
 mod document;
 mod end;
 pub(crate) mod error;
@@ -18,9 +19,10 @@ mod pose;
 mod resolve;
 mod tracks;
 
+pub use around::{AssetInfo, EgoStart, Surroundings};
 pub use document::{Case, Document};
 pub use end::{EndInput, EndReason, EndRules, Stuck};
 pub use error::FileError;
 pub use file::*;
-pub use resolve::{AssetInfo, EgoStart, Scenario, Surroundings};
+pub use resolve::Scenario;
 pub use tracks::{KeyframeSection, TrackSection, TracksFile};

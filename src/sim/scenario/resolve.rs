@@ -2,50 +2,23 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
-
-use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
-use wildcity_scene::{ActorBox, ActorClass, Trajectory};
+use wildcity_scene::{ActorBox, Trajectory};
 
 use super::actors::{Courses, actors_of};
+use super::around::{EgoStart, Surroundings, drive_named};
 use super::end::EndRules;
-use super::error::{FileError, hashed, in_range, listed, named};
+use super::error::{FileError, hashed, in_range, named};
 use super::file::{
     DynamicsSection, EgoSection, EndSection, FilePin, ModelSection, RouteSection, ScenarioFile,
 };
 use super::pose::pose_of;
-use super::tracks::{TracksFile, box_of};
+use super::tracks::box_of;
 use crate::limits;
-use crate::map::Map;
 use crate::route::{COMMAND_AHEAD_M, NavigationRoute, RouteCommand};
 use crate::traffic::{EgoBox, Traffic};
 use crate::{Dynamics, EgoModel};
-
-/// What a scenario refers to.
-#[derive(Clone, Copy)]
-pub struct Surroundings<'a> {
-    /// Recorded drives of the twin.
-    pub drives: &'a [Trajectory],
-    /// The tracks file that the scenario names.
-    pub tracks: Option<&'a TracksFile>,
-    /// The map that the scenario names.
-    pub map: Option<&'a Map>,
-    /// Looks up an asset by its hash or by the name of a built-in one.
-    pub asset: &'a dyn Fn(&str) -> Option<AssetInfo>,
-}
-
-/// What a scenario needs to know about an asset.
-#[derive(Clone, Debug, PartialEq)]
-pub struct AssetInfo {
-    /// Its hash, 64 lower-case hex digits.
-    pub hash: String,
-    /// Its kind.
-    pub class: ActorClass,
-    /// Its box.
-    pub box_: ActorBox,
-}
 
 /// A scenario that is ready to run.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,20 +39,6 @@ pub struct Scenario {
     pub dynamics: Option<Dynamics>,
     /// Length of the warm-up, in microseconds; `None` leaves it to the request.
     pub warm_up_us: Option<i64>,
-}
-
-/// Where the ego starts.
-#[derive(Clone, Debug, PartialEq)]
-pub enum EgoStart {
-    /// At a pose, `world_from_rig`.
-    Pose(Pose),
-    /// Along a recorded trajectory.
-    Station {
-        /// Its name.
-        trajectory: String,
-        /// Distance along it, in metres.
-        station_m: f64,
-    },
 }
 
 /// The ego's box unless a scenario says otherwise: AlpaSim's vehicle.
@@ -230,19 +189,6 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     Ok(stations_m[before] + t * (stations_m[after] - stations_m[before]))
 }
 
-/// A recorded drive by its name.
-pub(super) fn drive_named<'a>(
-    path: &str,
-    name: &str,
-    drives: &'a [Trajectory],
-) -> Result<&'a Trajectory, FileError> {
-    let found = drives.iter().find(|drive| drive.name == *name);
-    found.ok_or_else(|| {
-        let known = listed(drives.iter().map(|drive| drive.name.as_str()));
-        FileError::new(path, format!("the twin has no trajectory {name:?}; it has {known}"))
-    })
-}
-
 fn dynamics_of(section: &DynamicsSection) -> Result<Dynamics, FileError> {
     let model = match section.model {
         ModelSection::Teleport => EgoModel::Teleport,
@@ -313,28 +259,4 @@ fn end_of(section: &EndSection, has_route: bool) -> Result<EndRules, FileError> 
         stuck_us: microseconds("stuck_s", section.stuck_s)?,
         route_done: section.route_done.unwrap_or(true) && has_route,
     })
-}
-
-impl std::fmt::Debug for Surroundings<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Surroundings").field("drives", &self.drives.len()).finish_non_exhaustive()
-    }
-}
-
-/// Points of a file.
-pub(super) fn points_of(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
-    if !(2..=limits::COURSE_POINTS).contains(&points.len()) {
-        let message =
-            format!("{} points; 2 to {} are accepted", points.len(), limits::COURSE_POINTS);
-        return Err(FileError::new(path, message));
-    }
-    let most_m = Pose::MAX_COORDINATE_M;
-    let mut points_m = Vec::with_capacity(points.len());
-    for (index, point) in points.iter().enumerate() {
-        for (axis, value) in point.iter().enumerate() {
-            in_range(&format!("{path}[{index}][{axis}]"), *value, [-most_m, most_m])?;
-        }
-        points_m.push(DVec3::from_array(*point));
-    }
-    Ok(points_m)
 }
