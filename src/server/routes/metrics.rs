@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::Extension;
 use axum::extract::{Request, State};
-use axum::http::header;
+use axum::http::{StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
@@ -14,7 +14,7 @@ use crate::fault::Fault;
 use crate::metrics::GaugeValues;
 use crate::state::ServerState;
 
-use super::refusal::HttpResult;
+use super::refusal::{HttpResult, Refusal};
 
 /// `GET /metrics`, in OpenMetrics' text format.
 pub(super) async fn show(
@@ -44,7 +44,17 @@ pub(super) async fn count_refusals(
     request: Request,
     next: Next,
 ) -> Response {
-    let response = next.run(request).await;
+    let length = request.headers().get(header::CONTENT_LENGTH).cloned();
+    let mut response = next.run(request).await;
+    // The body that axum itself refuses has no code yet.
+    if response.status() == StatusCode::PAYLOAD_TOO_LARGE
+        && response.extensions().get::<WireCode>().is_none()
+    {
+        let limit = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
+        let announced = length.and_then(|length| length.to_str().ok()?.parse().ok());
+        let bytes = announced.unwrap_or(limit + 1);
+        response = Refusal::from(Fault::MessageTooLarge { bytes, limit }).into_response();
+    }
     if let Some(code) = response.extensions().get::<WireCode>() {
         state.metrics.refused(&code.0);
     }

@@ -50,7 +50,7 @@ impl Schedule {
                 let field = format!("outputs.period_us.{name}");
                 return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
             }
-            check_period("outputs.period_us", period_us, dt_us)?;
+            check_period(&format!("outputs.period_us.{name}"), period_us, dt_us)?;
         }
         let period_us = |camera: &RigCamera| periods_us.get(&camera.name).copied().unwrap_or(dt_us);
         let periods_us = cameras.iter().map(period_us).collect();
@@ -100,14 +100,14 @@ impl Schedule {
 }
 
 /// Checks that a period is a whole number of steps and within its limits.
-fn check_period(field: &'static str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
+fn check_period(field: &str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
     let limits_us = dt_us..=limits::BUNDLE_PERIOD_US.max(dt_us);
     if value_us % dt_us == 0 && limits_us.contains(&value_us) {
         return Ok(());
     }
     let most_us = limits::BUNDLE_PERIOD_US;
     let must = format!("{value_us} µs; whole steps of {dt_us} µs up to {most_us} µs are accepted");
-    Err(SessionError::OutOfRange { field, must })
+    Err(SessionError::CameraOption { field: field.to_owned(), must })
 }
 
 #[cfg(test)]
