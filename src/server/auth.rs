@@ -191,7 +191,10 @@ impl Grant {
         if self.allows_twin(twin) {
             return Ok(());
         }
-        Err(Fault::Forbidden { field: "twin", reason: format!("it does not include twin {twin:?}") })
+        Err(Fault::Forbidden {
+            field: "twin",
+            reason: format!("it does not include twin {twin:?}"),
+        })
     }
 
     /// Whether the token may use the twin. Lists of twins leave out those that it may not use.

@@ -281,8 +281,7 @@ impl Connection {
         };
         if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
             check(closed.last.seq)?;
-            let text =
-                convert::resumed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
+            let text = convert::resumed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
             self.answered_seq = Some(closed.last.seq);
             self.last = Some(closed.last);
             return Ok(Answer::Text(text.into()));

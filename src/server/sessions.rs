@@ -118,12 +118,7 @@ pub(crate) struct SlotGuard {
 
 impl SessionRegistry {
     pub(crate) fn new(limit: usize, resume_grace: Duration) -> Arc<Self> {
-        Arc::new(Self {
-            limit,
-            resume_grace,
-            entries: Mutex::default(),
-            closed: Mutex::default(),
-        })
+        Arc::new(Self { limit, resume_grace, entries: Mutex::default(), closed: Mutex::default() })
     }
 
     /// Adds an empty slot under a new name; `owner` is the name of the client's token.

@@ -1,8 +1,8 @@
 //! Small observations and an encoder of their binary layout, independent of the server's.
 
 use serde_json::{Map, Value, json};
-use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::camera::{Windshield, WindshieldReference};
+use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::observation::{
     Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
 };
@@ -120,7 +120,8 @@ impl Frame {
                     tensors.extend(depth_and_opacity(number, &stem, camera));
                 }
                 if recipe.normals {
-                    let grid = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+                    let grid =
+                        (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
                     let normals: Vec<f32> = grid.flat_map(|(x, y)| normal(x, y)).collect();
                     let shape = vec![camera.height, camera.width, 3];
                     tensors.push(f32_tensor(&format!("{stem}/normals"), shape, &normals));

@@ -2,8 +2,8 @@
 
 use serde_json::{Value, json};
 use wildcity_protocol::camera::{Exposure, Lens, Shutter, ShutterDirection};
-use wildcity_protocol::error::Code;
 use wildcity_protocol::decode::decode;
+use wildcity_protocol::error::Code;
 use wildcity_protocol::message::*;
 use wildcity_protocol::{PROTOCOL, http};
 
@@ -313,7 +313,9 @@ fn answers() -> Vec<(&'static str, Answer)> {
     let fatal = Answer::Error {
         seq: None,
         code: Code::ShuttingDown,
-        message: "the server is shutting down, and its sessions end: open a new one when it is back".into(),
+        message:
+            "the server is shutting down, and its sessions end: open a new one when it is back"
+                .into(),
         field: None,
         fatal: true,
     };

@@ -142,6 +142,9 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
         if let Some(depth_m) = &depth_m {
             assert_eq!(depth_m[pixel], frames::depth_m(number, x, y));
         }
+        if let (Some(depth_m), Some(opacity)) = (&depth_m, &opacity) {
+            assert_eq!(depth_m[pixel] == 0.0, opacity[pixel] == 0.0, "pixel ({x}, {y})");
+        }
         if let Some(opacity) = &opacity {
             assert_eq!(opacity[pixel], frames::opacity(x, y));
         }

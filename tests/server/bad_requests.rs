@@ -40,15 +40,15 @@ fn table() -> Vec<(&'static str, Vec<Row>)> {
 /// The text of a request with the next number.
 fn text(request: &str, seq: u64) -> String {
     let open = r#"{"type":"open","seq":N,"twin":"test""#;
-    let camera = r#""name":"c","width":8,"height":8,"fx":8,"fy":8,"cx":4,"cy":4,"camera_to_rig":POSE"#;
+    let camera =
+        r#""name":"c","width":8,"height":8,"fx":8,"fy":8,"cx":4,"cy":4,"camera_to_rig":POSE"#;
     let step = r#"{"type":"step","seq":N,"pose":"#;
     let action = r#"{"type":"step","seq":N,"action":"#;
     let whole = match request.strip_prefix("RIG") {
         Some(camera) => format!(r#"OPEN,"rig":{{"name":"r","cameras":[{camera}]}}}}"#),
         None => request.to_owned(),
     };
-    let macros =
-        [("OPEN", open), ("CAM", camera), ("STEP", step), ("CAR", action), ("POSE", POSE)];
+    let macros = [("OPEN", open), ("CAM", camera), ("STEP", step), ("CAR", action), ("POSE", POSE)];
     let whole = macros.iter().fold(whole, |text, (name, body)| text.replace(name, body));
     let number = format!(r#""seq":{seq}"#);
     whole.replace(r#""seq":N"#, &number)

@@ -89,9 +89,17 @@ async fn refusals_are_json_with_a_code_and_a_field() {
     for (body, code, field) in [
         ("[]".to_owned(), "invalid_request", None),
         ("{".to_owned(), "malformed_json", None),
-        (format!(r#"{{"name":"a","size":null,"digest":"{digest}"}}"#), "invalid_request", Some("size")),
+        (
+            format!(r#"{{"name":"a","size":null,"digest":"{digest}"}}"#),
+            "invalid_request",
+            Some("size"),
+        ),
         (format!(r#"{{"name":"a","size":-1,"digest":"{digest}"}}"#), "out_of_range", Some("size")),
-        (format!(r#"{{"name":"a","size":1.5,"digest":"{digest}"}}"#), "invalid_request", Some("size")),
+        (
+            format!(r#"{{"name":"a","size":1.5,"digest":"{digest}"}}"#),
+            "invalid_request",
+            Some("size"),
+        ),
         (
             format!(r#"{{"name":"a","name":"b","size":1,"digest":"{digest}"}}"#),
             "invalid_request",

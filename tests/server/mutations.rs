@@ -80,9 +80,28 @@ fn places(value: &Value, here: &str, all: &mut Vec<String>) {
 /// A request with one to three changes: a value replaced, a field left out or added, or bytes of the text changed.
 fn mutated(random: &mut Random, seq: u64) -> String {
     const TOKENS: [&str; 22] = [
-        "null", "true", "NaN", "-Infinity", "1e999", "-1", "0", "1e5", "1.5", "1e30", "\"\"", "\"x\"",
-        "\"log\"", "[]", "{}", "[[]]", "[0,0,0]", "{\"xyz\":[0,0,0]}", "18446744073709551615",
-        "\"\\u0000\"", "[null]", "9007199254740993.0",
+        "null",
+        "true",
+        "NaN",
+        "-Infinity",
+        "1e999",
+        "-1",
+        "0",
+        "1e5",
+        "1.5",
+        "1e30",
+        "\"\"",
+        "\"x\"",
+        "\"log\"",
+        "[]",
+        "{}",
+        "[[]]",
+        "[0,0,0]",
+        "{\"xyz\":[0,0,0]}",
+        "18446744073709551615",
+        "\"\\u0000\"",
+        "[null]",
+        "9007199254740993.0",
     ];
     let requests = valid(seq);
     let mut request = requests[random.below(requests.len())].clone();
@@ -132,7 +151,8 @@ fn mutated(random: &mut Random, seq: u64) -> String {
 
 async fn driver(server: &TestServer) -> Agent {
     let mut agent = server.agent().await;
-    let open = json!({ "session": "mutated", "outputs": { "encoding": "raw", "cameras": ["rear"] } });
+    let open =
+        json!({ "session": "mutated", "outputs": { "encoding": "raw", "cameras": ["rear"] } });
     agent.open(open).await;
     agent
 }

@@ -69,6 +69,19 @@ fn limits_are_those_of_the_configuration() {
     assert_eq!(pixels, Some(wildcity_session::limits::ANSWER_PIXELS.to_string()));
 }
 
+/// The page lists the cameras of every preset, in their order.
+#[test]
+fn presets_have_the_cameras_of_the_page() {
+    let page = page();
+    for preset in wildcity_scene::Rig::preset_names() {
+        let rig = wildcity_scene::Rig::preset(preset).unwrap();
+        let names: Vec<_> = rig.cameras.iter().map(|camera| format!("`{}`", camera.name)).collect();
+        let row = format!("| {} |", names.join(", "));
+        let line = page.lines().find(|line| line.starts_with(&format!("| `{preset}`")));
+        assert!(line.is_some_and(|line| line.ends_with(&row)), "{preset}: {line:?}, not {row}");
+    }
+}
+
 fn page() -> String {
     std::fs::read_to_string(crate::root::root().join("protocol/README.md")).unwrap()
 }

@@ -72,7 +72,11 @@ async fn mistakes_are_named_by_their_path() {
             "missing",
         ),
         (rig(good.replace("\"width\":8", "\"width\":8.5")), "rig.cameras[1].width", "an integer"),
-        (rig(camera(r#","fy":8,"fov":90"#)), "rig.cameras[1].fov", "no such field; there is camera_to_rig, cx"),
+        (
+            rig(camera(r#","fy":8,"fov":90"#)),
+            "rig.cameras[1].fov",
+            "no such field; there is camera_to_rig, cx",
+        ),
         (r#""rig":7"#.to_owned(), "rig", "a string or an object, found a number"),
         (
             r#""start":{"pose":{"xyz":[0,0],"q":[1,0,0,0]}}"#.to_owned(),

@@ -124,7 +124,10 @@ async fn last_seq_is_the_number_that_the_server_counts_by() {
         assert_eq!(resumed["last_seq"], 3, "{resumed}");
         for wrong in [2, 7] {
             agent.seq = wrong;
-            refused(&agent.ask(json!({ "type": "step", "pose": pose(3.0) })).await, "seq_out_of_order");
+            refused(
+                &agent.ask(json!({ "type": "step", "pose": pose(3.0) })).await,
+                "seq_out_of_order",
+            );
         }
         agent.seq = next;
         let seen = agent.step(3.0).await;

@@ -74,7 +74,9 @@ async fn requests_that_come_early_wait_in_order() {
 #[tokio::test]
 async fn a_close_frame_is_answered_with_its_code() {
     let server = TestServer::start().await;
-    for (code, answered) in [(Some(1000_u16), Some(1000_u16)), (Some(4321), Some(4321)), (None, None)] {
+    for (code, answered) in
+        [(Some(1000_u16), Some(1000_u16)), (Some(4321), Some(4321)), (None, None)]
+    {
         let mut agent = server.agent().await;
         let frame = code.map(|code| CloseFrame { code: code.into(), reason: "done".into() });
         agent.socket.send(Message::Close(frame)).await.unwrap();

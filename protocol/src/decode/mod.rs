@@ -113,8 +113,7 @@ pub fn decode<T: Inbound>(text: &str) -> Result<T, Refused> {
         Err(error) => match Tree::parse(&non_finite::without_infinities(text)) {
             Ok(tree) => tree,
             Err(_) => {
-                let mistake =
-                    Mistake { kind: MistakeKind::NotJson, field: None, reason: error };
+                let mistake = Mistake { kind: MistakeKind::NotJson, field: None, reason: error };
                 return Err(Refused { seq: None, mistake });
             }
         },

@@ -72,8 +72,11 @@ impl Walk<'_> {
                     return Err(self.wrong("expected an integer, found a fraction"));
                 };
                 if !accepted.contains(&whole) {
-                    let reason =
-                        format!("is {number}; {} to {} is accepted", accepted.start(), accepted.end());
+                    let reason = format!(
+                        "is {number}; {} to {} is accepted",
+                        accepted.start(),
+                        accepted.end()
+                    );
                     return Err(self.mistake(MistakeKind::OutOfRange, &reason));
                 }
                 if !number.is_u64() && !number.is_i64() && whole.abs() > EXACT {
@@ -118,12 +121,7 @@ impl Walk<'_> {
         }
     }
 
-    fn list(
-        &mut self,
-        item: &Shape,
-        len: Option<usize>,
-        items: &[Tree],
-    ) -> Result<Value, Mistake> {
+    fn list(&mut self, item: &Shape, len: Option<usize>, items: &[Tree]) -> Result<Value, Mistake> {
         if let Some(len) = len.filter(|&len| len != items.len()) {
             return Err(self.wrong(&format!("expected {len} values, found {}", items.len())));
         }
@@ -134,11 +132,7 @@ impl Walk<'_> {
         Ok(Value::Array(values))
     }
 
-    fn object(
-        &mut self,
-        shape: &ObjectShape,
-        fields: &[(String, Tree)],
-    ) -> Result<Value, Mistake> {
+    fn object(&mut self, shape: &ObjectShape, fields: &[(String, Tree)]) -> Result<Value, Mistake> {
         let mut seen = BTreeSet::new();
         let mut values = Map::new();
         for (name, tree) in fields {

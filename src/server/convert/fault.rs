@@ -272,9 +272,7 @@ fn of_session(error: &SessionError) -> WireFault {
 fn of_profile(error: &ProfileError) -> WireFault {
     match error {
         ProfileError::Value { field, .. } => at(Code::OutOfRange, &format!("profile.{field}")),
-        ProfileError::Change { field, .. } => {
-            at(Code::InvalidRequest, &format!("profile.{field}"))
-        }
+        ProfileError::Change { field, .. } => at(Code::InvalidRequest, &format!("profile.{field}")),
         ProfileError::Setting { .. } => at(Code::InvalidRequest, "profile"),
     }
 }

@@ -22,6 +22,7 @@ impl From<Mistake> for Fault {
 
 /// Reads the body of an HTTP request.
 pub(super) fn read_body<T: Inbound>(body: &[u8]) -> Result<T, Fault> {
-    let text = std::str::from_utf8(body).map_err(|error| Fault::MalformedJson(error.to_string()))?;
+    let text =
+        std::str::from_utf8(body).map_err(|error| Fault::MalformedJson(error.to_string()))?;
     decode(text).map_err(|refused| refused.mistake.into())
 }

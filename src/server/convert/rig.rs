@@ -2,8 +2,8 @@
 
 use crate::fault::Fault;
 use wildcity_protocol::message;
-use wildcity_scene::geometry::camera::json::Intrinsics;
 use wildcity_scene::appearance::AppearanceError;
+use wildcity_scene::geometry::camera::json::Intrinsics;
 use wildcity_scene::rig::{Rig, RigCamera, RigError, check_overlays};
 
 use super::camera::{appearance_of, lens_of, shutter_of, windshield_of};

@@ -178,7 +178,8 @@ impl TrainingCoverage {
         if rays == 0 {
             // An image of less than 64 rows may have all of its followed samples above the horizon.
             rays = skipped.len() as u64;
-            outside = skipped.iter().filter(|ray| !self.meets_content(from_m, **ray)).count() as u64;
+            outside =
+                skipped.iter().filter(|ray| !self.meets_content(from_m, **ray)).count() as u64;
         }
         if rays == 0 {
             let outside = if self.is_near_content(from_m) { 0.0 } else { 1.0 };

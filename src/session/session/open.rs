@@ -251,15 +251,13 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
         let camera = &mut rig.cameras[index];
         if let Some([left, top, width, height]) = *crop {
             let cropped = camera.cropped([left, top], [width, height]);
-            *camera = cropped.map_err(|cause| {
-                refused(&format!(".{name}.crop"), format!("unusable: {cause}"))
-            })?;
+            *camera = cropped
+                .map_err(|cause| refused(&format!(".{name}.crop"), format!("unusable: {cause}")))?;
         }
         if let Some([width, height]) = *size {
             let scaled = camera.scaled(width, height);
-            *camera = scaled.map_err(|cause| {
-                refused(&format!(".{name}.size"), format!("unusable: {cause}"))
-            })?;
+            *camera = scaled
+                .map_err(|cause| refused(&format!(".{name}.size"), format!("unusable: {cause}")))?;
         }
     }
     Ok(rig)
