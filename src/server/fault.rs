@@ -194,6 +194,8 @@ pub(crate) enum Fault {
     UnknownUpload {
         /// The id asked for.
         id: String,
+        /// The field of a body that has it, if one does.
+        field: Option<String>,
     },
     /// The bytes do not continue the upload.
     #[error("the upload has {held} bytes, Upload-Offset is {given}: go on from {held}")]

@@ -99,7 +99,7 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
         (json!({ "overlay": "hood.png" }), "rig.cameras[0].overlay"),
         (json!({ "exposure": {} }), "rig.cameras[0].exposure"),
         (json!({ "exposure": both }), "rig.cameras[0].exposure"),
-        (json!({ "exposure": { "gain": [1, 1, 1e9] } }), "rig.cameras[0].exposure"),
+        (json!({ "exposure": { "gain": [1, 1, 1e9] } }), "rig.cameras[0].exposure.gain"),
     ] {
         let mut agent = server.agent().await;
         let answer = agent.try_open(json!({ "rig": front(more) })).await;

@@ -76,7 +76,7 @@ async fn every_bad_request_has_its_code_and_field() {
                 && answer["fatal"] == false
                 && (!is_json || !has_seq || seq == Some(agent.seq) || field == Some("seq"));
             let message = answer["message"].as_str().unwrap_or_default();
-            let rust = ["u64", "i64", "f64", "usize", "enum ", "struct ", "tuple", "expected `"];
+            let rust = ["u64", "i64", "f64", "u8", "usize", "enum ", "struct ", "tuple"];
             if !is_right || rust.iter().any(|word| message.contains(word)) {
                 wrong.push(format!("line {number}: {request}\n    {answer}"));
             }

@@ -191,10 +191,13 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
     assert!((share - 25.0 * std::f64::consts::PI / 144.0).abs() < 0.05, "{share}");
     // What does not lie within the image is refused.
     let mut agent = server.agent().await;
-    for part in [json!({ "front": { "crop": [0, 0, 9, 6] } }), json!({ "top": {} })] {
+    for (part, code, field) in [
+        (json!({ "front": { "crop": [0, 0, 9, 6] } }), "out_of_range", "outputs.images.front.crop"),
+        (json!({ "top": {} }), "unknown_camera", "outputs.images.top"),
+    ] {
         let answer = agent.try_open(json!({ "outputs": { "images": part } })).await;
-        crate::support::refused(&answer, "out_of_range");
-        assert_eq!(answer["field"], "outputs.images");
+        crate::support::refused(&answer, code);
+        assert_eq!(answer["field"], field);
     }
     server.still_serves().await;
 }

@@ -238,7 +238,6 @@ def test_websockets_gets_its_pongs(url: str) -> None:
         connection.pong(b"unasked")
         connection.send(HELLO)
         welcomed(connection.recv(timeout=10))
-        assert connection.latency < 0.1
 
 
 def test_fragmented_pings_and_long_ones_are_errors(url: str) -> None:

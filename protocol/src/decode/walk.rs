@@ -25,7 +25,7 @@ pub(super) fn seq(tree: &Tree) -> Option<u64> {
     let Tree::Object(fields) = tree else { return None };
     let mut numbers = fields.iter().filter(|(name, _)| name == "seq");
     match (numbers.next(), numbers.next()) {
-        (Some((_, Tree::Number(number))), None) => {
+        (Some((_, Tree::Number(number))), None) if is_exact(number) => {
             integer(number).and_then(|number| u64::try_from(number).ok())
         }
         _ => None,
@@ -79,7 +79,7 @@ impl Walk<'_> {
                     );
                     return Err(self.mistake(MistakeKind::OutOfRange, &reason));
                 }
-                if !number.is_u64() && !number.is_i64() && whole.abs() > EXACT {
+                if !is_exact(number) {
                     let reason = "write an integer of this size without a point or an exponent";
                     return Err(self.wrong(reason));
                 }
@@ -245,6 +245,12 @@ impl Walk<'_> {
             Shape::Choice(_) => "another type",
         }
     }
+}
+
+/// Whether a number says exactly which integer it is, if it is one.
+fn is_exact(number: &Number) -> bool {
+    let has_point = !number.is_u64() && !number.is_i64();
+    !has_point || integer(number).is_some_and(|whole| whole.abs() <= EXACT)
 }
 
 /// The value of a number that is whole.

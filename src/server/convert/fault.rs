@@ -206,7 +206,9 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::Handshake { header, .. } => at(Code::InvalidRequest, header),
         Fault::NoSubprotocol { .. } => at(Code::UnsupportedProtocol, "sec-websocket-protocol"),
         Fault::NoRoute { .. } | Fault::NoMethod { .. } => plain(Code::InvalidRequest),
-        Fault::UnknownUpload { .. } => plain(Code::UnknownUpload),
+        Fault::UnknownUpload { field, .. } => {
+            WireFault { code: Code::UnknownUpload, field: field.clone() }
+        }
         Fault::UploadOffset { .. } => at(Code::UploadOffset, "upload-offset"),
         Fault::UploadDigest { .. } => plain(Code::UploadDigest),
         Fault::StorageFull { .. } => plain(Code::StorageFull),

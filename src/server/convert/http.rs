@@ -14,7 +14,7 @@ use wildcity_push::{
     CellChange, CellSelection, FileReport, PushError, PushReport, PushRequest, PushedVersion,
     RequestedFile, SourceAxes, State, Status,
 };
-use wildcity_twin::ingest::BadGaussian;
+use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
@@ -86,9 +86,13 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
 
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
     let axes = SourceAxes::parse(&file.axes, file.scale);
-    let axes = axes.map_err(|error| PushError::InvalidField {
-        field: format!("files[{index}]"),
-        reason: error.to_string(),
+    let axes = axes.map_err(|error| {
+        let part = match error {
+            IngestError::InvalidAxes { option: "--scale", .. } => "scale",
+            _ => "axes",
+        };
+        let field = format!("files[{index}].{part}");
+        PushError::InvalidField { field, reason: error.to_string() }
     })?;
     Ok(RequestedFile { upload: file.upload, axes })
 }

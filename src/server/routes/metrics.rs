@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::Extension;
 use axum::extract::{Request, State};
-use axum::http::{StatusCode, header};
+use axum::http::{Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
@@ -44,16 +44,22 @@ pub(super) async fn count_refusals(
     request: Request,
     next: Next,
 ) -> Response {
-    let length = request.headers().get(header::CONTENT_LENGTH).cloned();
-    let mut response = next.run(request).await;
-    // The body that axum itself refuses has no code yet.
+    let limit = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
+    let too_large =
+        |bytes: usize| Refusal::from(Fault::MessageTooLarge { bytes, limit }).into_response();
+    let announced = request.headers().get(header::CONTENT_LENGTH);
+    let announced = announced.and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    // Only the parts of an upload may be larger.
+    let is_upload = request.method() == Method::PATCH;
+    let mut response = match announced {
+        Some(bytes) if bytes > limit && !is_upload => too_large(bytes),
+        _ => next.run(request).await,
+    };
+    // A body of unknown length is refused by axum itself, without a code.
     if response.status() == StatusCode::PAYLOAD_TOO_LARGE
         && response.extensions().get::<WireCode>().is_none()
     {
-        let limit = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
-        let announced = length.and_then(|length| length.to_str().ok()?.parse().ok());
-        let bytes = announced.unwrap_or(limit + 1);
-        response = Refusal::from(Fault::MessageTooLarge { bytes, limit }).into_response();
+        response = too_large(limit + 1);
     }
     if let Some(code) = response.extensions().get::<WireCode>() {
         state.metrics.refused(&code.0);

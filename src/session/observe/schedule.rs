@@ -188,8 +188,8 @@ mod tests {
         assert_eq!(new(16, "rear", 100_000, 100_000), "");
         assert!(new(17, "rear", 100_000, 100_000).starts_with("outputs.frames is 17"));
         assert!(new(0, "rear", 100_000, 100_000).starts_with("outputs.frames is 0"));
-        assert!(new(1, "rear", 150_000, 100_000).starts_with("outputs.period_us is 150000"));
-        assert!(new(1, "rear", 0, 100_000).starts_with("outputs.period_us is 0"));
+        assert!(new(1, "rear", 150_000, 100_000).starts_with("outputs.period_us.rear is 150000"));
+        assert!(new(1, "rear", 0, 100_000).starts_with("outputs.period_us.rear is 0"));
         assert!(new(1, "rear", 100_000, -100_000).starts_with("decision_us is -100000"));
         assert!(new(1, "roof", 100_000, 100_000).contains("no camera \"roof\""));
     }
