@@ -114,7 +114,7 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
     rig["cameras"][1]["name"] = "rear".into();
     let answer = server.agent().await.try_open(json!({ "rig": rig })).await;
     refused(&answer, "out_of_range");
-    assert_eq!(answer["field"], "rig.cameras");
+    assert_eq!(answer["field"], "rig.cameras[1].overlay");
     assert!(answer["message"].as_str().unwrap().contains("24576000 pixels"), "{answer}");
     server.still_serves().await;
 }
