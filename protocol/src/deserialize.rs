@@ -1,44 +1,14 @@
-//! Parsing of requests with errors that name the mistake: fields that accept one of two forms, and fields
-//! that do not exist.
+//! Deserialization of fields that accept one of two forms.
 
 use std::fmt;
 
 use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer};
-use serde_json::Value;
 
 use crate::message::{
     BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, ScenarioChoice,
     Start,
 };
-
-/// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
-///
-/// Answers may gain fields, so the types that requests share with answers ignore unknown ones. `understood`
-/// is the parsed request written as JSON again: a field that is missing there was ignored.
-pub fn unknown_field(sent: &Value, understood: &Value) -> Option<String> {
-    match (sent, understood) {
-        (Value::Object(sent), Value::Object(understood)) => {
-            sent.iter().find_map(|(name, value)| match understood.get(name) {
-                Some(same) => unknown_field(value, same).map(|path| join(name, &path)),
-                // An option that is `null` is left out when it is written again.
-                None if value.is_null() => None,
-                None => Some(name.clone()),
-            })
-        }
-        (Value::Array(sent), Value::Array(understood)) => {
-            sent.iter().zip(understood).enumerate().find_map(|(index, (value, same))| {
-                unknown_field(value, same).map(|path| join(&format!("[{index}]"), &path))
-            })
-        }
-        _ => None,
-    }
-}
-
-fn join(outer: &str, inner: &str) -> String {
-    let dot = if inner.starts_with('[') { "" } else { "." };
-    format!("{outer}{dot}{inner}")
-}
 
 /// Decided by the fields that are present. Serde's own `untagged` tries one variant after the other, and
 /// cannot say what was wrong with each.
@@ -84,16 +54,9 @@ impl<'de> Deserialize<'de> for BranchPoint {
     }
 }
 
-/// A string is a name; an object is the scenario if it has a format, and else a name with values.
+/// A string is a name.
 impl<'de> Deserialize<'de> for ScenarioChoice {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        #[derive(Deserialize)]
-        #[serde(deny_unknown_fields)]
-        struct Values {
-            name: String,
-            #[serde(default)]
-            values: serde_json::Map<String, serde_json::Value>,
-        }
         struct Either;
         impl<'de> Visitor<'de> for Either {
             type Value = ScenarioChoice;
@@ -107,13 +70,8 @@ impl<'de> Deserialize<'de> for ScenarioChoice {
             }
 
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<ScenarioChoice, A::Error> {
-                let map = serde_json::Map::deserialize(MapAccessDeserializer::new(map))?;
-                if map.contains_key("format") {
-                    return Ok(ScenarioChoice::Inline(map));
-                }
-                let Values { name, values } =
-                    serde_json::from_value(map.into()).map_err(A::Error::custom)?;
-                Ok(ScenarioChoice::Values { name, values })
+                serde_json::Map::deserialize(MapAccessDeserializer::new(map))
+                    .map(ScenarioChoice::Object)
             }
         }
         deserializer.deserialize_any(Either)

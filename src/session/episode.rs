@@ -250,8 +250,8 @@ impl Episode {
         outcome: Outcome,
         least_trust: Option<f64>,
     ) -> EpisodeSummary {
-        let completed =
-            self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
+        let completed = self.terminated
+            || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
         let failed = self.failed || outcome == Outcome::DrivingFailure;
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model, failed) {

@@ -108,7 +108,8 @@ impl Session {
                 start.as_ref(),
                 self.settings.warm_up_us,
                 self.settings.dynamics,
-            )?,
+            )
+            .map_err(|error| error.of_reset(start.as_ref()))?,
             None => self.settings.start.clone(),
         };
         let mut next = start.episode(seed, self.settings.dynamics, self.settings.dt_us);
