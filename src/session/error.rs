@@ -10,7 +10,7 @@ use wildcity_twin::store::StoreError;
 
 use crate::options::Start;
 use crate::record::error::{BranchError, RecordError};
-use crate::scenario::ScenarioError;
+use crate::scenario::load::ScenarioError;
 
 /// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]

@@ -9,7 +9,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
 use crate::observe::encode::Encoding;
-use crate::scenario::ScenarioSource;
+use crate::scenario::load::ScenarioSource;
 
 /// How to open a session. For a field that is `None`, the twin or this package's `limits` decide.
 #[derive(Clone, Debug, PartialEq)]

@@ -27,7 +27,7 @@ use self::twin_summaries::{SummaryCache, TwinSummary};
 use crate::blocking::run_blocking;
 use crate::error::SessionError;
 use crate::limits;
-use crate::scenario::Scenarios;
+use crate::scenario::load::Scenarios;
 
 /// The parts and settings of an [`Engine`].
 pub struct EngineSettings {

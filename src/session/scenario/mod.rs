@@ -1,6 +1,6 @@
 //! Scenarios: files by name with the tracks and maps beside them, and the traffic of a session's episodes.
 
-mod load;
+pub(crate) mod load;
 mod traffic;
 
 use std::collections::BTreeMap;
