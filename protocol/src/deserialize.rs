@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use crate::message::{
-    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start,
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, RandomStart, Rig, RigChoice, Start,
 };
 
 /// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
@@ -49,14 +49,18 @@ impl<'de> Deserialize<'de> for Start {
             pose: Option<Pose>,
             trajectory: Option<String>,
             station_m: Option<f64>,
+            random: Option<RandomStart>,
         }
-        let Either { pose, trajectory, station_m } = Either::deserialize(deserializer)?;
-        match (pose, trajectory, station_m) {
-            (Some(pose), None, None) => Ok(Self::Pose { pose }),
-            (None, Some(trajectory), station_m) => {
+        let Either { pose, trajectory, station_m, random } = Either::deserialize(deserializer)?;
+        match (pose, trajectory, station_m, random) {
+            (Some(pose), None, None, None) => Ok(Self::Pose { pose }),
+            (None, None, None, Some(random)) => Ok(Self::Random { random }),
+            (None, Some(trajectory), station_m, None) => {
                 Ok(Self::Station { trajectory, station_m: station_m.unwrap_or_default() })
             }
-            _ => Err(D::Error::custom("a start has either pose, or trajectory and station_m")),
+            _ => Err(D::Error::custom(
+                "a start has either pose, or trajectory and station_m, or random",
+            )),
         }
     }
 }

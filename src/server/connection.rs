@@ -183,11 +183,14 @@ impl Connection {
             Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
             Command::Branch { name, from } => self.branch(seq, name, from).await,
             Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
-            Command::Step { movement, terminate } => {
+            Command::Step { movement, options } => {
                 let begun = Instant::now();
-                let frame = self.session()?.step(movement, terminate).await?;
+                let session = self.session()?;
+                let done = session.episode().step();
+                let frame = session.follow(movement, options).await?;
+                let steps = session.episode().step() - done;
                 let metrics = &self.state.metrics;
-                metrics.steps.inc();
+                metrics.steps.inc_by(steps);
                 metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
                 metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
                 self.observation(seq, frame)
@@ -208,8 +211,8 @@ impl Connection {
                 let frame = self.session()?.restore(&name).await?;
                 self.observation(seq, frame)
             }
-            Command::Reset { seed, start } => {
-                let frame = self.session()?.reset(seed, start).await?;
+            Command::Reset { options } => {
+                let frame = self.session()?.reset_with(options).await?;
                 self.observation(seq, frame)
             }
             Command::SwitchVersion { version } => {

@@ -72,6 +72,8 @@ pub enum SessionError {
     /// The twin has no trajectory of this name.
     #[error("the twin has no trajectory {name:?}; it has {}", joined_or_none(known))]
     UnknownTrajectory {
+        /// The field of the request that names it, as on the wire.
+        field: &'static str,
         /// The requested name.
         name: String,
         /// The names of the twin's trajectories.

@@ -45,7 +45,10 @@ pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{TrainingCoverage, Trust};
-pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
+pub use options::{
+    ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, SessionOptions, Start,
+    StepOptions,
+};
 pub use preview::{ProposedChange, PsnrPreview};
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;

@@ -16,8 +16,8 @@ pub use answer::{Answer, Limits, Opened, Outcome, ServerInfo, Summary, Trajector
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};
 pub use open::{
-    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, Rig, RigCamera,
-    RigChoice, Start,
+    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, RandomStart, Rig,
+    RigCamera, RigChoice, Start,
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, TimedPose};

@@ -59,6 +59,11 @@ pub(crate) fn opened(
     session: &Session,
     section: Option<&DriveRequest>,
 ) -> Result<String, Fault> {
+    text(&Answer::Opened(Box::new(settings(seq, session, section)?)))
+}
+
+/// All settings of a session.
+fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Result<Opened, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
@@ -79,7 +84,7 @@ pub(crate) fn opened(
         cameras: Some(names),
         images: BTreeMap::new(),
     };
-    text(&Answer::Opened(Box::new(Opened {
+    Ok(Opened {
         seq,
         session: session.name().to_owned(),
         twin: manifest.twin.clone(),
@@ -105,7 +110,7 @@ pub(crate) fn opened(
             .collect(),
         reserved_bytes: session.reserved_bytes(),
         trajectory: trajectory.transpose()?,
-    })))
+    })
 }
 
 /// The answer to `resume`.
@@ -117,6 +122,7 @@ pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<Stri
         last_seq,
         step: episode.step(),
         time_us: episode.time_us(),
+        opened: Some(Box::new(settings(seq, session, None)?)),
     })
 }
 
