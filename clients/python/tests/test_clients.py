@@ -27,7 +27,6 @@ from wildcity import (
     ProtocolError,
     Refused,
     TimedOut,
-    WildCityError,
 )
 from wildcity.protocol import PROTOCOL
 
