@@ -6,8 +6,8 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer};
 
 use crate::message::{
-    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, ScenarioChoice,
-    Start,
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, RandomStart, Rig, RigChoice,
+    ScenarioChoice, Start,
 };
 
 /// Decided by the fields that are present. Serde's own `untagged` tries one variant after the other, and
@@ -20,14 +20,18 @@ impl<'de> Deserialize<'de> for Start {
             pose: Option<Pose>,
             trajectory: Option<String>,
             station_m: Option<f64>,
+            random: Option<RandomStart>,
         }
-        let Either { pose, trajectory, station_m } = Either::deserialize(deserializer)?;
-        match (pose, trajectory, station_m) {
-            (Some(pose), None, None) => Ok(Self::Pose { pose }),
-            (None, Some(trajectory), station_m) => {
+        let Either { pose, trajectory, station_m, random } = Either::deserialize(deserializer)?;
+        match (pose, trajectory, station_m, random) {
+            (Some(pose), None, None, None) => Ok(Self::Pose { pose }),
+            (None, None, None, Some(random)) => Ok(Self::Random { random }),
+            (None, Some(trajectory), station_m, None) => {
                 Ok(Self::Station { trajectory, station_m: station_m.unwrap_or_default() })
             }
-            _ => Err(D::Error::custom("a start has either pose, or trajectory and station_m")),
+            _ => Err(D::Error::custom(
+                "a start has either pose, or trajectory and station_m, or random",
+            )),
         }
     }
 }

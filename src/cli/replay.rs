@@ -142,6 +142,7 @@ fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {
     let request = match request {
         FrameRequest::Reset => "reset".to_owned(),
         FrameRequest::Step => "step".to_owned(),
+        FrameRequest::Restore => "restore".to_owned(),
         FrameRequest::Observe => format!("observe{pose}"),
     };
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));

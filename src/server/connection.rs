@@ -198,11 +198,14 @@ impl Connection {
             Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
             Command::Branch { name, from } => self.branch(seq, name, from).await,
             Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
-            Command::Step { movement, terminate } => {
+            Command::Step { movement, options } => {
                 let begun = Instant::now();
-                let frame = self.session()?.step(movement, terminate).await?;
+                let session = self.session()?;
+                let done = session.episode().step();
+                let frame = session.follow(movement, options).await?;
+                let steps = session.episode().step() - done;
                 let metrics = &self.state.metrics;
-                metrics.steps.inc();
+                metrics.steps.inc_by(steps);
                 metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
                 metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
                 self.observation(seq, frame)
@@ -223,8 +226,8 @@ impl Connection {
                 let frame = self.session()?.restore(&name).await?;
                 self.observation(seq, frame)
             }
-            Command::Reset { seed, start } => {
-                let frame = self.session()?.reset(seed, start).await?;
+            Command::Reset { options } => {
+                let frame = self.session()?.reset_with(options).await?;
                 self.observation(seq, frame)
             }
             Command::SwitchVersion { version } => {
@@ -335,7 +338,8 @@ impl Connection {
         };
         if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
             check(closed.last.seq)?;
-            let text = convert::resumed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
+            let text =
+                convert::resumed_closed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
             self.answered_seq = Some(closed.last.seq);
             self.last = Some(closed.last);
             return Ok(Answer::Text(text.into()));
@@ -344,8 +348,7 @@ impl Connection {
         check(slot.answered_seq)?;
         let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
         let session = slot.session.as_ref().ok_or(NO_SESSION)?;
-        let episode = session.episode();
-        let text = convert::resumed(seq, name, carried_out, episode.step(), episode.time_us())?;
+        let text = convert::resumed(seq, carried_out, session)?;
         tracing::info!(session = session.name(), "resumed");
         self.last = slot.last.clone();
         self.answered_seq = Some(slot.answered_seq);

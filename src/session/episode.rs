@@ -134,21 +134,40 @@ impl Episode {
         ground: &Ground<'_>,
         terminate: bool,
     ) -> Result<Self, SessionError> {
+        self.followed(command, 1, ground, terminate)
+    }
+
+    /// The episode after one or more steps along a plan: a command that holds for all of them.
+    ///
+    /// # Errors
+    /// As [`Episode::stepped`].
+    pub fn followed(
+        &self,
+        command: &Command,
+        steps: usize,
+        ground: &Ground<'_>,
+        terminate: bool,
+    ) -> Result<Self, SessionError> {
         if self.terminated {
             return Err(SessionError::EpisodeOver { steps: self.step });
         }
         let mut next = self.clone();
-        next.ego = self.ego.stepped(command, self.dt_us, ground)?;
-        let world_from_rig = next.ego.world_from_rig();
-        let moved_m = world_from_rig.position_m - self.world_from_rig().position_m;
-        let time_us = self.time_us() + self.dt_us;
-        next.step += 1;
-        next.distance_m += moved_m.length();
+        for ego in self.ego.followed(command, self.dt_us, steps, ground)? {
+            let world_from_rig = ego.world_from_rig();
+            let moved_m = world_from_rig.position_m - next.world_from_rig().position_m;
+            let time_us = next.time_us() + self.dt_us;
+            next.step += 1;
+            next.distance_m += moved_m.length();
+            next.track.push_back(Keyframe { time_us, world_from_rig });
+            next.ego = ego;
+        }
         next.terminated = terminate;
-        next.track.push_back(Keyframe { time_us, world_from_rig });
-        // Keep one pose at or before the history's first, to interpolate from. The first step may still
-        // render frames of the warm-up, so it keeps all of that.
-        let reach_us = HISTORY_US.max(self.dt_us - self.begin_us);
+        // Keep one pose at or before the history's first, to interpolate from, for every step of the plan: the
+        // frames that were taken since its start are rendered at its end. The first plan may still render frames
+        // of the warm-up, so it keeps all of that.
+        let time_us = next.time_us();
+        let plan_us = time_us - self.time_us();
+        let reach_us = (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
         while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }
@@ -157,22 +176,22 @@ impl Episode {
 
     /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
     ///
-    /// With `in_motion`, cameras with a rolling shutter move during the exposure: the ego's last motion is
-    /// transferred to that pose. Otherwise the rig stands still during the exposure, as in a warm-up and at
-    /// the start of an episode.
+    /// Cameras with a rolling shutter move during the exposure: the ego's motion up to the time `taken_us` is
+    /// transferred to that pose. In a warm-up (`taken_us` below 0) and at the start of an episode, the rig stands
+    /// still during the exposure.
     pub(crate) fn views(
         &self,
         cameras: &[RigCamera],
         selected: &[usize],
         world_from_rig: Pose,
-        in_motion: bool,
+        taken_us: i64,
     ) -> Vec<View> {
-        let now = self.world_from_rig();
+        let now = self.pose_at(taken_us);
         let all = View::of_moving_rig(cameras, world_from_rig, &|age_us| {
-            if !in_motion {
+            if taken_us < 0 {
                 return world_from_rig;
             }
-            let then = self.pose_at((self.time_us() - age_us).max(0));
+            let then = self.pose_at((taken_us - age_us).max(0));
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         });
         selected.iter().map(|&camera| all[camera]).collect()
@@ -392,7 +411,8 @@ mod tests {
     #[test]
     fn rolling_shutters_see_from_where_the_ego_was() {
         let views = |episode: &Episode, camera: &RigCamera, x_m: f64| {
-            episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), true)
+            let now_us = episode.time_us();
+            episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), now_us)
         };
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
         let mut camera = RigCamera::new("front", Camera::from_pinhole(8, 6, pinhole), at(1.5, 0.2));

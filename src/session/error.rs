@@ -85,6 +85,8 @@ pub enum SessionError {
     /// The twin has no trajectory of this name.
     #[error("the twin has no trajectory {name:?}; it has {}", joined_or_none(known))]
     UnknownTrajectory {
+        /// The field of the request that names it, as on the wire.
+        field: &'static str,
         /// The requested name.
         name: String,
         /// The names of the twin's trajectories.
@@ -167,6 +169,7 @@ impl SessionError {
                 let field = match start {
                     Start::Pose(_) => "start.pose",
                     Start::Station { .. } => "start.station_m",
+                    Start::Random(_) => "start.random.from_m",
                 };
                 let must = format!("too early for the session's warm_up_us, which is {must}");
                 Self::OutOfRange { field, must }

@@ -48,7 +48,8 @@ pub use observe::observation::{
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{
-    ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, SessionOptions, Start,
+    ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
+    SessionOptions, Start, StepOptions,
 };
 pub use preview::{ProposedChange, PsnrPreview};
 pub use record::continuation::Continuation;

@@ -37,6 +37,15 @@ pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 /// Sessions at once, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
 
+/// Most steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the plan's end.
+pub const PLAN_STEPS: usize = 1_000;
+
+/// Longest plan, in microseconds: as long as the longest trajectory.
+pub const PLAN_US: i64 = wildcity_sim::limits::PATH_US;
+
+/// Largest notes of a step, in bytes of JSON. A line of the record has room for them.
+pub const NOTES_BYTES: usize = 64 << 10;
+
 /// Snapshots of one session. A snapshot holds the last frames of a bundle, which count against
 /// [`ANSWERS_BYTES`], and the poses of 1.5 s.
 pub const SNAPSHOTS: usize = 64;
@@ -62,6 +71,9 @@ pub const BUNDLE_FRAMES: usize = HISTORY_POSES;
 /// Longest time between two frames of a camera, or between two decisions, in microseconds. A longer step
 /// raises it to the step.
 pub const BUNDLE_PERIOD_US: i64 = 10_000_000;
+
+/// Largest lateral jitter of a random start, in metres: the other side of a wide road.
+pub const START_LATERAL_M: f64 = 20.0;
 
 /// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known agent
 /// reads. At 100 Hz these are 2,000 poses of a recorded drive.

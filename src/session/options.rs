@@ -80,6 +80,17 @@ impl SessionOptions {
     }
 }
 
+/// How a step is made, beside its command.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepOptions {
+    /// For how long the command is followed, in microseconds: a whole number of steps; one step if absent.
+    pub until_us: Option<i64>,
+    /// Whether the episode ends with it.
+    pub terminate: bool,
+    /// What the agent notes, for the record.
+    pub notes: Option<serde_json::Value>,
+}
+
 /// Where an episode starts.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Start {
@@ -92,6 +103,36 @@ pub enum Start {
         /// Distance along it in metres, from 0 to its length.
         station_m: f64,
     },
+    /// Somewhere along a recorded trajectory, drawn with the episode's seed.
+    Random(RandomStart),
+}
+
+/// A start that is drawn anew for each episode. Every draw is uniform.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RandomStart {
+    /// Name of the trajectory; the first one if absent.
+    pub trajectory: Option<String>,
+    /// Where the stations begin, in metres; at 0, or where a warm-up ends, if absent.
+    pub from_m: Option<f64>,
+    /// Where the stations end, in metres; at the trajectory's end if absent.
+    pub to_m: Option<f64>,
+    /// Largest distance to the left or right of the drive, in metres.
+    pub lateral_m: f64,
+    /// Largest angle to the drive's heading, in radians.
+    pub heading_rad: f64,
+}
+
+/// What `reset` changes for its episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ResetOptions {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Where it starts; the session's start if absent.
+    pub start: Option<Start>,
+    /// How the ego moves; the session's dynamics if absent.
+    pub dynamics: Option<Dynamics>,
+    /// Speed at the start, in m/s, in place of that of the dynamics.
+    pub speed_m_s: Option<f64>,
 }
 
 /// Which rig.

@@ -12,6 +12,7 @@ use crate::episode::Episode;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::trust::TrainingCoverage;
+use crate::options::RandomStart;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
 use crate::scenario::{EpisodeTraffic, SessionScenario};
@@ -27,8 +28,9 @@ pub(crate) struct SessionSettings {
     /// The share of the budget for answers that the cameras' overlays take.
     pub(crate) _overlays: BudgetShare,
     pub(crate) dynamics: Dynamics,
-    /// Where episodes start unless `reset` names another start.
+    /// Where episodes start unless `reset` names another start; drawn anew for each if `random_start` is set.
     pub(crate) start: EpisodeStart,
+    pub(crate) random_start: Option<RandomStart>,
     pub(crate) warm_up_us: i64,
     pub(crate) dt_us: i64,
     pub(crate) deadline: Duration,

@@ -34,7 +34,7 @@ async fn open(agent: &mut Agent, name: &str, model: &str) {
     let speed = if model == "teleport" { 0.0 } else { 9.0 };
     let fields = json!({
         "session": name, "version": 1, "seed": 5,
-        "rig": { "name": "pair", "cameras": [camera("front", 30_000), camera("rear", 0)] },
+        "rig": { "name": "pair", "cameras": [camera("front", 30_000), camera("rear", 20_000)] },
         "outputs": { "encoding": "raw", "depth": true, "frames": 4, "trust": true,
                      "period_us": { "rear": 200_000 } },
         "dynamics": { "model": model, "speed": speed }, "decision_us": 300_000, "warm_up_us": 500_000,

@@ -25,6 +25,7 @@ from wildcity import (
     Outputs,
     Pose,
     ProtocolError,
+    RandomStart,
     RecordedPoint,
     Rig,
     Shutter,
@@ -41,6 +42,9 @@ HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
 PLANNED = Trajectory(
     (TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0))))
+)
+LONGER = Trajectory(
+    (TimedPose(500_000, Pose((1.5, 0.5, 0.0))), TimedPose(1_000_000, Pose((3.25, 0.5, 0.0))))
 )
 LOG = Station("log", 12.5)
 FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
@@ -90,6 +94,9 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
     "step_trajectory": lambda c: c.step(PLANNED, False),
+    "step_until": lambda c: c.step(
+        LONGER, False, 1_000_000, {"confidence": 0.75, "reasoning": "a clear road"}
+    ),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
@@ -97,6 +104,9 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "reset": lambda c: c.reset(7, None),
     "reset_pose": lambda c: c.reset(8, HERE),
     "reset_station": lambda c: c.reset(9, LOG),
+    "reset_random": lambda c: c.reset(
+        10, RandomStart("log", 20.0, 300.0, 0.5, 0.0625), Dynamics("kinematic", 3.0), 8.5
+    ),
     "switch_version": lambda c: c.switch_version(4),
     "switch_latest": lambda c: c.switch_version(None),
     "snapshot": lambda c: c.snapshot("before-junction"),

@@ -42,6 +42,9 @@ pub enum Answer {
         step: u64,
         /// Simulated time, in microseconds.
         time_us: i64,
+        /// The settings of the session, as in the answer to `open`; the version is the present one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        opened: Option<Box<Opened>>,
     },
     /// Answer to `prefetch` and to `snapshot`.
     Ok {

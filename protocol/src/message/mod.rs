@@ -17,8 +17,8 @@ pub use answer::{
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};
 pub use open::{
-    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, Rig, RigCamera,
-    RigChoice, ScenarioChoice, Start,
+    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, RandomStart, Rig,
+    RigCamera, RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, TimedPose};

@@ -153,6 +153,33 @@ pub enum Start {
         #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
         station_m: f64,
     },
+    /// Somewhere along a recorded trajectory, drawn anew for each episode with its seed.
+    Random {
+        /// What is drawn.
+        random: RandomStart,
+    },
+}
+
+/// A start that is drawn with the episode's seed. Every draw is uniform.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct RandomStart {
+    /// Name of the trajectory. If absent, the twin's first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<String>,
+    /// Least distance from the start of the trajectory, in metres. If absent, 0, or where the warm-up ends.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from_m: Option<f64>,
+    /// Largest distance from the start of the trajectory. If absent, its length.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub to_m: Option<f64>,
+    /// Largest distance to the left or right of the drive, in metres, 0 to 20.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lateral_m: Option<f64>,
+    /// Largest angle to the drive's heading, in radians, 0 to π.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_rad: Option<f64>,
 }
 
 /// The scenario of a session.

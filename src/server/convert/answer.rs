@@ -60,6 +60,11 @@ pub(crate) fn opened(
     session: &Session,
     section: Option<&DriveRequest>,
 ) -> Result<String, Fault> {
+    text(&Answer::Opened(Box::new(settings(seq, session, section)?)))
+}
+
+/// All settings of a session.
+fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Result<Opened, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
@@ -81,7 +86,7 @@ pub(crate) fn opened(
         cameras: Some(names),
         images: BTreeMap::new(),
     };
-    text(&Answer::Opened(Box::new(Opened {
+    Ok(Opened {
         seq,
         session: session.name().to_owned(),
         twin: manifest.twin.clone(),
@@ -108,7 +113,7 @@ pub(crate) fn opened(
         reserved_bytes: session.reserved_bytes(),
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
-    })))
+    })
 }
 
 fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
@@ -119,15 +124,29 @@ fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
     }
 }
 
-/// The answer to `resume`.
-pub(crate) fn resumed(
+/// The answer to `resume` of an open session.
+pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<String, Fault> {
+    let episode = session.episode();
+    text(&Answer::Resumed {
+        seq,
+        session: session.name().to_owned(),
+        last_seq,
+        step: episode.step(),
+        time_us: episode.time_us(),
+        opened: Some(Box::new(settings(seq, session, None)?)),
+    })
+}
+
+/// The answer to `resume` of a session that was closed, whose client did not get the answer to that.
+pub(crate) fn resumed_closed(
     seq: u64,
     session: &str,
     last_seq: u64,
     step: u64,
     time_us: i64,
 ) -> Result<String, Fault> {
-    text(&Answer::Resumed { seq, session: session.to_owned(), last_seq, step, time_us })
+    let session = session.to_owned();
+    text(&Answer::Resumed { seq, session, last_seq, step, time_us, opened: None })
 }
 
 /// The answer to `prefetch`.

@@ -257,7 +257,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
         SessionError::Branch(_) => at(Code::UnknownState, "from"),
         SessionError::CameraOption { field, .. } => at(Code::OutOfRange, field),
-        SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
+        SessionError::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         SessionError::Profile(error) => of_profile(error),
         SessionError::Sky(_) => at(Code::OutOfRange, "profile.sky_error"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),

@@ -58,8 +58,8 @@ pub(crate) enum Command {
     Step {
         /// How the ego moves.
         movement: wildcity_sim::Command,
-        /// Whether it is the last step.
-        terminate: bool,
+        /// How long, whether it is the last step, and notes.
+        options: StepOptions,
     },
     /// Renders images of poses.
     Observe {
@@ -73,10 +73,8 @@ pub(crate) enum Command {
     },
     /// Begins a new episode.
     Reset {
-        /// Its seed.
-        seed: u64,
-        /// Its start.
-        start: Option<Start>,
+        /// Seed, start and dynamics.
+        options: ResetOptions,
     },
     /// Switches to another version of the twin.
     SwitchVersion {
@@ -156,9 +154,10 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, command)
         }
         Request::Open(open) => (open.seq, open_command(*open)),
-        Request::Step { seq, pose, trajectory, action, terminate } => {
+        Request::Step { seq, pose, trajectory, action, until_us, notes, terminate } => {
             let movement = movement_of(pose, trajectory, action);
-            (seq, movement.map(|movement| Command::Step { movement, terminate }))
+            let options = StepOptions { until_us, terminate, notes };
+            (seq, movement.map(|movement| Command::Step { movement, options }))
         }
         Request::Observe { seq, poses } => {
             let poses = poses_of("poses", &poses, wildcity_session::limits::OBSERVE_POSES);
@@ -168,9 +167,9 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             let poses = poses_of("poses", &poses, wildcity_session::limits::PREFETCH_POSES);
             (seq, poses.map(|poses| Command::Prefetch { poses }))
         }
-        Request::Reset { seq, seed, start } => {
-            let start = start.map(start_of).transpose();
-            (seq, start.map(|start| Command::Reset { seed, start }))
+        Request::Reset { seq, seed, start, dynamics, speed } => {
+            let options = reset_options(seed, start, dynamics, speed);
+            (seq, options.map(|options| Command::Reset { options }))
         }
         Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
         Request::Snapshot { seq, name } => {
@@ -307,6 +306,20 @@ fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
     Ok(Command::Branch { name, from })
 }
 
+fn reset_options(
+    seed: u64,
+    start: Option<message::Start>,
+    dynamics: Option<message::DynamicsChoice>,
+    speed_m_s: Option<f64>,
+) -> Result<ResetOptions, Fault> {
+    Ok(ResetOptions {
+        seed,
+        start: start.map(start_of).transpose()?,
+        dynamics: dynamics.map(dynamics_of).transpose()?,
+        speed_m_s,
+    })
+}
+
 fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
     let message::Dynamics { model, speed, reverse } = match choice {
         message::DynamicsChoice::Full(dynamics) => dynamics,
@@ -361,6 +374,16 @@ fn start_of(start: message::Start) -> Result<Start, Fault> {
         message::Start::Pose { pose } => Start::Pose(pose_of("start.pose", &pose)?),
         message::Start::Station { trajectory, station_m } => {
             Start::Station { trajectory, station_m }
+        }
+        message::Start::Random { random } => {
+            let message::RandomStart { trajectory, from_m, to_m, lateral_m, heading_rad } = random;
+            Start::Random(RandomStart {
+                trajectory,
+                from_m,
+                to_m,
+                lateral_m: lateral_m.unwrap_or(0.0),
+                heading_rad: heading_rad.unwrap_or(0.0),
+            })
         }
     })
 }

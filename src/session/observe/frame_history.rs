@@ -67,9 +67,10 @@ impl FrameHistory {
         self
     }
 
-    /// Drops the frames that no decision after a time will show.
+    /// Drops the frames that no decision at a time, in microseconds, or after it will show. Those that the
+    /// observation of now shows stay: a snapshot of now shows them again.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
         self.0
-            .retain(|kept| schedule.is_shown_after(kept.frame.camera, kept.frame.time_us, time_us));
+            .retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.time_us, time_us));
     }
 }

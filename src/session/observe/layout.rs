@@ -169,11 +169,9 @@ impl ObservationLayout {
         poses.into_iter().map(capture).collect()
     }
 
-    /// The views of a capture. Those of an earlier time are in the warm-up: the rig stands during the
-    /// exposure.
+    /// The views of a capture.
     pub(crate) fn views(&self, episode: &Episode, capture: &RigCapture) -> Vec<View> {
-        let in_motion = capture.time_us == episode.time_us();
-        episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, in_motion)
+        episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, capture.time_us)
     }
 
     /// Checks that the images of so many rigs, which `field` of a request asks for, fit one answer.

@@ -116,6 +116,12 @@ impl Schedule {
         self.shown_times(camera, next_us).filter(move |&taken_us| taken_us <= time_us)
     }
 
+    /// Whether the first decision at `time_us` or after it shows the frame of a camera that was taken at
+    /// `taken_us`. If it does not, no later one does.
+    pub(crate) fn is_shown_from(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {
+        self.is_shown_after(camera, taken_us, time_us - 1)
+    }
+
     /// Whether the first decision after `time_us` shows the frame of a camera that was taken at
     /// `taken_us`. If it does not, no later one does.
     pub(crate) fn is_shown_after(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {

@@ -198,12 +198,12 @@ fn frames_taken(
     Ok(taken)
 }
 
-/// Drops the frames that no observation after a time shows.
+/// Drops the frames that no observation at a time or after it shows.
 fn drop_unneeded(layout: &ObservationLayout, kept: &mut Vec<KeptFrames>, time_us: i64) {
     let schedule = layout.schedule();
     for frames in kept.iter_mut() {
         let is_needed =
-            |one: &KeptFrame| schedule.is_shown_after(one.camera, one.capture.time_us, time_us);
+            |one: &KeptFrame| schedule.is_shown_from(one.camera, one.capture.time_us, time_us);
         frames.frames.retain(is_needed);
     }
     kept.retain(|frames| !frames.frames.is_empty());

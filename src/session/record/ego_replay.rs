@@ -62,7 +62,7 @@ impl EgoReplay {
                 Command::Path(Path::checked(poses.clone()).map_err(SessionError::Ego)?)
             }
         };
-        self.episode = self.episode.stepped(&command, ground, false)?;
+        self.episode = self.episode.followed(&command, frame.steps as usize, ground, false)?;
         let now = self.episode.world_from_rig();
         Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))
     }

@@ -11,6 +11,7 @@
 //! A scenario adds the lines of [`wildcity_episode`]: `scenario`, `actors`, `event` and `result`.
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
@@ -136,6 +137,16 @@ pub struct FrameRecord {
     /// The command that moved the ego, unless it was the pose itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub command: Option<RecordedCommand>,
+    /// Steps that the command moved the ego by, for which it was a plan.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub steps: u64,
+    /// When the frames at the poses were taken, in microseconds; only for a plan. Otherwise the last one is at
+    /// `time_us`, and those before it are in the warm-up.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub times_us: Vec<i64>,
+    /// What the agent noted, as it was sent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub notes: Option<Value>,
     /// Whether the agent ended the episode with this step.
     pub terminated: bool,
     /// BLAKE3 of the shown images' hashes, in hex.
@@ -243,7 +254,22 @@ impl EpisodeHeader {
     }
 }
 
+fn one() -> u64 {
+    1
+}
+
+fn is_one(steps: &u64) -> bool {
+    *steps == 1
+}
+
 impl FrameRecord {
+    /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time below 0.
+    pub(crate) fn taken_us(&self, pose: usize) -> i64 {
+        let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
+        let otherwise = if is_now { self.time_us } else { -1 };
+        self.times_us.get(pose).copied().unwrap_or(otherwise)
+    }
+
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
     pub(crate) fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())

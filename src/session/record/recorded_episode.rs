@@ -10,7 +10,7 @@ use wildcity_scene::appearance::Overlay;
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
 use super::replay_report::ReplayError;
 use crate::episode::EpisodeSummary;
-use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
+use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES, PLAN_STEPS};
 
 // The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a thousandth that
 // PNG may add. The rest of a rig and a profile are below 1 MiB.
@@ -119,6 +119,12 @@ impl RecordedEpisode {
 /// Checks that the cameras and images of a frame match its poses. Returns what is wrong otherwise.
 fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     let poses = frame.poses.len();
+    if !(1..=PLAN_STEPS as u64).contains(&frame.steps) {
+        return Err(format!("a plan of {} steps; 1 to {PLAN_STEPS} are accepted", frame.steps));
+    }
+    if !frame.times_us.is_empty() && frame.times_us.len() != poses {
+        return Err(format!("times of {} poses, but {poses} poses", frame.times_us.len()));
+    }
     if !frame.cameras.is_empty() && frame.cameras.len() != poses {
         return Err(format!("cameras for {} poses, but {poses} poses", frame.cameras.len()));
     }

@@ -90,7 +90,7 @@ impl EpisodeTraffic {
     }
 
     /// The traffic after a step of `dt_us` in which the ego went from one state to another.
-    pub(crate) fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64) -> Self {
+    fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64) -> Self {
         let mut next = self.clone();
         next.events.clear();
         let motion = EgoMotion {
@@ -140,7 +140,23 @@ impl EpisodeTraffic {
         next
     }
 
-    /// Moves on along the route, and ends the episode if a rule says so.
+    /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through `egos`. Its events are
+    /// those of all steps.
+    pub(crate) fn followed(&self, from: &Ego, egos: &[Ego], dt_us: i64) -> Self {
+        let mut next = self.clone();
+        let mut from = from;
+        let mut events = Vec::new();
+        for ego in egos {
+            next = next.stepped(from, ego, dt_us);
+            events.append(&mut next.events);
+            from = ego;
+        }
+        events.truncate(limits::EVENTS);
+        Self { events, ..next }
+    }
+
+    /// Moves on along the route, and ends the episode if a rule says so. The first reason stands: a plan goes on to
+    /// its end.
     fn end(&mut self, ego: &Ego, has_contact: bool) {
         let world_from_rig = ego.world_from_rig();
         let route = self.loaded.scenario.route.clone();
@@ -156,6 +172,9 @@ impl EpisodeTraffic {
                 .is_some_and(|(route, progress)| route.is_done(&progress, &world_from_rig)),
             has_contact,
         };
+        if self.ended.is_some() {
+            return;
+        }
         self.ended = self.loaded.scenario.end.ended(&input, &mut self.stuck);
         if let Some(reason) = self.ended {
             let event = Event { time_us: input.time_us, kind: EventKind::End(reason) };

@@ -174,6 +174,7 @@ impl Session {
             _overlays: overlays,
             dynamics: header.dynamics,
             start: EpisodeStart::recorded(header.start, header.state.as_ref()),
+            random_start: None,
             warm_up_us: recorded.warm_up_us,
             dt_us: header.dt_us,
             deadline,

@@ -20,7 +20,7 @@ use crate::limits;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::schedule::Schedule;
 use crate::observe::trust::TrainingCoverage;
-use crate::options::{ImagePart, Outputs, RigChoice, SessionOptions, Start};
+use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::scenario::{EpisodeTraffic, ScenarioError, SessionScenario};
@@ -112,6 +112,7 @@ impl Session {
             options.start.as_ref(),
             options.warm_up_us,
             options.dynamics,
+            options.seed,
         )?;
         let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
@@ -137,6 +138,10 @@ impl Session {
             _overlays: overlays,
             dynamics: options.dynamics,
             start,
+            random_start: match options.start {
+                Some(Start::Random(random)) => Some(random),
+                _ => None,
+            },
             warm_up_us: options.warm_up_us,
             dt_us,
             deadline,
@@ -331,10 +336,11 @@ pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
 /// The drive that the start names, else the twin's first.
 fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Option<&'a Trajectory> {
     match start {
-        Some(Start::Station { trajectory, .. }) => {
-            drives.iter().find(|drive| drive.name == *trajectory)
-        }
-        Some(Start::Pose(_)) | None => drives.first(),
+        Some(
+            Start::Station { trajectory, .. }
+            | Start::Random(RandomStart { trajectory: Some(trajectory), .. }),
+        ) => drives.iter().find(|drive| drive.name == *trajectory),
+        Some(Start::Pose(_) | Start::Random(_)) | None => drives.first(),
     }
 }
 

@@ -3,6 +3,7 @@
 //! Each request first renders, then records, and only then changes the session. If it fails or its future
 //! is dropped before that, nothing has happened, and the client can repeat it.
 
+use serde_json::Value;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 
@@ -23,7 +24,7 @@ use crate::observe::builder::finish::RenderedObservation;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
-use crate::options::Start;
+use crate::options::{ResetOptions, Start, StepOptions};
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::EpisodeTraffic;
@@ -42,12 +43,32 @@ impl Session {
         command: impl Into<Command>,
         terminate: bool,
     ) -> Result<Observation, SessionError> {
-        let command = command.into();
+        self.follow(command.into(), StepOptions { terminate, ..StepOptions::default() }).await
+    }
+
+    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of then, and
+    /// those since its start that the observation shows.
+    ///
+    /// # Errors
+    /// As [`Session::step`], and if the notes or the number of steps are out of range.
+    pub async fn follow(
+        &mut self,
+        command: Command,
+        options: StepOptions,
+    ) -> Result<Observation, SessionError> {
+        let steps = self.plan_steps(&command, options.until_us)?;
+        check_notes(options.notes.as_ref())?;
         let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
-        let mut next = self.state.episode.stepped(&command, &ground, terminate)?;
-        let traffic = self.state.traffic.as_ref().map(|traffic| {
-            traffic.stepped(self.state.episode.ego(), next.ego(), self.settings.dt_us)
-        });
+        let now = &self.state.episode;
+        let mut next = now.followed(&command, steps, &ground, options.terminate)?;
+        let traffic = match &self.state.traffic {
+            None => None,
+            Some(traffic) => {
+                let dt_us = self.settings.dt_us;
+                let egos = now.ego().followed(&command, dt_us, steps, &ground)?;
+                Some(traffic.followed(now.ego(), &egos, dt_us))
+            }
+        };
         if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
             next.end(reason);
         }
@@ -58,6 +79,11 @@ impl Session {
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = RecordedCommand::of(&command);
+        record.notes = options.notes;
+        if steps > 1 {
+            record.steps = steps as u64;
+            record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
+        }
         self.record(record).await?;
 
         next.add_trusts(rendered.trusts());
@@ -65,6 +91,26 @@ impl Session {
         self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
         Ok(rendered.observation)
+    }
+
+    /// Number of steps of a plan that is followed for `until_us`.
+    fn plan_steps(&self, command: &Command, until_us: Option<i64>) -> Result<usize, SessionError> {
+        let dt_us = self.settings.dt_us;
+        let Some(until_us) = until_us else { return Ok(1) };
+        let refused = |must: String| SessionError::OutOfRange { field: "until_us", must };
+        let most_us =
+            dt_us.saturating_mul(limits::PLAN_STEPS as i64).min(limits::PLAN_US.max(dt_us));
+        if !(dt_us..=most_us).contains(&until_us) || until_us % dt_us != 0 {
+            return Err(refused(format!(
+                "{until_us} µs; whole steps of {dt_us} µs up to {most_us} µs are accepted"
+            )));
+        }
+        if matches!(command, Command::Pose(_)) && until_us > dt_us {
+            let must =
+                "several steps, and a pose is reached with one: send a trajectory or an action";
+            return Err(refused(format!("{until_us} µs, {must}")));
+        }
+        Ok((until_us / dt_us) as usize)
     }
 
     /// Renders from 1 to [`limits::OBSERVE_POSES`] poses (`world_from_rig`) without moving the ego.
@@ -92,8 +138,22 @@ impl Session {
         seed: u64,
         start: Option<Start>,
     ) -> Result<Observation, SessionError> {
+        self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
+    }
+
+    /// As [`Session::reset`], with dynamics for this episode alone.
+    ///
+    /// # Errors
+    /// As [`Session::reset`], and if the speed is out of range.
+    pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, SessionError> {
+        let settings = &self.settings;
+        let ResetOptions { seed, start, dynamics, speed_m_s } = options;
+        let mut dynamics = dynamics.unwrap_or(settings.dynamics);
+        if let Some(speed_m_s) = speed_m_s {
+            dynamics = dynamics.with_speed("speed", speed_m_s)?;
+        }
         // With a scenario, the seed decides jitter, and perhaps the start.
-        let loaded = match &self.settings.scenario {
+        let loaded = match &settings.scenario {
             None => None,
             Some(scenario) => {
                 let scenario = scenario.clone();
@@ -101,18 +161,23 @@ impl Session {
                 Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
             }
         };
-        let start = start.or_else(|| loaded.as_ref().and_then(|loaded| loaded.start()));
+        let start = start
+            .or_else(|| settings.random_start.clone().map(Start::Random))
+            .or_else(|| loaded.as_ref().and_then(|loaded| loaded.start()));
         let start = match &start {
-            Some(_) => EpisodeStart::resolve(
+            // Dynamics decide whether a start is placed on the ground.
+            None if dynamics.model == settings.dynamics.model => settings.start.clone(),
+            None => settings.start.placed(&self.resident().version.manifest, dynamics),
+            Some(start) => EpisodeStart::resolve(
                 &self.resident().version.manifest,
-                start.as_ref(),
-                self.settings.warm_up_us,
-                self.settings.dynamics,
+                Some(start),
+                settings.warm_up_us,
+                dynamics,
+                seed,
             )
-            .map_err(|error| error.of_reset(start.as_ref()))?,
-            None => self.settings.start.clone(),
+            .map_err(|error| error.of_reset(Some(start)))?,
         };
-        let mut next = start.episode(seed, self.settings.dynamics, self.settings.dt_us);
+        let mut next = start.episode(seed, dynamics, settings.dt_us);
         let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
 
         let frame_history = FrameHistory::default();
@@ -190,6 +255,15 @@ impl Session {
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
     }
+}
+
+fn check_notes(notes: Option<&Value>) -> Result<(), SessionError> {
+    let bytes = notes.map_or(0, |notes| notes.to_string().len());
+    if bytes > limits::NOTES_BYTES {
+        let must = format!("{bytes} bytes of JSON; at most {} are accepted", limits::NOTES_BYTES);
+        return Err(SessionError::OutOfRange { field: "notes", must });
+    }
+    Ok(())
 }
 
 /// Waits until all sections that a frame needs are in memory, and pins them.

@@ -92,6 +92,21 @@ class Station:
 
 
 @dataclass(frozen=True)
+class RandomStart:
+    """A start along a recorded drive that is drawn anew for each episode with its seed; every draw is uniform.
+
+    `trajectory` is the first one if None, `from_m` and `to_m` its ends (or where a warm-up ends). `lateral_m` is
+    the largest distance to the left or right of the drive, `heading_rad` the largest angle to it.
+    """
+
+    trajectory: str | None = None
+    from_m: float | None = None
+    to_m: float | None = None
+    lateral_m: float | None = None
+    heading_rad: float | None = None
+
+
+@dataclass(frozen=True)
 class DriveSection:
     """A part of a recorded drive: from `from_m` (0) to `to_m` (its end), with a pose every `every_m` metres.
 
@@ -351,6 +366,7 @@ class Resumed:
     last_seq: int
     step: int
     time_us: int
+    opened: Opened | None = None
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from .protocol import (
     Opened,
     Outputs,
     Pose,
+    RandomStart,
     RecordedPoint,
     Refusal,
     Resumed,
@@ -75,7 +76,7 @@ class SessionProtocol:
         version: int | None = None,
         session: str | None = None,
         seed: int = 0,
-        start: Pose | Station | None = None,
+        start: Pose | Station | RandomStart | None = None,
         rig: str | Rig | None = None,
         profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
@@ -108,9 +109,17 @@ class SessionProtocol:
         self.session = opened.session
         return opened
 
-    def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
-        """Moves the ego and advances the time by one step."""
+    def step(
+        self,
+        movement: Pose | Trajectory | Action,
+        terminate: bool,
+        until_us: int | None = None,
+        notes: Any = None,
+    ) -> Exchange[Observation]:
+        """Moves the ego and advances the time by one step, or by several along a plan."""
+        optional = {"until_us": until_us, "notes": notes}
         fields = {**_movement(movement), "terminate": terminate}
+        fields |= {name: value for name, value in optional.items() if value is not None}
         return (yield from self._next("step", Observation, fields))
 
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
@@ -121,11 +130,17 @@ class SessionProtocol:
         """Announces where the ego may go next."""
         yield from self._next("prefetch", Ok, {"poses": encode(poses)})
 
-    def reset(self, seed: int, start: Pose | Station | None) -> Exchange[Observation]:
+    def reset(
+        self,
+        seed: int,
+        start: Pose | Station | RandomStart | None,
+        dynamics: Model | Dynamics | None = None,
+        speed: float | None = None,
+    ) -> Exchange[Observation]:
         """Starts a new episode."""
+        optional = {"start": _start(start), "dynamics": encode(dynamics), "speed": speed}
         fields: dict[str, Any] = {"seed": seed}
-        if start is not None:
-            fields["start"] = _start(start)
+        fields |= {name: value for name, value in optional.items() if value is not None}
         return (yield from self._next("reset", Observation, fields))
 
     def branch(self, point: SnapshotPoint | RecordedPoint, session: str | None) -> Exchange[Opened]:
@@ -242,5 +257,7 @@ def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
     return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
 
 
-def _start(start: Pose | Station | None) -> Any:
+def _start(start: Pose | Station | RandomStart | None) -> Any:
+    if isinstance(start, RandomStart):
+        return {"random": encode(start)}
     return {"pose": encode(start)} if isinstance(start, Pose) else encode(start)
