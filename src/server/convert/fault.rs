@@ -246,7 +246,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
         SessionError::Scenario(error) => match error {
             ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
-            _ => at(Code::ScenarioInvalid, error.field()),
+            _ => at(Code::ScenarioInvalid, &error.field()),
         },
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),

@@ -13,8 +13,8 @@ use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, ScenarioSource,
-    SessionError, SessionOptions, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
+    ScenarioSource, SessionError, SessionOptions, Start, StepOptions,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
