@@ -220,7 +220,7 @@ fn of_session(error: &SessionError) -> WireFault {
         }
         SessionError::UnknownSnapshot { field, .. } => at(Code::UnknownState, field),
         SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
-        SessionError::Branch(_) => at(Code::UnknownState, "from"),
+        SessionError::Branch { .. } => at(Code::UnknownState, "from"),
         SessionError::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         SessionError::Profile(_) | SessionError::Sky(_) => at(Code::OutOfRange, "profile"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
