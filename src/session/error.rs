@@ -9,7 +9,7 @@ use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
 use crate::options::Start;
-use crate::record::error::{BranchError, RecordError};
+use crate::record::error::RecordError;
 use crate::scenario::load::ScenarioError;
 
 /// Why a request was refused. The session is then as it was before the request.
@@ -64,8 +64,11 @@ pub enum SessionError {
         name: String,
     },
     /// A recorded episode cannot be continued.
-    #[error("the recorded episode cannot be continued: {0}")]
-    Branch(Box<BranchError>),
+    #[error("the recorded episode cannot be continued: {reason}")]
+    Branch {
+        /// What prevents it.
+        reason: String,
+    },
     /// A camera was requested twice.
     #[error("camera {name:?} is requested twice; name each camera once")]
     CameraTwice {

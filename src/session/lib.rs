@@ -54,7 +54,7 @@ pub use options::{
 pub use preview::{ProposedChange, PsnrPreview};
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
-pub use record::error::{BranchError, RecordError};
+pub use record::error::RecordError;
 pub use record::format::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOrigin, RecordedOutputs,
     RecordedSettings, RecordedVersion, is_episode_name,

@@ -2,12 +2,11 @@
 
 use serde_json::Value;
 
-use wildcity_protocol::message::{Drive, DrivePose, DriveSection};
+use wildcity_protocol::message::{Drive, DrivePose, DriveSection, Pose};
 use wildcity_scene::route::{Route, RouteError, RouteSection};
 use wildcity_session::SessionError;
 use wildcity_twin::store::Version;
 
-use super::answer::pose;
 use crate::fault::Fault;
 
 /// A part of a recorded drive.
@@ -47,7 +46,7 @@ pub(crate) fn drive(
     let poses = poses.into_iter().map(|at| DrivePose {
         station_m: at.station_m,
         time_us: at.time_us,
-        pose: pose(&at.world_from_rig),
+        pose: Pose { xyz: at.world_from_rig.position_m.to_array(), q: at.world_from_rig.q_wxyz() },
     });
     Ok(Drive {
         name: name.clone(),

@@ -255,7 +255,7 @@ fn of_session(error: &SessionError) -> WireFault {
         }
         SessionError::UnknownSnapshot { field, .. } => at(Code::UnknownState, field),
         SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
-        SessionError::Branch(_) => at(Code::UnknownState, "from"),
+        SessionError::Branch { .. } => at(Code::UnknownState, "from"),
         SessionError::CameraOption { field, .. } => at(Code::OutOfRange, field),
         SessionError::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         SessionError::Profile(error) => of_profile(error),

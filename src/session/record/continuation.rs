@@ -9,8 +9,8 @@ use wildcity_scene::RenderProfile;
 use wildcity_sim::Ground;
 use wildcity_twin::residency::Resident;
 
+use super::branch_error::BranchError;
 use super::ego_replay::EgoReplay;
-use super::error::BranchError;
 use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedOrigin};
 use super::recorded_episode::RecordedEpisode;
 use crate::episode::Episode;

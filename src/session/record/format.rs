@@ -23,7 +23,6 @@ use wildcity_sim::{Command, Dynamics, Ego};
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
-use crate::state::SessionSettings;
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -218,18 +217,6 @@ pub(crate) enum Line {
 }
 
 impl RecordedSettings {
-    /// The settings of a session; `None` if all are the defaults.
-    pub(crate) fn of(settings: &SessionSettings, trust: bool) -> Option<Self> {
-        let recorded = Self {
-            profile_overrides: settings.profile_overrides.clone(),
-            schedule: settings.layout.schedule().clone(),
-            trust,
-            warm_up_us: settings.warm_up_us,
-        };
-        let cameras = settings.layout.cameras().len();
-        (recorded != Self::default_of(cameras, settings.dt_us)).then_some(recorded)
-    }
-
     /// The settings of a session that requests none.
     pub(crate) fn default_of(cameras: usize, dt_us: i64) -> Self {
         Self {

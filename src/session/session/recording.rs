@@ -14,7 +14,7 @@ use crate::record::format::{
 };
 use crate::record::recorder::{NewFile, Recorder};
 use crate::scenario::EpisodeTraffic;
-use crate::state::PinnedVersion;
+use crate::state::{PinnedVersion, SessionSettings};
 
 impl Session {
     /// Appends a frame to the episode's file. The first frame of an episode creates the file.
@@ -116,7 +116,7 @@ impl Session {
             dynamics: episode.ego().dynamics(),
             start: episode.world_from_rig(),
             dt_us: settings.dt_us,
-            settings: RecordedSettings::of(settings, pinned.coverage.is_some()),
+            settings: recorded_settings(settings, pinned.coverage.is_some()),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
             scenario,
@@ -144,6 +144,18 @@ impl Session {
 /// BLAKE3 of an episode's scenario, in hex.
 pub(super) fn scenario_hash(traffic: Option<&EpisodeTraffic>) -> Option<String> {
     traffic.map(|traffic| traffic.loaded().hash.clone())
+}
+
+/// The settings that the header does not have otherwise; `None` if all are the defaults.
+fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<RecordedSettings> {
+    let recorded = RecordedSettings {
+        profile_overrides: settings.profile_overrides.clone(),
+        schedule: settings.layout.schedule().clone(),
+        trust,
+        warm_up_us: settings.warm_up_us,
+    };
+    let cameras = settings.layout.cameras().len();
+    (recorded != RecordedSettings::default_of(cameras, settings.dt_us)).then_some(recorded)
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
