@@ -22,6 +22,8 @@ pub(crate) struct SessionScenario {
     scenarios: Scenarios,
     /// With the values of its sweep, without a seed.
     file: ScenarioFile,
+    /// Whether episodes start where the scenario says: the request named no start.
+    gives_start: bool,
 }
 
 impl SessionScenario {
@@ -30,6 +32,7 @@ impl SessionScenario {
         scenarios: Scenarios,
         source: &ScenarioSource,
         values: &BTreeMap<String, Value>,
+        gives_start: bool,
     ) -> Result<Self, ScenarioError> {
         let document = scenarios.document(source)?;
         let mut chosen = document.first_values();
@@ -41,7 +44,7 @@ impl SessionScenario {
             let message = "\"static\" is not known to a session; write any, at_fault or pedestrian";
             return Err(wrong(FileError { path, message: message.to_owned() }));
         }
-        Ok(Self { scenarios, file })
+        Ok(Self { scenarios, file, gives_start })
     }
 
     /// The scenario of an episode with a seed.
@@ -54,12 +57,11 @@ impl SessionScenario {
         let file = self.file.clone();
         self.scenarios.resolve(file, seed, pinned, false, &|_| None).map(Arc::new)
     }
-}
 
-impl LoadedScenario {
-    /// Where the ego starts, if the scenario says.
-    pub(crate) fn start(&self) -> Option<Start> {
-        self.scenario.start.as_ref().map(|start| match start {
+    /// Where an episode starts, if the scenario says.
+    pub(crate) fn start_of(&self, loaded: &LoadedScenario) -> Option<Start> {
+        let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
+        Some(match start {
             EgoStart::Pose(pose) => Start::Pose(*pose),
             EgoStart::Station { trajectory, station_m } => {
                 Start::Station { trajectory: trajectory.clone(), station_m: *station_m }

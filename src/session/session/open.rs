@@ -57,14 +57,16 @@ impl Session {
                 let scenarios = engine.scenarios().clone();
                 let version = resident.version.clone();
                 let seed = options.seed;
+                let gives_start = options.start.is_none();
                 let (asked, scenario, found) = run_blocking(move || {
-                    let read = SessionScenario::read(scenarios, &asked.source, &asked.values);
+                    let read =
+                        SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start);
                     let scenario = read?;
                     let found = scenario.of_episode(seed, &version)?;
                     Ok::<_, ScenarioError>((asked, scenario, found))
                 })
                 .await??;
-                options.start = options.start.or_else(|| found.start());
+                options.start = options.start.or_else(|| scenario.start_of(&found));
                 if let (true, Some(dynamics)) = (asked.dynamics, found.scenario.dynamics) {
                     options.dynamics = dynamics;
                 }

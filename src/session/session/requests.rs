@@ -163,7 +163,7 @@ impl Session {
         };
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
-            .or_else(|| loaded.as_ref().and_then(|loaded| loaded.start()));
+            .or_else(|| settings.scenario.as_ref()?.start_of(loaded.as_ref()?));
         let start = match &start {
             // Dynamics decide whether a start is placed on the ground.
             None if dynamics.model == settings.dynamics.model => settings.start.clone(),
