@@ -406,7 +406,7 @@ mod tests {
         assert!(command(&step("1.5")).is_ok());
         for x in ["nope", "\"1\"", "1e", "[1]"] {
             let fault = command(&step(x)).unwrap_err();
-            assert!(!matches!(fault, Fault::NotFinite { .. }), "{x}: {fault}");
+            assert!(!matches!(fault, Fault::PoseNotFinite { .. }), "{x}: {fault}");
         }
     }
 
@@ -419,7 +419,7 @@ mod tests {
 
     fn field_of(command: Result<Command, Fault>) -> String {
         match command {
-            Err(Fault::NotFinite { field }) => field,
+            Err(Fault::PoseNotFinite { field }) => field,
             other => panic!("{other:?}"),
         }
     }
