@@ -13,6 +13,7 @@
 //! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number
 //! of threads.
 
+mod actor_views;
 pub mod automatic;
 pub mod compare;
 pub mod constants;
@@ -31,13 +32,14 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
-pub use view::{RollingShutter, View};
+pub use view::{Readout, RollingShutter, View};
 
 /// What is rendered together: all views of one step.
 #[derive(Clone, Copy, Debug)]
@@ -193,6 +195,14 @@ pub enum RenderError {
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
+    /// More actors than [`PlacedChunk::MAX_ACTORS`](wildcity_scene::actor::PlacedChunk::MAX_ACTORS).
+    #[error("{placed} chunks of actors are placed; at most {limit} are drawn: remove actors")]
+    Actors {
+        /// The given number.
+        placed: usize,
+        /// The largest number that is drawn.
+        limit: usize,
+    },
     /// The device failed. The next frame opens it again.
     #[error("{device} failed: {reason}")]
     Device {
@@ -302,11 +312,16 @@ impl Frame<'_> {
         }
     }
 
-    /// Checks the number of views.
+    /// Checks the number of views, and that of placed chunks.
     ///
     /// # Errors
-    /// [`RenderError::Views`].
+    /// [`RenderError::Views`], [`RenderError::Actors`].
     pub fn check_views(&self) -> Result<(), RenderError> {
+        let placed = self.scene.placed.len();
+        let limit = PlacedChunk::MAX_ACTORS;
+        if placed > limit {
+            return Err(RenderError::Actors { placed, limit });
+        }
         let count = self.views.len();
         match (1..=MAX_VIEWS).contains(&count) {
             true => Ok(()),

@@ -10,6 +10,7 @@
 //! three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box, which is
 //! culled as a unit.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -17,6 +18,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
+use super::actor::PlacedChunk;
 use super::{Gaussians, Sky, sh};
 
 /// Edge of a cell, in metres.
@@ -441,7 +443,7 @@ fn spread(x: u64) -> u64 {
 }
 
 /// The chunks that a frame draws, and the sky behind them. The global id of a Gaussian is its index when
-/// counting through all chunks in order.
+/// counting through all chunks in order, and then through the actors' in order.
 ///
 /// ```
 /// use wildcity_scene::{Gaussians, Scene};
@@ -462,6 +464,9 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
+    /// Actors. Of Gaussians with equal depths, those of the twin are in front, then those of actors in the order of
+    /// this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
+    pub placed: Vec<PlacedChunk>,
     /// The sky; without one, the background colour of the render profile is drawn (black by default).
     pub sky: Option<Arc<Sky>>,
 }
@@ -478,22 +483,31 @@ impl Scene {
             }
             Arc::new(chunk)
         };
-        Self { chunks: partition.cells.par_iter().map(chunk).collect(), sky: None }
+        Self { chunks: partition.cells.par_iter().map(chunk).collect(), ..Self::default() }
     }
 
-    /// Number of Gaussians in all chunks.
+    /// Number of Gaussians in all chunks, with those of each actor.
     pub fn gaussians(&self) -> usize {
-        self.chunks.iter().map(|chunk| chunk.len()).sum()
+        let placed = self.placed.iter().map(|placed| &placed.chunk);
+        self.chunks.iter().chain(placed).map(|chunk| chunk.len()).sum()
     }
 
-    /// Spherical-harmonic degree; 0 for an empty scene.
+    /// Spherical-harmonic degree of the twin; 0 if it is empty.
     pub fn sh_degree(&self) -> u8 {
         self.chunks.first().map_or(0, |chunk| chunk.sh_degree())
     }
 
-    /// Memory that the chunks have allocated, in bytes.
+    /// Every chunk once, in order: those of the twin, then those of actors. Actors may share chunks.
+    pub fn distinct_chunks(&self) -> impl Iterator<Item = &Arc<Chunk>> {
+        let mut shared = BTreeSet::new();
+        let placed = self.placed.iter().map(|placed| &placed.chunk);
+        let own = placed.filter(move |chunk| shared.insert(Arc::as_ptr(chunk)));
+        self.chunks.iter().chain(own)
+    }
+
+    /// Memory that the chunks have allocated, in bytes. What several actors share is counted once.
     pub fn bytes(&self) -> usize {
-        self.chunks.iter().map(|chunk| chunk.bytes()).sum()
+        self.distinct_chunks().map(|chunk| chunk.bytes()).sum()
     }
 }
 

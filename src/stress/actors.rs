@@ -1,12 +1,13 @@
 //! Actors: Gaussians that move and rotate as one.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DQuat, DVec3};
 
 use super::order::low_discrepancy;
 use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
 use wildcity_render::compare::images::max_difference;
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
 pub(super) const T25: Case = Case {
@@ -28,7 +29,9 @@ fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         ("turned about all", DQuat::from_rotation_x(2.5) * DQuat::from_rotation_z(0.4)),
     ] {
         // The actor and the camera rotate alike about the origin, so the image must not change.
-        let turned = Scene::from_gaussians(&rotated(&actor, turn));
+        let mut turned = actor.clone();
+        turned.transform(&Pose { rotation: turn, ..Pose::IDENTITY });
+        let turned = Scene::from_gaussians(&turned);
         let mut moved = view;
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
         let image = run.render_and_compare(what, &turned, &profile, moved)?;
@@ -59,22 +62,4 @@ fn actor() -> Gaussians {
         }
     }
     actor
-}
-
-/// The same Gaussians rotated about the origin, with their colours.
-fn rotated(actor: &Gaussians, turn: DQuat) -> Gaussians {
-    let mut turned = actor.clone();
-    let colours = sh::ShRotation::new(DMat3::from_quat(turn), 3);
-    for mean in &mut turned.means_m {
-        *mean = (turn * DVec3::from_array(*mean)).to_array();
-    }
-    for quat in &mut turned.quats_wxyz {
-        let [w, x, y, z] = quat.map(f64::from);
-        let q = turn * DQuat::from_xyzw(x, y, z, w);
-        *quat = [q.w, q.x, q.y, q.z].map(|q| q as f32);
-    }
-    for colour in turned.sh.chunks_exact_mut(3 * sh::coefficients(3)) {
-        colours.apply(colour);
-    }
-    turned
 }

@@ -229,7 +229,7 @@ fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Sce
         }
         Arc::new(again)
     });
-    Scene { chunks: again.collect(), sky: scene.sky.clone() }
+    Scene { chunks: again.collect(), ..scene.clone() }
 }
 
 /// Moves Gaussians so that a pinhole draws them where an OpenCV lens' polynomial puts them, beyond its fold

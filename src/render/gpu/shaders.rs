@@ -47,6 +47,10 @@ const fn plain(name: &'static str) -> Variant {
     Variant { name, file: name, choices: &[] }
 }
 
+const PINHOLE: Choice = choice("PROJECTION", "pinhole");
+const UNSCENTED: Choice = choice("PROJECTION", "unscented");
+const NO_ACTORS: Choice = choice("ACTORS", "no_actors");
+const ACTORS: Choice = choice("ACTORS", "actors");
 const BACKGROUND: Choice = choice("BACKGROUND", "background");
 const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
 const MAP: Choice = choice("SKY", "sky_map");
@@ -55,8 +59,10 @@ const RAY_PINHOLE: Choice = choice("RAYS", "ray_pinhole");
 const RAY_LENS: Choice = choice("RAYS", "ray_lens");
 
 const VARIANTS: &[Variant] = &[
-    variant("project", "project", &[choice("PROJECTION", "pinhole")]),
-    variant("project_unscented", "project", &[choice("PROJECTION", "unscented")]),
+    variant("project", "project", &[PINHOLE, NO_ACTORS]),
+    variant("project_unscented", "project", &[UNSCENTED, NO_ACTORS]),
+    variant("project_actors", "project", &[PINHOLE, ACTORS]),
+    variant("project_unscented_actors", "project", &[UNSCENTED, ACTORS]),
     plain("scan"),
     plain("plan"),
     plain("sort"),
@@ -73,6 +79,7 @@ const VARIANTS: &[Variant] = &[
 
 /// Name and content of the files in `shaders` and `shaders/shared`.
 const FILES: &[(&str, &str)] = &[
+    ("actors", include_str!("../../../shaders/actors.wgsl")),
     ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
     ("appearance", include_str!("../../../shaders/appearance.wgsl")),
     ("background", include_str!("../../../shaders/background.wgsl")),
@@ -82,6 +89,7 @@ const FILES: &[(&str, &str)] = &[
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
+    ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
     ("no_background", include_str!("../../../shaders/shared/no_background.wgsl")),
     ("pinhole", include_str!("../../../shaders/pinhole.wgsl")),
     ("plan", include_str!("../../../shaders/plan.wgsl")),

@@ -1,6 +1,10 @@
 //! Actors: what moves in a twin beside the ego.
 
+mod placed;
+
 use serde::{Deserialize, Serialize};
+
+pub use placed::{ContactShadow, PlacedChunk};
 
 /// The kind of an actor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
