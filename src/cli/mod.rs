@@ -11,6 +11,7 @@
 
 use std::process::ExitCode;
 
+mod actor;
 mod backend_options;
 mod bench;
 mod bisect;
@@ -64,6 +65,7 @@ enum Command {
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
+    Actor(actor::Actor),
     Render(render::Render),
     Replay(replay::Replay),
     Rig(rig::RigCommand),
@@ -87,6 +89,7 @@ pub fn main() -> ExitCode {
         Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
+        Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Rig(command) => command.run(),

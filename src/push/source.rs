@@ -67,6 +67,21 @@ pub fn read_scene(
     Ok(SourceScene { gaussians, hash })
 }
 
+/// As [`read_scene`], with another number of Gaussians for the triangles of a mesh.
+///
+/// # Errors
+/// As [`ingest::read`].
+pub fn read_actor(
+    path: &Path,
+    axes: &SourceAxes,
+    mesh_gaussians: u32,
+    progress: Progress<'_>,
+) -> Result<SourceScene, IngestError> {
+    let (mut gaussians, hash) = ingest::read_with(path, mesh_gaussians, progress)?;
+    axes.axes.apply(&mut gaussians);
+    Ok(SourceScene { gaussians, hash })
+}
+
 /// The provenance of a version that is made from files with these hashes. It contains no time and no user,
 /// so that the same content gives the same version.
 pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> Provenance {

@@ -1,9 +1,11 @@
 //! Actors: what moves in a twin beside the ego.
 
+mod asset;
 mod placed;
 
 use serde::{Deserialize, Serialize};
 
+pub use asset::{ActorAsset, ActorViewpoint, AssetDescription, AssetError, AssetLevel};
 pub use placed::{ContactShadow, PlacedChunk};
 
 /// The kind of an actor.
