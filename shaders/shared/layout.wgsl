@@ -99,6 +99,11 @@ struct Lens {
     axis_angle: vec4f,
 }
 
+struct Owner {
+    cluster_view: u32,
+    instance: u32,
+}
+
 struct ClusterView {
     line: u32,
     chunk_view: u32,

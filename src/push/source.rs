@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
-use wildcity_twin::ingest::{self, Axes, IngestError, Progress};
+use wildcity_twin::ingest::{self, Axes, IngestError, Progress, TrackedObject};
 
 /// The axes and unit of a scene file, and how the user wrote them.
 #[derive(Clone, Debug)]
@@ -80,6 +80,20 @@ pub fn read_actor(
     let (mut gaussians, hash) = ingest::read_with(path, mesh_gaussians, progress)?;
     axes.axes.apply(&mut gaussians);
     Ok(SourceScene { gaussians, hash })
+}
+
+/// The tracked objects of a recorded drive, each in its own axes, and the file's BLAKE3 in hex.
+///
+/// # Errors
+/// As [`ingest::read_tracked`].
+pub fn read_tracked(
+    path: &Path,
+    axes: &SourceAxes,
+    progress: Progress<'_>,
+) -> Result<(Vec<TrackedObject>, String), IngestError> {
+    let (mut objects, hash) = ingest::read_tracked(path, progress)?;
+    objects.iter_mut().for_each(|object| axes.axes.apply(&mut object.gaussians));
+    Ok((objects, hash))
 }
 
 /// The provenance of a version that is made from files with these hashes. It contains no time and no user,

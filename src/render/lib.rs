@@ -52,6 +52,12 @@ pub struct Frame<'a> {
     pub views: &'a [View],
 }
 
+/// The twin in [`Target::instances`].
+pub const TWIN_INSTANCE: u16 = 1;
+
+/// Actor 0 in [`Target::instances`].
+pub const FIRST_ACTOR_INSTANCE: u16 = 2;
+
 /// Most views of one frame: the cameras of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
@@ -72,6 +78,9 @@ pub struct Target<'a> {
     /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
     /// in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
+    /// `[height, width]`: whose Gaussian brings the transmittance to a half or less: 0 none, [`TWIN_INSTANCE`] the
+    /// twin, and actor `k` is `k` + [`FIRST_ACTOR_INSTANCE`].
+    pub instances: Option<&'a mut [u16]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
@@ -90,6 +99,9 @@ impl Target<'_> {
         let Some(field) = FieldMask::of(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
             field.clear_outside(camera, 3, rgb8);
+        }
+        if let Some(instances) = &mut self.instances {
+            field.clear_outside(camera, 1, instances);
         }
         for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
         {
@@ -282,6 +294,7 @@ impl Frame<'_> {
                 ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
                 ("normals", target.normals.as_ref().map(|b| b.len()), 3 * pixels),
+                ("instances", target.instances.as_ref().map(|b| b.len()), pixels),
             ];
             if target.normals.is_some() && target.depth_m.is_none() {
                 return Err(RenderError::Normals { view });

@@ -303,6 +303,27 @@ impl Chunk {
         self.lane_group(index / LANES)[column].0[index % LANES]
     }
 
+    /// The Gaussians before activation, in the order of the chunk and in its origin's axes. Opacities of 1, which no
+    /// logit has, become 1 - 1e-13; empty lanes become invisible Gaussians.
+    pub fn to_gaussians(&self) -> Gaussians {
+        let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count);
+        for index in 0..self.count {
+            let value = |column| self.value(index, column);
+            let three = |column| [0, 1, 2].map(|axis| value(column + axis));
+            let mean_m = DVec3::from_array(three(column::MEAN).map(f64::from)) + self.origin_m;
+            gaussians.means_m.push(mean_m.to_array());
+            let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
+            let is_empty = quat == [0.0; 4];
+            gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
+            let ln = |scale_m: f32| f64::from(scale_m).max(1e-30).ln() as f32;
+            gaussians.ln_scales.push(three(column::SCALE).map(ln));
+            gaussians.logit_opacities.push(logit_from_log2(value(column::LOG2_OPACITY)));
+            let count = columns(self.sh_degree) - column::SH;
+            gaussians.sh.extend((0..count).map(|k| value(column::SH + k)));
+        }
+        gaussians
+    }
+
     /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes.
     pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
         let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
@@ -332,6 +353,12 @@ fn is_drawable(columns: impl Iterator<Item = f32>) -> bool {
 fn log2_sigmoid(logit: f32) -> f32 {
     let x = f64::from(logit);
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
+}
+
+/// The inverse of [`log2_sigmoid`], within -100 to 30: `-ln(1/opacity - 1)`.
+fn logit_from_log2(log2_opacity: f32) -> f32 {
+    let inverse_less_one = (-f64::from(log2_opacity) * std::f64::consts::LN_2).exp_m1();
+    (-inverse_less_one.max(0.0).ln()).clamp(-100.0, 30.0) as f32
 }
 
 /// The Gaussians of a file, sorted by cell, then by 16 m block, then by Morton code.
@@ -610,6 +637,27 @@ mod tests {
             for chunk in [laid, pushed] {
                 assert_eq!(opacities(&chunk), [f32::NEG_INFINITY, -1.0], "{column} is {value}");
             }
+        }
+    }
+
+    #[test]
+    fn raw_values_are_restored() {
+        let raw = three();
+        let scene = Scene::from_gaussians(&raw);
+        let mut again = Gaussians::default();
+        scene.chunks.iter().for_each(|chunk| again.append(&chunk.to_gaussians()));
+        // In order of cells.
+        let order = [1, 0, 2];
+        for (index, from) in order.into_iter().enumerate() {
+            assert_eq!(again.means_m[index], raw.means_m[from]);
+            assert_eq!(again.quats_wxyz[index], [1.0, 0.0, 0.0, 0.0]);
+            assert_eq!(again.sh_of(index), raw.sh_of(from));
+            for axis in 0..3 {
+                let off = again.ln_scales[index][axis] - raw.ln_scales[from][axis];
+                assert!(off.abs() < 1e-6, "{off}");
+            }
+            let [was, is] = [raw.logit_opacities[from], again.logit_opacities[index]];
+            assert!((was.clamp(-100.0, 30.0) - is).abs() < 1e-4, "{was} became {is}");
         }
     }
 

@@ -1,12 +1,13 @@
 //! Actors, drawn by the gpu backend.
 
-use wildcity_render::View;
 use wildcity_render::gpu::Gpu;
 use wildcity_render::reference::Reference;
+use wildcity_render::stage::Stage;
+use wildcity_render::{Frame, Target, View, hybrid};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
-use crate::images::{agree, render, render_one};
+use crate::images::{agree, cpu, render, render_one};
 use crate::placed;
 
 #[test]
@@ -27,6 +28,34 @@ fn tints_and_contact_shadows_are_those_of_the_reference() {
 #[test]
 fn actors_leave_nothing_behind() {
     placed::check_ghosts(&gpu());
+}
+
+#[test]
+fn instances_are_those_of_the_reference() {
+    placed::check_instances(&gpu(), &Reference);
+}
+
+/// The cpu runs the first stages, the gpu the rest.
+#[test]
+fn instances_of_stages_that_ran_on_the_cpu() {
+    let (scene, _) = placed::street_with_actors();
+    let views: Vec<View> = placed::views().into_iter().map(|(_, view)| view).collect();
+    let profile = RenderProfile::default();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    for last in Stage::ALL {
+        let mut all: Vec<Vec<u16>> =
+            views.iter().map(|view| vec![77; view.camera.pixels()]).collect();
+        let targets =
+            all.iter_mut().map(|ids| Target { instances: Some(ids), ..Target::default() });
+        let mut targets: Vec<Target<'_>> = targets.collect();
+        hybrid::render_split(&cpu(), &gpu(), last, &frame, &mut targets, &|_, _| {}).unwrap();
+        drop(targets);
+        for (ids, view) in all.iter().zip(&views) {
+            let (truth, _) = placed::instances(&cpu(), &scene, *view);
+            let differing = ids.iter().zip(&truth).filter(|(a, b)| a != b).count();
+            assert!(differing * 500 < ids.len(), "{last:?}: {differing} of {}", ids.len());
+        }
+    }
 }
 
 /// All views in one frame: pinholes and lenses, with lenses of actors beside those of views. And in regions, on a

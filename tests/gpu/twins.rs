@@ -100,6 +100,7 @@ fn layouts_are_the_same() {
         ChunkLight { tint, first_shadow, shadows, pad0, pad1, pad2 }
         ChunkShadow { actor_from_chunk, half_m, pad }
         ClusterView { line, chunk_view }
+        Owner { cluster_view, instance }
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }

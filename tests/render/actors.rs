@@ -36,6 +36,11 @@ fn actors_leave_nothing_behind() {
     placed::check_ghosts(&cpu());
 }
 
+#[test]
+fn instances_are_those_of_the_reference() {
+    placed::check_instances(&cpu(), &Reference);
+}
+
 /// Every instruction set, and any number of threads.
 #[test]
 fn actors_do_not_depend_on_threads_and_agree_on_instruction_sets() {

@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::{Backend, Readout, RollingShutter, View};
+use wildcity_render::{Backend, Frame, Readout, RollingShutter, Target, View};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
@@ -200,4 +200,52 @@ pub(crate) fn check_ghosts(backend: &dyn Backend) {
         *placed = PlacedChunk::at_rest(placed.chunk.clone(), on_street(-40.0, 0.0, 0.0), 0);
     }
     assert_eq!(before, draw(&behind));
+}
+
+/// The instance ids of one view.
+pub(crate) fn instances(backend: &dyn Backend, scene: &Scene, view: View) -> (Vec<u16>, Vec<f32>) {
+    let pixels = view.camera.pixels();
+    let mut ids = vec![77; pixels];
+    let mut opacity = vec![f32::NAN; pixels];
+    let target =
+        Target { instances: Some(&mut ids), opacity: Some(&mut opacity), ..Target::default() };
+    let profile = RenderProfile::default();
+    let frame = Frame { scene, profile: &profile, views: &[view] };
+    backend.render(&frame, &mut [target], &|_, _| {}).unwrap();
+    (ids, opacity)
+}
+
+/// Asserts that instance ids are those of the reference backend, that they name what is seen, and that asking for them
+/// changes no other image.
+pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
+    let (mut scene, _) = street_with_actors();
+    scene.placed[2].actor = 40;
+    for (name, view) in views() {
+        let (ids, opacity) = instances(backend, &scene, view);
+        let (truth, _) = instances(reference, &scene, view);
+        let differing = ids.iter().zip(&truth).filter(|(a, b)| a != b).count();
+        assert!(differing * 500 < ids.len(), "{name}: {differing} of {} differ", ids.len());
+        for (pixel, (&id, &opacity)) in ids.iter().zip(&opacity).enumerate() {
+            // A pixel without an instance has more than half of its transmittance left.
+            assert_eq!(id == 0, opacity < 0.5, "{name}: pixel {pixel} is {id} at {opacity}");
+        }
+        let mut seen = ids.clone();
+        seen.sort_unstable();
+        seen.dedup();
+        assert_eq!(seen, [0, 1, 2, 3, 42], "{name}");
+        let image = render_one(backend, &scene, &RenderProfile::default(), view);
+        assert_eq!(image.opacity, opacity, "{name}");
+    }
+    // All views in one frame.
+    let views: Vec<View> = views().into_iter().map(|(_, view)| view).collect();
+    let mut all: Vec<Vec<u16>> = views.iter().map(|view| vec![77; view.camera.pixels()]).collect();
+    let targets = all.iter_mut().map(|ids| Target { instances: Some(ids), ..Target::default() });
+    let mut targets: Vec<Target<'_>> = targets.collect();
+    let profile = RenderProfile::default();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
+    drop(targets);
+    for (ids, view) in all.iter().zip(&views) {
+        assert_eq!(*ids, instances(backend, &scene, *view).0);
+    }
 }

@@ -1,5 +1,6 @@
 //! `wildcity actor`.
 
+mod cut;
 mod import;
 mod list;
 mod picture;
@@ -24,6 +25,7 @@ enum Subcommand {
     Import(import::Import),
     List(list::List),
     Show(show::Show),
+    Cut(cut::Cut),
 }
 
 impl Actor {
@@ -32,6 +34,7 @@ impl Actor {
             Subcommand::Import(import) => import.run(),
             Subcommand::List(list) => list.run(),
             Subcommand::Show(show) => show.run(),
+            Subcommand::Cut(cut) => cut.run(),
         }
     }
 }

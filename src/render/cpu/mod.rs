@@ -8,6 +8,7 @@ mod appearance;
 mod background;
 mod bin;
 mod export;
+mod instances;
 mod lanes;
 mod lens;
 mod math;

@@ -2,6 +2,8 @@
 
 use fearless_simd::{f32x16, prelude::*, u32x16};
 
+use super::instances::{HalvedBy, instance_of};
+use super::project::Projected;
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::{Target, View};
 use wildcity_scene::appearance::Appearance;
@@ -48,6 +50,7 @@ pub(super) struct Band<'a> {
     rgb8: Option<&'a mut [u8]>,
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
+    instances: Option<&'a mut [u16]>,
     /// Exposure and overlay of the camera; `None` if they change nothing.
     pub(super) appearance: Option<&'a Appearance>,
 }
@@ -56,6 +59,32 @@ impl Band<'_> {
     /// Whether depth must be accumulated.
     pub(super) fn wants_depth(&self) -> bool {
         self.depth_m.is_some()
+    }
+
+    /// Whether the splats that halve the transmittance must be noted.
+    pub(super) fn wants_instances(&self) -> bool {
+        self.instances.is_some()
+    }
+
+    /// Writes the instances of one tile with its left edge at column `left`.
+    pub(super) fn write_instances(
+        &mut self,
+        halved_by: &HalvedBy,
+        left: u32,
+        projected: &Projected,
+    ) {
+        let Some(instances) = &mut self.instances else { return };
+        let edge = BLOCK_PX as usize;
+        for (block, halved_by) in halved_by.iter().enumerate() {
+            let [block_left, row] = block_corner(block).map(|px| px as usize);
+            let column = left as usize + block_left;
+            for y in 0..edge.min(self.rows.saturating_sub(row)) {
+                for x in 0..edge.min(self.width.saturating_sub(column)) {
+                    let pixel = (row + y) * self.width + column + x;
+                    instances[pixel] = instance_of(projected, halved_by[y * edge + x]);
+                }
+            }
+        }
     }
 }
 
@@ -69,6 +98,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
     let mut opacity = target.opacity.as_mut().map(|b| b.chunks_mut(pixels));
+    let mut instances = target.instances.as_mut().map(|b| b.chunks_mut(pixels));
     (0..height)
         .step_by(TILE_PX as usize)
         .map(|top| Band {
@@ -78,6 +108,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
             rgb8: rgb8.as_mut().and_then(Iterator::next),
             depth_m: depth_m.as_mut().and_then(Iterator::next),
             opacity: opacity.as_mut().and_then(Iterator::next),
+            instances: instances.as_mut().and_then(Iterator::next),
             appearance,
         })
         .collect()

@@ -335,6 +335,16 @@ pub struct Lens {
     pub axis_angle: [f32; 4],
 }
 
+/// Whose splats begin with a cluster view (8 bytes). The first record of a list holds its length as `instance`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Owner {
+    /// Index of the cluster view.
+    pub cluster_view: u32,
+    /// As in [`Target::instances`](crate::Target::instances).
+    pub instance: u32,
+}
+
 /// One cluster in one view (8 bytes): the unit of work of stage project.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

@@ -35,7 +35,7 @@ use super::scan::Scan;
 use crate::actor_views::ActorViews;
 use crate::layout::{ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Frustum};
 use crate::unscented::UnscentedView;
-use crate::{Frame, View};
+use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
 use wildcity_scene::Chunk;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::Cluster;
@@ -51,6 +51,8 @@ pub(super) struct ProjectWork {
     /// One per chunk view if the frame has actors; empty otherwise.
     lights: Vec<ChunkLight>,
     shadows: Vec<ChunkShadow>,
+    /// Whose cluster views they are, in order.
+    owners: Vec<super::layout::Owner>,
 }
 
 /// The cluster views of one page that one kernel projects.
@@ -153,6 +155,9 @@ impl ProjectWork {
         let mut by_kernel: BTreeMap<(usize, Variant), Vec<u32>> = BTreeMap::new();
         for (pair, clusters) in pairs.into_iter().zip(visible) {
             let mut chunk_views = [None; 2];
+            if !clusters.is_empty() {
+                work.add_owner(&pair);
+            }
             for ClusterPlace { page, line, shadowed } in clusters {
                 let variant = pair.variant(shadowed);
                 let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
@@ -181,6 +186,23 @@ impl ProjectWork {
     /// Number of (cluster, view) pairs.
     pub(super) fn cluster_views(&self) -> u32 {
         self.cluster_views.len() as u32
+    }
+
+    /// Whose cluster views they are, in order.
+    pub(super) fn owners(&self) -> &[super::layout::Owner] {
+        &self.owners
+    }
+
+    /// Adds the owner of the next cluster view, if it is another one than that of the last.
+    fn add_owner(&mut self, pair: &ChunkInView<'_>) {
+        let instance = match pair.of {
+            Owner::Twin { .. } => TWIN_INSTANCE.into(),
+            Owner::Actor { placed, .. } => (FIRST_ACTOR_INSTANCE + placed.actor).into(),
+        };
+        let cluster_view = self.cluster_views.len() as u32;
+        if self.owners.last().is_none_or(|last| last.instance != instance) {
+            self.owners.push(super::layout::Owner { cluster_view, instance });
+        }
     }
 
     /// Adds the light of the last chunk view.
@@ -413,6 +435,16 @@ impl Project {
         }
         self.visible.reserve(device, 32 * u64::from(work.cluster_views()));
         self.offsets.reserve(device, 4 * u64::from(work.cluster_views()));
+    }
+
+    /// For each cluster view, the index of its first splat.
+    pub(super) fn first_splats(&self) -> &GrowableBuffer {
+        &self.offsets
+    }
+
+    /// Sets those indices, for splats that another backend projected.
+    pub(super) fn set_first_splats(&mut self, device: &Device, first_splats: &[u32]) {
+        self.offsets.fill(device, bytemuck::cast_slice(first_splats));
     }
 
     /// Projects the work that was uploaded.

@@ -123,5 +123,8 @@ fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
         if let Some(to) = &mut target.opacity {
             to[i] = opacity as f32;
         }
+        if let Some(to) = &mut target.instances {
+            to[i] = pixel.instance;
+        }
     }
 }

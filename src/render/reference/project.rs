@@ -6,8 +6,8 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::View;
 use crate::unscented::max_center_angle_rad;
+use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
@@ -19,6 +19,8 @@ pub struct Splat {
     /// The Gaussian: index of its chunk, counting through those of the twin and then through those of actors, and
     /// index within the chunk.
     pub gaussian: [usize; 2],
+    /// Whose Gaussian it is, as in [`Target::instances`](crate::Target::instances).
+    pub instance: u16,
     /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
     /// Centre, in pixels.
@@ -50,7 +52,8 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
         let splat = move |i| {
             let splat = project_one(&placed.chunk, i, profile, &view)?;
             let number = scene.chunks.len() + number;
-            Some(Splat { gaussian: [number, i], rgb: splat.rgb * tint, ..splat })
+            let instance = FIRST_ACTOR_INSTANCE + placed.actor;
+            Some(Splat { gaussian: [number, i], instance, rgb: splat.rgb * tint, ..splat })
         };
         (0..placed.chunk.len()).filter_map(splat)
     });
@@ -94,6 +97,7 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
     let visible = opacity >= profile.alpha_cut;
     visible.then(|| Splat {
         gaussian: [0, index],
+        instance: TWIN_INSTANCE,
         depth_m,
         mean_px,
         conic: DVec3::new(yy, -xy, xx) / det,

@@ -28,6 +28,7 @@ pub mod sky;
 mod sog;
 mod splat;
 mod spz;
+mod tracked;
 mod unpack_budget;
 
 use std::fs::File;
@@ -41,6 +42,7 @@ pub use axes::Axes;
 pub use error::IngestError;
 pub use file::{FileError, read_whole};
 pub use progress::Progress;
+pub use tracked::{TrackedObject, read_tracked};
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use error::check_count;

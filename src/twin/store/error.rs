@@ -108,6 +108,19 @@ pub enum StoreError {
         /// Those that have it, or else all that exist.
         known: Vec<String>,
     },
+    /// A box contains no Gaussian of the twin, or all of a cell's.
+    #[error(
+        "{}",
+        match cell {
+            None => "no Gaussian lies in the box, from 5 cm above its bottom on: check its place with `wildcity \
+                     inspect`".to_owned(),
+            Some([x, y]) => format!("no Gaussian would stay in cell ({x}, {y}): choose a smaller box"),
+        }
+    )]
+    NothingToCut {
+        /// Grid cell (x, y) of which none would stay.
+        cell: Option<[i32; 2]>,
+    },
     /// Another commit took the same number first.
     #[error("version {number} of twin {name:?} was committed by another import; try again")]
     Conflict {

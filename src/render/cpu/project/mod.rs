@@ -38,7 +38,7 @@ use super::lens::LensProjection;
 use crate::actor_views::ActorViews;
 use crate::layout::{ChunkShadow, ChunkView, Cutoffs, Frustum, Splat};
 use crate::unscented::UnscentedView;
-use crate::{Frame, View};
+use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES};
 
@@ -72,6 +72,8 @@ pub(super) struct Unit {
     pub(super) len: usize,
     /// Index of its first page.
     first_page: usize,
+    /// Whose splats they are, as in [`Target::instances`](crate::Target::instances).
+    pub(super) instance: u16,
 }
 
 /// A view that is not a static pinhole.
@@ -88,6 +90,16 @@ struct Job<'a> {
     clusters: Range<usize>,
     projection: ChunkProjection<'a>,
     light: Light<'a>,
+    /// As of [`Unit`].
+    instance: u16,
+}
+
+/// What the jobs of one chunk in one view share.
+#[derive(Clone, Copy)]
+struct JobOwner<'a> {
+    view: usize,
+    light: Light<'a>,
+    instance: u16,
 }
 
 /// How one view projects the Gaussians of one chunk.
@@ -132,7 +144,8 @@ impl Projected {
         // In the order of the jobs: list the pages.
         units.clear();
         for (job, (len, mut filled)) in jobs.iter().zip(filled) {
-            units.push(Unit { view: job.view, len, first_page: pages.len() });
+            let Job { view, instance, .. } = *job;
+            units.push(Unit { view, len, first_page: pages.len(), instance });
             pages.append(&mut filled);
         }
     }
@@ -157,6 +170,13 @@ impl Projected {
         let first = (unit.first_page << PAGE_BITS) as u32;
         let pages = &self.pages[unit.first_page..];
         (first..).zip(pages.iter().flat_map(|page| page.iter()).take(unit.len))
+    }
+
+    /// Whose splat is at a place, as in [`Target::instances`](crate::Target::instances).
+    pub(super) fn instance(&self, place: u32) -> u16 {
+        let page = (place >> PAGE_BITS) as usize;
+        let after = self.units.partition_point(|unit| unit.first_page <= page);
+        self.units[after - 1].instance
     }
 
     /// The splat at a place: the high bits are the page, the low 8 bits the splat of the page.
@@ -267,7 +287,8 @@ fn add_twin<'a>(
             [] => Light::AsStored,
             shadows => Light::Shadowed(shadows),
         };
-        add_jobs(index, projection, light, chunk, jobs);
+        let owner = JobOwner { view: index, light, instance: TWIN_INSTANCE };
+        add_jobs(owner, projection, chunk, jobs);
     }
 }
 
@@ -286,15 +307,16 @@ fn add_actors<'a>(
             [1.0, 1.0, 1.0] => Light::AsStored,
             tint => Light::Tinted(tint),
         };
-        add_jobs(index, projection, light, &placed.chunk, jobs);
+        let instance = FIRST_ACTOR_INSTANCE + placed.actor;
+        let owner = JobOwner { view: index, light, instance };
+        add_jobs(owner, projection, &placed.chunk, jobs);
     }
 }
 
 /// Adds the jobs of one view and one chunk.
 fn add_jobs<'a>(
-    view: usize,
+    JobOwner { view, light, instance }: JobOwner<'a>,
     projection: ChunkProjection<'a>,
-    light: Light<'a>,
     chunk: &'a Chunk,
     jobs: &mut Vec<Job<'a>>,
 ) {
@@ -304,7 +326,7 @@ fn add_jobs<'a>(
     };
     let count = chunk.clusters().len();
     let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
-    let job = |clusters| Job { view, chunk, clusters, projection, light };
+    let job = |clusters| Job { view, chunk, clusters, projection, light, instance };
     jobs.extend(ranges.filter(visible).map(job));
 }
 
