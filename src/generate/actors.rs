@@ -29,6 +29,11 @@ pub struct ActorModel {
     pub gaussians: Gaussians,
 }
 
+impl ActorModel {
+    /// The names of all models.
+    pub const NAMES: [&'static str; 4] = ["hatchback", "sedan", "van", "pedestrian"];
+}
+
 /// Counts changes of the models: assets of another revision are made again.
 pub const ACTOR_REVISION: u32 = 1;
 
@@ -71,7 +76,8 @@ mod tests {
     #[test]
     fn every_model_fills_its_box() {
         let models = actor_models();
-        assert_eq!(models.len(), 4);
+        let names: Vec<&str> = models.iter().map(|model| model.name).collect();
+        assert_eq!(names, ActorModel::NAMES);
         for ActorModel { name, box_, gaussians, .. } in models {
             box_.check().unwrap();
             let half_m = 0.5 * DVec3::new(box_.length_m, box_.width_m, box_.height_m);

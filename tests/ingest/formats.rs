@@ -1,6 +1,8 @@
 //! Scenes written by small writers of every format are read back, within the precision of the
 //! format.
 
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 use wildcity_scene::Gaussians;
 use wildcity_twin::ingest;
 

@@ -1,6 +1,7 @@
 //! `wildcity actor`.
 
 mod cut;
+mod generate;
 mod import;
 mod list;
 mod picture;
@@ -13,6 +14,7 @@ mod show;
 #[command(after_long_help = "\
 Examples:
   wildcity actor import car.glb --axes '0 0 1 1 0 0 0 1 0'
+  wildcity actor generate
   wildcity actor list
   wildcity actor show car --picture car.png")]
 pub(super) struct Actor {
@@ -23,6 +25,7 @@ pub(super) struct Actor {
 #[derive(Debug, clap::Subcommand)]
 enum Subcommand {
     Import(import::Import),
+    Generate(generate::Generate),
     List(list::List),
     Show(show::Show),
     Cut(cut::Cut),
@@ -32,6 +35,7 @@ impl Actor {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.subcommand {
             Subcommand::Import(import) => import.run(),
+            Subcommand::Generate(generate) => generate.run(),
             Subcommand::List(list) => list.run(),
             Subcommand::Show(show) => show.run(),
             Subcommand::Cut(cut) => cut.run(),
