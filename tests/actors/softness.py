@@ -125,7 +125,10 @@ def main() -> None:
     described, size = shapes(source, out)
     truths = {}
     for distance in DISTANCES:
-        truths[distance] = truth(described, size, distance)
+        stored = out / f"truth_{distance}.npy"
+        if not stored.exists():
+            np.save(stored, truth(described, size, distance))
+        truths[distance] = np.load(stored)
         Image.fromarray((truths[distance] * 255 + 0.5).astype(np.uint8)).save(out / f"truth_{distance}.png")
         print(f"triangles at {distance} m: edge {edge_px(truths[distance]):.2f} px", flush=True)
     axes = " ".join(str(int(value)) for value in AXES.ravel())

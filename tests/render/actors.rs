@@ -96,3 +96,71 @@ fn more_actors_than_are_drawn_are_refused() {
     let error = cpu().render(&frame, &mut [target], &|_, _| {}).unwrap_err();
     assert_eq!(error, RenderError::Actors { placed: 257, limit: 256 });
 }
+
+/// Step time with 50 actors of 100,000 Gaussians, against the same Gaussians within the twin.
+#[test]
+#[ignore = "a minute and 2 GB: cargo test --release -p wildcity-render --test render fifty -- --ignored --nocapture"]
+fn fifty_cars_cost_as_much_as_in_the_twin() {
+    let street = wildcity_generate::street(&wildcity_generate::StreetSettings::default()).unwrap();
+    let mut model = wildcity_generate::actor_models().remove(1).gaussians;
+    // 100,000 Gaussians: the model again and again, each time smaller by a hundredth.
+    let own = model.clone();
+    while model.len() < 100_000 {
+        let mut more = own.select(0..own.len().min(100_000 - model.len()));
+        let share = 1.0 - 0.01 * (model.len() / own.len()) as f64;
+        more.means_m.iter_mut().for_each(|mean_m| *mean_m = mean_m.map(|m| share * m));
+        model.append(&more);
+    }
+    let chunk = Arc::new(Scene::single_chunk(&model));
+    let mut merged = street.gaussians.clone();
+    let mut scene = Scene::from_gaussians(&street.gaussians);
+    for index in 0..50_u16 {
+        let station = street.trajectory.at_station(60.0 + 2.5 * f64::from(index / 2));
+        let beside = glam::DVec3::new(0.0, if index % 2 == 0 { 0.0 } else { 3.2 }, 0.0);
+        let pose = wildcity_scene::geometry::Pose {
+            position_m: station.transform_point(beside),
+            ..station
+        };
+        let mut moved = model.clone();
+        moved.transform(&pose);
+        merged.append(&moved);
+        scene.placed.push(PlacedChunk::at_rest(Arc::clone(&chunk), pose, index));
+    }
+    let merged = Scene::from_gaussians(&merged);
+    let rig = wildcity_scene::Rig::preset("vehicle6").unwrap();
+    let world_from_rig = street.trajectory.at_station(50.0);
+    let views: Vec<View> = View::of_rig(&rig.cameras, world_from_rig)
+        .into_iter()
+        .map(|view| {
+            let [width, height] = [view.camera.width_px / 2, view.camera.height_px / 2];
+            let camera = view.camera.scaled(width.into(), height.into()).unwrap();
+            View { camera, ..view }
+        })
+        .collect();
+    let backend = cpu();
+    let profile = RenderProfile::default();
+    let mut buffers: Vec<Vec<u8>> =
+        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
+    let mut time_ms = |scene: &Scene| {
+        let targets = buffers.iter_mut().map(|b| Target { rgb8: Some(b), ..Target::default() });
+        let mut targets: Vec<Target<'_>> = targets.collect();
+        let frame = Frame { scene, profile: &profile, views: &views };
+        let start = std::time::Instant::now();
+        let stats = backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
+        (start.elapsed().as_secs_f64() * 1e3, stats)
+    };
+    // In pairs, and the median of their ratios: the machine may be loaded.
+    let mut ratios = Vec::new();
+    for _ in 0..9 {
+        let (baked_ms, baked) = time_ms(&merged);
+        let (placed_ms, placed) = time_ms(&scene);
+        eprintln!(
+            "baked {baked_ms:.0} ms {:?}, placed {placed_ms:.0} ms {:?}",
+            baked.stages_ms, placed.stages_ms
+        );
+        ratios.push(placed_ms / baked_ms);
+    }
+    ratios.sort_by(f64::total_cmp);
+    eprintln!("ratio {:.3}", ratios[4]);
+    assert!(ratios[4] <= 1.1, "{ratios:?}");
+}

@@ -49,25 +49,31 @@ pub(super) struct Rasterize {
 /// The kernels and the input of instance ids.
 #[derive(Debug)]
 struct Instances {
+    shaders: InstanceShaders,
+    owners: GrowableBuffer,
+}
+
+/// The stage with each kind of background and instance ids.
+#[derive(Debug)]
+struct InstanceShaders {
     no_background: Shader,
     map: Shader,
     network: Shader,
     map_lens: Shader,
     network_lens: Shader,
-    owners: GrowableBuffer,
 }
 
 impl Instances {
     fn new(device: &Device) -> Self {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
-        Self {
+        let shaders = InstanceShaders {
             no_background: Shader::new("instances"),
             map: Shader::new("instances_map"),
             network: Shader::new("instances_network"),
             map_lens: Shader::new("instances_map_lens"),
             network_lens: Shader::new("instances_network_lens"),
-            owners: GrowableBuffer::new(device, "owners", usage),
-        }
+        };
+        Self { shaders, owners: GrowableBuffer::new(device, "owners", usage) }
     }
 }
 
@@ -178,6 +184,10 @@ impl Rasterize {
             instances.owners.fill(device, bytemuck::cast_slice(&list));
         }
         let instances = self.instances.as_mut().filter(|_| planes.has_instances());
+        let (instances, owners) = match instances {
+            Some(Instances { shaders, owners }) => (Some(shaders), Some(&*owners)),
+            None => (None, None),
+        };
         let shader = match (background.map(Background::shader), instances) {
             (None, None) => &mut self.no_background,
             (None, Some(own)) => &mut own.no_background,
@@ -194,9 +204,7 @@ impl Rasterize {
             Kernel::new(device, module, "main", &planes.constants())
         });
         let mut background_resources = Vec::new();
-        if let Some(Instances { owners, .. }) =
-            self.instances.as_ref().filter(|_| planes.has_instances())
-        {
+        if let Some(owners) = owners {
             background_resources.extend([(13, owners.bind()), (14, first_splats.bind())]);
         }
         if let Some(background) = background {
