@@ -24,7 +24,6 @@ use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::{RecordFormat, sh};
 
-use super::backend::ObjectBackend;
 use super::chunk_file::{self, LevelOfBlock};
 use super::layout::is_hash;
 use super::{Catalog, StoreError};

@@ -193,6 +193,7 @@ impl ObservationBuilder {
                 opacity,
                 normals,
                 appearance: Some(&camera.appearance),
+                ..Target::default()
             });
         }
         targets
