@@ -58,7 +58,8 @@ def shapes(path: pathlib.Path, folder: pathlib.Path) -> tuple[list[dict], np.nda
         parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
         if uv is not None:
             # Mitsuba counts v from the top of a bitmap, trimesh from its bottom.
-            parameters["vertex_texcoords"] = np.ravel(np.column_stack([uv[:, 0], uv[:, 1]])).astype(np.float32)
+            flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]])
+            parameters["vertex_texcoords"] = np.ravel(flipped).astype(np.float32)
         parameters.update()
         file = folder / f"{name}.ply"
         own.write_ply(str(file))
