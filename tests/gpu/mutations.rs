@@ -141,7 +141,7 @@ pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("let fraction = remaining_exposure(view_index, point.at_px);", "let fraction = guess;"),
     ("middle = (1.0 / ROOT_3)", "middle = 0.0"),
     ("+ center.fraction * lenses[lens].moved_world_m", ""),
-    ("<= lenses[lens].widest_rad", "<= 0.5 * lenses[view_index].widest_rad"),
+    ("<= lenses[lens].widest_rad", "<= 0.5 * lenses[lens].widest_rad"),
     ("moved_m.z + rotation_shift(index_of_lens(view), at_end_m + moved_m, fraction).z", "moved_m.z"),
     ("sum.x + (sum.y + exact_m.y)", "sum.x"),
     ("2.0 * moved.x * (offset.y + moved.y - view.depth_low[axis])", "0.0"),
