@@ -106,7 +106,7 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             psnr_of(&image, &truth),
             60.0,
         );
-        let alone = run.render(&road, &profile, view)?;
+        let alone = run.render(&Scene::from_gaussians(&road), &profile, view)?;
         let seen = max_difference(&image.rgba, &alone.rgba) > 0.1;
         run.check(format!("{what}: the actor is seen"), seen == (what != "under the road"));
     }
