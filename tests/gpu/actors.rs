@@ -1,9 +1,10 @@
 //! Actors, drawn by the gpu backend.
 
-use wildcity_render::gpu::Gpu;
+use wildcity_render::gpu::{AdapterChoice, Gpu};
+use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
 use wildcity_render::stage::Stage;
-use wildcity_render::{Frame, Target, View, hybrid};
+use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
@@ -48,7 +49,9 @@ fn instances_of_stages_that_ran_on_the_cpu() {
         let targets =
             all.iter_mut().map(|ids| Target { instances: Some(ids), ..Target::default() });
         let mut targets: Vec<Target<'_>> = targets.collect();
-        hybrid::render_split(&cpu(), &gpu(), last, &frame, &mut targets, &|_, _| {}).unwrap();
+        let own = Gpu::new(&AdapterChoice::Best, 0).unwrap();
+        let hybrid = HybridBackend::new(cpu(), own, last);
+        hybrid.render(&frame, &mut targets, &|_, _| {}).unwrap();
         drop(targets);
         for (ids, view) in all.iter().zip(&views) {
             let (truth, _) = placed::instances(&cpu(), &scene, *view);

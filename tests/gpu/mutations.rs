@@ -142,7 +142,10 @@ pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("middle = (1.0 / ROOT_3)", "middle = 0.0"),
     ("+ center.fraction * lenses[lens].moved_world_m", ""),
     ("<= lenses[lens].widest_rad", "<= 0.5 * lenses[lens].widest_rad"),
-    ("moved_m.z + rotation_shift(index_of_lens(view), at_end_m + moved_m, fraction).z", "moved_m.z"),
+    (
+        "moved_m.z + rotation_shift(index_of_lens(view), at_end_m + moved_m, fraction).z",
+        "moved_m.z",
+    ),
     ("sum.x + (sum.y + exact_m.y)", "sum.x"),
     ("2.0 * moved.x * (offset.y + moved.y - view.depth_low[axis])", "0.0"),
     ("/ max(2.0 * root, 1e-30)", "* 0.0"),

@@ -132,7 +132,7 @@ fn what_is_cut_out_and_what_stays_are_the_twin() {
     // Put back, all of them are where they were.
     let mut back = cut.gaussians;
     back.transform(&pose);
-    let mut sorted = |gaussians: &Gaussians| {
+    let sorted = |gaussians: &Gaussians| {
         let mut means: Vec<[i64; 3]> = gaussians
             .means_m
             .iter()
