@@ -18,6 +18,7 @@ pub mod geometry;
 pub mod lod;
 pub mod manifest;
 pub mod profile;
+pub mod random;
 pub mod record;
 pub mod rig;
 pub mod route;
