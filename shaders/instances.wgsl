@@ -1,5 +1,5 @@
 // Instance ids: whose splat brings a pixel's transmittance to a half or less. The other choice of `INSTANCES`
-// is `no_instances.wgsl`. Twin of `src/render/cpu/instances.rs`.
+// is `no_instances.wgsl`. Twin of `Wants::instances` in `src/render/cpu/rasterize.rs`.
 //
 // Splats are in order of (view, global id), so the chunks of each owner are one range of them. A pixel keeps
 // the index of the splat in its tile's list, and looks up the owner once, at its end.

@@ -8,7 +8,6 @@ mod appearance;
 mod background;
 mod bin;
 mod export;
-mod instances;
 mod lanes;
 mod lens;
 mod math;

@@ -2,7 +2,6 @@
 
 use fearless_simd::{f32x16, prelude::*, u32x16};
 
-use super::instances::{HalvedBy, instance_of};
 use super::project::Projected;
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::{Target, View};
@@ -18,6 +17,13 @@ pub(super) fn block_corner(block: usize) -> [u32; 2] {
     let per_row = TILE_PX / BLOCK_PX;
     [block as u32 % per_row * BLOCK_PX, block as u32 / per_row * BLOCK_PX]
 }
+
+/// For each pixel of a tile, the place of the splat that brings its transmittance to a half or less, plus 1; 0 if none
+/// has.
+pub(super) type HalvedBy = [[u32; LANES]; BLOCKS];
+
+/// Before any splat is blended.
+pub(super) const NOT_HALVED: HalvedBy = [[0; LANES]; BLOCKS];
 
 /// Accumulated values of the 256 pixels of a tile, block by block.
 #[derive(Debug)]
@@ -81,7 +87,8 @@ impl Band<'_> {
             for y in 0..edge.min(self.rows.saturating_sub(row)) {
                 for x in 0..edge.min(self.width.saturating_sub(column)) {
                     let pixel = (row + y) * self.width + column + x;
-                    instances[pixel] = instance_of(projected, halved_by[y * edge + x]);
+                    let place = halved_by[y * edge + x].checked_sub(1);
+                    instances[pixel] = place.map_or(0, |place| projected.instance(place));
                 }
             }
         }

@@ -8,8 +8,8 @@ use zip::result::ZipError;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
+use super::objects::TrackedObject;
 use super::scene_files::SceneFiles;
-use super::tracked::TrackedObject;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 

@@ -20,6 +20,7 @@ mod gltf;
 mod hash_reader;
 mod ksplat;
 mod nurec;
+mod objects;
 mod ply;
 mod progress;
 mod safetensors;
@@ -41,8 +42,9 @@ use wildcity_scene::Gaussians;
 pub use axes::Axes;
 pub use error::IngestError;
 pub use file::{FileError, read_whole};
+pub use objects::TrackedObject;
 pub use progress::Progress;
-pub use tracked::{TrackedObject, read_tracked};
+pub use tracked::read_tracked;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use error::check_count;

@@ -5,25 +5,14 @@
 //! drivestudio has RigidNodes, which `python -m wildcity.convert --model RigidNodes` writes as safetensors with the
 //! tensor `point_ids`. A static reading of the file leaves them out, since they have no fixed place.
 
-use std::collections::BTreeMap;
 use std::io::BufReader;
 use std::path::Path;
 
-use wildcity_scene::Gaussians;
-
 use super::hash_reader::HashReader;
+use super::objects::{self, TrackedObject};
 use super::{
     BUFFER_BYTES, Format, IngestError, Progress, archive, file, read_whole_part, safetensors,
 };
-
-/// The Gaussians of one moving object.
-#[derive(Clone, Debug, PartialEq)]
-pub struct TrackedObject {
-    /// The track's name in the file, or its number.
-    pub track: String,
-    /// Its Gaussians, in the object's axes. Axes and unit are the file's.
-    pub gaussians: Gaussians,
-}
 
 /// Reads the tracked objects of a file, in order of their tracks, and the file's BLAKE3 in hex.
 ///
@@ -35,10 +24,10 @@ pub fn read_tracked(
 ) -> Result<(Vec<TrackedObject>, String), IngestError> {
     let (opened, file_bytes) = file::open(path)?;
     let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(opened));
-    let objects = match Format::of(std::io::BufRead::fill_buf(&mut input)?)? {
+    let found = match Format::of(std::io::BufRead::fill_buf(&mut input)?)? {
         Format::Safetensors => {
             let (gaussians, ids) = safetensors::read_tracked(&mut input, file_bytes, progress)?;
-            split(&gaussians, &ids, |id| Some(id.to_string()))
+            objects::split(&gaussians, &ids, |id| Some(id.to_string()))
         }
         Format::Zip => {
             let bytes = read_whole_part(&mut input)?;
@@ -48,7 +37,7 @@ pub fn read_tracked(
         _ => Vec::new(),
     };
     std::io::copy(&mut input, &mut std::io::sink())?;
-    if objects.is_empty() {
+    if found.is_empty() {
         return Err(IngestError::Body {
             format: "file",
             place: "tracked objects".into(),
@@ -56,21 +45,5 @@ pub fn read_tracked(
                 .into(),
         });
     }
-    Ok((objects, input.into_inner().finish()))
-}
-
-/// The Gaussians by their number, in order of numbers. Those without a name are left out.
-pub(super) fn split(
-    gaussians: &Gaussians,
-    ids: &[i64],
-    name: impl Fn(i64) -> Option<String>,
-) -> Vec<TrackedObject> {
-    let mut indices: BTreeMap<i64, Vec<usize>> = BTreeMap::new();
-    for (index, &id) in ids.iter().enumerate() {
-        indices.entry(id).or_default().push(index);
-    }
-    let object = |(id, indices): (i64, Vec<usize>)| {
-        Some(TrackedObject { track: name(id)?, gaussians: gaussians.select(indices) })
-    };
-    indices.into_iter().filter_map(object).collect()
+    Ok((found, input.into_inner().finish()))
 }

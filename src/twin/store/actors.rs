@@ -25,11 +25,8 @@ use wildcity_scene::record::Clamped;
 use wildcity_scene::{RecordFormat, sh};
 
 use super::chunk_file::{self, LevelOfBlock};
-use super::layout::is_hash;
+use super::layout::{ACTORS, is_hash};
 use super::{Catalog, StoreError};
-
-/// The folder of assets; it cannot be the name of a twin.
-pub(super) const ACTORS: &str = ".actors";
 
 const MAGIC: [u8; 8] = *b"WILDACTR";
 const FORMAT: u32 = 1;

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind};
 
-use super::actors::ACTORS;
+use super::layout::ACTORS;
 use super::{Catalog, StoreError};
 
 impl Catalog {

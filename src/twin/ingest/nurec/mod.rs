@@ -18,7 +18,7 @@ use half::f16;
 
 use wildcity_scene::{Gaussians, sh};
 
-use super::tracked::{self, TrackedObject};
+use super::objects::{self, TrackedObject};
 use super::unpack_budget::{self, UnpackBudget};
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
@@ -56,7 +56,7 @@ pub(super) fn read_tracked(
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
     let Payload { data, state } = Payload::of(&root)?;
-    let mut objects = Vec::new();
+    let mut found = Vec::new();
     for name in layers_of(state) {
         let tracks = tracks_of(state, name);
         if tracks.is_empty() {
@@ -73,9 +73,9 @@ pub(super) fn read_tracked(
             Value::Count(number) => Some(number.to_string()),
             _ => Some(id.to_string()),
         };
-        objects.extend(tracked::split(&gaussians, &ids, track));
+        found.extend(objects::split(&gaussians, &ids, track));
     }
-    Ok(objects)
+    Ok(found)
 }
 
 /// The bytes of a gzip stream.

@@ -16,9 +16,8 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::actors::ACTORS;
 use super::backend::{ListedObject, ObjectBackend, Staging};
-use super::layout::{check_hash, check_side_file, is_hash, log_numbers};
+use super::layout::{ACTORS, check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
