@@ -75,7 +75,7 @@ pub(crate) fn views() -> Vec<(&'static str, View)> {
 
 /// The twin, three actors in it (two share a chunk, two overlap), and the same as one set of Gaussians.
 pub(crate) fn street_with_actors() -> (Scene, Scene) {
-    let mut twin = street(20_000, 1, 31);
+    let mut twin = street(10_000, 1, 31);
     let car = actor(3_000, 3, 5);
     let other = actor(2_000, 0, 6);
     let scene = Scene::from_gaussians(&twin);
@@ -188,7 +188,8 @@ pub(crate) fn check_light(backend: &dyn Backend, reference: &dyn Backend) {
 pub(crate) fn check_ghosts(backend: &dyn Backend) {
     let (scene, _) = street_with_actors();
     let twin = Scene { placed: Vec::new(), ..scene.clone() };
-    let views: Vec<View> = views().into_iter().map(|(_, view)| view).collect();
+    // A pinhole and a lens: a software device that is loaded takes long for each.
+    let views = [views()[0].1, views()[3].1];
     let draw = |scene: &Scene| render(backend, scene, &RenderProfile::default(), &views);
     let before: Vec<Image> = draw(&twin);
     let with = draw(&scene);
