@@ -26,7 +26,7 @@ const SKIN: Paint = Paint::matt(0.80, 0.62, 0.52);
 const HAIR: Paint = Paint::matt(0.20, 0.15, 0.12);
 const SHOES: Paint = Paint::matt(0.15, 0.14, 0.14);
 
-/// Paints a person of 1.75 m who walks along x: the left foot and the right arm are in front.
+/// Paints a person of 1.75 m in mid-stride along x: the left foot and the right arm are in front.
 pub(super) fn paint(painter: &mut Painter) {
     for (side, ahead) in [(1.0, 1.0), (-1.0, -1.0)] {
         leg(painter, side, ahead);
