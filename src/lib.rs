@@ -31,14 +31,14 @@
 //! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
-//! 5. An image is a function of scene version, render profile, poses and cameras. Caches change
+//! 5. An image is a function of scene version, render profile, poses, cameras and actors. Caches change
 //!    latency, never pixels.
 //! 6. Every observation names the scene version and the render profile that it was made with. A new version
 //!    becomes visible only between two steps, and only to a session that asked for it.
 //! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative f32.
 //! 8. Every queue, message, buffer and count has a maximum, in the `limits` module of its package.
-//! 9. A scene pays only for what it has: without a sky, spherical harmonics or lenses there is no buffer,
-//!    pass, pipeline or library for them.
+//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses or actors there is no
+//!    buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 
 pub mod cli;

@@ -11,6 +11,7 @@
 
 use std::process::ExitCode;
 
+mod actor;
 mod backend_options;
 mod bench;
 mod bisect;
@@ -68,6 +69,7 @@ enum Command {
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
+    Actor(actor::Actor),
     Render(render::Render),
     Replay(replay::Replay),
     Episode(episode::Episode),
@@ -94,6 +96,7 @@ pub fn main() -> ExitCode {
         Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
+        Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Episode(command) => command.run(),

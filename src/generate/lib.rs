@@ -19,6 +19,7 @@
 //!
 //! Behind them is a sky of its own ([`SKY`]).
 
+mod actors;
 mod backdrop;
 mod buildings;
 mod canyon;
@@ -30,6 +31,7 @@ mod furniture;
 mod ground_floor;
 mod light;
 mod map;
+mod pedestrian;
 mod plants;
 mod random;
 mod road;
@@ -37,6 +39,7 @@ mod route;
 mod street;
 mod surface;
 
+pub use actors::{ACTOR_REVISION, ActorModel, actor_models};
 pub use canyon::canyon;
 pub use city::{Cell, City, city, city_drive, city_map};
 use serde::{Deserialize, Serialize};

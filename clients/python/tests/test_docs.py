@@ -17,6 +17,7 @@ from test_push import write_ply
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = [
     "README.md",
+    "docs/actors.md",
     "docs/agents.md",
     "docs/operators.md",
     "docs/pipelines.md",

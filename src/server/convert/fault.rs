@@ -294,7 +294,7 @@ fn of_profile(error: &ProfileError) -> WireFault {
 fn of_store(error: &StoreError) -> WireFault {
     match error {
         StoreError::Name { .. } => at(Code::InvalidName, "twin"),
-        StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
+        StoreError::NoTwin { .. } | StoreError::NoActor { .. } => at(Code::UnknownTwin, "twin"),
         StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
             at(Code::UnknownVersion, "version")
         }
@@ -304,7 +304,8 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
-        | StoreError::ManifestSize { .. } => plain(Code::PushRefused),
+        | StoreError::ManifestSize { .. }
+        | StoreError::NothingToCut { .. } => plain(Code::PushRefused),
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
         StoreError::NotSynced { .. }
         | StoreError::OutcomeUnknown { .. }
@@ -342,6 +343,7 @@ fn of_render(error: &RenderError) -> WireFault {
         | RenderError::TargetSize { .. }
         | RenderError::Normals { .. }
         | RenderError::Overlay { .. }
+        | RenderError::Actors { .. }
         | RenderError::Targets { .. }
         | RenderError::Sky(_)
         | RenderError::Device { .. } => plain(Code::Internal),
