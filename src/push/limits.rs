@@ -15,8 +15,14 @@ pub const PUSH_FILES: usize = 256;
 /// as much again while files are joined. The largest upload holds no more, unless it is compressed.
 pub const PUSH_GAUSSIANS: u64 = 250_000_000;
 
-/// Poses of one preview: 32 small images before, and 32 after.
-pub const PREVIEW_POSES: usize = 32;
+/// The most poses of one preview: 32 small images before, and 32 after.
+pub const PREVIEW_MAX_POSES: usize = 32;
+
+/// Poses of a preview whose push names none, along the twin's first trajectory.
+pub const PREVIEW_DEFAULT_POSES: usize = 4;
+
+/// Longest side of the images that are compared, in pixels.
+pub const PREVIEW_SIDE_PX: u32 = 320;
 
 /// Gaussians of a push that gets a preview. They are in memory as a scene beside the push itself: 92 B
 /// each at SH degree 1, 1.8 GB.

@@ -23,8 +23,10 @@ use wildcity_twin::residency::Viewpoint;
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::base::find_base;
+use crate::blocking::run_blocking;
 use crate::commit::{NewContent, commit};
 use crate::error::PushError;
+use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
 use crate::queue::PushQueue;
 use crate::read::{PushedScene, read};
@@ -65,14 +67,14 @@ pub async fn publish(
     let scene = {
         let push = push.clone();
         let request = request.clone();
-        blocking(move || read(&push, &request, &files)).await?
+        run_blocking(move || read(&push, &request, &files)).await?
     };
 
     push.enter(State::Validating);
     let base = {
         let engine = engine.clone();
         let request = request.clone();
-        blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
+        run_blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
     };
     let scene = check(engine, push, &request, scene, base.clone()).await?;
 
@@ -81,7 +83,7 @@ pub async fn publish(
         let engine = engine.clone();
         let push = push.clone();
         let request = request.clone();
-        blocking(move || commit_held(&engine, &push, &request, &scene, base.as_deref())).await?
+        run_blocking(move || commit_held(&engine, &push, &request, &scene, base.as_deref())).await?
     };
     let Committed { version, held } = committed;
     tracing::info!(twin = request.twin, version = version.number, "pushed");
@@ -104,7 +106,7 @@ async fn check(
         let push = push.clone();
         let request = request.clone();
         let base = base.clone();
-        blocking(move || {
+        run_blocking(move || {
             let scene = compare_cells(&push, &request, scene, base.as_deref())?;
             let changed = comparison(&request, &scene.gaussians, &scene.report, base.as_ref())?;
             Ok((scene, changed))
@@ -114,7 +116,7 @@ async fn check(
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
         let poses = request.preview_poses.clone();
-        scene.report.preview = engine.preview_psnr(changed, poses, &progress).await?;
+        scene.report.preview = preview_psnr(engine, changed, poses, &progress).await?;
         push.set_report(scene.report.clone());
     }
     check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;
@@ -189,11 +191,4 @@ async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec
         Ok(Err(error)) => tracing::warn!(twin, "not loaded ahead: {error}"),
         Err(_) => tracing::warn!(twin, "not loaded ahead in time"),
     }
-}
-
-/// Runs work that may wait for a disk, or takes long, beside the asynchronous tasks.
-async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, PushError> + Send + 'static,
-) -> Result<T, PushError> {
-    tokio::task::spawn_blocking(work).await.map_err(|_| PushError::Crashed)?
 }

@@ -13,7 +13,6 @@
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
-//! | `preview` | the preview of a push |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
@@ -24,7 +23,6 @@ pub mod limits;
 mod observe;
 mod options;
 mod prefetch;
-mod preview;
 mod record;
 mod session;
 mod start;
@@ -43,7 +41,6 @@ pub use observe::observation::{
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
-pub use preview::{ProposedChange, PsnrPreview};
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;
 pub use record::format::{

@@ -120,12 +120,6 @@ pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 /// Most steps that prefetching looks ahead, even if the agent steps much faster than real time.
 pub const STEPS_AHEAD: usize = 256;
 
-/// Poses along the twin's trajectory at which a push is compared, unless the push names its own.
-pub const PREVIEW_POSES: usize = 4;
-
-/// Longest side of the images that are compared, in pixels.
-pub const PREVIEW_SIDE_PX: u32 = 320;
-
 /// How long a push may preload its version for the running sessions. After that the version counts as ready
 /// even if something is still missing.
 pub const PRELOAD_TIMEOUT: Duration = Duration::from_secs(60);
