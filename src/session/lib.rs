@@ -29,7 +29,9 @@ mod start;
 mod viewpoint;
 
 pub use engine::render_queue::Scratch;
-pub use engine::twin_summaries::{TrajectorySummary, TwinSummary};
+pub use engine::twin_summaries::{
+    DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary,
+};
 pub use engine::{Engine, EngineSettings, LatestPin};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;

@@ -20,7 +20,7 @@ async fn request(server: &TestServer, text: &str) -> (u16, String) {
     (status, answer)
 }
 
-async fn get(server: &TestServer, path: &str) -> (u16, String) {
+pub(crate) async fn get(server: &TestServer, path: &str) -> (u16, String) {
     request(server, &format!("GET {path} HTTP/1.1\nHost: localhost\n\n")).await
 }
 

@@ -9,6 +9,7 @@ mod support;
 
 mod appearance;
 mod bundles;
+mod damaged_twin;
 mod ego;
 mod http;
 mod leases;

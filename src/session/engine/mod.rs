@@ -23,7 +23,7 @@ use wildcity_twin::store::Catalog;
 use self::answer_budget::AnswerBudget;
 use self::leases::Leases;
 use self::render_queue::{RenderQueue, Scratch};
-use self::twin_summaries::{SummaryCache, TwinSummary};
+use self::twin_summaries::{SummaryCache, TwinSummaries};
 use crate::blocking::run_blocking;
 use crate::error::SessionError;
 use crate::limits;
@@ -79,12 +79,11 @@ impl Engine {
         }))
     }
 
-    /// The version of every twin that `latest` stands for, in order of the twins' names. A damaged twin
-    /// is logged and left out, so that it does not hide the others.
+    /// The version of every twin that `latest` stands for, and the damaged twins, which are also logged.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
+    pub async fn twins(self: &Arc<Self>) -> Result<TwinSummaries, SessionError> {
         let engine = self.clone();
         let pinned = move |twin: &str| engine.pinned_latest(twin);
         let summaries = self.summaries.clone();

@@ -70,6 +70,12 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError>;
 
+    /// Renames a log record, so that it is part of the log no more. Returns the path that it has then.
+    ///
+    /// # Errors
+    /// The record does not exist, or the backend cannot rename.
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError>;
+
     /// All objects of a twin, in order of their hashes.
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
 

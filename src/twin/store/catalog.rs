@@ -44,6 +44,24 @@ pub struct TwinListing {
     pub hash: String,
 }
 
+/// The twins of a catalog.
+#[derive(Debug, Default)]
+pub struct TwinList {
+    /// Those whose newest log record can be read, sorted by name.
+    pub twins: Vec<TwinListing>,
+    /// The others, sorted by name. Their damage does not concern the twins beside them.
+    pub damaged: Vec<DamagedTwin>,
+}
+
+/// A twin whose newest log record cannot be read.
+#[derive(Debug)]
+pub struct DamagedTwin {
+    /// The twin's name.
+    pub name: String,
+    /// What is wrong.
+    pub error: StoreError,
+}
+
 /// One immutable version of a twin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Version {
@@ -63,8 +81,8 @@ impl Catalog {
     /// credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed, or the remains of a killed commit cannot be removed;
-    /// [`StoreError::Url`].
+    /// The directory cannot be listed; [`StoreError::Url`]. Remains that cannot be removed are no error here, so
+    /// that one twin does not keep the others from being opened: the next commit of that twin reports it.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         Self::open_cached(dir, None)
     }
@@ -85,7 +103,7 @@ impl Catalog {
             (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
             (None, None) => Self { objects: Arc::new(Local::new(place)), remote: None },
         };
-        catalog.remove_abandoned_commits()?;
+        catalog.remove_abandoned_commits(None)?;
         Ok(catalog)
     }
 
@@ -123,19 +141,28 @@ impl Catalog {
         self.objects.root()
     }
 
-    /// All twins with their latest versions, sorted by name.
+    /// All twins with their latest versions, and the damaged ones.
     ///
     /// # Errors
-    /// A log cannot be read.
-    pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
-        let mut twins = Vec::new();
+    /// The directory or the object store cannot be listed.
+    pub fn twins(&self) -> Result<TwinList, StoreError> {
+        let mut list = TwinList::default();
         for name in self.objects.twin_names()? {
-            if let Some(&number) = self.objects.version_numbers(&name)?.last() {
-                let hash = self.record(&name, number)?.manifest;
-                twins.push(TwinListing { name, number, hash });
+            match self.listing(&name) {
+                Ok(Some(listing)) => list.twins.push(listing),
+                // Its only version was removed meanwhile.
+                Ok(None) => {}
+                Err(error) => list.damaged.push(DamagedTwin { name, error }),
             }
         }
-        Ok(twins)
+        Ok(list)
+    }
+
+    fn listing(&self, name: &str) -> Result<Option<TwinListing>, StoreError> {
+        let numbers = self.objects.version_numbers(name)?;
+        let Some(&number) = numbers.last() else { return Ok(None) };
+        let hash = self.record(name, number)?.manifest;
+        Ok(Some(TwinListing { name: name.to_owned(), number, hash }))
     }
 
     /// Number of a twin's latest version, from the names of the log's records alone. The records

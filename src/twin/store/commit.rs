@@ -62,7 +62,7 @@ impl Catalog {
         storage: StorageOptions,
     ) -> Result<Commit, StoreError> {
         check_name(name)?;
-        self.remove_abandoned_commits()?;
+        self.remove_abandoned_commits(Some(name))?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         Ok(Commit {
             staging: self.objects.begin_staging(name, &id)?,

@@ -64,11 +64,13 @@ mod remote;
 mod settings;
 mod sky;
 
-pub use catalog::{Catalog, DiskCacheSettings, TwinListing, Version};
+pub use catalog::{
+    Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version,
+};
 pub use commit::{Commit, StoredCells};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
-pub use fsck::{DamagedObject, FsckReport, VerifyReport};
+pub use fsck::{DamagedObject, FsckReport, RecordSetAside, VerifyReport};
 pub use gc::{CollectionReport, ObjectTotals, Retention};
 pub use lease::Lease;
 pub use log::{CommitKind, LogEntry};

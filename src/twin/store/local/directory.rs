@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use crate::store::StoreError;
 use crate::store::layout::{object_key, record_key};
 
-use super::files::{create_dirs, entries};
+use super::files::{create_dirs, entries, open_regular, open_regular_with};
 
 /// Name of the directory for commits in preparation.
 pub(super) const STAGING: &str = ".staging";
@@ -52,7 +52,7 @@ impl Local {
 
     pub(super) fn open(&self, name: &str, hash: &str) -> Result<OpenObject, StoreError> {
         let path = self.object_file(name, hash);
-        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let file = open_regular(&path).map_err(StoreError::io("open", &path))?;
         let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
         Ok(OpenObject { path, file, bytes })
     }
@@ -100,7 +100,7 @@ impl Local {
     /// files of one name.
     pub(super) fn publish_lock(&self, name: &str) -> Result<PublishLock, StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
-        let file = File::options().create(true).append(true).open(&path);
+        let file = open_regular_with(File::options().create(true).append(true), &path);
         let file = file.map_err(StoreError::io("create", &path))?;
         Ok(PublishLock { path, file })
     }
@@ -109,7 +109,7 @@ impl Local {
 /// Whether no process holds the lock of a staging directory. The caller holds the publish lock.
 pub(super) fn is_abandoned(dir: &Path) -> Result<bool, StoreError> {
     let path = dir.join(LOCK);
-    match File::options().append(true).open(&path) {
+    match open_regular_with(File::options().append(true), &path) {
         Ok(lock) => match lock.try_lock() {
             Ok(()) => Ok(true),
             Err(TryLockError::WouldBlock) => Ok(false),

@@ -1,8 +1,11 @@
 //! Files and directories, synced so that they survive a power cut.
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
+
+use rustix::fs::OFlags;
 
 use crate::store::StoreError;
 
@@ -41,6 +44,29 @@ impl Write for HashingFile {
 
     fn flush(&mut self) -> io::Result<()> {
         self.inner.flush()
+    }
+}
+
+/// Opens a regular file for reading; see [`open_regular_with`].
+pub(super) fn open_regular(path: &Path) -> io::Result<File> {
+    open_regular_with(File::options().read(true), path)
+}
+
+/// Opens a regular file. The store writes nothing but regular files, so that anything else is damage or an attack:
+/// opening a pipe would wait for ever, and a link could lead out of the twin.
+pub(super) fn open_regular_with(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
+    // NONBLOCK concerns pipes and devices only; regular files ignore it.
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let opened = options.custom_flags(flags.bits().cast_signed()).open(path);
+    match opened {
+        Ok(file) if file.metadata()?.is_file() => Ok(file),
+        Ok(_) => Err(io::Error::other("it is not a regular file")),
+        // The error of the system does not say what a link or a pipe is.
+        Err(error) => Err(match fs::symlink_metadata(path) {
+            Ok(found) if found.is_symlink() => io::Error::other("it is a symbolic link"),
+            Ok(found) if !found.is_file() => io::Error::other("it is not a regular file"),
+            _ => error,
+        }),
     }
 }
 

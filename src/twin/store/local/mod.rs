@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 use crate::limits;
@@ -23,7 +23,9 @@ pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
 
 use directory::{OpenObject, PublishLock, SEPARATOR, STAGING, is_abandoned};
-use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, sync_parent};
+use files::{
+    BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, open_regular, sync_parent,
+};
 use staging::LocalStaging;
 
 impl ObjectBackend for Local {
@@ -45,7 +47,7 @@ impl ObjectBackend for Local {
 
     fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
         let path = self.record_path(name, number);
-        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let file = open_regular(&path).map_err(StoreError::io("open", &path))?;
         let mut bytes = Vec::new();
         file.take(limits::LOG_RECORD_BYTES)
             .read_to_end(&mut bytes)
@@ -181,16 +183,27 @@ impl ObjectBackend for Local {
         Ok(())
     }
 
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError> {
+        let _publish_lock = self.lock_publishing(name)?;
+        let path = self.record_file(name, number);
+        // Any name will do that is not ten digits: readers ignore it.
+        let id = uuid::Uuid::now_v7().as_simple().to_string();
+        let aside = path.with_extension(format!("damaged-{id}"));
+        fs::rename(&path, &aside).map_err(StoreError::io("rename", &path))?;
+        sync_parent(&path)?;
+        Ok(aside)
+    }
+
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
         let objects = self.root.join(name).join("objects");
         let mut listed = Vec::new();
         for prefix in entries(&objects)? {
             for hash in entries(&objects.join(&prefix))? {
                 let path = objects.join(&prefix).join(&hash);
-                let found = fs::metadata(&path).map_err(StoreError::io("find", &path))?;
+                let found = fs::symlink_metadata(&path).map_err(StoreError::io("find", &path))?;
                 let written = found.modified().map_err(StoreError::io("find", &path))?;
                 let since = written.duration_since(UNIX_EPOCH).unwrap_or_default();
-                if is_hash(&hash) {
+                if is_hash(&hash) && found.is_file() {
                     let written_us = i64::try_from(since.as_micros()).unwrap_or(i64::MAX);
                     listed.push(ListedObject { hash, bytes: found.len(), written_us });
                 }
@@ -221,7 +234,7 @@ impl ObjectBackend for Local {
 
     fn read_side_file(&self, name: &str, file: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let path = self.root.join(name).join(file);
-        let file = match File::open(&path) {
+        let file = match open_regular(&path) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
         };

@@ -13,7 +13,7 @@ mod url;
 use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use futures_util::{StreamExt, TryStreamExt};
 use object_store::{ObjectMeta, ObjectStoreExt, PutPayload};
@@ -138,6 +138,12 @@ impl ObjectBackend for Remote {
                 Ok(bytes)
             }
         })
+    }
+
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError> {
+        let path = self.record_path(name, number);
+        let reason = "an object store has no rename; move the object away with the store's own tools";
+        Err(StoreError::io("set aside", &path)(std::io::Error::new(ErrorKind::Unsupported, reason)))
     }
 
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {
