@@ -55,6 +55,23 @@ pub enum PushError {
         /// How many may wait or run.
         limit: usize,
     },
+    /// Its client cancelled it.
+    #[error("the push was cancelled; send it again if it is wanted after all")]
+    Cancelled,
+    /// It can no longer be cancelled.
+    #[error("the push {id:?} {why}")]
+    TooLate {
+        /// Its id.
+        id: String,
+        /// Why not.
+        why: &'static str,
+    },
+    /// Reading and checking it took too long.
+    #[error("reading and checking took longer than {seconds} s; push the scene in parts, some cells each")]
+    TimedOut {
+        /// The most that it may take.
+        seconds: u64,
+    },
     /// The process stops.
     #[error("the server is shutting down; send the push again when it is back")]
     ShuttingDown,
@@ -82,10 +99,13 @@ impl PushError {
             Self::OutOfRange { .. }
             | Self::InvalidField { .. }
             | Self::InvalidName { .. }
-            | Self::Content { .. } => true,
+            | Self::Content { .. }
+            | Self::TimedOut { .. } => true,
             Self::Session(SessionError::Twin(error)) => is_refused_content(error),
             Self::UnknownPush { .. }
             | Self::Busy { .. }
+            | Self::Cancelled
+            | Self::TooLate { .. }
             | Self::ShuttingDown
             | Self::Session(_)
             | Self::Unreadable { .. }

@@ -1,8 +1,33 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
+use std::time::Duration;
+
 /// Default maximum of pushes that wait or run. A waiting push holds its request in memory, but not its
 /// files.
 pub const OPEN_PUSHES: usize = 16;
+
+/// Bytes of memory that a push may take per byte of its files, beside [`MEMORY_BASE_BYTES`]. Compressed formats have
+/// 12 to 24 bytes per Gaussian, which take 68 to 248 in memory; joining files and the preview make copies.
+pub const MEMORY_PER_FILE_BYTE: u64 = 24;
+
+/// Bytes of memory that the smallest push may take: a mesh becomes 400,000 Gaussians of 68 bytes, and its textures are
+/// decoded.
+pub const MEMORY_BASE_BYTES: u64 = 256 << 20;
+
+/// Bytes of memory that running pushes are assigned at a time.
+pub const MEMORY_UNIT_BYTES: u64 = 1 << 20;
+
+/// Part of the memory for twins that running pushes may take in addition: a third, which with the default for
+/// twins is a quarter of the machine's memory.
+pub const MEMORY_SHARE_OF_TWINS: u64 = 3;
+
+/// Default for how long reading and checking one push may take. 60 GB at 100 MB/s are 10 minutes.
+pub const CHECK_TIMEOUT: Duration = Duration::from_secs(1800);
+
+/// Bytes of memory that a push of files of so many bytes may take.
+pub fn push_memory_bytes(file_bytes: u64) -> u64 {
+    file_bytes.saturating_mul(MEMORY_PER_FILE_BYTE).saturating_add(MEMORY_BASE_BYTES)
+}
 
 /// Number of ended pushes whose status is kept. A report of 100,000 cells takes 3 MB, and most reports
 /// have about a hundred cells.

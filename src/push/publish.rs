@@ -28,7 +28,7 @@ use crate::commit::{NewContent, commit};
 use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
-use crate::queue::PushQueue;
+use crate::queue::{PushQueue, Turn};
 use crate::read::{PushedScene, read};
 use crate::report::{CellChanges, PushReport};
 use crate::request::{CellSelection, PushRequest};
@@ -60,38 +60,64 @@ pub async fn publish(
     files: Vec<SourceFile>,
     viewpoints: Viewpoints<'_>,
 ) -> Result<PushedVersion, PushError> {
-    let _turn = queue.turn().await?;
+    let file_bytes = files.iter().map(|file| file.bytes).sum();
+    let turn = queue.turn(&request.twin, file_bytes).await?;
     let request = Arc::new(request);
 
-    push.enter(State::Ingesting);
+    let limit = queue.check_timeout();
+    let checked = timeout(limit, read_and_check(engine, push, &request, files, &turn)).await;
+    let Ok(checked) = checked else {
+        push.stop_flag().stop();
+        return Err(PushError::TimedOut { seconds: limit.as_secs() });
+    };
+    let (scene, base) = checked?;
+
+    // From here on the push cannot be cancelled.
+    push.enter(State::Committing)?;
+    let committed = {
+        let engine = engine.clone();
+        let push = push.clone();
+        let request = request.clone();
+        let turn = turn.clone();
+        run_blocking(move || {
+            let _turn = turn;
+            commit_held(&engine, &push, &request, &scene, base.as_deref())
+        })
+        .await?
+    };
+    let Committed { version, held } = committed;
+    tracing::info!(twin = request.twin, version = version.number, "pushed");
+
+    push.enter(State::Prefetching)?;
+    preload(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
+    drop(held);
+    Ok(PushedVersion { number: version.number, hash: version.hash })
+}
+
+/// Everything before the commit. Threads hold the turn: they end a moment after their push does.
+async fn read_and_check(
+    engine: &Arc<Engine>,
+    push: &Arc<Push>,
+    request: &Arc<PushRequest>,
+    files: Vec<SourceFile>,
+    turn: &Turn,
+) -> Result<(CheckedScene, Option<Arc<Version>>), PushError> {
+    push.enter(State::Ingesting)?;
     let scene = {
         let push = push.clone();
         let request = request.clone();
-        run_blocking(move || read(&push, &request, &files)).await?
+        let turn = turn.clone();
+        run_blocking(move || read(&push, &request, &files, turn.memory_bytes())).await?
     };
 
-    push.enter(State::Validating);
+    push.enter(State::Validating)?;
     let base = {
         let engine = engine.clone();
         let request = request.clone();
         run_blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
     };
-    let scene = check(engine, push, &request, scene, base.clone()).await?;
-
-    push.enter(State::Committing);
-    let committed = {
-        let engine = engine.clone();
-        let push = push.clone();
-        let request = request.clone();
-        run_blocking(move || commit_held(&engine, &push, &request, &scene, base.as_deref())).await?
-    };
-    let Committed { version, held } = committed;
-    tracing::info!(twin = request.twin, version = version.number, "pushed");
-
-    push.enter(State::Prefetching);
-    preload(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
-    drop(held);
-    Ok(PushedVersion { number: version.number, hash: version.hash })
+    let scene = check(engine, push, request, scene, base.clone()).await?;
+    Ok((scene, base))
 }
 
 /// Determines which cells would change, and compares images before and after.

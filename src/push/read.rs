@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest::{self, IngestError, ListedFiles};
+use wildcity_twin::ingest::{self, IngestError, ListedFiles, ReadLimits};
 
 use crate::error::PushError;
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
 use crate::request::{PushRequest, RequestedFile};
-use crate::source::{SourceFile, SourceScene, read_listed};
+use crate::source::{SourceFile, SourceScene, read_limited};
 use crate::status::Push;
 
 /// The joined files of a push.
@@ -29,8 +29,9 @@ pub(crate) fn read(
     push: &Push,
     request: &PushRequest,
     files: &[SourceFile],
+    memory_bytes: u64,
 ) -> Result<PushedScene, PushError> {
-    let mut reader = Reader::new(push, files);
+    let mut reader = Reader::new(push, files, memory_bytes);
     // Scenes that may name others come first: what they name is known before it could be read as a scene.
     let names_others: Vec<bool> =
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
@@ -60,6 +61,8 @@ struct Reader<'a> {
     files: &'a [SourceFile],
     /// The files that a scene may name.
     listed: ListedFiles,
+    /// Bytes that each scene may unpack to.
+    memory_bytes: u64,
     total_bytes: u64,
     read_bytes: u64,
     /// Names of the files that are parts of a scene.
@@ -78,7 +81,7 @@ struct ReadFile {
 }
 
 impl<'a> Reader<'a> {
-    fn new(push: &'a Push, files: &'a [SourceFile]) -> Self {
+    fn new(push: &'a Push, files: &'a [SourceFile], memory_bytes: u64) -> Self {
         // A name of two different files stands for neither.
         let mut listed = ListedFiles::new();
         let mut ambiguous = BTreeSet::new();
@@ -93,6 +96,7 @@ impl<'a> Reader<'a> {
             push,
             files,
             listed,
+            memory_bytes,
             total_bytes: files.iter().map(|file| file.bytes).sum(),
             read_bytes: 0,
             parts: BTreeSet::new(),
@@ -119,7 +123,12 @@ impl<'a> Reader<'a> {
             reason: format!("{name}: {error}"),
             cells: Vec::new(),
         };
-        let read = match read_listed(&file.path, &requested.axes, &self.listed, progress) {
+        let limits = ReadLimits {
+            listed: Some(&self.listed),
+            memory_bytes: self.memory_bytes,
+            stop: push.stop_flag().clone(),
+        };
+        let read = match read_limited(&file.path, &requested.axes, &limits, progress) {
             Ok(read) => read,
             Err(IngestError::Values(bad)) => {
                 let report = &mut self.scene.report;

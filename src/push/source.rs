@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
-use wildcity_twin::ingest::{self, Axes, IngestError, ListedFiles, Progress, ReadScene};
+use wildcity_twin::ingest::{self, Axes, IngestError, Progress, ReadLimits, ReadScene};
 
 /// The axes and unit of a scene file, and how the user wrote them.
 #[derive(Clone, Debug)]
@@ -77,17 +77,17 @@ pub fn read_scene(
     Ok(axes.apply(ReadScene { gaussians, hash, parts: BTreeSet::new() }))
 }
 
-/// As [`read_scene`], but the scene may name the listed files only.
+/// As [`read_scene`], within limits.
 ///
 /// # Errors
-/// As [`ingest::read_listed`].
-pub(crate) fn read_listed(
+/// As [`ingest::read_limited`].
+pub(crate) fn read_limited(
     path: &Path,
     axes: &SourceAxes,
-    listed: &ListedFiles,
+    limits: &ReadLimits<'_>,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    ingest::read_listed(path, listed, progress).map(|read| axes.apply(read))
+    ingest::read_limited(path, limits, progress).map(|read| axes.apply(read))
 }
 
 /// The provenance of a version that is made from files with these hashes. It contains no time and no user,

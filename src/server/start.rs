@@ -101,7 +101,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         profile,
         tokens,
         spool,
-        pushes: PushQueue::new(limits.pushes),
+        pushes: PushQueue::new(limits.queue()),
     });
     Ok(Running::new(state, listener, address, stop))
 }

@@ -2,7 +2,7 @@
 //! format.
 
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest::{self, ListedFiles};
+use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,
@@ -283,10 +283,39 @@ fn a_listed_scene_reads_listed_files_only() {
     std::fs::write(&path, &json).unwrap();
     std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
     std::fs::write(&elsewhere, &buffer).unwrap();
-    let read = |listed: &ListedFiles| ingest::read_listed(&path, listed, &mut |_, _| {});
+    let read = |listed: &ListedFiles| {
+        let limits = ReadLimits { listed: Some(listed), ..ReadLimits::of_own_file() };
+        ingest::read_limited(&path, &limits, &mut |_, _| {})
+    };
     let error = read(&ListedFiles::new()).unwrap_err().to_string();
     assert!(error.starts_with("part \"scene.bin\": is not the name of exactly one file"), "{error}");
     let read = read(&ListedFiles::from([("scene.bin".to_owned(), elsewhere)])).unwrap();
     assert_eq!((read.gaussians.len(), read.parts.len()), (20, 1));
     assert_eq!(read.hash, ingest::read_hashed(&path, &mut |_, _| {}).unwrap().1);
+}
+
+/// What is unpacked counts against the memory of the reader, and reading stops when it is told to.
+#[test]
+fn a_reader_has_a_budget_and_can_be_stopped() {
+    let g = gaussians(2_000, 3, 20.0, 1);
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in [
+        ("gzip.spz", gzip(&spz_plain(&g, 3))),
+        ("zstd.spz", spz4(&g)),
+        ("scene.glb", glb(gltf(&g, "", ""))),
+        ("scene.sog", zip_of(&sog(&g, 2), false)),
+        ("scene.usdz", usdz(nurec_plain(&g, false))),
+    ] {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let read = |limits: ReadLimits<'_>| ingest::read_limited(&path, &limits, &mut |_, _| {});
+        assert_eq!(read(ReadLimits::of_own_file()).unwrap().gaussians.len(), 2_000);
+        let error = read(ReadLimits { memory_bytes: 10_000, ..ReadLimits::of_own_file() });
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("10000 may be used"), "{name}: {error}");
+        let stop = StopFlag::default();
+        stop.stop();
+        let error = read(ReadLimits { stop, ..ReadLimits::of_own_file() }).unwrap_err().to_string();
+        assert!(error.contains("reading was stopped"), "{name}: {error}");
+    }
 }

@@ -332,3 +332,38 @@ fn a_splat_file_is_detected_by_its_first_record() {
         );
     }
 }
+
+/// A NuRec payload of empty layers, each of six arrays with their shapes.
+fn empty_layers(count: usize) -> Vec<u8> {
+    let text = |text: &str| [&[0xd9, text.len() as u8], text.as_bytes()].concat();
+    let long = |kind: u8, length: usize| [&[kind][..], &(length as u32).to_be_bytes()].concat();
+    let fields = [
+        ("positions", 3),
+        ("rotations", 4),
+        ("scales", 3),
+        ("densities", 1),
+        ("features_albedo", 3),
+        ("features_specular", 0),
+    ];
+    let mut state = long(0xdf, count * 2 * fields.len());
+    for layer in 0..count {
+        for (field, columns) in fields {
+            let key = format!(".gaussians_nodes.{layer}.{field}");
+            state.extend([text(&key), vec![0xc4, 0]].concat());
+            state.extend([text(&format!("{key}.shape")), vec![0x92, 0, columns]].concat());
+        }
+    }
+    let state = [&[0x81][..], &text("state_dict"), &state].concat();
+    usdz([&[0x81][..], &text("nre_data"), &state].concat())
+}
+
+/// The time to read layers is linear in their number, which has a limit.
+#[test]
+fn many_empty_layers_take_no_time() {
+    let begun = std::time::Instant::now();
+    assert_eq!(crate::read(&empty_layers(1_024)).unwrap().len(), 0);
+    let text = refusal(&empty_layers(29_000));
+    assert!(text.ends_with("29000 layers; at most 1024 are read"), "{text}");
+    let took = begun.elapsed();
+    assert!(took.as_secs_f64() < 1.0, "{took:?}");
+}

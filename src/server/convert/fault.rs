@@ -199,6 +199,8 @@ pub(super) fn of_push(error: &PushError) -> WireFault {
         PushError::Content { .. } => plain(Code::PushRefused),
         PushError::UnknownPush { .. } => plain(Code::UnknownPush),
         PushError::Busy { .. } => plain(Code::Busy),
+        PushError::TimedOut { .. } => plain(Code::PushRefused),
+        PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
         PushError::Session(error) => of_session(error),
         PushError::Unreadable { .. } | PushError::Crashed => plain(Code::Internal),

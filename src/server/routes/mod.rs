@@ -35,7 +35,7 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .route("/v1/twins/{twin}/versions", get(twins::versions))
         .route("/v1/twins/{twin}/rollback", post(twins::rollback))
         .route("/v1/twins/{twin}/pushes", post(pushes::begin))
-        .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show))
+        .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show).delete(pushes::cancel))
         .route("/v1/uploads", post(uploads::begin))
         // The body of an upload is not held in memory: it is written to disk as it arrives.
         .route(

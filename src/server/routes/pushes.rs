@@ -58,6 +58,19 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
+/// `DELETE /v1/twins/{twin}/pushes/{id}`: cancels a push, and answers with its last status.
+pub(super) async fn cancel(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path((twin, id)): Path<(String, String)>,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&twin)?;
+    let push = state.pushes.get(&twin, &id).map_err(Fault::from)?;
+    push.cancel().map_err(|why| Fault::from(PushError::TooLate { id: id.clone(), why }))?;
+    Ok(answer(StatusCode::OK, &id, &twin, &push))
+}
+
 /// Runs a push to its end and records the result.
 async fn run(
     state: Arc<ServerState>,
@@ -70,6 +83,7 @@ async fn run(
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
     let result = tokio::select! {
         result = published => result,
+        () = push.cancelled() => Err(PushError::Cancelled),
         () = state.stopped() => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string);

@@ -12,9 +12,9 @@ use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
-/// Reads the scene of an archive, found by the first file in it of a known name.
-pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
-    let mut archive = Archive::open(bytes)?;
+/// Reads the scene of an archive within a budget of nothing read, found by the first file in it of a known name.
+pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, IngestError> {
+    let mut archive = Archive::open(bytes, budget)?;
     if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
         let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
         return nurec::read(&payload, archive.budget());
@@ -41,8 +41,7 @@ struct Archive {
 }
 
 impl Archive {
-    fn open(bytes: Vec<u8>) -> Result<Self, IngestError> {
-        let mut budget = UnpackBudget::default();
+    fn open(bytes: Vec<u8>, mut budget: UnpackBudget) -> Result<Self, IngestError> {
         budget.read(bytes.len() as u64);
         let zip =
             ZipArchive::new(Cursor::new(bytes)).map_err(|e| error("directory", damaged(&e)))?;

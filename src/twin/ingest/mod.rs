@@ -22,6 +22,7 @@ mod ksplat;
 mod nurec;
 mod ply;
 mod progress;
+mod read_limits;
 mod safetensors;
 mod scene_files;
 pub mod sky;
@@ -35,13 +36,14 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 
-use crate::limits;
+use crate::limits::{SCENE_JSON_BYTES, SCENE_PART_BYTES};
 use wildcity_scene::Gaussians;
 
 pub use axes::Axes;
 pub use error::IngestError;
 pub use file::{FileError, read_whole};
 pub use progress::Progress;
+pub use read_limits::{ReadLimits, StopFlag};
 pub use scene_files::ListedFiles;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
@@ -49,6 +51,7 @@ use error::check_count;
 use hash_reader::HashReader;
 use progress::ProgressReader;
 use scene_files::PartFiles;
+use unpack_budget::UnpackBudget;
 
 /// Reads a scene of any of the formats.
 ///
@@ -73,7 +76,8 @@ pub fn read_hashed(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
-    read_source(path, None, progress).map(|read| (read.gaussians, read.hash))
+    let limits = ReadLimits::of_own_file();
+    read_limited(path, &limits, progress).map(|read| (read.gaussians, read.hash))
 }
 
 /// A scene that was read.
@@ -87,17 +91,51 @@ pub struct ReadScene {
     pub parts: BTreeSet<String>,
 }
 
-/// As [`read_hashed`], for a file from an untrusted source: of other files, it may name the listed ones
-/// only.
+/// As [`read_hashed`], within limits.
 ///
 /// # Errors
-/// As [`read`], and [`FileError::NotListed`].
-pub fn read_listed(
+/// As [`read`], and what exceeds a limit.
+pub fn read_limited(
     path: &Path,
-    listed: &ListedFiles,
+    limits: &ReadLimits<'_>,
     progress: Progress<'_>,
 ) -> Result<ReadScene, IngestError> {
-    read_source(path, Some(listed), progress)
+    let (file, file_bytes) = file::open(path)?;
+    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
+    let gaussians = match Format::of(input.fill_buf()?)? {
+        Format::Json => {
+            let parts = PartFiles::new(path, limits, progress);
+            return read_parts(input, file_bytes, parts, MultiFileFormat::Json);
+        }
+        Format::Glb => {
+            let parts = PartFiles::new(path, limits, progress);
+            return read_parts(input, file_bytes, parts, MultiFileFormat::Glb);
+        }
+        Format::Ply => ply::read(&mut input, file_bytes, progress)?,
+        Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
+        Format::Spz => {
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            spz::read(input, file_bytes, UnpackBudget::new(limits))?
+        }
+        Format::Gzip => {
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            spz::read_gzip(input, file_bytes, UnpackBudget::new(limits))?
+        }
+        Format::Splat => {
+            splat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
+        Format::Ksplat => {
+            ksplat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+        }
+        Format::Zip => {
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            let bytes = file::read_at_most(input, file_bytes, SCENE_PART_BYTES)?;
+            archive::read(bytes, UnpackBudget::new(limits))?
+        }
+    };
+    io::copy(&mut input, &mut io::sink())?;
+    let hash = input.into_inner().finish();
+    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new() })
 }
 
 /// Whether a file is of a format in which it may name others.
@@ -108,46 +146,6 @@ pub fn may_name_others(path: &Path) -> Result<bool, FileError> {
     let (file, _) = file::open(path)?;
     let mut input = BufReader::new(file);
     Ok(matches!(Format::of(input.fill_buf()?), Ok(Format::Json | Format::Glb)))
-}
-
-fn read_source(
-    path: &Path,
-    listed: Option<&ListedFiles>,
-    progress: Progress<'_>,
-) -> Result<ReadScene, IngestError> {
-    let (file, file_bytes) = file::open(path)?;
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file));
-    let gaussians = match Format::of(input.fill_buf()?)? {
-        Format::Json => {
-            let parts = PartFiles::new(path, listed, progress);
-            return read_parts(input, file_bytes, parts, MultiFileFormat::Json);
-        }
-        Format::Glb => {
-            let parts = PartFiles::new(path, listed, progress);
-            return read_parts(input, file_bytes, parts, MultiFileFormat::Glb);
-        }
-        Format::Ply => ply::read(&mut input, file_bytes, progress)?,
-        Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
-        Format::Spz => {
-            spz::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
-        }
-        Format::Gzip => {
-            spz::read_gzip(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
-        }
-        Format::Splat => {
-            splat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
-        }
-        Format::Ksplat => {
-            ksplat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
-        }
-        Format::Zip => {
-            let input = ProgressReader::new(&mut input, file_bytes, progress);
-            archive::read(file::read_at_most(input, file_bytes, limits::SCENE_PART_BYTES)?)?
-        }
-    };
-    io::copy(&mut input, &mut io::sink())?;
-    let hash = input.into_inner().finish();
-    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new() })
 }
 
 /// A format in which the first file may name others.
@@ -164,8 +162,8 @@ fn read_parts(
     format: MultiFileFormat,
 ) -> Result<ReadScene, IngestError> {
     let limit_bytes = match format {
-        MultiFileFormat::Json => limits::SCENE_JSON_BYTES,
-        MultiFileFormat::Glb => limits::SCENE_PART_BYTES,
+        MultiFileFormat::Json => SCENE_JSON_BYTES,
+        MultiFileFormat::Glb => SCENE_PART_BYTES,
     };
     let first = file::read_at_most(&mut input, file_bytes, limit_bytes)?;
     parts.add(first.len() as u64, input.into_inner().finish());

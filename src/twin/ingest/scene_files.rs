@@ -3,11 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::limits;
-
 use super::hash_reader::HashReader;
 use super::unpack_budget::UnpackBudget;
-use super::{FileError, IngestError, Progress, file};
+use super::{FileError, IngestError, Progress, ReadLimits, StopFlag, file};
 
 /// Reads the files that a scene names.
 pub(super) trait SceneFiles {
@@ -32,6 +30,7 @@ pub(super) struct PartFiles<'a> {
     read_bytes: u64,
     progress: Progress<'a>,
     budget: UnpackBudget,
+    stop: StopFlag,
 }
 
 /// Where the files are.
@@ -43,20 +42,21 @@ enum Place<'a> {
 }
 
 impl<'a> PartFiles<'a> {
-    /// The files below the folder of the one given first, or the listed ones.
+    /// The files that a scene may name.
     pub(super) fn new(
         first: &Path,
-        listed: Option<&'a ListedFiles>,
+        limits: &ReadLimits<'a>,
         progress: Progress<'a>,
     ) -> Self {
         let folder = || first.parent().unwrap_or(Path::new("")).to_owned();
         Self {
-            place: listed.map_or_else(|| Place::Folder(folder()), Place::Listed),
+            place: limits.listed.map_or_else(|| Place::Folder(folder()), Place::Listed),
             names: BTreeSet::new(),
             hashes: Vec::new(),
             read_bytes: 0,
             progress,
-            budget: UnpackBudget::default(),
+            budget: UnpackBudget::new(limits),
+            stop: limits.stop.clone(),
         }
     }
 
@@ -101,8 +101,8 @@ impl<'a> PartFiles<'a> {
 impl SceneFiles for PartFiles<'_> {
     fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError> {
         let failed = |cause| IngestError::Part { name: name.into(), cause };
-        if self.names.len() >= limits::SCENE_PARTS {
-            return Err(failed(FileError::TooMany { limit: limits::SCENE_PARTS }));
+        if self.names.len() >= crate::limits::SCENE_PARTS {
+            return Err(failed(FileError::TooMany { limit: crate::limits::SCENE_PARTS }));
         }
         let path = self.path(name).map_err(failed)?;
         // A name takes a few bytes, and a file any number: read once per name, a small file could take any time.
@@ -110,7 +110,7 @@ impl SceneFiles for PartFiles<'_> {
             return Err(failed(FileError::Repeated));
         }
         let (file, file_bytes) = file::open(&path).map_err(failed)?;
-        let mut input = HashReader::new(file);
+        let mut input = HashReader::new(file, self.stop.clone());
         let bytes = file::read_at_most(&mut input, file_bytes, limit_bytes).map_err(failed)?;
         self.add(bytes.len() as u64, input.finish());
         Ok(bytes)
