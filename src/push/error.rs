@@ -1,5 +1,7 @@
 //! Why a push was refused or failed.
 
+use std::time::Duration;
+
 use wildcity_session::SessionError;
 use wildcity_twin::ingest::IngestError;
 use wildcity_twin::store::StoreError;
@@ -67,10 +69,10 @@ pub enum PushError {
         why: &'static str,
     },
     /// Reading and checking it took too long.
-    #[error("reading and checking took longer than {seconds} s; push the scene in parts, some cells each")]
+    #[error("reading and checking took longer than {limit:?}; push the scene in parts, some cells each")]
     TimedOut {
         /// The most that it may take.
-        seconds: u64,
+        limit: Duration,
     },
     /// The process stops.
     #[error("the server is shutting down; send the push again when it is back")]

@@ -68,7 +68,7 @@ pub async fn publish(
     let checked = timeout(limit, read_and_check(engine, push, &request, files, &turn)).await;
     let Ok(checked) = checked else {
         push.stop_flag().stop();
-        return Err(PushError::TimedOut { seconds: limit.as_secs() });
+        return Err(PushError::TimedOut { limit });
     };
     let (scene, base) = checked?;
 

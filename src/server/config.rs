@@ -78,8 +78,10 @@ pub struct SpoolLimits {
     pub uploads: usize,
     /// Bytes of the largest upload.
     pub upload_bytes: u64,
-    /// Bytes of all uploads, as announced.
+    /// Bytes of all uploads.
     pub bytes: u64,
+    /// Bytes of the uploads of one token; if there is no value, half of all if several tokens may upload.
+    pub token_bytes: Option<u64>,
     /// How long an upload is kept after its last byte.
     pub age: Duration,
 }
@@ -123,6 +125,7 @@ impl Default for SpoolLimits {
             uploads: limits::UPLOADS,
             upload_bytes: limits::UPLOAD_BYTES,
             bytes: limits::SPOOL_BYTES,
+            token_bytes: None,
             age: limits::UPLOAD_AGE,
         }
     }

@@ -51,8 +51,21 @@ pub const UPLOAD_NAME_BYTES: usize = 255;
 /// Largest upload: 250 million Gaussians of 236 bytes are 59 GB.
 pub const UPLOAD_BYTES: u64 = 64 << 30;
 
-/// Bytes of all uploads, as announced: two of the largest.
+/// Bytes of all uploads: two of the largest.
 pub const SPOOL_BYTES: u64 = 2 * UPLOAD_BYTES;
+
+/// Part of the spool that each token may use, if several may: half of it, one of the largest uploads.
+pub const TOKEN_SHARE: u64 = 2;
+
+/// Bytes beyond those that have arrived that an active upload has room for: the bytes of a fast connection until
+/// room is next looked for, many times over.
+pub const RESERVED_BYTES: u64 = 16 << 20;
+
+/// How long after its last byte, or its announcement, an upload keeps that room.
+pub const RESERVED_FOR: Duration = Duration::from_secs(120);
+
+/// How long after its last byte an upload may not be removed to make room for those of another token.
+pub const KEPT_FOR: Duration = Duration::from_secs(600);
 
 /// How long an upload is kept after its last byte.
 pub const UPLOAD_AGE: Duration = Duration::from_secs(24 * 3600);

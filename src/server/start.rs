@@ -13,6 +13,7 @@ use wildcity_session::{Engine, EngineSettings, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
+use crate::auth::Tokens;
 use crate::config::Config;
 use crate::metrics::Metrics;
 use crate::sessions::SessionRegistry;
@@ -84,7 +85,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     let address = listener.local_addr().map_err(listen_error)?;
 
     // Uploads. Agents can drive without them.
-    let spool = Spool::open(&uploads, limits.spool).map(Arc::new).map_err(|error| {
+    let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
+    let spool = Spool::open(&uploads, limits.spool, uploaders).map(Arc::new).map_err(|error| {
         let reason = format!("{}: {error}", uploads.display());
         tracing::warn!("uploads are refused: {reason}");
         reason

@@ -84,6 +84,10 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().bytes), value_parser = gib)]
     spool_gib: f64,
 
+    /// Size of the uploads of one token, in GiB [default: half of --spool-gib if several tokens may upload, else all]
+    #[arg(long, value_name = "GIB", value_parser = gib)]
+    token_spool_gib: Option<f64>,
+
     /// Seconds that an upload is kept after its last byte.
     #[arg(long, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
     upload_age_s: f64,
@@ -110,6 +114,7 @@ impl LimitOptions {
                 uploads: self.max_uploads,
                 upload_bytes: bytes_of_gib(self.upload_gib),
                 bytes: bytes_of_gib(self.spool_gib),
+                token_bytes: self.token_spool_gib.map(bytes_of_gib),
                 age: seconds(self.upload_age_s),
             },
         }

@@ -36,7 +36,7 @@ pub(super) async fn begin(
     };
     let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
     let twin = request.twin.clone();
-    let push = match state.pushes.begin(&request, &id, || find_uploads(&state, &request))? {
+    let push = match state.pushes.begin(&request, &id, || find_uploads(&state, &grant.name, &request))? {
         Begun::Known(push) => push,
         Begun::New { push, files } => {
             tokio::spawn(run(state.clone(), push.clone(), request, files));
@@ -99,12 +99,16 @@ async fn run(
     state.metrics.push_ended(outcome);
 }
 
-/// The finished uploads of a push. An upload is not removed while its file is held.
-fn find_uploads(state: &ServerState, request: &PushRequest) -> Result<Vec<SourceFile>, Fault> {
+/// The finished uploads of a push, which belong to its token. An upload is not removed while its file is held.
+fn find_uploads(
+    state: &ServerState,
+    owner: &str,
+    request: &PushRequest,
+) -> Result<Vec<SourceFile>, Fault> {
     let spool = state.spool()?;
     let mut files = Vec::with_capacity(request.files.len());
     for (index, file) in request.files.iter().enumerate() {
-        let upload = spool.get(&file.upload)?;
+        let upload = spool.get(owner, &file.upload)?;
         let size = upload.announced().size;
         if !upload.is_complete() {
             let held = upload.offset();
