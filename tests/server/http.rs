@@ -120,3 +120,20 @@ async fn public_addresses_are_refused() {
         wildcity_server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
     assert!(matches!(taken, ServerError::Listen { .. }), "{taken}");
 }
+
+/// Sockets that are opened and not used do not keep health checks and agents away.
+#[tokio::test]
+async fn idle_sockets_take_no_slot_from_others() {
+    let limits = Limits { connections: 8, ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    let mut idle = Vec::new();
+    for round in 0..14 {
+        for _ in 0..90 {
+            idle.push(TcpStream::connect(server.address()).await.unwrap());
+        }
+        let health = tokio::time::timeout(Duration::from_secs(2), get(&server, "/healthz"));
+        let (status, _) = health.await.unwrap_or_else(|_| panic!("no answer in round {round}"));
+        assert_eq!(status, 200);
+    }
+    server.still_serves().await;
+}

@@ -20,6 +20,7 @@ use axum::{Json, Router};
 use crate::auth::Grant;
 use crate::convert;
 use crate::fault::Fault;
+use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
 
 use refusal::Refusal;
@@ -69,6 +70,9 @@ async fn authorize(
         }
         None => Grant::everything(),
     };
+    if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
+        slot.become_known()?;
+    }
     request.extensions_mut().insert(grant);
     Ok(next.run(request).await)
 }
