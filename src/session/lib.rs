@@ -28,11 +28,11 @@ mod session;
 mod start;
 mod viewpoint;
 
-pub use engine::render_queue::Scratch;
+pub use engine::render_queue::{FrameCost, Scratch};
 pub use engine::twin_summaries::{
     DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary,
 };
-pub use engine::{Engine, EngineSettings, LatestPin};
+pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;

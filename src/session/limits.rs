@@ -63,6 +63,10 @@ pub const DT_MAX_US: i64 = 10_000_000;
 /// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
+/// A frame of more pixels takes so long on processors, a second and more, that small frames are rendered beside it.
+/// Sixteen 1440x928 images are 21 million.
+pub const LARGE_PIXELS: u64 = 24 << 20;
+
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
 /// overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw 1440x928 images,
 /// depth and opacity (88 MB each), or for JPEGs to every session.

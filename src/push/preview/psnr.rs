@@ -11,7 +11,7 @@ use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Rig, Scene};
-use wildcity_session::{Engine, SessionError, viewpoints};
+use wildcity_session::{Engine, FrameCost, PUSHES, SessionError, viewpoints};
 use wildcity_twin::residency::{SectionRef, demand};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
@@ -122,7 +122,9 @@ async fn render_small(
     views: Vec<View>,
 ) -> Result<Vec<u8>, PushError> {
     let deadline = Instant::now() + engine.step_timeout();
-    let rendered = engine.run(deadline, move |_, backend| {
+    let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
+    let cost = FrameCost { session: PUSHES, pixels };
+    let rendered = engine.run(cost, deadline, move |_, backend| {
         let mut images: Vec<_> =
             views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
         let mut targets: Vec<_> = images

@@ -47,6 +47,8 @@ pub struct Session {
     /// Prefetches beside the session.
     prefetch_task: LatestTask,
     name: String,
+    /// Tells the render queue whose frames are whose.
+    number: u64,
     /// Fields that override the profile of each version of the twin.
     profile_overrides: ProfileOverrides,
     /// The version's profile with the overrides.

@@ -95,6 +95,7 @@ impl Session {
         let reservation = Engine::reserve(resident.clone(), extent, profile).await?;
 
         let session = Self {
+            number: engine.new_session_number(),
             engine,
             reservation,
             prefetch_task: LatestTask::default(),

@@ -13,7 +13,7 @@ use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
 use crate::blocking::run_blocking;
-use crate::engine::render_queue::Scratch;
+use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
 use crate::limits;
@@ -143,13 +143,15 @@ impl Session {
             let pinned = self.pin(deadline, viewpoints(&views)).await?;
             builder.add_load(pinned.waited_for, pinned.waited);
             let profile = self.profile;
+            let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
+            let cost = FrameCost { session: self.number, pixels };
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
                 let frame = Frame { scene: &pinned, profile: &profile, views: &views };
                 let rendered = builder.render(&capture, &frame, backend, scratch);
                 builder.add_capture(capture);
                 rendered.map(|()| builder)
             };
-            let (rendered, queued) = self.engine.run(deadline, work).await?;
+            let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
             builder = rendered?;
             builder.add_queue_time(queued);
         }
