@@ -23,8 +23,9 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again; the exit code is 1 if an image differs, or if the recording is incomplete.
-    /// Without --out, stops at the first difference.
+    /// Render every frame again; the exit code is 1 if an image differs or there are none, and 3 if all images are as
+    /// recorded, but the recording was cut: the episode still runs, or the server was killed. Without --out, stops at
+    /// the first difference.
     #[arg(long)]
     verify: bool,
 
@@ -92,15 +93,37 @@ impl Replay {
                 writeln!(out, "differs     {difference}")?;
             }
         }
+        if !self.verify {
+            return Ok(());
+        }
         // An empty or unfinished recording does not prove that the whole episode repeats.
-        let missing = match (recording.frames.is_empty(), &recording.end) {
-            (true, _) => "has no frames",
-            (false, None) => "has no end: the episode still runs, or was interrupted",
-            (false, Some(_)) => return Ok(()),
-        };
-        anyhow::ensure!(!self.verify, "the recording is incomplete: it {missing}");
+        let last = recording.frames.last().context("the recording has no frames")?;
+        if recording.end.is_none() {
+            return Err(CutRecording { step: last.step }.into());
+        }
         Ok(())
     }
+}
+
+/// A recording without an end, all of which is verified.
+#[derive(Debug)]
+pub(super) struct CutRecording {
+    /// The last recorded step.
+    step: u64,
+}
+
+impl std::fmt::Display for CutRecording {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let step = self.step;
+        write!(f, "the recording is cut, verified to step {step}: the episode still runs, or was interrupted")
+    }
+}
+
+impl std::error::Error for CutRecording {}
+
+impl CutRecording {
+    /// The exit code of `wildcity replay --verify`.
+    pub(super) const EXIT_CODE: u8 = 3;
 }
 
 fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {

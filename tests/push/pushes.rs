@@ -9,6 +9,7 @@ use serde_json::json;
 use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushState};
 use wildcity_protocol::error::Code;
 use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::Gaussians;
 use wildcity_server::Limits;
 use wildcity_twin::store::Catalog;
 
@@ -240,12 +241,12 @@ async fn a_slow_push_delays_no_other_twin_and_can_be_cancelled() {
     let server = TestServer::start().await;
     let client = client(&server);
     let dir = tempfile::tempdir().unwrap();
-    let upload = async |name: &str, gaussians| {
-        let path = write(dir.path(), name, gaussians);
+    let upload = async |name: &str, gaussians: Gaussians| {
+        let path = write(dir.path(), name, &gaussians);
         client.upload(&path, &mut |_, _| {}).await.unwrap().id
     };
-    let slow_id = upload("slow.ply", &in_cell([0, 0], 40, 1)).await;
-    let other_id = upload("other.ply", &in_cell([0, 0], 20, 2)).await;
+    let slow_id = upload("slow.ply", in_cell([0, 0], 40, 1)).await;
+    let other_id = upload("other.ply", in_cell([0, 0], 20, 2)).await;
     // The preview of a push renders eight frames.
     server.painter.slow_ms.store(1_000, Ordering::SeqCst);
     let slow = NewPush { id: Some("slow".to_owned()), ..push_of(&[&slow_id]) };

@@ -137,3 +137,25 @@ async fn idle_sockets_take_no_slot_from_others() {
     }
     server.still_serves().await;
 }
+
+/// DNS rebinding: a page's own host name, made to stand for 127.0.0.1.
+#[tokio::test]
+async fn a_server_without_tokens_answers_for_its_own_host_only() {
+    let server = TestServer::start().await;
+    for (host, status) in [
+        ("localhost", 200),
+        ("LOCALHOST:8080", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:8080", 200),
+        ("evil.example", 403),
+        ("evil.example:8080", 403),
+        ("localhost.evil.example", 403),
+        ("127.0.0.1.evil.example", 403),
+        ("", 403),
+    ] {
+        let text = format!("GET /v1/twins HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, status, "{host}");
+        let text = format!("GET /healthz HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, 200, "{host}");
+    }
+}

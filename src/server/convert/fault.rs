@@ -235,6 +235,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Busy { .. } => plain(Code::Busy),
         SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
         SessionError::Render(error) => of_render(error),
+        SessionError::Record(error) if is_full(&error.cause) => plain(Code::StorageFull),
         SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
@@ -288,8 +289,8 @@ fn of_render(error: &RenderError) -> WireFault {
         RenderError::TooMany { .. } => plain(Code::AnswerTooLarge),
         // The device may have room again when other sessions have ended.
         RenderError::DeviceMemory { .. } => at(Code::Busy, "twin"),
+        RenderError::ExactRays { .. } => at(Code::OutOfRange, "profile"),
         RenderError::Views { .. }
-        | RenderError::ExactRays { .. }
         | RenderError::TargetSize { .. }
         | RenderError::Normals { .. }
         | RenderError::Overlay { .. }

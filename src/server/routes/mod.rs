@@ -68,7 +68,10 @@ async fn authorize(
             let authorization = request.headers().get(header::AUTHORIZATION);
             tokens.grant(authorization.map(|value| value.as_bytes()))?
         }
-        None => Grant::everything(),
+        None => {
+            check_host(&request)?;
+            Grant::everything()
+        }
     };
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
         slot.become_known()?;
@@ -89,6 +92,20 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Fault> {
     }
 }
 
+/// Refuses requests for other hosts, on a server without tokens. A web page can let the name of its own host stand
+/// for 127.0.0.1 (DNS rebinding); then its requests have no foreign `Origin`, but still that name as the host.
+fn check_host(request: &Request) -> Result<(), Fault> {
+    let header = request.headers().get(header::HOST).map(|host| host.to_str().unwrap_or_default());
+    let host = request.uri().authority().map(|authority| authority.as_str()).or(header);
+    match host {
+        Some(host) if !is_local_authority(host) => {
+            let reason = format!("requests for host {host:?} are refused; without tokens, localhost is served");
+            Err(Fault::Forbidden { reason })
+        }
+        _ => Ok(()),
+    }
+}
+
 /// `GET /readyz`: whether sessions can be opened, which needs the list of twins.
 async fn ready(State(state): State<Arc<ServerState>>) -> Response {
     match state.engine.check_twins().await {
@@ -102,12 +119,16 @@ async fn ready(State(state): State<Arc<ServerState>>) -> Response {
 
 /// Whether an origin is a page served from this machine.
 fn is_local(origin: &str) -> bool {
-    let Some((_, authority)) = origin.split_once("://") else { return false };
+    origin.split_once("://").is_some_and(|(_, authority)| is_local_authority(authority))
+}
+
+/// Whether a host, with or without a port, is this machine.
+fn is_local_authority(authority: &str) -> bool {
     let host = match authority.rsplit_once(':') {
         Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
         _ => authority,
     };
-    ["localhost", "127.0.0.1", "[::1]"].contains(&host)
+    host.eq_ignore_ascii_case("localhost") || ["127.0.0.1", "[::1]"].contains(&host)
 }
 
 #[cfg(test)]

@@ -14,8 +14,8 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{Instant, sleep};
 
-use wildcity_render::Backend;
-use wildcity_scene::RenderProfile;
+use wildcity_render::{Backend, RenderError};
+use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
     Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
 };
@@ -170,6 +170,18 @@ impl Engine {
         .await?;
         while prefetcher.pending() > 0 && Instant::now() < deadline {
             sleep(limits::PRELOAD_POLL).await;
+        }
+        Ok(())
+    }
+
+    /// Checks that the backend can draw as a profile asks.
+    ///
+    /// # Errors
+    /// [`RenderError::ExactRays`].
+    pub(crate) fn check_profile(&self, profile: &RenderProfile) -> Result<(), SessionError> {
+        let backend = self.queue.backend();
+        if profile.rays == Rays::Exact && !backend.draws_exact_rays() {
+            return Err(RenderError::ExactRays { backend: backend.name() }.into());
         }
         Ok(())
     }

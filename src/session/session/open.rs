@@ -83,6 +83,7 @@ impl Session {
 
         // The render profile, and the sky map that it requires.
         let profile = options.profile.apply(manifest.profile)?;
+        engine.check_profile(&profile)?;
         Engine::bake_sky(resident.clone(), profile).await?;
 
         // Where the twin was recorded, for the trust of images.
