@@ -115,7 +115,10 @@ pub(super) struct CutRecording {
 impl std::fmt::Display for CutRecording {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let step = self.step;
-        write!(f, "the recording is cut, verified to step {step}: the episode still runs, or was interrupted")
+        write!(
+            f,
+            "the recording is cut, verified to step {step}: the episode still runs, or was interrupted"
+        )
     }
 }
 

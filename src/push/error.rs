@@ -69,7 +69,9 @@ pub enum PushError {
         why: &'static str,
     },
     /// Reading and checking it took too long.
-    #[error("reading and checking took longer than {limit:?}; push the scene in parts, some cells each")]
+    #[error(
+        "reading and checking took longer than {limit:?}; push the scene in parts, some cells each"
+    )]
     TimedOut {
         /// The most that it may take.
         limit: Duration,

@@ -8,9 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use parking_lot::Mutex;
-use tokio::sync::{
-    Mutex as AsyncMutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore,
-};
+use tokio::sync::{Mutex as AsyncMutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
 use crate::error::PushError;
 use crate::limits;

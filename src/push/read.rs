@@ -143,13 +143,17 @@ impl<'a> Reader<'a> {
                 return Err(refused(IngestError::Values(bad)));
             }
             Err(IngestError::File(cause)) => {
-                return Err(PushError::Unreadable { name: name.clone(), reason: cause.to_string() });
+                return Err(PushError::Unreadable {
+                    name: name.clone(),
+                    reason: cause.to_string(),
+                });
             }
             Err(error) => return Err(refused(error)),
         };
         self.read_bytes += file.bytes;
         self.parts.extend(read.parts.iter().cloned());
-        self.read.insert(index, ReadFile { scene: read, options: requested.axes.options().clone() });
+        self.read
+            .insert(index, ReadFile { scene: read, options: requested.axes.options().clone() });
         if index == self.next {
             self.join_read(index + 1)?;
         }

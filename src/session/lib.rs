@@ -29,9 +29,7 @@ mod start;
 mod viewpoint;
 
 pub use engine::render_queue::{FrameCost, Scratch};
-pub use engine::twin_summaries::{
-    DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary,
-};
+pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
 pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;

@@ -41,7 +41,10 @@ fn gc_fsck_list_and_log_print_their_results() {
     std::fs::write(place.twins().join("street/log/0000000004"), "").unwrap();
     let (code, said) = run(&["list"]);
     assert_eq!(code, Some(0));
-    assert!(said.contains("street") && said.contains("damaged: ") && said.contains("log/0000000004"), "{said}");
+    assert!(
+        said.contains("street") && said.contains("damaged: ") && said.contains("log/0000000004"),
+        "{said}"
+    );
     assert_eq!(run(&["fsck", "street"]).0, Some(1));
     assert_eq!(run(&["fsck", "street", "--repair"]).0, Some(0));
     assert!(run(&["list"]).1.contains("version 3"));

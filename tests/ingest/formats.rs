@@ -288,7 +288,10 @@ fn a_listed_scene_reads_listed_files_only() {
         ingest::read_limited(&path, &limits, &mut |_, _| {})
     };
     let error = read(&ListedFiles::new()).unwrap_err().to_string();
-    assert!(error.starts_with("part \"scene.bin\": is not the name of exactly one file"), "{error}");
+    assert!(
+        error.starts_with("part \"scene.bin\": is not the name of exactly one file"),
+        "{error}"
+    );
     let read = read(&ListedFiles::from([("scene.bin".to_owned(), elsewhere)])).unwrap();
     assert_eq!((read.gaussians.len(), read.parts.len()), (20, 1));
     assert_eq!(read.hash, ingest::read_hashed(&path, &mut |_, _| {}).unwrap().1);

@@ -367,3 +367,36 @@ fn many_empty_layers_take_no_time() {
     let took = begun.elapsed();
     assert!(took.as_secs_f64() < 1.0, "{took:?}");
 }
+
+/// What follows the content is damage, or hides something.
+#[test]
+fn bytes_after_the_end_and_wrong_counts_are_refused() {
+    let g = gaussians(COUNT, 0, 20.0, 1);
+    let with = |mut file: Vec<u8>, more: &[u8]| {
+        file.extend(more);
+        file
+    };
+    let payload = with(gzip(&nurec_plain(&g, false)), b"more");
+    let usdz = zip_of(&[("scene.nurec".to_owned(), payload)], false);
+    let mut counted = ksplat(&g, 0);
+    counted[16] += 1;
+    // Four bytes within the length that the header says.
+    let mut padded = with(glb(gltf(&g, "", "")), &[0; 4]);
+    let length = padded.len() as u32;
+    padded[8..12].copy_from_slice(&length.to_le_bytes());
+    for (file, wanted) in [
+        (with(gzip(&spz_plain(&g, 3)), b"more"), "SPZ body, the end: more than the gzip stream"),
+        (
+            with(gzip(&spz_plain(&g, 3)), &gzip(b"x")),
+            "SPZ body, the end: more than the gzip stream",
+        ),
+        (usdz, "NuRec body, the gzip stream: is followed by 4 bytes"),
+        (with(zip_of(&sog(&g, 2), false), &[0]), "zip body, the end of the directory: is not at"),
+        (counted, ".ksplat header, bytes 16 to 19: 7 Gaussians; the sections have 6"),
+        (with(splat(&g), &[0; 32]), ".splat body, record 6: is all zeros"),
+        (padded, "glTF header, chunks: 4 bytes after the last one"),
+    ] {
+        let text = refusal(&file);
+        assert!(text.starts_with(wanted), "{text}\n{wanted}");
+    }
+}

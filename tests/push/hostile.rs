@@ -111,7 +111,8 @@ async fn a_pushed_scene_names_only_files_of_its_push() {
     let stolen = json.replace("block.bin", &format!("{buffer_id}.data"));
     let stolen_id = upload("stolen.gltf", stolen.as_bytes()).await;
 
-    for (uploads, part) in [(&stolen_id, format!("{buffer_id}.data")), (&scene_id, "block.bin".into())]
+    for (uploads, part) in
+        [(&stolen_id, format!("{buffer_id}.data")), (&scene_id, "block.bin".into())]
     {
         let refused = pushed(&[uploads]).await;
         assert_eq!(refused.state, PushState::Refused, "{refused:?}");

@@ -10,8 +10,8 @@ use std::io::Write;
 
 use wildcity_scene::{Gaussians, sh};
 
-pub(crate) use gltf_files::{glb, gltf, opacity};
 use gltf_files::unit;
+pub(crate) use gltf_files::{glb, gltf, opacity};
 
 fn byte(value: f64) -> u8 {
     (value * 255.0).round().clamp(0.0, 255.0) as u8

@@ -12,7 +12,9 @@ use wildcity_twin::store::{FsckReport, RecordSetAside};
 /// everything is as it was committed, and 1 otherwise. To repair objects, import the same source again with
 /// the same options. Objects without a version are not damage: `wildcity twin gc` removes them.
 #[derive(Debug, clap::Args)]
-#[command(after_long_help = "Examples:\n  wildcity twin fsck street && wildcity serve\n  wildcity twin fsck street --repair")]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin fsck street && wildcity serve\n  wildcity twin fsck street --repair"
+)]
 pub(super) struct Fsck {
     /// The twin's name.
     #[arg(value_name = "TWIN")]
@@ -37,7 +39,10 @@ impl Fsck {
         if self.repair {
             for RecordSetAside { number, error, path } in catalog.repair_log(&self.twin)? {
                 let path = path.display();
-                writeln!(io::stderr(), "set the record of version {number} aside as {path}: {error}")?;
+                writeln!(
+                    io::stderr(),
+                    "set the record of version {number} aside as {path}: {error}"
+                )?;
             }
         }
         let bar = progress::bytes("checking");

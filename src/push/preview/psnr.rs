@@ -157,11 +157,7 @@ struct SceneReader {
 impl SceneReader {
     /// The part of the version that the views show, without some of its cells. Sections that were read
     /// before are not read again.
-    fn read(
-        &mut self,
-        without: &BTreeSet<[i32; 2]>,
-        views: &[View],
-    ) -> Result<Scene, StoreError> {
+    fn read(&mut self, without: &BTreeSet<[i32; 2]>, views: &[View]) -> Result<Scene, StoreError> {
         let manifest = &self.version.manifest;
         let mut scene = Scene::default();
         for section in demand(manifest, &viewpoints(views), &self.profile) {

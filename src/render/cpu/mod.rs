@@ -157,7 +157,8 @@ impl Cpu {
 impl Lane {
     fn new(threads: usize, name: &'static str) -> Result<Self, rayon::ThreadPoolBuildError> {
         let name = move |i| format!("{name}-{i}");
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()?;
+        let pool =
+            rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()?;
         Ok(Self { pool, scratch: Mutex::default() })
     }
 

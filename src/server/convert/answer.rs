@@ -152,9 +152,7 @@ pub(crate) fn twins(list: &TwinSummaries) -> serde_json::Value {
     if list.damaged.is_empty() {
         return serde_json::json!({ "twins": twins });
     }
-    let damaged = |DamagedSummary { name, reason }: &DamagedSummary| {
-        serde_json::json!({ "name": name, "reason": reason })
-    };
+    let damaged = |DamagedSummary { name, reason }: &DamagedSummary| serde_json::json!({ "name": name, "reason": reason });
     let damaged: Vec<_> = list.damaged.iter().map(damaged).collect();
     serde_json::json!({ "twins": twins, "damaged": damaged })
 }

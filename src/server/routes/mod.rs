@@ -99,7 +99,9 @@ fn check_host(request: &Request) -> Result<(), Fault> {
     let host = request.uri().authority().map(|authority| authority.as_str()).or(header);
     match host {
         Some(host) if !is_local_authority(host) => {
-            let reason = format!("requests for host {host:?} are refused; without tokens, localhost is served");
+            let reason = format!(
+                "requests for host {host:?} are refused; without tokens, localhost is served"
+            );
             Err(Fault::Forbidden { reason })
         }
         _ => Ok(()),

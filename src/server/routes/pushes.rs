@@ -36,13 +36,14 @@ pub(super) async fn begin(
     };
     let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
     let twin = request.twin.clone();
-    let push = match state.pushes.begin(&request, &id, || find_uploads(&state, &grant.name, &request))? {
-        Begun::Known(push) => push,
-        Begun::New { push, files } => {
-            tokio::spawn(run(state.clone(), push.clone(), request, files));
-            push
-        }
-    };
+    let push =
+        match state.pushes.begin(&request, &id, || find_uploads(&state, &grant.name, &request))? {
+            Begun::Known(push) => push,
+            Begun::New { push, files } => {
+                tokio::spawn(run(state.clone(), push.clone(), request, files));
+                push
+            }
+        };
     Ok(answer(StatusCode::ACCEPTED, &id, &twin, &push))
 }
 

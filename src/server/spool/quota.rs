@@ -90,8 +90,9 @@ impl Quota {
                 return Ok(());
             }
             // The token's own uploads go first, and nothing else may go if the token's own quota is full.
-            let is_removable =
-                |known: &&Arc<Upload>| is_removable(known, owner) && (!is_own_full || known.owner() == owner);
+            let is_removable = |known: &&Arc<Upload>| {
+                is_removable(known, owner) && (!is_own_full || known.owner() == owner)
+            };
             let first = others()
                 .filter(is_removable)
                 .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used()));

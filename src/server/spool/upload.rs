@@ -93,13 +93,7 @@ impl Upload {
         Some(Self::with(dir, owner, announced, held, used))
     }
 
-    fn with(
-        dir: &Path,
-        owner: String,
-        announced: Announced,
-        held: u64,
-        used: SystemTime,
-    ) -> Self {
+    fn with(dir: &Path, owner: String, announced: Announced, held: u64, used: SystemTime) -> Self {
         let id = announced.digest.id();
         Self {
             stem: stem(&owner, &id),

@@ -20,7 +20,9 @@ pub enum FileError {
     #[error("is not a plain path below the folder of the file that names it; move it there")]
     OutsideFolder,
     /// A scene of a push names it, and the push has none or several files of this name.
-    #[error("is not the name of exactly one file of this push; push it together with the file that names it")]
+    #[error(
+        "is not the name of exactly one file of this push; push it together with the file that names it"
+    )]
     NotListed,
     /// The scene names it again.
     #[error("is named more than once; each file of a scene is read once")]

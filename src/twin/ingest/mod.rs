@@ -101,7 +101,8 @@ pub fn read_limited(
     progress: Progress<'_>,
 ) -> Result<ReadScene, IngestError> {
     let (file, file_bytes) = file::open(path)?;
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
+    let mut input =
+        BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
     let gaussians = match Format::of(input.fill_buf()?)? {
         Format::Json => {
             let parts = PartFiles::new(path, limits, progress);

@@ -43,11 +43,7 @@ enum Place<'a> {
 
 impl<'a> PartFiles<'a> {
     /// The files that a scene may name.
-    pub(super) fn new(
-        first: &Path,
-        limits: &ReadLimits<'a>,
-        progress: Progress<'a>,
-    ) -> Self {
+    pub(super) fn new(first: &Path, limits: &ReadLimits<'a>, progress: Progress<'a>) -> Self {
         let folder = || first.parent().unwrap_or(Path::new("")).to_owned();
         Self {
             place: limits.listed.map_or_else(|| Place::Folder(folder()), Place::Listed),

@@ -91,6 +91,9 @@ pub(super) fn read_gzip(
         let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
         return Err(body("the end", reason));
     }
+    if more < limit && !input.into_inner().fill_buf()?.is_empty() {
+        return Err(body("the end", "more than the gzip stream: copy the file again".into()));
+    }
     Ok(gaussians)
 }
 

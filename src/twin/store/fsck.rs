@@ -119,7 +119,8 @@ impl Catalog {
         for number in self.numbers(name)?.into_iter().rev() {
             let Err(error) = self.record(name, number) else { break };
             // A file that the system refuses to read may be sound: its permissions or the disk may be at fault.
-            let is_refused = matches!(&error, StoreError::Io { cause, .. } if cause.raw_os_error().is_some());
+            let is_refused =
+                matches!(&error, StoreError::Io { cause, .. } if cause.raw_os_error().is_some());
             if is_refused {
                 return Err(error);
             }

@@ -64,9 +64,7 @@ mod remote;
 mod settings;
 mod sky;
 
-pub use catalog::{
-    Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version,
-};
+pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;

@@ -37,12 +37,7 @@ struct Waiting<T> {
 
 impl<T> Default for FairQueue<T> {
     fn default() -> Self {
-        Self {
-            waiting: BTreeMap::new(),
-            finished: BTreeMap::new(),
-            virtual_time: 0,
-            arrivals: 0,
-        }
+        Self { waiting: BTreeMap::new(), finished: BTreeMap::new(), virtual_time: 0, arrivals: 0 }
     }
 }
 

@@ -166,7 +166,8 @@ impl Shared {
         state.queue.push(cost, job);
         if needs_side_thread {
             // Without the thread, small frames wait for the large one.
-            state.has_side_thread = self.clone().start_thread("render-side".into(), Lane::Side).is_ok();
+            state.has_side_thread =
+                self.clone().start_thread("render-side".into(), Lane::Side).is_ok();
         }
         drop(state);
         self.changed.notify_all();
@@ -227,7 +228,8 @@ impl State {
         self.rendering -= cost.pixels;
         let measured = took.as_secs_f64() * 1e9 / cost.pixels as f64;
         let is_first = self.ns_per_pixel == 0.0;
-        self.ns_per_pixel = if is_first { measured } else { 0.75 * self.ns_per_pixel + 0.25 * measured };
+        self.ns_per_pixel =
+            if is_first { measured } else { 0.75 * self.ns_per_pixel + 0.25 * measured };
     }
 }
 

@@ -87,6 +87,10 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussi
         }
         rest = after;
     }
+    if !rest.is_empty() {
+        let reason = format!("{} bytes after the last one, too few for another", rest.len());
+        return Err(bad("chunks", reason));
+    }
     let json = json.ok_or_else(|| bad("chunks", "there is no chunk JSON".into()))?;
     read(json, buffer, parts)
 }

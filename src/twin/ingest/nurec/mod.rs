@@ -12,7 +12,7 @@ mod msgpack;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use half::f16;
 
 use crate::limits;
@@ -30,9 +30,14 @@ const LAYERS: &str = ".gaussians_nodes.";
 pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
     let limit = budget.left_bytes();
     let mut bytes = Vec::new();
-    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
+    let mut decoder = GzDecoder::new(payload);
+    let read = decoder.by_ref().take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
     budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let rest = decoder.into_inner();
+    if !rest.is_empty() {
+        return Err(bad("the gzip stream", format!("is followed by {} bytes", rest.len())));
+    }
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
     let missing = |name: &str| bad(name, "is missing".into());
     let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;

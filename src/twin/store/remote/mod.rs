@@ -142,7 +142,8 @@ impl ObjectBackend for Remote {
 
     fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError> {
         let path = self.record_path(name, number);
-        let reason = "an object store has no rename; move the object away with the store's own tools";
+        let reason =
+            "an object store has no rename; move the object away with the store's own tools";
         Err(StoreError::io("set aside", &path)(std::io::Error::new(ErrorKind::Unsupported, reason)))
     }
 
