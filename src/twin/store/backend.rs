@@ -7,6 +7,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::StoreError;
+use super::disk::Lock;
 use super::layout::{object_key, record_key};
 
 /// A directory or an object store with twins. Callers must check names of twins and hashes before they
@@ -103,6 +104,13 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
 
     /// Removes a side file, if it exists.
     fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError>;
+
+    /// Keeps a side file locked until the lock is dropped, or the process ends. `None` where the backend has no
+    /// locks.
+    fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError>;
+
+    /// Whether a process keeps a side file locked.
+    fn is_held(&self, name: &str, file: &str) -> Result<bool, StoreError>;
 
     /// Path or URL of one log record.
     fn record_path(&self, name: &str, number: u64) -> PathBuf {

@@ -11,6 +11,8 @@ use wildcity_scene::rig::is_name;
 use wildcity_scene::{Chunk, Manifest, sh};
 
 use super::backend::ObjectBackend;
+use super::clock::{Clock, SystemClock};
+use super::disk::{Disk, RealDisk};
 use super::layout::is_hash;
 use super::local::{DiskCache, Local};
 use super::log::{LogEntry, LogRecord};
@@ -21,6 +23,7 @@ use super::{StoreError, chunk_file};
 #[derive(Clone, Debug)]
 pub struct Catalog {
     pub(super) objects: Arc<dyn ObjectBackend>,
+    pub(super) clock: Arc<dyn Clock>,
     remote: Option<Remote>,
 }
 
@@ -99,9 +102,9 @@ impl Catalog {
         let url = place.to_str().filter(|place| place.contains("://"));
         let dir = url.and_then(|url| url.strip_prefix("file://"));
         let catalog = match (url, dir) {
-            (_, Some(dir)) => Self { objects: Arc::new(Local::new(Path::new(dir))), remote: None },
+            (_, Some(dir)) => Self::local(Path::new(dir)),
             (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
-            (None, None) => Self { objects: Arc::new(Local::new(place)), remote: None },
+            (None, None) => Self::local(place),
         };
         catalog.remove_abandoned_commits(None)?;
         Ok(catalog)
@@ -122,8 +125,26 @@ impl Catalog {
         Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
     }
 
+    /// Opens a directory of twins on a disk, with a clock: the parts of a machine, or of a simulated one. As
+    /// [`Catalog::open`], removes the remains of killed commits.
+    ///
+    /// # Errors
+    /// As [`Catalog::open`].
+    pub fn on(dir: &Path, disk: Arc<dyn Disk>, clock: Arc<dyn Clock>) -> Result<Self, StoreError> {
+        let objects = Arc::new(Local::new(dir, disk));
+        let catalog = Self { objects, clock, remote: None };
+        catalog.remove_abandoned_commits(None)?;
+        Ok(catalog)
+    }
+
+    fn local(dir: &Path) -> Self {
+        let objects = Arc::new(Local::new(dir, Arc::new(RealDisk)));
+        Self { objects, clock: Arc::new(SystemClock), remote: None }
+    }
+
     fn remote(remote: Remote) -> Self {
-        Self { objects: Arc::new(remote.clone()), remote: Some(remote) }
+        let objects = Arc::new(remote.clone());
+        Self { objects, clock: Arc::new(SystemClock), remote: Some(remote) }
     }
 
     /// The same twins, read without the disk cache.

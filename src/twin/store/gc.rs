@@ -17,7 +17,6 @@ use crate::limits;
 
 use super::catalog::check_name;
 use super::lease::LeaseRecord;
-use super::log::now_us;
 use super::{Catalog, StoreError};
 
 /// Which versions are kept, and how long garbage is kept.
@@ -82,7 +81,7 @@ impl Catalog {
         dry_run: bool,
     ) -> Result<CollectionReport, StoreError> {
         check_name(name)?;
-        let now_us = now_us();
+        let now_us = self.clock.now_us();
         let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
@@ -98,8 +97,10 @@ impl Catalog {
             })?;
         }
         self.objects.write_side_file(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
-        for lease in self.leases(name)?.iter().filter(|lease| !lease.is_live(now_us)) {
-            lease.remove(self, name)?;
+        for lease in self.leases(name)? {
+            if !self.is_live(name, &lease, now_us)? {
+                lease.remove(self, name)?;
+            }
         }
         Ok(plan.report)
     }
@@ -120,8 +121,8 @@ impl Catalog {
         let before = self.collected(name)?;
         let after: BTreeSet<u64> = before.union(gone).copied().collect();
         self.objects.write_side_file(name, COLLECTED, &self.encode(&after)?)?;
-        let leases = self.leases(name)?;
-        let leased = |lease: &&LeaseRecord| lease.is_live(now_us) && gone.contains(&lease.version);
+        let leases = self.live_leases(name, now_us)?;
+        let leased = |lease: &&LeaseRecord| gone.contains(&lease.version);
         let Some(lease) = leases.iter().find(leased) else { return Ok(()) };
         self.objects.write_side_file(name, COLLECTED, &self.encode(&before)?)?;
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
@@ -144,7 +145,7 @@ impl Catalog {
         let numbers = self.numbers(name)?;
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
-        let live = self.leases(name)?.into_iter().filter(|lease| lease.is_live(now_us));
+        let live = self.live_leases(name, now_us)?.into_iter();
         kept.extend(live.map(|lease| lease.version).filter(|number| numbers.contains(number)));
         let gone = self.collected(name)?;
         kept.retain(|number| !gone.contains(number));

@@ -48,8 +48,10 @@
 mod backend;
 mod catalog;
 mod chunk_file;
+pub mod clock;
 mod commit;
 mod diff;
+pub mod disk;
 mod error;
 mod fsck;
 mod gc;

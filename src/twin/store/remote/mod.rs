@@ -23,6 +23,7 @@ use wildcity_scene::rig::is_name;
 
 use super::StoreError;
 use super::backend::{ListedObject, ObjectBackend, Staging};
+use super::disk::Lock;
 use super::layout::{check_side_file, is_hash, log_numbers, object_key, record_key};
 
 pub(super) use client::Remote;
@@ -145,6 +146,14 @@ impl ObjectBackend for Remote {
         let reason =
             "an object store has no rename; move the object away with the store's own tools";
         Err(StoreError::io("set aside", &path)(std::io::Error::new(ErrorKind::Unsupported, reason)))
+    }
+
+    fn hold(&self, _: &str, _: &str) -> Result<Option<Lock>, StoreError> {
+        Ok(None)
+    }
+
+    fn is_held(&self, _: &str, _: &str) -> Result<bool, StoreError> {
+        Ok(false)
     }
 
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {
