@@ -12,9 +12,9 @@ use wildcity_scene::{Chunk, Manifest, sh};
 
 use super::backend::ObjectBackend;
 use super::clock::{Clock, SystemClock};
-use super::disk::{Disk, RealDisk};
+use super::disk::Disk;
 use super::layout::is_hash;
-use super::local::{DiskCache, Local};
+use super::local::{DiskCache, Local, RealDisk};
 use super::log::{LogEntry, LogRecord};
 use super::remote::{Remote, RetryPolicy, Traffic};
 use super::{StoreError, chunk_file};

@@ -18,9 +18,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use crate::store::StoreError;
-use crate::store::disk::RealDisk;
 use crate::store::layout::{check_hash, is_hash};
 
+use super::RealDisk;
 use super::files::{WRITING, create_dirs, entries};
 
 /// A part gets a new modification time when it is used and the old one is older than this.

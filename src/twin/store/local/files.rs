@@ -94,7 +94,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::store::disk::RealDisk;
+    use crate::store::local::RealDisk;
 
     #[test]
     fn directories_are_created_with_those_above_them() {

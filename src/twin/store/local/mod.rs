@@ -3,6 +3,7 @@
 mod directory;
 mod disk_cache;
 mod files;
+mod real_disk;
 mod staging;
 
 use std::collections::BTreeSet;
@@ -20,6 +21,7 @@ use super::layout::{check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
+pub(super) use real_disk::RealDisk;
 
 use directory::{OpenObject, SEPARATOR, STAGING};
 use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, sync_parent};
@@ -286,7 +288,6 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::store::disk::RealDisk;
 
     fn begin(local: &Local, name: &str, commit: &str) -> Result<LocalStaging, StoreError> {
         LocalStaging::begin(local, name, commit)
