@@ -208,7 +208,7 @@ fn the_damage_of_one_twin_is_not_that_of_others() {
         assert!(fs::symlink_metadata(&aside[0].path).is_ok(), "{how}: nothing is deleted");
         assert_eq!(catalog.version("broken", None).unwrap().number, 1);
         assert_eq!(catalog.twins().unwrap().damaged.len(), 0);
-        fs::remove_dir_all(&staging).unwrap();
+        fs::remove_dir_all(&staging).ok();
         assert_eq!(
             commit(dir.path(), street_named("broken", &gaussians(50, 0, 20.0, 3))).unwrap().number,
             2
