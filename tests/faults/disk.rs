@@ -451,7 +451,7 @@ impl Seek for OpenFile {
 }
 
 impl ReadFile for OpenFile {
-    fn bytes(&self) -> io::Result<u64> {
+    fn size_bytes(&self) -> io::Result<u64> {
         Ok(self.0.get_ref().len() as u64)
     }
 }

@@ -103,7 +103,7 @@ pub trait ReadFile: Read + Seek + Debug + Send {
     ///
     /// # Errors
     /// The file system fails.
-    fn bytes(&self) -> io::Result<u64>;
+    fn size_bytes(&self) -> io::Result<u64>;
 }
 
 /// A file that is written.

@@ -49,7 +49,7 @@ impl Local {
     pub(super) fn open(&self, name: &str, hash: &str) -> Result<OpenObject, StoreError> {
         let path = self.object_file(name, hash);
         let file = self.disk.open(&path).map_err(StoreError::io("open", &path))?;
-        let bytes = file.bytes().map_err(StoreError::io("read", &path))?;
+        let bytes = file.size_bytes().map_err(StoreError::io("read", &path))?;
         Ok(OpenObject { path, file, bytes })
     }
 

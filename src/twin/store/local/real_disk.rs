@@ -89,7 +89,7 @@ impl Disk for RealDisk {
 }
 
 impl ReadFile for File {
-    fn bytes(&self) -> io::Result<u64> {
+    fn size_bytes(&self) -> io::Result<u64> {
         Ok(self.metadata()?.len())
     }
 }
