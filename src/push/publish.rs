@@ -168,7 +168,8 @@ fn compare_cells(
     for mean_m in &gaussians.means_m {
         *counts.entry(cell_at(mean_m)).or_insert(0) += 1;
     }
-    check_density(counts.len(), gaussians.len()).inspect_err(|_| push.set_report(report.clone()))?;
+    check_density(counts.len(), gaussians.len())
+        .inspect_err(|_| push.set_report(report.clone()))?;
     let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts);
     let changes = changes.inspect_err(|_| push.set_report(report.clone()))?;
     report.cells = changes.cells;

@@ -3,7 +3,7 @@
 //! A connection is a *newcomer* until it sends a request that a token allows (any request, on a server without
 //! tokens). Newcomers have slots of their own, and clients that are known have theirs, so that neither can take all.
 //! While newcomers have no slot left, the oldest connection of the address with the most newcomers is closed for the
-//! next one: whoever opens connections without using them loses them, and a health check, which comes and asks at once,
+//! next one: a client that opens connections without using them loses them, and a health check, which comes and asks at once,
 //! gets its answer.
 
 use std::collections::BTreeMap;

@@ -9,7 +9,7 @@
 //!
 //! **A frame that cannot be ready in time is not begun.** The time that large frames take per pixel is measured. One that
 //! cannot be done before its deadline is refused when it comes, or when its turn comes: otherwise a server with too
-//! many large frames would render most of them for nobody.
+//! many large frames would discard most of what it renders.
 
 mod fair;
 
