@@ -15,7 +15,7 @@ use wildcity_twin::ingest;
 use wildcity_twin::store::Catalog;
 
 /// A target: its name, which is also that of its folder in the corpus, and its function.
-pub const TARGETS: [(&str, fn(&[u8])); 8] = [
+pub(crate) const TARGETS: [(&str, fn(&[u8])); 8] = [
     ("scene", scene),
     ("record", record),
     ("observation", observation),
@@ -27,7 +27,7 @@ pub const TARGETS: [(&str, fn(&[u8])); 8] = [
 ];
 
 /// A scene file of any format.
-pub fn scene(data: &[u8]) {
+pub(crate) fn scene(data: &[u8]) {
     let dir = tempfile::tempdir().expect("a directory");
     let path = dir.path().join("scene");
     fs::write(&path, data).expect("written");
@@ -38,7 +38,7 @@ pub fn scene(data: &[u8]) {
 }
 
 /// The newest log record of a twin.
-pub fn record(data: &[u8]) {
+pub(crate) fn record(data: &[u8]) {
     let dir = tempfile::tempdir().expect("a directory");
     let log = dir.path().join("city/log");
     fs::create_dir_all(&log).expect("created");
@@ -50,14 +50,14 @@ pub fn record(data: &[u8]) {
 }
 
 /// An observation, as a client gets it.
-pub fn observation(data: &[u8]) {
+pub(crate) fn observation(data: &[u8]) {
     if let Ok(observation) = Observation::decode(data.to_vec()) {
         let _ = observation.verify();
     }
 }
 
 /// A request, as the server gets it.
-pub fn request(data: &[u8]) {
+pub(crate) fn request(data: &[u8]) {
     let Ok(mut value) = serde_json::from_slice::<serde_json::Value>(data) else { return };
     if let Some(fields) = value.as_object_mut() {
         fields.remove("seq");
@@ -66,28 +66,28 @@ pub fn request(data: &[u8]) {
 }
 
 /// The file of an episode.
-pub fn episode(data: &[u8]) {
+pub(crate) fn episode(data: &[u8]) {
     let file = tempfile::NamedTempFile::new().expect("a file");
     fs::write(file.path(), data).expect("written");
     let _ = RecordedEpisode::read(file.path());
 }
 
 /// A file of tokens.
-pub fn tokens(data: &[u8]) {
+pub(crate) fn tokens(data: &[u8]) {
     if let Err(error) = Tokens::parse(data) {
         assert!(!error.to_string().contains("secret"), "the message has a token");
     }
 }
 
 /// A file of cameras.
-pub fn rig(data: &[u8]) {
+pub(crate) fn rig(data: &[u8]) {
     if let Ok(rig) = serde_json::from_slice::<Rig>(data) {
         let _ = rig.check();
     }
 }
 
 /// A file of a recorded drive.
-pub fn trajectory(data: &[u8]) {
+pub(crate) fn trajectory(data: &[u8]) {
     if let Ok(trajectory) = serde_json::from_slice::<Trajectory>(data) {
         let _ = trajectory.check();
     }
