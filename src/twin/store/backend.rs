@@ -105,6 +105,10 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Removes a side file, if it exists.
     fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError>;
 
+    /// Removes what stopped processes left in a folder of side files, if it was written before a time: files that
+    /// were being written, and locks without their side file.
+    fn remove_leftovers(&self, name: &str, folder: &str, before_us: i64) -> Result<(), StoreError>;
+
     /// Keeps a side file locked until the lock is dropped, or the process ends. `None` where the backend has no
     /// locks.
     fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError>;

@@ -16,7 +16,7 @@ use serde::Deserialize;
 use crate::limits;
 
 use super::catalog::check_name;
-use super::lease::LeaseRecord;
+use super::lease::{self, LeaseRecord};
 use super::{Catalog, StoreError};
 
 /// Which versions are kept, and how long garbage is kept.
@@ -52,6 +52,10 @@ pub struct ObjectTotals {
 /// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
+/// The folder of the state of garbage collection.
+const FOLDER: &str = "gc";
+/// Age of what a stopped process left of a side file, in microseconds: a day, in which every write ends.
+const LEFTOVER_AGE_US: i64 = 86_400_000_000;
 /// The side file with the candidates.
 const CANDIDATES: &str = "gc/candidates";
 /// The side file with the versions that were removed.
@@ -101,6 +105,10 @@ impl Catalog {
             if !self.is_live(name, &lease, now_us)? {
                 lease.remove(self, name)?;
             }
+        }
+        for folder in [lease::FOLDER, FOLDER] {
+            let before_us = now_us.saturating_sub(LEFTOVER_AGE_US);
+            self.objects.remove_leftovers(name, folder, before_us)?;
         }
         Ok(plan.report)
     }

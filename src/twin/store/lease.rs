@@ -9,10 +9,11 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::disk::Lock;
+use super::layout::LOCK_ENDING;
 use super::{Catalog, StoreError};
 
-/// A version in use. The lease ends when it is dropped, or when it was not renewed for its
-/// duration.
+/// A version in use. The lease ends when it is dropped; or when it was not renewed for its duration, except in a
+/// directory, as long as its process lives.
 #[derive(Debug)]
 pub struct Lease {
     catalog: Catalog,
@@ -33,9 +34,8 @@ pub(super) struct LeaseRecord {
     until_us: i64,
 }
 
-const FOLDER: &str = "leases";
-/// Ending of the file that the process keeps locked.
-const LOCK: &str = ".lock";
+/// The folder of leases among a twin's side files.
+pub(super) const FOLDER: &str = "leases";
 
 impl Catalog {
     /// Records that a version of a twin is in use by `holder` (a text for people), until the
@@ -77,7 +77,7 @@ impl Catalog {
     pub(super) fn leases(&self, name: &str) -> Result<Vec<LeaseRecord>, StoreError> {
         let mut leases = Vec::new();
         let files = self.objects.list_side_files(name, FOLDER)?;
-        for id in files.into_iter().filter(|file| !file.ends_with(LOCK)) {
+        for id in files.into_iter().filter(|file| !file.ends_with(LOCK_ENDING)) {
             let read = self.objects.read_side_file(name, &format!("{FOLDER}/{id}"))?;
             // A missing file is a lease that ended meanwhile. A damaged one cannot say which
             // version it holds.
@@ -145,7 +145,7 @@ impl LeaseRecord {
     }
 
     fn lock_file(&self) -> String {
-        format!("{FOLDER}/{}{LOCK}", self.id)
+        format!("{FOLDER}/{}{LOCK_ENDING}", self.id)
     }
 
     fn file(&self) -> String {

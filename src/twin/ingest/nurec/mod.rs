@@ -47,7 +47,6 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
     let tracks = tracks.map(Value::index).unwrap_or_default();
     let settings = data.get("config").and_then(|config| config.get("layers"));
     let settings = settings.map(Value::index).unwrap_or_default();
-    let fields = state.index();
 
     let names = state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
     let is_static = |layer: &&str| match tracks.get(layer) {
@@ -64,6 +63,7 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
         let reason = format!("{} layers; at most {} are read", layers.len(), limits::NUREC_LAYERS);
         return Err(bad("nre_data.state_dict", reason));
     }
+    let fields = state.index();
     let mut all = Gaussians::default();
     for name in layers {
         budget.check_stop()?;

@@ -17,7 +17,7 @@ use wildcity_scene::rig::is_name;
 use super::StoreError;
 use super::backend::{ListedObject, ObjectBackend, Staging};
 use super::disk::{FileInfo, Lock, Wait};
-use super::layout::{check_hash, check_side_file, is_hash, log_numbers};
+use super::layout::{LOCK_ENDING, check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
@@ -255,6 +255,26 @@ impl ObjectBackend for Local {
             .and_then(|()| self.disk.rename(&writing, &path))
             .map_err(StoreError::io("write", &path))?;
         sync_parent(&*self.disk, &path)
+    }
+
+    fn remove_leftovers(&self, name: &str, folder: &str, before_us: i64) -> Result<(), StoreError> {
+        let dir = self.root.join(name).join(folder);
+        let files = entries(&*self.disk, &dir)?;
+        for file in &files {
+            let is_leftover = match file.strip_suffix(LOCK_ENDING) {
+                Some(of) => {
+                    let is_used = files.iter().any(|other| other == of);
+                    !is_used && !self.is_held(name, &format!("{folder}/{file}"))?
+                }
+                None => file.starts_with(WRITING),
+            };
+            let path = dir.join(file);
+            if is_leftover && self.disk.info(&path).is_ok_and(|found| found.modified_us < before_us)
+            {
+                self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
+            }
+        }
+        Ok(())
     }
 
     fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError> {

@@ -148,6 +148,11 @@ impl ObjectBackend for Remote {
         Err(StoreError::io("set aside", &path)(std::io::Error::new(ErrorKind::Unsupported, reason)))
     }
 
+    fn remove_leftovers(&self, _: &str, _: &str, _: i64) -> Result<(), StoreError> {
+        // A put is all or nothing, and there are no locks.
+        Ok(())
+    }
+
     fn hold(&self, _: &str, _: &str) -> Result<Option<Lock>, StoreError> {
         Ok(None)
     }
