@@ -2,7 +2,7 @@
 //!
 //! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
 //! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
-//! failure, 2 for a command line that cannot be parsed.
+//! failure, 2 for a command line that cannot be parsed; `episode run` has more, which its help lists.
 //!
 //! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
 //! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
@@ -17,6 +17,8 @@ mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod episode;
+mod exit;
 mod import;
 mod input_files;
 mod inspect;
@@ -66,6 +68,7 @@ enum Command {
     Twin(twin::Twin),
     Render(render::Render),
     Replay(replay::Replay),
+    Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
     Bench(bench::Bench),
@@ -90,6 +93,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
@@ -102,10 +106,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            match error.is::<replay::CutRecording>() {
-                true => ExitCode::from(replay::CutRecording::EXIT_CODE),
-                false => ExitCode::FAILURE,
-            }
+            error.downcast_ref::<exit::Exit>().map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
     }
 }

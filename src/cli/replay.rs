@@ -10,6 +10,7 @@ use wildcity_twin::residency::Cache;
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
+use super::exit::Exit;
 use super::{output, progress};
 
 /// Show a recorded episode, or render it again and compare every image with the recording.
@@ -23,9 +24,9 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again; the exit code is 1 if an image differs or there are none, and 3 if all images are as
-    /// recorded, but the recording was cut: the episode still runs, or the server was killed. Without --out, stops at
-    /// the first difference.
+    /// Render every frame again; the exit code is 1 if an image, a time, a hash or the summary at the end differs, or
+    /// if there are no frames; and 3 if all is as recorded, but the recording was cut: the episode still runs, or the
+    /// server was killed. Without --out, stops at the first difference.
     #[arg(long)]
     verify: bool,
 
@@ -39,6 +40,9 @@ pub(super) struct Replay {
     #[command(flatten)]
     backend: BackendOptions,
 }
+
+/// The exit code of a recording that was cut and verifies as far as it goes.
+const CUT_EXIT_CODE: u8 = 3;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -93,44 +97,29 @@ impl Replay {
                 writeln!(out, "differs     {difference}")?;
             }
         }
+        match &report.wrong_value {
+            None => {}
+            Some(wrong) if self.verify => anyhow::bail!("the record contradicts itself: {wrong}"),
+            Some(wrong) => writeln!(out, "wrong       {wrong}")?,
+        }
         if !self.verify {
             return Ok(());
         }
         // An empty or unfinished recording does not prove that the whole episode repeats.
         let last = recording.frames.last().context("the recording has no frames")?;
         if recording.end.is_none() {
-            return Err(CutRecording { step: last.step }.into());
+            let step = last.step;
+            let message = format!(
+                "the recording is cut, verified to step {step}: the episode still runs, or was interrupted"
+            );
+            return Err(Exit { code: CUT_EXIT_CODE, message }.into());
         }
         Ok(())
     }
 }
 
-/// A recording without an end, all of which is verified.
-#[derive(Debug)]
-pub(super) struct CutRecording {
-    /// The last recorded step.
-    step: u64,
-}
-
-impl std::fmt::Display for CutRecording {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let step = self.step;
-        write!(
-            f,
-            "the recording is cut, verified to step {step}: the episode still runs, or was interrupted"
-        )
-    }
-}
-
-impl std::error::Error for CutRecording {}
-
-impl CutRecording {
-    /// The exit code of `wildcity replay --verify`.
-    pub(super) const EXIT_CODE: u8 = 3;
-}
-
 fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {
-    let RecordedEpisode { header, frames, versions, end } = recording;
+    let RecordedEpisode { header, frames, versions, end, .. } = recording;
     let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
