@@ -98,7 +98,7 @@ mod tests {
 
     #[test]
     fn each_session_gets_the_same_number_of_pixels() {
-        let counts = served(&[100, 10, 10, 50], 2_600);
+        let counts = served(&[100, 10, 10, 50], 2_300);
         for (count, wanted) in counts.iter().zip([100, 1_000, 1_000, 200]) {
             assert!(count.abs_diff(wanted) < 40, "{counts:?}");
         }
