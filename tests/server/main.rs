@@ -8,11 +8,13 @@ mod root;
 mod support;
 
 mod appearance;
+mod bad_requests;
 mod bundles;
 mod damaged_twin;
 mod ego;
 mod http;
 mod leases;
+mod mutations;
 mod observation;
 mod page;
 mod profile;
@@ -21,3 +23,4 @@ mod refused;
 mod replay;
 mod resume;
 mod shutdown;
+mod socket;

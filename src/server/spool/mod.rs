@@ -140,7 +140,7 @@ impl Spool {
     /// # Errors
     /// [`Fault::UnknownUpload`].
     pub(crate) fn get(&self, owner: &str, id: &str) -> Result<Arc<Upload>, Fault> {
-        let unknown = || Fault::UnknownUpload { id: id.to_owned() };
+        let unknown = || Fault::UnknownUpload { id: id.to_owned(), field: None };
         self.uploads.lock().get(&upload::stem(owner, id)).cloned().ok_or_else(unknown)
     }
 
