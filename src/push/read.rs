@@ -127,6 +127,7 @@ impl<'a> Reader<'a> {
             listed: Some(&self.listed),
             memory_bytes: self.memory_bytes,
             stop: push.stop_flag().clone(),
+            ..ReadLimits::of_own_file()
         };
         let read = match read_limited(&file.path, &requested.axes, &limits, progress) {
             Ok(read) => read,
