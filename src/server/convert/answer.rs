@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::config::Limits as ServerLimits;
 use crate::fault::Fault;
+use crate::sessions::ClosedSession;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
@@ -114,15 +115,24 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
 }
 
 /// The answer to `resume`.
-pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<String, Fault> {
-    let episode = session.episode();
+pub(crate) fn resumed(
+    seq: u64,
+    name: &str,
+    last_seq: u64,
+    session: Result<&Session, &ClosedSession>,
+) -> Result<String, Fault> {
+    let (step, time_us) = match session {
+        Ok(open) => (open.episode().step(), open.episode().time_us()),
+        Err(closed) => (closed.steps, closed.time_us),
+    };
+    let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
     text(&Answer::Resumed {
         seq,
-        session: session.name().to_owned(),
+        session: name.to_owned(),
         last_seq,
-        step: episode.step(),
-        time_us: episode.time_us(),
-        opened: Some(Box::new(settings(seq, session, None)?)),
+        step,
+        time_us,
+        opened: opened.map(Box::new),
     })
 }
 
@@ -191,7 +201,11 @@ fn twin_info(twin: &TwinSummary) -> TwinInfo {
 
 fn profile(session: &Session) -> Result<serde_json::Map<String, serde_json::Value>, Fault> {
     match serde_json::to_value(session.profile()) {
-        Ok(serde_json::Value::Object(profile)) => Ok(profile),
+        Ok(serde_json::Value::Object(mut profile)) => {
+            // What is not set is left out, so that a client can send the profile back.
+            profile.retain(|_, value| !value.is_null());
+            Ok(profile)
+        }
         other => Err(Fault::Internal(format!("the profile is not an object: {other:?}"))),
     }
 }

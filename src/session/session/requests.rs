@@ -148,7 +148,8 @@ impl Session {
                 settings.warm_up_us,
                 dynamics,
                 seed,
-            )?,
+            )
+            .map_err(|error| error.of_reset(Some(start)))?,
         };
         let mut next = start.episode(seed, dynamics, settings.dt_us);
 
