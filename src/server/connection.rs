@@ -338,8 +338,7 @@ impl Connection {
         };
         if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
             check(closed.last.seq)?;
-            let text =
-                convert::resumed_closed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
+            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed))?;
             self.answered_seq = Some(closed.last.seq);
             self.last = Some(closed.last);
             return Ok(Answer::Text(text.into()));
@@ -348,7 +347,7 @@ impl Connection {
         check(slot.answered_seq)?;
         let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
         let session = slot.session.as_ref().ok_or(NO_SESSION)?;
-        let text = convert::resumed(seq, carried_out, session)?;
+        let text = convert::resumed(seq, name, carried_out, Ok(session))?;
         tracing::info!(session = session.name(), "resumed");
         self.last = slot.last.clone();
         self.answered_seq = Some(slot.answered_seq);

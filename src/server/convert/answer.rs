@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::config::Limits as ServerLimits;
 use crate::fault::Fault;
+use crate::sessions::ClosedSession;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
@@ -124,29 +125,26 @@ fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
     }
 }
 
-/// The answer to `resume` of an open session.
-pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<String, Fault> {
-    let episode = session.episode();
+/// The answer to `resume`.
+pub(crate) fn resumed(
+    seq: u64,
+    name: &str,
+    last_seq: u64,
+    session: Result<&Session, &ClosedSession>,
+) -> Result<String, Fault> {
+    let (step, time_us) = match session {
+        Ok(open) => (open.episode().step(), open.episode().time_us()),
+        Err(closed) => (closed.steps, closed.time_us),
+    };
+    let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
     text(&Answer::Resumed {
         seq,
-        session: session.name().to_owned(),
+        session: name.to_owned(),
         last_seq,
-        step: episode.step(),
-        time_us: episode.time_us(),
-        opened: Some(Box::new(settings(seq, session, None)?)),
+        step,
+        time_us,
+        opened: opened.map(Box::new),
     })
-}
-
-/// The answer to `resume` of a session that was closed, whose client did not get the answer to that.
-pub(crate) fn resumed_closed(
-    seq: u64,
-    session: &str,
-    last_seq: u64,
-    step: u64,
-    time_us: i64,
-) -> Result<String, Fault> {
-    let session = session.to_owned();
-    text(&Answer::Resumed { seq, session, last_seq, step, time_us, opened: None })
 }
 
 /// The answer to `prefetch`.

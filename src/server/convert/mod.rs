@@ -23,9 +23,7 @@ mod observation;
 mod request;
 mod rig;
 
-pub(crate) use answer::{
-    closed, ok, opened, resumed, resumed_closed, switched, twin, twins, welcome,
-};
+pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
