@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PAGES = [
     "README.md",
     "docs/agents.md",
+    "docs/alpamayo.md",
     "docs/operators.md",
     "docs/pipelines.md",
     "docs/scenes.md",
