@@ -82,7 +82,8 @@ enum Command {
     Devices(devices::Devices),
 }
 
-/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure. A
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
+/// for a recording that is cut (`replay --verify`). A
 /// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();

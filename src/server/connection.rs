@@ -259,7 +259,7 @@ impl Connection {
             return Err(Fault::WrongOrder("hello was sent already"));
         }
         let engine = &self.state.engine;
-        let mut twins = engine.twins().await?;
+        let mut twins = engine.twins().await?.twins;
         twins.retain(|twin| self.grant.allows_twin(&twin.name));
         let text = convert::welcome(seq, &self.state.limits, engine.backend(), &twins)?;
         tracing::debug!(client, "hello");

@@ -13,6 +13,7 @@ use wildcity_session::{Engine, EngineSettings, Scenarios, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
+use crate::auth::Tokens;
 use crate::config::Config;
 use crate::metrics::Metrics;
 use crate::sessions::SessionRegistry;
@@ -99,7 +100,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     let address = listener.local_addr().map_err(listen_error)?;
 
     // Uploads. Agents can drive without them.
-    let spool = Spool::open(&uploads, limits.spool).map(Arc::new).map_err(|error| {
+    let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
+    let spool = Spool::open(&uploads, limits.spool, uploaders).map(Arc::new).map_err(|error| {
         let reason = format!("{}: {error}", uploads.display());
         tracing::warn!("uploads are refused: {reason}");
         reason
@@ -116,7 +118,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         profile,
         tokens,
         spool,
-        pushes: PushQueue::new(limits.pushes),
+        pushes: PushQueue::new(limits.queue()),
     });
     Ok(Running::new(state, listener, address, stop))
 }

@@ -15,7 +15,6 @@
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
 //! | `scenario` | scenarios by name, and the files beside them |
-//! | `preview` | the preview of a push |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
@@ -26,7 +25,6 @@ pub mod limits;
 mod observe;
 mod options;
 mod prefetch;
-mod preview;
 mod record;
 mod scenario;
 mod session;
@@ -35,9 +33,9 @@ mod start;
 mod state;
 mod viewpoint;
 
-pub use engine::render_queue::Scratch;
-pub use engine::twin_summaries::{TrajectorySummary, TwinSummary};
-pub use engine::{Engine, EngineSettings, LatestPin};
+pub use engine::render_queue::{FrameCost, Scratch};
+pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
+pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;
@@ -51,7 +49,6 @@ pub use options::{
     ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
     SessionOptions, Start, StepOptions,
 };
-pub use preview::{ProposedChange, PsnrPreview};
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;

@@ -89,6 +89,10 @@ pub const DT_MAX_US: i64 = 10_000_000;
 /// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
+/// A frame of more pixels takes so long on processors, a second and more, that small frames are rendered beside it.
+/// Sixteen 1440x928 images are 21 million.
+pub const LARGE_PIXELS: u64 = 24 << 20;
+
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
 /// overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw 1440x928 images,
 /// depth and opacity (88 MB each), or for JPEGs to every session.
@@ -145,12 +149,6 @@ pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
 /// Most steps that prefetching looks ahead, even if the agent steps much faster than real time.
 pub const STEPS_AHEAD: usize = 256;
-
-/// Poses along the twin's trajectory at which a push is compared, unless the push names its own.
-pub const PREVIEW_POSES: usize = 4;
-
-/// Longest side of the images that are compared, in pixels.
-pub const PREVIEW_SIDE_PX: u32 = 320;
 
 /// How long a push may preload its version for the running sessions. After that the version counts as ready
 /// even if something is still missing.

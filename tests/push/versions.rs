@@ -181,7 +181,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
         session.resident().version.number
     };
     assert_eq!(latest().await, 2);
-    let listed = async || engine.twins().await.unwrap()[0].number;
+    let listed = async || engine.twins().await.unwrap().twins[0].number;
     assert_eq!(listed().await, 2);
     let held = engine.pin_latest("test", 1);
     assert_eq!((latest().await, listed().await), (1, 1));

@@ -11,6 +11,7 @@ mod appearance;
 mod bad_requests;
 mod branches;
 mod bundles;
+mod damaged_twin;
 mod drives;
 mod ego;
 mod http;

@@ -17,12 +17,12 @@ use crate::source::{Fault, Faulty, Place};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 
 /// An engine with its own directory of episodes.
-struct Bench {
-    engine: Arc<Engine>,
+pub(crate) struct Bench {
+    pub(crate) engine: Arc<Engine>,
     _episodes: tempfile::TempDir,
 }
 
-fn bench(cache: Cache) -> Bench {
+pub(crate) fn bench(cache: Cache) -> Bench {
     let episodes = tempfile::tempdir().unwrap();
     let engine = Engine::start(EngineSettings {
         cache,

@@ -14,6 +14,7 @@ use tracing_subscriber::EnvFilter;
 use wildcity_server::Tokens;
 use wildcity_twin::ingest;
 use wildcity_twin::residency::default_memory_bytes;
+use wildcity_twin::store::DamagedTwin;
 
 use limit_options::{LimitOptions, gib_of};
 
@@ -145,7 +146,11 @@ impl Serve {
             "--twins {} is not a directory",
             twins.display()
         );
-        if self.twins.catalog()?.twins()?.is_empty() {
+        let found = self.twins.catalog()?.twins()?;
+        for DamagedTwin { name, error } in &found.damaged {
+            tracing::error!(twin = name, "damaged, not served: {error}");
+        }
+        if found.twins.is_empty() {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }

@@ -13,8 +13,8 @@ use wildcity_protocol::message::{
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session, TrajectorySummary,
-    TwinSummary,
+    DamagedSummary, Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session,
+    TrajectorySummary, TwinSummaries, TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
@@ -183,8 +183,14 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
 }
 
 /// The body of `GET /v1/twins`.
-pub(crate) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
-    serde_json::json!({ "twins": twins.iter().map(|twin| twin_info(twin)).collect::<Vec<_>>() })
+pub(crate) fn twins(list: &TwinSummaries) -> serde_json::Value {
+    let twins: Vec<_> = list.twins.iter().map(|twin| twin_info(twin)).collect();
+    if list.damaged.is_empty() {
+        return serde_json::json!({ "twins": twins });
+    }
+    let damaged = |DamagedSummary { name, reason }: &DamagedSummary| serde_json::json!({ "name": name, "reason": reason });
+    let damaged: Vec<_> = list.damaged.iter().map(damaged).collect();
+    serde_json::json!({ "twins": twins, "damaged": damaged })
 }
 
 /// The body of `GET /v1/twins/{twin}`: one twin.

@@ -233,6 +233,8 @@ pub(super) fn of_push(error: &PushError) -> WireFault {
         PushError::Content { .. } => plain(Code::PushRefused),
         PushError::UnknownPush { .. } => plain(Code::UnknownPush),
         PushError::Busy { .. } => plain(Code::Busy),
+        PushError::TimedOut { .. } => plain(Code::PushRefused),
+        PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
         PushError::Session(error) => of_session(error),
         PushError::Unreadable { .. } | PushError::Crashed => plain(Code::Internal),
@@ -276,6 +278,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Busy { .. } => plain(Code::Busy),
         SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
         SessionError::Render(error) => of_render(error),
+        SessionError::Record(error) if is_full(&error.cause) => plain(Code::StorageFull),
         SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
@@ -337,8 +340,8 @@ fn of_render(error: &RenderError) -> WireFault {
         RenderError::TooMany { .. } => plain(Code::AnswerTooLarge),
         // The device may have room again when other sessions have ended.
         RenderError::DeviceMemory { .. } => at(Code::Busy, "twin"),
+        RenderError::ExactRays { .. } => at(Code::OutOfRange, "profile"),
         RenderError::Views { .. }
-        | RenderError::ExactRays { .. }
         | RenderError::TargetSize { .. }
         | RenderError::Normals { .. }
         | RenderError::Overlay { .. }

@@ -17,13 +17,14 @@ use crate::state::ServerState;
 
 use super::refusal::HttpResult;
 
-/// `GET /v1/twins`: the latest version of every twin that the token may use.
+/// `GET /v1/twins`: the latest version of every twin that the token may use, and the damaged ones of them.
 pub(super) async fn list(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
 ) -> HttpResult {
     let mut twins = state.engine.twins().await?;
-    twins.retain(|twin| grant.allows_twin(&twin.name));
+    twins.twins.retain(|twin| grant.allows_twin(&twin.name));
+    twins.damaged.retain(|twin| grant.allows_twin(&twin.name));
     Ok(Json(convert::twins(&twins)).into_response())
 }
 
@@ -35,7 +36,7 @@ pub(super) async fn show(
 ) -> HttpResult {
     grant.require_twin(&name)?;
     let twins = state.engine.twins().await?;
-    match twins.iter().find(|twin| twin.name == name) {
+    match twins.twins.iter().find(|twin| twin.name == name) {
         Some(twin) => Ok(Json(convert::twin(twin)).into_response()),
         None => {
             // A twin that is not listed may be damaged: opening it gives the reason.

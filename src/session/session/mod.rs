@@ -47,6 +47,8 @@ pub struct Session {
     /// Prefetches beside the session.
     prefetch_task: LatestTask,
     name: String,
+    /// Tells the render queue whose frames are whose.
+    number: u64,
     settings: Arc<SessionSettings>,
     version: PinnedVersion,
     state: EpisodeState,

@@ -121,6 +121,7 @@ impl Session {
 
         // The render profile, and the sky map that it requires.
         let profile = options.profile.apply(manifest.profile)?;
+        engine.check_profile(&profile)?;
         Engine::bake_sky(resident.clone(), profile).await?;
 
         // Where the twin was recorded, for the trust of images.
@@ -168,6 +169,7 @@ impl Session {
     ) -> Self {
         let dt_us = settings.dt_us;
         let session = Self {
+            number: engine.new_session_number(),
             engine,
             reservation,
             prefetch_task: LatestTask::default(),

@@ -8,6 +8,7 @@ use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
 use crate::options::PixelMaps;
+use crate::record::error::RecordError;
 use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
     RecordedSettings, RecordedVersion,
@@ -125,7 +126,8 @@ impl Session {
         let name = self.name.clone();
         let first_number = self.episode_number + 1;
         let lines = [Line::Episode(Box::new(header)), first_frame];
-        let created = run_blocking(move || Recorder::create(&dir, &name, first_number, &lines));
+        let created =
+            run_blocking(move || logged(Recorder::create(&dir, &name, first_number, &lines)));
         Ok(created.await??)
     }
 
@@ -159,5 +161,10 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
-    Ok(run_blocking(move || recorder.append(&lines)).await??)
+    Ok(run_blocking(move || logged(recorder.append(&lines))).await??)
+}
+
+/// Logs a failure: it concerns the operator, and the client may not tell him.
+fn logged<T>(recorded: Result<T, RecordError>) -> Result<T, RecordError> {
+    recorded.inspect_err(|error| tracing::error!("{error}"))
 }

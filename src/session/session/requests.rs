@@ -15,7 +15,7 @@ use wildcity_twin::residency::{PinnedScene, Viewpoint};
 use super::Session;
 use super::recording::scenario_hash;
 use crate::blocking::run_blocking;
-use crate::engine::render_queue::Scratch;
+use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
 use crate::limits;
@@ -242,13 +242,15 @@ impl Session {
             let pinned = pin(version, deadline, viewpoints(&views)).await?;
             builder.add_load(pinned.waited_for, pinned.waited);
             let profile = version.profile;
+            let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
+            let cost = FrameCost { session: self.number, pixels };
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
                 let frame = Frame { scene: &pinned, profile: &profile, views: &views };
                 let rendered = builder.render(&capture, &frame, backend, scratch);
                 builder.add_capture(capture);
                 rendered.map(|()| builder)
             };
-            let (rendered, queued) = self.engine.run(deadline, work).await?;
+            let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
             builder = rendered?;
             builder.add_queue_time(queued);
         }

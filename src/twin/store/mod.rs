@@ -48,8 +48,10 @@
 mod backend;
 mod catalog;
 mod chunk_file;
+pub mod clock;
 mod commit;
 mod diff;
+pub mod disk;
 mod error;
 mod fsck;
 mod gc;
@@ -64,11 +66,11 @@ mod remote;
 mod settings;
 mod sky;
 
-pub use catalog::{Catalog, DiskCacheSettings, TwinListing, Version};
+pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
-pub use fsck::{DamagedObject, FsckReport, VerifyReport};
+pub use fsck::{DamagedObject, FsckReport, RecordSetAside, VerifyReport};
 pub use gc::{CollectionReport, ObjectTotals, Retention};
 pub use lease::Lease;
 pub use log::{CommitKind, LogEntry};

@@ -9,14 +9,16 @@
 
 mod msgpack;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use half::f16;
 
+use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
-use super::unpack_budget::{self, UnpackBudget};
+use super::unpack_budget::UnpackBudget;
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
 use msgpack::Value;
@@ -26,29 +28,49 @@ const LAYERS: &str = ".gaussians_nodes.";
 
 /// Reads a payload.
 pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
-    let limit = unpack_budget::limit_bytes(payload.len() as u64);
+    let limit = budget.left_bytes();
     let mut bytes = Vec::new();
-    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
+    let mut decoder = GzDecoder::new(payload);
+    let read = decoder.by_ref().take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
     budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let rest = decoder.into_inner();
+    if !rest.is_empty() {
+        return Err(bad("the gzip stream", format!("is followed by {} bytes", rest.len())));
+    }
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
     let missing = |name: &str| bad(name, "is missing".into());
     let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
     let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
+    // Maps are searched once per layer and field, so they are indexed.
     let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
+    let tracks = tracks.map(Value::index).unwrap_or_default();
+    let settings = data.get("config").and_then(|config| config.get("layers"));
+    let settings = settings.map(Value::index).unwrap_or_default();
+
     let names = state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
-    let is_static = |layer: &&str| match tracks.and_then(|tracks| tracks.get(layer)) {
+    let is_static = |layer: &&str| match tracks.get(layer) {
         Some(Value::Array(ids)) => ids.is_empty(),
         _ => true,
     };
-    let mut all = Gaussians::default();
-    let mut layers = names.filter(is_static).peekable();
-    if layers.peek().is_none() {
+    // A key may be repeated: the first one counts.
+    let mut seen = BTreeSet::new();
+    let layers: Vec<&str> = names.filter(is_static).filter(|&name| seen.insert(name)).collect();
+    if layers.is_empty() {
         return Err(missing("a layer of static Gaussians"));
     }
+    if layers.len() > limits::NUREC_LAYERS {
+        let reason = format!("{} layers; at most {} are read", layers.len(), limits::NUREC_LAYERS);
+        return Err(bad("nre_data.state_dict", reason));
+    }
+    let fields = state.index();
+    let mut all = Gaussians::default();
     for name in layers {
-        check_activations(data, name)?;
-        let part = Layer { state, name }.read()?;
+        budget.check_stop()?;
+        if let Some(settings) = settings.get(name) {
+            check_activations(settings, name)?;
+        }
+        let part = Layer { fields: &fields, name }.read()?;
         all.append(&part);
         check_count(all.len() as u64)?;
     }
@@ -57,9 +79,7 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
 }
 
 /// Checks that parameters have the activations that this reader assumes.
-fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
-    let layers = data.get("config").and_then(|config| config.get("layers"));
-    let Some(settings) = layers.and_then(|layers| layers.get(layer)) else { return Ok(()) };
+fn check_activations(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     let wanted = [
         ("density_activation", "sigmoid"),
         ("scale_activation", "exp"),
@@ -79,7 +99,7 @@ fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
 
 /// The arrays of one layer.
 struct Layer<'a> {
-    state: &'a Value<'a>,
+    fields: &'a BTreeMap<&'a str, &'a Value<'a>>,
     name: &'a str,
 }
 
@@ -118,7 +138,7 @@ impl Layer<'_> {
 
     /// The SH degree that training had reached, stored as i64.
     fn active_degree(&self) -> Option<u8> {
-        match self.state.get(&self.key("n_active_features")) {
+        match self.fields.get(&*self.key("n_active_features")) {
             Some(Value::Bytes(bytes)) => {
                 let degree = i64::from_le_bytes(**bytes.first_chunk().as_ref()?);
                 u8::try_from(degree).ok()
@@ -134,7 +154,7 @@ impl Layer<'_> {
         rows: Option<usize>,
     ) -> Result<Array<'_>, IngestError> {
         let key = self.key(field);
-        let shape = match self.state.get(&format!("{key}.shape")) {
+        let shape = match self.fields.get(&*format!("{key}.shape")) {
             Some(Value::Array(shape)) => shape.iter().map(Value::as_usize).collect(),
             _ => None,
         };
@@ -148,7 +168,7 @@ impl Layer<'_> {
                 format!("[{found_rows}, {found_columns}], not [{}, {}]", any(rows), any(columns));
             return Err(bad(&format!("{key}.shape"), reason));
         }
-        let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
+        let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
         let values = found_rows as u128 * found_columns as u128;
