@@ -7,7 +7,7 @@ use wildcity_twin::ingest::BadGaussian;
 
 use crate::error::PushError;
 use crate::limits;
-use crate::preview::PsnrPreview;
+use crate::preview::psnr::PsnrPreview;
 use crate::request::CellSelection;
 
 /// What was found in the files of a push.

@@ -192,8 +192,9 @@ def test_observations_decode_to_their_contents(name: str) -> None:
 
 def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
     """Without the fields that the server omits: an empty history, and `back` of current frames."""
-    if not metadata["history"]:
-        del metadata["history"]
+    for name in ("history", "events"):
+        if not metadata[name]:
+            del metadata[name]
     for image in metadata["images"]:
         assert image.pop("back") == 0
     return metadata

@@ -105,7 +105,7 @@ fn check_host(request: &Request) -> Result<(), Fault> {
             let reason = format!(
                 "requests for host {host:?} are refused; without tokens, localhost is served"
             );
-            Err(Fault::Forbidden { reason })
+            Err(Fault::Forbidden { field: "host", reason })
         }
         _ => Ok(()),
     }
