@@ -19,6 +19,7 @@ PAGES = [
     "README.md",
     "docs/actors.md",
     "docs/agents.md",
+    "docs/alpamayo.md",
     "docs/operators.md",
     "docs/pipelines.md",
     "docs/scenes.md",
