@@ -114,7 +114,8 @@ fn damage(text: &[u8], random: &mut Random) -> Vec<u8> {
 
 #[test]
 fn the_whole_scenario_resolves_and_runs() {
-    assert_eq!(run(&serde_json::to_vec(&scenario()).unwrap()), Ok(9));
+    // Seven of the file, and the recorded one.
+    assert_eq!(run(&serde_json::to_vec(&scenario()).unwrap()), Ok(8));
 }
 
 /// Resolves a scenario with its first values and runs it for two seconds. Returns the number of actors.
@@ -151,7 +152,9 @@ fn run(text: &[u8]) -> Result<usize, String> {
 
 /// A refusal, which must name a place and say something.
 fn told(place: &str, message: &str) -> String {
-    assert!(!place.is_empty() && message.len() > 3, "{place:?}: {message:?}");
+    // The place of an unknown field at the top whose name is empty is empty.
+    let names_place = !place.is_empty() || message.contains("field ``");
+    assert!(names_place && message.len() > 3, "{place:?}: {message:?}");
     format!("{place}: {message}")
 }
 

@@ -107,7 +107,7 @@ fn mistakes_name_the_feature_and_the_fix() {
     };
     assert_eq!(place("\"lane\"", "\"lame\""), "features[0].properties.layer");
     assert_eq!(place("\"width_m\":3.5", "\"width_m\":0"), "features[0].properties.width_m");
-    assert_eq!(place("\"width_m\":3.5,", "").as_str(), "features[0].properties.width_m");
+    assert_eq!(place(",\"width_m\":3.5", "").as_str(), "features[0].properties.width_m");
     assert_eq!(place("[50,0]", "[50]"), "features[0].geometry.coordinates");
     assert_eq!(place("\"Polygon\"", "\"Point\""), "features[2].geometry.type");
     assert_eq!(place("[\"b\"]", "[\"c\"]"), "lanes[0].next[0]");

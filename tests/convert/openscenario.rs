@@ -166,14 +166,14 @@ fn what_is_not_read_is_refused_by_name_and_line() {
         (
             "<WorldPosition x=\"60\"",
             "<LanePosition roadId=\"1\" laneId=\"-1\" s=\"60\"",
-            "line 48, <LanePosition>",
+            "line 46, <LanePosition>",
         ),
         ("$Gap", "$Gab", "\"Gab\""),
-        ("${$EgoKmh / 3.6}", "${pow($EgoKmh, 2)}", "line 36, <AbsoluteTargetSpeed>"),
+        ("${$EgoKmh / 3.6}", "${pow($EgoKmh, 2)}", "line 33, <AbsoluteTargetSpeed>"),
         (
             "dynamicsShape=\"linear\"",
             "dynamicsShape=\"sinusoidal\"",
-            "line 82, <SpeedActionDynamics>",
+            "line 72, <SpeedActionDynamics>",
         ),
         (
             "<TraveledDistanceCondition value=\"12\"/>",
