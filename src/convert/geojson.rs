@@ -380,11 +380,12 @@ mod tests {
     #[test]
     fn a_degree_is_as_long_as_on_the_ellipsoid() {
         let origin = Origin::at([10.0, 48.0]).unwrap();
-        // Radii of curvature at 48°: 6,390 km in the prime vertical, 6,371 km in the meridian.
+        // Length of a degree in metres, in series of the latitude φ: 111412.84 cos φ - 93.5 cos 3φ + 0.118 cos 5φ
+        // to the east, 111132.92 - 559.82 cos 2φ + 1.175 cos 4φ to the north (American Practical Navigator, table 7).
         let [east_m, _, _] = origin.to_enu([10.001, 48.0, 0.0]);
-        assert!((east_m - 74.627_778).abs() < 1e-3, "{east_m}");
+        assert!((east_m - 74.625_33).abs() < 1e-3, "{east_m}");
         let [_, north_m, up_m] = origin.to_enu([10.0, 48.001, 5.0]);
-        assert!((north_m - 111.200_6).abs() < 1e-2, "{north_m}");
+        assert!((north_m - 111.190_3).abs() < 1e-3, "{north_m}");
         assert_eq!(up_m, 5.0);
         assert!(Origin::at([10.0, 91.0]).is_err());
     }
