@@ -114,6 +114,6 @@ fn traffic_flows_and_the_walker_crosses() {
             .length();
         assert!(driven_m > 100.0, "{driven_m}");
         let gone = driven.steps.last().unwrap().2.iter().filter(|actor| !actor.present).count();
-        assert!(gone >= 2, "oncoming cars left: {gone}");
+        assert!(gone >= 1, "oncoming cars that left: {gone}");
     }
 }
