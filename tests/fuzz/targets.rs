@@ -15,7 +15,10 @@ use wildcity_twin::ingest;
 use wildcity_twin::store::Catalog;
 
 /// A target: its name, which is also that of its folder in the corpus, and its function.
-pub(crate) const TARGETS: [(&str, fn(&[u8])); 8] = [
+type Target = (&'static str, fn(&[u8]));
+
+/// All targets.
+pub(crate) const TARGETS: [Target; 8] = [
     ("scene", scene),
     ("record", record),
     ("observation", observation),

@@ -228,11 +228,11 @@ fn speed_of(action: Element<'_>, from_mps: f64) -> Result<(f64, f64), ConvertErr
     Ok((to_mps, rate.clamp(LEAST_MPS2, STEP_MPS2)))
 }
 
-/// The points of a `<FollowTrajectoryAction>`, with their times if they count.
-fn trajectory_of(
-    action: Element<'_>,
-    entities: &Entities,
-) -> Result<(Vec<[f64; 3]>, Option<Vec<f64>>), ConvertError> {
+/// Points in metres, with their times in seconds if they count.
+type TimedPoints = (Vec<[f64; 3]>, Option<Vec<f64>>);
+
+/// The points of a `<FollowTrajectoryAction>`.
+fn trajectory_of(action: Element<'_>, entities: &Entities) -> Result<TimedPoints, ConvertError> {
     let follow = action.only_child()?;
     if follow.name() != "FollowTrajectoryAction" {
         return Err(follow.unread());

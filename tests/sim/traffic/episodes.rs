@@ -305,13 +305,13 @@ fn compare_orders(steps: u32, dt_us: i64) {
         let begin = one.states().to_vec();
         one.step(dt_us, &ego, &mut |_| {});
         other.step(dt_us, &ego, &mut |_| {});
-        for index in 0..count {
+        for (index, before) in begin.iter().enumerate() {
             let [a, b] = [one.states()[index], other.states()[place(index)]];
             if bits(&a) != bits(&b) {
                 panic!("step {step}, actor {index}: {a:?} is not {b:?}");
             }
             assert!(a.world_from_actor.position_m.is_finite(), "step {step}, actor {index}");
-            moved += u32::from(a != begin[index]);
+            moved += u32::from(a != *before);
         }
     }
     assert!(moved > steps, "only {moved} moves: nothing was compared");
