@@ -40,5 +40,7 @@
 //! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses or actors there is no
 //!    buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
+//!
+//! [`wildcity_score`]: ../wildcity_score/index.html
 
 pub mod cli;
