@@ -204,6 +204,8 @@ async fn public_addresses_are_refused() {
         scenarios: server.twins.path().join(".scenarios"),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
+        origins: wildcity_server::Origins::default(),
+        tls: None,
         backend: server.painter.clone(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),
