@@ -55,14 +55,15 @@ impl Running {
         stop: watch::Sender<bool>,
     ) -> Self {
         let has_tls = tls.is_some();
-        let listening = tokio::spawn(listen(state.clone(), listener, tls.clone()));
+        let reloading = tls::reload(tls.clone());
+        let listening = tokio::spawn(listen(state.clone(), listener, tls));
         let periodic = state.clone();
         tokio::spawn(async move {
             tokio::select! {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
                 () = renew_leases(&periodic) => {}
-                () = tls::reload(tls.as_deref()) => {}
+                () = reloading => {}
                 () = periodic.stopped() => {}
             }
         });

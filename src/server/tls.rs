@@ -48,31 +48,41 @@ impl Tls {
     pub(crate) fn acceptor(&self) -> TlsAcceptor {
         self.acceptor.lock().clone()
     }
+
+    fn read_again(&self) {
+        match read(&self.files) {
+            Ok(acceptor) => {
+                *self.acceptor.lock() = acceptor;
+                tracing::info!(cert = %self.files.cert.display(), "read the certificate again");
+            }
+            Err(error) => tracing::error!("the old certificate stays: {error}"),
+        }
+    }
 }
 
 /// Reads the files again with every SIGHUP, until dropped. Connections that exist keep their certificate. If the new
-/// files cannot be used, the old ones stay.
-pub(crate) async fn reload(tls: Option<&Tls>) {
-    let Some(tls) = tls else { return std::future::pending().await };
+/// files cannot be used, the old ones stay. From the call on, SIGHUP does not end the process.
+pub(crate) fn reload(tls: Option<Arc<Tls>>) -> impl Future<Output = ()> + Send {
     #[cfg(unix)]
-    {
+    let hangup = tls.is_some().then(|| {
         use tokio::signal::unix::{SignalKind, signal};
-        match signal(SignalKind::hangup()) {
-            Ok(mut hangup) => {
+        signal(SignalKind::hangup())
+    });
+    async move {
+        #[cfg(unix)]
+        match (&tls, hangup) {
+            (Some(tls), Some(Ok(mut hangup))) => {
                 while hangup.recv().await.is_some() {
-                    match read(&tls.files) {
-                        Ok(acceptor) => {
-                            *tls.acceptor.lock() = acceptor;
-                            tracing::info!(cert = %tls.files.cert.display(), "read the certificate again");
-                        }
-                        Err(error) => tracing::error!("the old certificate stays: {error}"),
-                    }
+                    tls.read_again();
                 }
             }
-            Err(error) => tracing::error!("SIGHUP does not read the certificate again: {error}"),
+            (_, Some(Err(error))) => {
+                tracing::error!("SIGHUP does not read the certificate again: {error}");
+            }
+            _ => {}
         }
+        std::future::pending().await
     }
-    std::future::pending().await
 }
 
 fn read(files: &TlsFiles) -> Result<TlsAcceptor, TlsError> {
