@@ -72,7 +72,10 @@ export class FlyPage implements Page {
       const { backend, twins, server } = this.client.welcome;
       const twin = twins.find(({ name }) => name === twinName);
       if (!twin) throw new Error(`there is no twin ${twinName} on this server`);
-      const [width, height] = backend === "gpu" ? [1280, 800] : [640, 400];
+      const { clientWidth, clientHeight } = this.mosaic.element;
+      const aspect = clamp(clientWidth / (clientHeight || clientWidth), 0.6, 2.4);
+      const width = backend === "gpu" ? 1280 : 640;
+      const height = Math.round(width / aspect);
       const focal = width / 2 / Math.tan(FIELD_OF_VIEW / 2);
       const eye: Pose = { xyz: [0, 0, 0], q: [0.5, -0.5, 0.5, -0.5] };
       const camera = { name: "free", width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2, camera_to_rig: eye };

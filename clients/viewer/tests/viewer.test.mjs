@@ -3,7 +3,7 @@ import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { decodedByPython, home, launch, open, serve, steps, tokenFile } from "./wildcity.mjs";
+import { behindWire, decodedByPython, home, launch, open, serve, steps, tokenFile } from "./wildcity.mjs";
 
 let place, server, browser;
 
@@ -113,6 +113,35 @@ test("the free camera moves and looks around", async () => {
   await page.waitForFunction((hash) => document.querySelector("canvas[data-hash]").dataset.hash !== hash, after.free);
   assert.deepEqual(complaints, []);
   await close();
+});
+
+test("a gamepad drives", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  const pose = () => page.$eval(".view", ({ dataset }) => Number(dataset.x));
+  const start = await pose();
+  await page.evaluate(() => {
+    const buttons = Array.from({ length: 17 }, (_, at) => ({ pressed: at === 7, value: at === 7 ? 1 : 0 }));
+    navigator.getGamepads = () => [null, { connected: true, mapping: "standard", axes: [-1, 0, 0, 0], buttons }];
+  });
+  await page.waitForFunction((x) => Number(document.querySelector(".view").dataset.x) > x + 1, start);
+  // The fourth number is the steering: to the left.
+  assert.match(await page.textContent(".facts div:nth-child(4) dd"), /^[1-9][0-9.]*°$/);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("a lost connection is resumed", async () => {
+  const wire = await behindWire(server);
+  const { page, close } = await open(browser, wire, "#/drive/demo");
+  await steps(page, 2);
+  const view = () => page.$eval(".view", ({ dataset }) => ({ step: Number(dataset.step), session: dataset.session }));
+  const before = await view();
+  wire.cut();
+  await steps(page, before.step + 3);
+  assert.equal((await view()).session, before.session);
+  await close();
+  wire.stop();
 });
 
 test("nothing is wider than a phone, and the pads drive", async () => {

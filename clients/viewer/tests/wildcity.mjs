@@ -1,6 +1,7 @@
 // A server with the demo twin, and Chromium.
 import assert from "node:assert/strict";
 import { execFile, spawn } from "node:child_process";
+import { connect, createServer } from "node:net";
 import { mkdtemp, rm, writeFile } from "node:fs/promises";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
@@ -36,6 +37,27 @@ function stop(child) {
   const ended = new Promise((resolve) => child.once("exit", resolve));
   child.kill("SIGTERM");
   return ended;
+}
+
+/** The same server behind connections that can be cut. */
+export async function behindWire(server) {
+  const { hostname, port } = new URL(server.url);
+  const sockets = new Set();
+  const wire = createServer((near) => {
+    const far = connect(Number(port), hostname);
+    for (const socket of [near, far]) {
+      sockets.add(socket);
+      socket.on("error", () => {}).on("close", () => sockets.delete(socket));
+    }
+    near.pipe(far).pipe(near);
+  });
+  await new Promise((resolve) => wire.listen(0, "127.0.0.1", resolve));
+  const cut = () => sockets.forEach((socket) => socket.destroy());
+  const stop = () => {
+    wire.close();
+    cut();
+  };
+  return { url: `http://127.0.0.1:${wire.address().port}/`, cut, stop };
 }
 
 export async function tokenFile(folder, tokens) {
