@@ -86,9 +86,9 @@ class Player {
     this.verdict.textContent = compared.length === 0 ? "no images recorded here"
       : isSame ? `${equal.length} of ${compared.length} images have the recorded hash`
       : `${compared.length - equal.length} of ${compared.length} images differ${rolls ? " (rolling shutter)" : ""}`;
-    this.element.dataset.step = String(frame.step);
-    this.element.dataset.same = String(isSame);
     await this.mosaic.show(observation);
+    this.element.dataset.same = String(isSame);
+    this.element.dataset.timeUs = String(frame.time_us);
     return { ...observation.metadata, step: frame.step, time_us: frame.time_us };
   }
 }
@@ -199,6 +199,7 @@ export class EpisodePage implements Page {
   private async seek(): Promise<void> {
     const timeUs = this.times[Number(this.slider.value)] ?? 0;
     this.time.textContent = `${fixed(timeUs * 1e-6, 2)} s`;
+    this.time.dataset.timeUs = String(timeUs);
     try {
       await Promise.all(this.players.map((player, at) => player.seek(timeUs, (metadata, { pose }) => {
         if (at === 0) this.map.at({ ...metadata, ego: { ...metadata.ego, pose } });
