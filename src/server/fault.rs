@@ -161,7 +161,9 @@ pub(crate) enum Fault {
     #[error("a token is needed that this server knows: send Authorization: Bearer TOKEN")]
     Unauthorized,
     /// The ticket is not good.
-    #[error("the ticket was used already, is older than 30 s, or was never issued: POST /v1/tickets")]
+    #[error(
+        "the ticket was used already, is older than 30 s, or was never issued: POST /v1/tickets"
+    )]
     UnknownTicket,
     /// There is no session to watch, or another token's.
     #[error("there is no session {name:?} of this token to watch; GET /v1/sessions lists them")]
@@ -190,7 +192,9 @@ pub(crate) enum Fault {
         reason: String,
     },
     /// A web page of another machine sent the request.
-    #[error("pages from {origin} are refused; only those of this machine and of --origin are accepted")]
+    #[error(
+        "pages from {origin} are refused; only those of this machine and of --origin are accepted"
+    )]
     ForbiddenOrigin {
         /// The header `Origin`.
         origin: String,

@@ -18,11 +18,7 @@ use crate::stream::Stream;
 use crate::tls::Tls;
 
 /// Serves connections until the server stops.
-pub(crate) async fn listen(
-    state: Arc<ServerState>,
-    listener: TcpListener,
-    tls: Option<Arc<Tls>>,
-) {
+pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: Option<Arc<Tls>>) {
     let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
     let app = routes::router(state.clone());
     loop {
@@ -55,7 +51,9 @@ pub(crate) async fn listen(
         let connection = {
             let hello = state.limits.hello;
             async move {
-                let Some(stream) = Stream::accept(stream, tls.as_deref(), hello).await else { return };
+                let Some(stream) = Stream::accept(stream, tls.as_deref(), hello).await else {
+                    return;
+                };
                 // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
                 let _ = http1::Builder::new()
                     .timer(TokioTimer::new())

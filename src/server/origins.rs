@@ -16,7 +16,9 @@ pub struct Origins(Vec<String>);
 
 /// An origin that cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[error("{origin:?} is no origin: expected http:// or https:// and a host, as https://sim.example.org:8443")]
+#[error(
+    "{origin:?} is no origin: expected http:// or https:// and a host, as https://sim.example.org:8443"
+)]
 pub struct OriginError {
     origin: String,
 }
@@ -32,7 +34,8 @@ impl Origins {
             let Ok(uri) = uri else { return false };
             let scheme = uri.scheme_str().filter(|scheme| ["http", "https"].contains(scheme));
             // Nothing after the authority, and no user in it.
-            let plain = scheme.zip(uri.authority()).map(|(scheme, host)| format!("{scheme}://{host}"));
+            let plain =
+                scheme.zip(uri.authority()).map(|(scheme, host)| format!("{scheme}://{host}"));
             plain.is_some_and(|plain| plain == origin && !plain.contains('@'))
                 && origin.to_ascii_lowercase() == origin
         };
@@ -78,7 +81,8 @@ impl Origins {
     pub(crate) fn check_host(&self, has_tokens: bool, host: Option<&str>) -> Result<(), Fault> {
         let Some(host) = host else { return Ok(()) };
         let listed = |origin: &String| origin.split_once("://").is_some_and(|(_, own)| own == host);
-        let is_address = has_tokens && name_of(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+        let is_address =
+            has_tokens && name_of(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
         let knows_none = has_tokens && self.0.is_empty();
         if knows_none || is_address || is_local_authority(host) || self.0.iter().any(listed) {
             return Ok(());
@@ -167,18 +171,25 @@ mod tests {
             ("[fe80::1]:8080", false, false, true, true),
             ("evil.example.org", false, false, true, false),
         ] {
-            let is_served = |origins: &Origins, tokens| origins.check_host(tokens, Some(host)).is_ok();
-            let found =
-                [(&none, false), (&listed, false), (&none, true), (&listed, true)].map(|(o, t)| is_served(o, t));
+            let is_served =
+                |origins: &Origins, tokens| origins.check_host(tokens, Some(host)).is_ok();
+            let found = [(&none, false), (&listed, false), (&none, true), (&listed, true)]
+                .map(|(o, t)| is_served(o, t));
             assert_eq!(found, [open, with_list, with_tokens, with_both], "{host}");
         }
     }
 
     #[test]
     fn an_origin_is_what_a_browser_sends() {
-        for wrong in
-            ["sim.example.org", "https://sim.example.org/", "ftp://a", "https://A.org", "https://u@a.org", "*", ""]
-        {
+        for wrong in [
+            "sim.example.org",
+            "https://sim.example.org/",
+            "ftp://a",
+            "https://A.org",
+            "https://u@a.org",
+            "*",
+            "",
+        ] {
             assert!(Origins::new(vec![wrong.to_owned()]).is_err(), "{wrong}");
         }
     }

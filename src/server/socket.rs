@@ -53,11 +53,7 @@ pub(crate) enum Disconnect {
 
 impl Socket {
     /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read from it.
-    pub(crate) async fn new(
-        stream: Stream,
-        read_ahead: Vec<u8>,
-        send_timeout: Duration,
-    ) -> Self {
+    pub(crate) async fn new(stream: Stream, read_ahead: Vec<u8>, send_timeout: Duration) -> Self {
         let config = WebSocketConfig::default()
             .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
             .max_frame_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))

@@ -96,7 +96,8 @@ fn read(files: &TlsFiles) -> Result<TlsAcceptor, TlsError> {
     if certificates.is_empty() {
         return Err(wrong(&files.cert, &"there is no certificate in PEM in it"));
     }
-    let key = PrivateKeyDer::from_pem_file(&files.key).map_err(|error| wrong(&files.key, &error))?;
+    let key =
+        PrivateKeyDer::from_pem_file(&files.key).map_err(|error| wrong(&files.key, &error))?;
     // One provider is named, because a program may have several.
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = ServerConfig::builder_with_provider(provider)

@@ -78,7 +78,10 @@ async fn unusable_certificates_are_named() {
     let missing = dir.path().join("missing.pem");
     for (tls, named) in [
         (TlsFiles { cert: missing, ..files(dir.path()) }, "missing.pem: "),
-        (TlsFiles { cert: dir.path().join("key.pem"), ..files(dir.path()) }, "key.pem: there is no certificate"),
+        (
+            TlsFiles { cert: dir.path().join("key.pem"), ..files(dir.path()) },
+            "key.pem: there is no certificate",
+        ),
         (TlsFiles { key: dir.path().join("cert.pem"), ..files(dir.path()) }, "cert.pem: "),
         (TlsFiles { key: other.path().join("key.pem"), ..files(dir.path()) }, "key.pem: "),
     ] {

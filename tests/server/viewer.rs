@@ -26,8 +26,9 @@ async fn guarded() -> TestServer {
 
 /// The status and the JSON of an answer.
 async fn ask(server: &TestServer, line: &str, token: &str) -> (u16, Value) {
-    let text =
-        format!("{line} HTTP/1.1\nHost: localhost\nAuthorization: Bearer {token}\nContent-Length: 0\n\n");
+    let text = format!(
+        "{line} HTTP/1.1\nHost: localhost\nAuthorization: Bearer {token}\nContent-Length: 0\n\n"
+    );
     let (status, answer) = request(server, &text).await;
     let body = answer.split("\r\n\r\n").nth(1).unwrap();
     (status, serde_json::from_str(body).unwrap_or(Value::Null))
@@ -94,7 +95,10 @@ async fn a_ticket_opens_one_connection_with_the_rights_of_its_token() {
     assert_eq!(again.err(), Some(401));
     let (_, issued) = ask(&server, "POST /v1/tickets", ADMIN).await;
     let ticket = issued["ticket"].as_str().unwrap();
-    assert_eq!(ask(&server, &format!("GET /v1/sessions?ticket={ticket}"), "no-such-token").await.0, 401);
+    assert_eq!(
+        ask(&server, &format!("GET /v1/sessions?ticket={ticket}"), "no-such-token").await.0,
+        401
+    );
     assert_eq!(ask(&server, "GET /v1/sessions", ticket).await.0, 401);
     // The session belongs to the token: another ticket of it resumes the session, a rival's does not.
     drop(agent);
@@ -103,7 +107,8 @@ async fn a_ticket_opens_one_connection_with_the_rights_of_its_token() {
         let path = format!("/v1/session?ticket={}", issued["ticket"].as_str().unwrap());
         let mut agent = connect(server.address(), &path, "wildcity.v1", None).await.ok().unwrap();
         agent.hello().await;
-        let resumed = agent.ask(json!({ "type": "resume", "session": "mine", "last_seq": 0 })).await;
+        let resumed =
+            agent.ask(json!({ "type": "resume", "session": "mine", "last_seq": 0 })).await;
         assert_eq!(resumed["type"], answer, "{resumed}");
     }
     assert_eq!(ask(&server, "POST /v1/tickets", "no-such-token").await.0, 401);
@@ -209,7 +214,9 @@ async fn recorded_episodes_are_listed_and_read() {
     assert_eq!(episode["episode"], "a-1");
     assert_eq!((&episode["twin"], &episode["steps"]), (&json!("test"), &json!(2)));
     assert_eq!(episode["outcome"], "completed");
-    let text = format!("GET /v1/episodes/a-1 HTTP/1.1\nHost: localhost\nAuthorization: Bearer {ADMIN}\n\n");
+    let text = format!(
+        "GET /v1/episodes/a-1 HTTP/1.1\nHost: localhost\nAuthorization: Bearer {ADMIN}\n\n"
+    );
     let (status, answer) = request(&server, &text).await;
     let body = answer.split_once("\r\n\r\n").unwrap().1;
     let file = std::fs::read_to_string(&server.recorded()[0]).unwrap();

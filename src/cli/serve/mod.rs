@@ -174,8 +174,12 @@ impl Serve {
         let tls = match (self.tls_cert, self.tls_key) {
             (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
             (None, None) => None,
-            (Some(_), None) => anyhow::bail!("--tls-cert needs --tls-key, the key of the certificate"),
-            (None, Some(_)) => anyhow::bail!("--tls-key needs --tls-cert, the certificate of the key"),
+            (Some(_), None) => {
+                anyhow::bail!("--tls-cert needs --tls-key, the key of the certificate")
+            }
+            (None, Some(_)) => {
+                anyhow::bail!("--tls-key needs --tls-cert, the certificate of the key")
+            }
         };
         let config = wildcity_server::Config {
             listen: self.listen,

@@ -27,7 +27,8 @@ pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welc
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
-    ListedEpisode, episodes, new_push, new_upload, push, rollback, sessions, ticket, upload, version, versions,
+    ListedEpisode, episodes, new_push, new_upload, push, rollback, sessions, ticket, upload,
+    version, versions,
 };
 pub(crate) use observation::observation;
 pub(crate) use request::{BranchPoint, Command, Parsed, parse};

@@ -26,7 +26,8 @@ pub(super) async fn list(
 ) -> HttpResult {
     grant.require(Role::Admin)?;
     let episodes = blocking(move || {
-        let listed = list_dir(&state.episodes).map_err(|error| Fault::Internal(error.to_string()))?;
+        let listed =
+            list_dir(&state.episodes).map_err(|error| Fault::Internal(error.to_string()))?;
         let newest = listed.into_iter().take(limits::LISTED_EPISODES);
         // Files of other builds, and those whose first line is not written yet, are left out.
         let read = newest.filter_map(|listed| {
