@@ -13,7 +13,6 @@ use wildcity_session::Observation;
 use crate::fault::Fault;
 use crate::limits;
 use crate::socket::{Disconnect, Incoming, Socket};
-use crate::state::ServerState;
 
 type Cell = watch::Sender<Option<Arc<Observation>>>;
 
@@ -56,11 +55,15 @@ impl Drop for Watch {
     }
 }
 
-/// Sends a session's observations to a watcher, until the session, the watcher or the server ends.
-pub(crate) async fn serve(state: &ServerState, mut socket: Socket, mut watch: Watch) {
+/// Sends a session's observations to a watcher, until the session or the watcher ends, or the server (`stopped`).
+pub(crate) async fn serve(
+    stopped: impl Future<Output = ()>,
+    mut socket: Socket,
+    mut watch: Watch,
+) {
     let reason = tokio::select! {
         reason = send_all(&mut socket, &mut watch) => reason,
-        () = state.stopped() => Disconnect::Fault(Fault::ShuttingDown),
+        () = stopped => Disconnect::Fault(Fault::ShuttingDown),
     };
     // The observation is released before the socket lingers.
     drop(watch);

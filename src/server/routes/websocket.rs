@@ -52,7 +52,7 @@ pub(super) async fn watch(
     let watch = state.sessions.watch(&session, &grant)?;
     let shared = state.clone();
     hand_over(&state, slot, accept, convert::WATCH_SUBPROTOCOL, request, async move |socket| {
-        watchers::serve(&shared, socket, watch).await;
+        watchers::serve(shared.stopped(), socket, watch).await;
     })
 }
 
