@@ -56,11 +56,7 @@ impl Drop for Watch {
 }
 
 /// Sends a session's observations to a watcher, until the session or the watcher ends, or the server (`stopped`).
-pub(crate) async fn serve(
-    stopped: impl Future<Output = ()>,
-    mut socket: Socket,
-    mut watch: Watch,
-) {
+pub(crate) async fn serve(stopped: impl Future<Output = ()>, mut socket: Socket, mut watch: Watch) {
     let reason = tokio::select! {
         reason = send_all(&mut socket, &mut watch) => reason,
         () = stopped => Disconnect::Fault(Fault::ShuttingDown),
