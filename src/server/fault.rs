@@ -181,7 +181,15 @@ pub(crate) enum Fault {
         /// Why not.
         reason: String,
     },
-    /// A field of a body is outside its limits.
+    /// The twin has no recorded drive of this name.
+    #[error("the twin has no trajectory {name:?}; it has {known}")]
+    UnknownTrajectory {
+        /// The name asked for.
+        name: String,
+        /// The names of its trajectories.
+        known: String,
+    },
+    /// A field of a body or of a query is outside its limits.
     #[error("{field} is {must}")]
     OutOfRange {
         /// The field.

@@ -63,6 +63,9 @@ pub const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
 /// Bytes of an upload that are written at once.
 pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
 
+/// Poses of a recorded drive in one answer: 5 km every 0.5 m. A pose has about 150 bytes of JSON.
+pub const DRIVE_POSES: usize = 10_000;
+
 /// Largest file of tokens: 200 B each.
 pub const TOKENS_FILE_BYTES: u64 = 1 << 20;
 

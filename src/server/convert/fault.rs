@@ -183,6 +183,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UploadOffset { .. } => at(Code::UploadOffset, "upload-offset"),
         Fault::UploadDigest { .. } => plain(Code::UploadDigest),
         Fault::StorageFull { .. } => plain(Code::StorageFull),
+        Fault::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "trajectory"),
         Fault::OutOfRange { field, .. } => at(Code::OutOfRange, field),
         Fault::Spool { .. } | Fault::Internal(_) => plain(Code::Internal),
         Fault::Session(error) => of_session(error),

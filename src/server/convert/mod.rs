@@ -8,6 +8,7 @@
 //! observation  observations
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! http         bodies of HTTP requests and answers
+//! recorded_drive  recorded drives over HTTP
 //! fault        the wire code and the HTTP status of each fault
 //! ```
 
@@ -19,12 +20,14 @@ mod http;
 mod non_finite;
 mod observation;
 mod request;
+mod recorded_drive;
 mod rig;
 
 pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use fault::{WireCode, code, http_status, refusal_body, refused};
 pub(crate) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
 pub(crate) use observation::observation;
+pub(crate) use recorded_drive::DriveQuery;
 pub(crate) use request::{Command, Parsed, parse};
 
 /// The WebSocket subprotocol.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use axum::body::Bytes;
-use axum::extract::{Path, State};
+use axum::extract::{Path, RawQuery, State};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
@@ -11,7 +11,7 @@ use wildcity_twin::store::StoreError;
 
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
-use crate::convert;
+use crate::convert::{self, DriveQuery};
 use crate::fault::Fault;
 use crate::state::ServerState;
 
@@ -63,6 +63,23 @@ pub(super) async fn versions(
     });
     let (versions, held) = listed.await?;
     Ok(Json(convert::versions(&versions, held)).into_response())
+}
+
+/// `GET /v1/twins/{twin}/trajectories/{trajectory}`: poses of a recorded drive.
+pub(super) async fn trajectory(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path((name, trajectory)): Path<(String, String)>,
+    RawQuery(query): RawQuery,
+) -> HttpResult {
+    grant.require_twin(&name)?;
+    let query = DriveQuery::parse(query.as_deref().unwrap_or_default())?;
+    let engine = state.engine.clone();
+    let version = blocking(move || {
+        let number = query.version.or_else(|| engine.pinned_latest(&name));
+        engine.catalog().version(&name, number)
+    });
+    Ok(Json(query.answer(&version.await?, &trajectory)?).into_response())
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.

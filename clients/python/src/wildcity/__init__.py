@@ -6,6 +6,7 @@ in SI units, or have their unit in their name. Frames and conventions are in `pr
 
 from importlib.metadata import version as _version
 
+from .drives import RecordedDrive, recorded_drive
 from .errors import (
     BadFrame,
     Code,
@@ -47,6 +48,7 @@ from .protocol import (
     png_data_uri,
 )
 from .pushing import Push, PushProgress, push, rollback
+from .serving import LocalServer, ServeFailed, serve
 from .sync import Client, Session, connect
 
 __version__ = _version("wildcity")
@@ -65,6 +67,7 @@ __all__ = [
     "ImageInfo",
     "ImagePart",
     "Lens",
+    "LocalServer",
     "Metadata",
     "Observation",
     "Opened",
@@ -74,9 +77,11 @@ __all__ = [
     "Push",
     "PushFailed",
     "PushProgress",
+    "RecordedDrive",
     "Refused",
     "Resumed",
     "Rig",
+    "ServeFailed",
     "Session",
     "Shutter",
     "Station",
@@ -95,5 +100,7 @@ __all__ = [
     "connect",
     "png_data_uri",
     "push",
+    "recorded_drive",
     "rollback",
+    "serve",
 ]
