@@ -7,6 +7,7 @@ Prints the mean return of 5 episodes before and after the training.
 """
 
 import sys
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,7 +18,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 
 def main(steps: int, twin: str) -> None:
-    arguments = {"twin": twin, "size": (48, 36), "horizon": 60, "speed": 5.0, "off_route_m": 2.0}
+    arguments: dict[str, Any] = {"twin": twin, "size": (48, 36), "horizon": 60, "speed": 5.0, "off_route_m": 2.0}
     with wildcity.serve() as server:
         env = gymnasium.make("wildcity/Drive-v0", server=server.url, **arguments)
         model = PPO("MultiInputPolicy", env, n_steps=256, batch_size=64, learning_rate=1e-3, seed=1, device="cpu")

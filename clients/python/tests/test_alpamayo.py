@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import os
 import struct
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -272,6 +276,25 @@ def test_as_torch_shares_the_memory() -> None:
     assert tensors["image_frames"].data_ptr() == data["image_frames"].ctypes.data
     planned = alpamayo.trajectory(*(torch.from_numpy(a).bfloat16() for a in Alpamayo("2")(data)))
     assert len(planned.poses) == 64
+
+
+def test_alpamayos_own_code_takes_the_dictionary() -> None:
+    """`create_message` of a checkout of Alpamayo 1.5 numbers the frames and names the cameras in order."""
+    checkout = os.environ.get("WILDCITY_ALPAMAYO")
+    if checkout is None:
+        pytest.skip("WILDCITY_ALPAMAYO names no checkout of github.com/NVlabs/alpamayo1.5")
+    pytest.importorskip("torch", reason="PyTorch is optional: pip install torch")
+    sys.path.insert(0, str(Path(checkout) / "src"))
+    helper = importlib.import_module("alpamayo1_5.helper")
+    data = alpamayo.as_torch(alpamayo.inputs(observation("1.5"), "1.5"))
+    _, user, _ = helper.create_message(data["image_frames"].flatten(0, 1), data["camera_indices"])
+    texts = [part["text"].strip() for part in user["content"][:-1] if part["type"] == "text"]
+    images = [part["image"] for part in user["content"] if part["type"] == "image"]
+    frames = ["frame 0", "frame 1", "frame 2", "frame 3"]
+    names = ["Front left camera:", "Front camera:", "Front right camera:", "Front telephoto camera:"]
+    assert texts == [text for name in names for text in (name, *frames)]
+    expected = [pixel(index, back) for index in (0, 1, 2, 6) for back in (3, 2, 1, 0)]
+    assert [int(image[0, 0, 0]) for image in images] == expected
 
 
 @pytest.mark.parametrize("model", ["1.5", "2"])
