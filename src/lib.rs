@@ -16,6 +16,7 @@
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | render, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | scene, session, twin |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
+//! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP | protocol, push, render, scene, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
@@ -24,7 +25,8 @@
 //! # Invariants
 //!
 //! 1. The wire is known to `protocol`, `client` and `server::convert` only.
-//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum.
+//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum;
+//!    only `alpasim` names tonic and prost.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
 //! 5. An image is a function of scene version, render profile, poses and cameras. Caches change

@@ -17,6 +17,7 @@ mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod drive;
 mod import;
 mod input_files;
 mod inspect;
@@ -65,6 +66,7 @@ enum Command {
     Lod(lod::Lod),
     Twin(twin::Twin),
     Render(render::Render),
+    Drive(drive::Drive),
     Replay(replay::Replay),
     Rig(rig::RigCommand),
     Route(route::Route),
@@ -88,6 +90,7 @@ pub fn main() -> ExitCode {
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Drive(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),

@@ -9,6 +9,8 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use wildcity_session::Engine;
+
 use crate::listen::listen;
 use crate::state::ServerState;
 
@@ -72,6 +74,11 @@ impl Running {
     /// The URL that agents connect to.
     pub fn url(&self) -> String {
         format!("ws://{}/v1/session", self.address)
+    }
+
+    /// The renderer and the twins, for other services of the same process.
+    pub fn engine(&self) -> &Arc<Engine> {
+        &self.state.engine
     }
 
     /// Number of sessions at this moment: connected, and waiting to be resumed.

@@ -14,6 +14,7 @@
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
 //! | `preview` | the preview of a push |
+//! | `stills` | images from any views, without an episode |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
@@ -23,11 +24,13 @@ mod error;
 pub mod limits;
 mod observe;
 mod options;
+mod pin;
 mod prefetch;
 mod preview;
 mod record;
 mod session;
 mod start;
+mod stills;
 mod viewpoint;
 
 pub use engine::render_queue::Scratch;
@@ -54,4 +57,5 @@ pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
 pub use session::Session;
+pub use stills::{Still, Stills};
 pub use viewpoint::viewpoints;

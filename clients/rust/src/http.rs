@@ -14,7 +14,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use wildcity_protocol::error::Code;
-use wildcity_protocol::http::{NewPush, Push, PushState, Refusal, Rollback};
+use wildcity_protocol::http::{NewPush, Push, PushState, RecordedDrive, Refusal, Rollback};
 
 use crate::limits;
 use crate::options::ConnectOptions;
@@ -180,6 +180,24 @@ impl HttpClient {
                 Err(error) => return Err(error),
             }
         }
+    }
+
+    /// The recorded keyframes of a drive, of the latest version if there is no `version`.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn recorded_drive(
+        &self,
+        twin: &str,
+        trajectory: &str,
+        version: Option<u64>,
+    ) -> Result<RecordedDrive, HttpError> {
+        let path = ["v1", "twins", twin, "trajectories", trajectory];
+        let mut server = self.clone();
+        if let Some(version) = version {
+            server.server.set_query(Some(&format!("version={version}")));
+        }
+        server.request_json(Method::GET, &path, None::<&()>).await
     }
 
     /// Makes an old version of a twin the latest again, as a new version, and returns the number of the new

@@ -3,16 +3,13 @@
 //! Each request first renders, then records, and only then changes the session. If it fails or its future
 //! is dropped before that, nothing has happened, and the client can repeat it.
 
-use tokio::sync::oneshot;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::Instant;
 
 use wildcity_render::{Backend, Frame};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
-use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
-use crate::blocking::run_blocking;
 use crate::engine::render_queue::Scratch;
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
@@ -23,6 +20,7 @@ use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::options::Start;
+use crate::pin::pin;
 use crate::record::format::{FrameRequest, Line, RecordedCommand};
 use crate::start::EpisodeStart;
 use crate::viewpoint::viewpoints;
@@ -140,7 +138,8 @@ impl Session {
             }
             let views = self.layout.views(episode, &capture);
             // Load before the job is queued, so that no render thread waits for a disk.
-            let pinned = self.pin(deadline, viewpoints(&views)).await?;
+            let resident = self.resident().clone();
+            let pinned = pin(resident, self.profile, deadline, viewpoints(&views)).await?;
             builder.add_load(pinned.waited_for, pinned.waited);
             let profile = self.profile;
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
@@ -155,30 +154,5 @@ impl Session {
         }
         let (held_bytes, limit_bytes) = self.resident().memory();
         builder.finish(history, held_bytes, limit_bytes)
-    }
-
-    /// Waits until all sections that a frame needs are in memory, and pins them.
-    async fn pin(
-        &self,
-        deadline: Instant,
-        viewpoints: Vec<Viewpoint>,
-    ) -> Result<PinnedScene, SessionError> {
-        let (reply, answer) = oneshot::channel();
-        let resident = self.resident().clone();
-        let profile = self.profile;
-        let request = run_blocking(move || {
-            let done = Box::new(move |pinned| {
-                // Sending fails if the deadline has passed and the receiver is gone.
-                let _ = reply.send(pinned);
-            });
-            resident.request(&viewpoints, &profile, done)
-        });
-        // Dropping the request takes the frame out of the pager's queue.
-        let request = request.await??;
-        match timeout_at(deadline, answer).await {
-            Ok(Ok(pinned)) => Ok(pinned?),
-            Ok(Err(_)) => Err(SessionError::Crashed),
-            Err(_) => Err(request.timeout_error().into()),
-        }
     }
 }
