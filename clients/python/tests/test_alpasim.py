@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import queue
 import subprocess
@@ -76,7 +77,13 @@ def listening(process: subprocess.Popen[str]) -> dict[str, str]:
     lines: queue.Queue[str] = queue.Queue()
     stdout = process.stdout
     assert stdout is not None
-    threading.Thread(target=lambda: [lines.put(line) for line in stdout], daemon=True).start()
+
+    def read() -> None:
+        # To the end, so that the server never blocks on a full pipe.
+        for line in stdout:
+            lines.put(line)
+
+    threading.Thread(target=read, daemon=True).start()
     found: dict[str, str] = {}
     while len(found) < 2:
         line = lines.get(timeout=30)
@@ -90,7 +97,7 @@ def write_rig(path: Path) -> None:
     front, rear = PAIR.cameras
     looks = Exposure(gain=(0.5, 1.0, 1.5))
     cameras = (front, Camera(**{**vars(rear), "exposure": looks, "overlay": hood()}))
-    path.write_text(wildcity.protocol.json.dumps(wildcity.protocol.encode(Rig("pair", cameras))))
+    path.write_text(json.dumps(wildcity.protocol.encode(Rig("pair", cameras))))
 
 
 def pose(xyz: tuple[float, ...], q: tuple[float, ...] = FORWARD) -> Any:

@@ -122,6 +122,8 @@ def _listening_url(process: subprocess.Popen[str], log_path: Path, timeout: floa
         for line in stdout:
             lines.put(line)
 
+        stdout.close()
+
     threading.Thread(target=read, daemon=True).start()
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:

@@ -47,7 +47,7 @@ class DriveEnv(gymnasium.Env[Any, Any]):
         self._seen, info = task.begin(first)
         return self._seen, info
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Applies acceleration and curvature for one step."""
         session, task = self._opened()
         result = task.advance(session.step(task.movement(action)))
