@@ -86,7 +86,8 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
     let size_px = [request.resolution_w, request.resolution_h];
     let camera = camera(request.camera_intrinsics.as_ref(), size_px)?;
     if request.frame_start_us > request.frame_end_us {
-        let must = format!("{} is after frame_end_us {}", request.frame_start_us, request.frame_end_us);
+        let must =
+            format!("{} is after frame_end_us {}", request.frame_start_us, request.frame_end_us);
         return Err(CameraSpecError::Field { field: "frame_start_us", must });
     }
     let pair = request.sensor_pose.ok_or(SceneError::Missing { field: "sensor_pose" })?;

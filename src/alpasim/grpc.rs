@@ -24,10 +24,8 @@ where
     Answering: Future<Output = Result<Answer, Status>> + Send,
 {
     let codec = ProstCodec::<Answer, Asked>::default();
-    let mut grpc = Grpc::new(codec).apply_max_message_size_config(
-        Some(limits::MESSAGE_BYTES),
-        Some(limits::MESSAGE_BYTES),
-    );
+    let mut grpc = Grpc::new(codec)
+        .apply_max_message_size_config(Some(limits::MESSAGE_BYTES), Some(limits::MESSAGE_BYTES));
     grpc.unary(Once(Some(method)), request).await
 }
 

@@ -6,6 +6,7 @@
 //! scene       scenes: pieces of recorded drives, and their local frames
 //! camera      cameras, poses and shutters, to and from the wire
 //! sensorsim   wildcity as AlpaSim's renderer
+//! export      scenes as the files that AlpaSim's runtime reads
 //! egodriver   wildcity driven by AlpaSim's drivers
 //! ```
 //!
@@ -18,6 +19,7 @@
 
 pub mod camera;
 pub mod egodriver;
+pub mod export;
 pub mod grpc;
 pub mod limits;
 pub mod scene;

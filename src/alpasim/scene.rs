@@ -36,9 +36,7 @@ pub struct SceneId {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SceneError {
     /// The text is no id.
-    #[error(
-        "{id:?} is no scene: expected TWIN@VERSION+TRAJECTORY+START_M, as demo@1+log+0"
-    )]
+    #[error("{id:?} is no scene: expected TWIN@VERSION+TRAJECTORY+START_M, as demo@1+log+0")]
     Id {
         /// The refused text.
         id: String,
@@ -187,14 +185,13 @@ pub fn pose_to_wire(pose: &Pose) -> common::Pose {
 pub fn trajectory(id: &SceneId, manifest: &Manifest) -> Result<common::Trajectory, SceneError> {
     let drive = id.drive(manifest)?;
     let frame = id.local_frame(manifest)?;
-    let missing = |_| SceneError::Trajectory {
-        twin: id.twin.clone(),
-        trajectory: id.trajectory.clone(),
-    };
+    let missing =
+        |_| SceneError::Trajectory { twin: id.twin.clone(), trajectory: id.trajectory.clone() };
     let route = Route::new(drive).map_err(missing)?;
     let start = route.at(id.start_m);
     let end_us = start.time_us + (limits::SCENE_S * 1e6) as i64;
-    let recorded = drive.keyframes.iter().filter(|key| (start.time_us + 1..=end_us).contains(&key.time_us));
+    let recorded =
+        drive.keyframes.iter().filter(|key| (start.time_us + 1..=end_us).contains(&key.time_us));
     let pose_at_time = |time_us: i64, pose: &Pose| common::PoseAtTime {
         pose: Some(frame.local_from(pose)),
         // The difference of times within a scene is not negative.
@@ -214,9 +211,17 @@ mod tests {
         for text in ["demo@1+log+0", "a.b-c@12+drive_2+1200", "demo@3+log+12.5"] {
             assert_eq!(text.parse::<SceneId>().unwrap().to_string(), text);
         }
-        for text in
-            ["", "demo", "demo@1", "demo@1+log", "demo@x+log+0", "de/mo@1+log+0", "demo@1+log+nan", "demo@-1+log+0", "demo@1+log+0+1"]
-        {
+        for text in [
+            "",
+            "demo",
+            "demo@1",
+            "demo@1+log",
+            "demo@x+log+0",
+            "de/mo@1+log+0",
+            "demo@1+log+nan",
+            "demo@-1+log+0",
+            "demo@1+log+0+1",
+        ] {
             assert!(text.parse::<SceneId>().is_err(), "{text}");
         }
     }

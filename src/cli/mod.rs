@@ -11,6 +11,7 @@
 
 use std::process::ExitCode;
 
+mod alpasim;
 mod backend_options;
 mod bench;
 mod bisect;
@@ -67,6 +68,7 @@ enum Command {
     Twin(twin::Twin),
     Render(render::Render),
     Drive(drive::Drive),
+    Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
     Rig(rig::RigCommand),
     Route(route::Route),
@@ -91,6 +93,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Drive(command) => command.run(),
+        Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),

@@ -81,7 +81,11 @@ async fn recorded_drives() {
     ] {
         let (found, answer) = get(&server, &format!("/v1/twins/test/{query}")).await;
         let body = json_body(&answer);
-        assert_eq!((found, body["code"].as_str(), body["field"].as_str()), (status, Some(code), Some(field)), "{query}");
+        assert_eq!(
+            (found, body["code"].as_str(), body["field"].as_str()),
+            (status, Some(code), Some(field)),
+            "{query}"
+        );
     }
     assert_eq!(get(&server, "/v1/twins/nowhere/trajectories/log").await.0, 404);
 }

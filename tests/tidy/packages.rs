@@ -20,7 +20,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
     ("rustls", &["src/twin/store/remote", "clients/rust"]),
     ("flate2", &["src/twin/ingest"]),
-    ("zip", &["src/twin/ingest/archive.rs"]),
+    ("zip", &["src/twin/ingest/archive.rs", "src/cli/alpasim"]),
     ("image_webp", &["src/twin/ingest/sog"]),
 ];
 

@@ -8,10 +8,11 @@ use std::time::Duration;
 
 use glam::{DMat3, DQuat, DVec3};
 
-use wildcity_client::protocol::message::{RigChoice, Start};
+use wildcity_client::protocol::http::RecordedPose;
+use wildcity_client::protocol::message::{ImagePart, Opened, Outputs, RigChoice, Start};
 use wildcity_client::{
     Client, ClientError, ConnectOptions, Dynamics, DynamicsChoice, DynamicsModel, HttpClient,
-    HttpError, ImageView, Movement, Observation, Open, Opened, Outputs,
+    HttpError, ImageView, Movement, Observation, Open,
 };
 use wildcity_scene::geometry::{Pose, PoseError};
 use wildcity_scene::rig::RigCamera;
@@ -170,7 +171,7 @@ fn outcome_of(error: &DriverError) -> Outcome {
 /// A recorded drive: its name, and its poses with their stations and times.
 struct Drive {
     name: String,
-    keyframes: Vec<wildcity_client::protocol::http::RecordedPose>,
+    keyframes: Vec<RecordedPose>,
 }
 
 async fn recorded_drive(
@@ -201,14 +202,15 @@ fn http_address(server: &str) -> String {
 
 fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
     let start_m = settings.start_m;
-    let start = start_m.map(|station_m| Start::Station { trajectory: drive.name.clone(), station_m });
+    let start =
+        start_m.map(|station_m| Start::Station { trajectory: drive.name.clone(), station_m });
     let speed = settings.speed_m_s.unwrap_or_else(|| recorded_speed_m_s(drive, settings));
     let dynamics = Dynamics { model: settings.model, speed, reverse: false };
     let images = settings.size_px.iter().flat_map(|size| {
         let names = settings.cameras.iter().flatten();
         names.map(|name| {
             let size = Some(size.map(u64::from));
-            (name.clone(), wildcity_client::protocol::message::ImagePart { crop: None, size })
+            (name.clone(), ImagePart { crop: None, size })
         })
     });
     Open {
@@ -231,7 +233,7 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
 /// The recorded speed where the episode starts.
 fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
     let first_us = drive.keyframes[0].time_us;
-    let is_after = |at: &wildcity_client::protocol::http::RecordedPose| match settings.start_m {
+    let is_after = |at: &RecordedPose| match settings.start_m {
         Some(start_m) => at.station_m >= start_m,
         None => at.time_us >= first_us + settings.warm_up_us,
     };
@@ -286,9 +288,8 @@ impl<'a> Episode<'a> {
         // A camera on the wire is one in a rig file.
         let cameras = opened.cameras.iter().map(|camera| {
             let json = serde_json::to_value(camera);
-            json.and_then(serde_json::from_value).map_err(|error| {
-                BridgeError::Setting(format!("camera {:?}: {error}", camera.name))
-            })
+            json.and_then(serde_json::from_value)
+                .map_err(|error| BridgeError::Setting(format!("camera {:?}: {error}", camera.name)))
         });
         let start = Pose::checked(opened.start.xyz, opened.start.q)?;
         let points = drive.keyframes.iter().map(|at| (at.station_m, at.pose.xyz));

@@ -48,7 +48,9 @@ pub enum DriverError {
     #[error("the plan {0}")]
     Plan(String),
     /// An image is larger than a driver accepts.
-    #[error("the image of camera {camera:?} has {bytes} bytes, and drivers accept 4 MiB: choose a smaller --size")]
+    #[error(
+        "the image of camera {camera:?} has {bytes} bytes, and drivers accept 4 MiB: choose a smaller --size"
+    )]
     Image {
         /// The camera.
         camera: String,
@@ -77,7 +79,8 @@ impl Driver {
         let no_address = |_| DriverError::Address(address.to_owned());
         let origin: Uri = format!("http://{address}").parse().map_err(no_address)?;
         let channel = Channel::connect(address, limits::DRIVER_START).await;
-        let channel = channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
+        let channel =
+            channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
         let mut driver = Self { grpc: Grpc::with_origin(channel, origin), uuid, patience };
         let version: common::VersionId = driver.call("get_version", common::Empty {}).await?;
         tracing::info!(driver = version.version_id, "connected");
@@ -159,16 +162,16 @@ impl Driver {
         let mut request = Request::new(message);
         let (key, value) = CONTRACT;
         request.metadata_mut().insert(key, tonic::metadata::MetadataValue::from_static(value));
+        let patience = self.patience;
+        let grpc = &mut self.grpc;
         let calling = async {
-            self.grpc.ready().await.map_err(|error| DriverError::Lost(error.to_string()))?;
+            grpc.ready().await.map_err(|error| DriverError::Lost(error.to_string()))?;
             let codec = ProstCodec::<Asked, Answer>::default();
-            let answer = self.grpc.unary(request, path, codec).await;
+            let answer = grpc.unary(request, path, codec).await;
             answer.map(tonic::Response::into_inner).map_err(|status| of_status(method, &status))
         };
-        let seconds = self.patience.as_secs_f64();
-        timeout(self.patience, calling)
-            .await
-            .unwrap_or(Err(DriverError::TimedOut { method, seconds }))
+        let seconds = patience.as_secs_f64();
+        timeout(patience, calling).await.unwrap_or(Err(DriverError::TimedOut { method, seconds }))
     }
 }
 

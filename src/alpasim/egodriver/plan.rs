@@ -77,7 +77,8 @@ mod tests {
         let times_us: Vec<i64> = planned.iter().map(|at| at.time_us).collect();
         assert_eq!(times_us, [100_000, 200_000]);
         assert!((planned[0].pose.xyz[0] - 1.0).abs() < 1e-6);
-        for times_us in [&[][..], &[100_000], &[150_000], &[300_000, 200_000], &[200_000, 200_000]] {
+        for times_us in [&[][..], &[100_000], &[150_000], &[300_000, 200_000], &[200_000, 200_000]]
+        {
             assert!(read(times_us).is_err(), "{times_us:?}");
         }
         let mut broken = plan(&[200_000]);

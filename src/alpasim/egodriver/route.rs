@@ -50,13 +50,15 @@ impl Route {
 
     /// Station of the nearest point of the polyline.
     fn nearest_m(&self, ego: DVec2) -> f64 {
-        let is_near = |station_m: f64| self.at_m.is_none_or(|at_m| (station_m - at_m).abs() <= NEAR_M);
+        let is_near =
+            |station_m: f64| self.at_m.is_none_or(|at_m| (station_m - at_m).abs() <= NEAR_M);
         let segments = self.points.windows(2).zip(self.stations_m.windows(2));
         let nearest = segments
             .filter(|(_, stations_m)| is_near(stations_m[0]))
             .map(|(points, stations_m)| {
                 let along = points[1] - points[0];
-                let t = ((ego - points[0]).dot(along) / along.length_squared().max(1e-12)).clamp(0.0, 1.0);
+                let t = ((ego - points[0]).dot(along) / along.length_squared().max(1e-12))
+                    .clamp(0.0, 1.0);
                 let distance_m = (points[0] + t * along).distance(ego);
                 (distance_m, stations_m[0] + t * (stations_m[1] - stations_m[0]))
             })

@@ -102,11 +102,7 @@ pub(super) async fn stopped(mut stopping: watch::Receiver<bool>) {
     let _ = stopping.wait_for(|&stop| stop).await;
 }
 
-async fn accept(
-    sensorsim: Arc<Sensorsim>,
-    listener: TcpListener,
-    stopping: watch::Receiver<bool>,
-) {
+async fn accept(sensorsim: Arc<Sensorsim>, listener: TcpListener, stopping: watch::Receiver<bool>) {
     let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
     // The semaphore is never closed.
     while let Ok(permit) = permits.clone().acquire_owned().await {
@@ -169,12 +165,15 @@ async fn call(
             unary(request, |asked| async { sensorsim.get_available_cameras(asked).await }).await
         }
         Some("get_available_trajectories") => {
-            unary(request, |asked| async { sensorsim.get_available_trajectories(asked).await }).await
+            unary(request, |asked| async { sensorsim.get_available_trajectories(asked).await })
+                .await
         }
         Some("get_available_ego_masks") => {
             unary(request, |_: Empty| async { sensorsim.get_available_ego_masks().await }).await
         }
-        Some("render_rgb") => unary(request, |asked| async { sensorsim.render_rgb(asked).await }).await,
+        Some("render_rgb") => {
+            unary(request, |asked| async { sensorsim.render_rgb(asked).await }).await
+        }
         Some("batch_render_rgb") => {
             unary(request, |asked| async { sensorsim.batch_render_rgb(asked).await }).await
         }

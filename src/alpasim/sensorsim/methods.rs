@@ -150,8 +150,10 @@ impl Sensorsim {
         &self,
         asked: wire::BatchRgbRenderRequest,
     ) -> Result<wire::BatchRgbRenderReturn, Status> {
-        let requests: Option<Vec<_>> = asked.items.iter().map(|item| item.request.as_ref()).collect();
-        let requests = requests.ok_or_else(|| Status::invalid_argument("items: request is missing"))?;
+        let requests: Option<Vec<_>> =
+            asked.items.iter().map(|item| item.request.as_ref()).collect();
+        let requests =
+            requests.ok_or_else(|| Status::invalid_argument("items: request is missing"))?;
         let images = self.images(&requests).await?;
         let mut items = Vec::with_capacity(images.len());
         for (item, image) in asked.items.iter().zip(images) {

@@ -15,3 +15,4 @@ mod render;
 mod status;
 
 pub use listen::{AlpasimError, Running, start};
+pub use render::offered_cameras;

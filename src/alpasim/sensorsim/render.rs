@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use wildcity_render::MAX_VIEWS;
-use wildcity_scene::Rig;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{Manifest, Rig};
 use wildcity_session::{Encoding, Engine, Still};
 use wildcity_twin::residency::Resident;
 
@@ -42,15 +42,9 @@ impl OpenScene {
         Ok(Self { id, resident, frame })
     }
 
-    /// The twin's own rig: the name and the cameras.
-    pub(super) fn own_rig(&self) -> Option<Rig> {
-        self.resident.version.manifest.rig.clone().or_else(|| Rig::preset(RIG))
-    }
-
     /// The cameras that the scene offers.
     pub(super) fn cameras(&self) -> Vec<RigCamera> {
-        let own = self.own_rig().map(|rig| rig.cameras).unwrap_or_default();
-        with_preset(&own, Rig::preset(OFFERED).map(|rig| rig.cameras).unwrap_or_default())
+        offered_cameras(&self.resident.version.manifest)
     }
 
     /// The image that a request asks for.
@@ -61,7 +55,8 @@ impl OpenScene {
             wire::ImageFormat::Jpeg => Encoding::Jpeg(jpeg_quality(request.image_quality)),
             wire::ImageFormat::RgbUint8Planar => Encoding::Raw,
             other => {
-                let must = format!("image_format {other:?}: PNG, JPEG and RGB_UINT8_PLANAR are offered");
+                let must =
+                    format!("image_format {other:?}: PNG, JPEG and RGB_UINT8_PLANAR are offered");
                 return Err(SensorsimError::Invalid(must));
             }
         };
@@ -90,6 +85,13 @@ impl OpenScene {
         let scaled = own.scaled(width_px.into(), height_px.into());
         Ok(scaled.map_err(|error| SensorsimError::Invalid(error.to_string()))?.appearance)
     }
+}
+
+/// The cameras that a scene of a twin offers: those of the twin's rig, then those of a preset.
+pub fn offered_cameras(manifest: &Manifest) -> Vec<RigCamera> {
+    let own = manifest.rig.clone().or_else(|| Rig::preset(RIG));
+    let own = own.map(|rig| rig.cameras).unwrap_or_default();
+    with_preset(&own, Rig::preset(OFFERED).map(|rig| rig.cameras).unwrap_or_default())
 }
 
 /// The images of requests, or why there is none, in their order. Requests of the same scene are rendered

@@ -19,8 +19,8 @@ mod field;
 mod http;
 mod non_finite;
 mod observation;
-mod request;
 mod recorded_drive;
+mod request;
 mod rig;
 
 pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};

@@ -144,7 +144,8 @@ fn set<T: FromStr>(target: &mut Option<T>, key: &str, value: &str) -> Result<(),
     if target.is_some() {
         return Err(invalid(key, format!("{key} occurs twice")));
     }
-    let number = value.parse().map_err(|_| invalid(key, format!("{key} is {value:?}, no number")))?;
+    let number =
+        value.parse().map_err(|_| invalid(key, format!("{key} is {value:?}, no number")))?;
     *target = Some(number);
     Ok(())
 }
