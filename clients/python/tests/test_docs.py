@@ -38,7 +38,7 @@ def test_a_page_does_what_it_says(page: str, reader: dict[str, str], tmp_path: P
     write_ply(tmp_path / "capture.ply", 0.0, 1)
     write_ply(tmp_path / "block7.ply", 0.0, 2)
     port = free_port()
-    text = (ROOT / page).read_text().replace("8080", str(port))
+    text = (ROOT / page).read_text().replace("8080", str(port)).replace("127.0.0.1:6000", "127.0.0.1:0")
     blocks = [block for block in BLOCK.findall(text) if block[0] in ("sh", "python")]
     assert blocks, f"{page} has nothing to run"
     servers: list[subprocess.Popen[str]] = []
