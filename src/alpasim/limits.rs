@@ -33,6 +33,9 @@ pub const JPEG_QUALITY: u8 = 95;
 /// HTTP/2 connections at once.
 pub const CONNECTIONS: usize = 256;
 
+/// How long connections may take to send their last answers when the service stops.
+pub const DRAIN: Duration = Duration::from_secs(2);
+
 /// Time of the start of every scene, in microseconds since 1970: AlpaSim wants integers of this size.
 pub const EPOCH_US: u64 = 1_700_000_000_000_000;
 

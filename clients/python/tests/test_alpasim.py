@@ -207,7 +207,7 @@ def test_a_lens_with_a_windshield_equals_observe(door: Door) -> None:
     asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=SCENE)
     listed = {c.logical_id: c.intrinsics for c in door.stub.get_available_cameras(asked).available_cameras}
     spec = listed["camera_front_wide_120fov"]
-    with wildcity.connect(door.url) as client, client.open("corridor", rig="alpamayo1") as session:
+    with wildcity.connect(door.url) as client, client.open("corridor", rig="alpamayo2") as session:
         (camera,) = (c for c in session.opened.cameras if c.name == "front_wide_120fov")
     mounted = Camera(**{**vars(camera), "fx": None, "fy": None, "camera_to_rig": ORIGIN})
     size = {"front_wide_120fov": wildcity.ImagePart(size=(192, 108))}

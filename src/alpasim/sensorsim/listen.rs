@@ -51,6 +51,8 @@ pub struct Running {
     address: SocketAddr,
     stop: watch::Sender<bool>,
     listening: JoinHandle<()>,
+    /// One permit per connection.
+    permits: Arc<Semaphore>,
 }
 
 /// Starts the service within the running tokio runtime, and returns once it listens.
@@ -70,14 +72,16 @@ pub async fn start(
     let address = listener.local_addr().map_err(failed)?;
     let (stop, stopping) = watch::channel(false);
     let sensorsim = Arc::new(Sensorsim::new(engine, stopping.clone()));
+    let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
+    let free = permits.clone();
     let listening = tokio::spawn(async move {
         tokio::select! {
-            () = accept(sensorsim.clone(), listener, stopping.clone()) => {}
+            () = accept(sensorsim.clone(), listener, free, stopping.clone()) => {}
             () = sensorsim.forget_idle() => {}
             () = stopped(stopping.clone()) => {}
         }
     });
-    Ok(Running { address, stop, listening })
+    Ok(Running { address, stop, listening, permits })
 }
 
 impl Running {
@@ -93,6 +97,11 @@ impl Running {
         if let Err(error) = self.listening.await {
             tracing::error!("the AlpaSim listener crashed: {error}");
         }
+        // All permits are free when all connections have ended, and so have sent their answers.
+        let all = self.permits.acquire_many(limits::CONNECTIONS as u32);
+        if tokio::time::timeout(limits::DRAIN, all).await.is_err() {
+            tracing::warn!("some AlpaSim clients did not leave within {:?}", limits::DRAIN);
+        }
     }
 }
 
@@ -102,8 +111,12 @@ pub(super) async fn stopped(mut stopping: watch::Receiver<bool>) {
     let _ = stopping.wait_for(|&stop| stop).await;
 }
 
-async fn accept(sensorsim: Arc<Sensorsim>, listener: TcpListener, stopping: watch::Receiver<bool>) {
-    let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
+async fn accept(
+    sensorsim: Arc<Sensorsim>,
+    listener: TcpListener,
+    permits: Arc<Semaphore>,
+    stopping: watch::Receiver<bool>,
+) {
     // The semaphore is never closed.
     while let Ok(permit) = permits.clone().acquire_owned().await {
         let stream = match listener.accept().await {
@@ -139,7 +152,7 @@ async fn accept(sensorsim: Arc<Sensorsim>, listener: TcpListener, stopping: watc
                 () = stopped(stopping) => {
                     // Running requests see the same signal, and are answered.
                     connection.as_mut().graceful_shutdown();
-                    let _ = tokio::time::timeout(Duration::from_secs(2), connection).await;
+                    let _ = tokio::time::timeout(limits::DRAIN, connection).await;
                 }
             }
             drop(permit);
