@@ -11,13 +11,16 @@
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
 //! | [`wildcity_generate`] | procedural streets and cities | scene |
 //! | [`wildcity_sim`] | what moves: the dynamics of the ego vehicle | scene |
+//! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
+//! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
-//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | render, scene, sim, twin |
+//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | scene, session, twin |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP | protocol, push, render, scene, session, sim, twin |
+//! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
 //! session, sim. Nothing below calls what is above it.

@@ -2,7 +2,7 @@
 //!
 //! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
 //! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
-//! failure, 2 for a command line that cannot be parsed.
+//! failure, 2 for a command line that cannot be parsed; `episode run` has more, which its help lists.
 //!
 //! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
 //! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
@@ -19,6 +19,8 @@ mod demo;
 mod devices;
 mod directories;
 mod drive;
+mod episode;
+mod exit;
 mod import;
 mod input_files;
 mod inspect;
@@ -70,6 +72,7 @@ enum Command {
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
+    Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
     Bench(bench::Bench),
@@ -95,6 +98,7 @@ pub fn main() -> ExitCode {
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
@@ -107,7 +111,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::FAILURE
+            error.downcast_ref::<exit::Exit>().map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
     }
 }

@@ -55,6 +55,7 @@ pub use record::format::{
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
+    WrongValue,
 };
 pub use session::Session;
 pub use stills::{Still, Stills};
