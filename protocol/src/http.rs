@@ -315,32 +315,6 @@ pub struct Rollback {
     pub version: u64,
 }
 
-/// A part of a recorded drive: the answer to `GET /v1/twins/{twin}/trajectories/{trajectory}`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-pub struct RecordedDrive {
-    /// Name of the trajectory.
-    pub trajectory: String,
-    /// The version of the twin that it belongs to.
-    pub version: u64,
-    /// Length of the whole drive, in metres.
-    pub length_m: f64,
-    /// Poses in driving order.
-    pub keyframes: Vec<RecordedPose>,
-}
-
-/// A pose of a recorded drive.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-pub struct RecordedPose {
-    /// Distance along the drive from its start, in metres: what `start.station_m` of `open` takes.
-    pub station_m: f64,
-    /// Recorded time, in microseconds.
-    pub time_us: i64,
-    /// `world_from_rig`.
-    pub pose: Pose,
-}
-
 /// A session: an entry of `GET /v1/sessions`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]

@@ -11,6 +11,7 @@
 
 use std::process::ExitCode;
 
+mod actor;
 mod alpasim;
 mod backend_options;
 mod bench;
@@ -26,6 +27,7 @@ mod input_files;
 mod inspect;
 mod limits;
 mod lod;
+mod map;
 mod output;
 mod profile_options;
 mod progress;
@@ -35,6 +37,7 @@ mod replay;
 mod report;
 mod rig;
 mod route;
+mod scenario;
 mod scene_source;
 mod serve;
 mod sky_source;
@@ -68,6 +71,7 @@ enum Command {
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
+    Actor(actor::Actor),
     Render(render::Render),
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
@@ -75,6 +79,8 @@ enum Command {
     Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
+    Scenario(scenario::ScenarioCommand),
+    Map(map::MapCommand),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
     Stress(stress::Stress),
@@ -82,7 +88,8 @@ enum Command {
     Devices(devices::Devices),
 }
 
-/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure. A
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
+/// for a recording that is cut (`replay --verify`). A
 /// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();
@@ -94,6 +101,7 @@ pub fn main() -> ExitCode {
         Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
+        Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
@@ -101,6 +109,8 @@ pub fn main() -> ExitCode {
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
+        Command::Scenario(command) => command.run(),
+        Command::Map(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
         Command::Stress(command) => command.run(),

@@ -14,6 +14,7 @@ use wildcity_twin::residency::{Reservation, Resident, RigExtent};
 
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
+use crate::engine::render_queue::FrameCost;
 use crate::error::SessionError;
 use crate::observe::encode::{Encoding, encode};
 use crate::pin::pin;
@@ -36,6 +37,8 @@ pub struct Stills {
     engine: Arc<Engine>,
     reservation: Reservation,
     profile: RenderProfile,
+    /// Its frames share one turn, as those of a session do.
+    number: u64,
 }
 
 impl Stills {
@@ -51,7 +54,8 @@ impl Stills {
         let profile = resident.version.manifest.profile;
         Engine::bake_sky(resident.clone(), profile).await?;
         let reservation = Engine::reserve(resident, extent(views), profile).await?;
-        Ok(Self { engine, reservation, profile })
+        let number = engine.new_session_number();
+        Ok(Self { engine, reservation, profile, number })
     }
 
     /// Whether the reserved memory is enough for these views.
@@ -109,7 +113,8 @@ impl Stills {
             let rendered = backend.render(&frame, &mut targets, &|_, _| {});
             rendered.map(|_| (images, stills))
         };
-        let (rendered, _queued) = self.engine.run(deadline, work).await?;
+        let cost = FrameCost { session: self.number, pixels };
+        let (rendered, _queued) = self.engine.run(cost, deadline, work).await?;
         let (images, stills) = rendered?;
         run_blocking(move || {
             let both = images.into_iter().zip(&stills).enumerate();

@@ -9,7 +9,7 @@
 //! opacities  every opacity, NaN and infinity, the stop rule         T11 T12 T19 T28
 //! sizes      nothing, one pixel, 8K, growing buffers, crops         T14 to T18
 //! lenses     a wide splat, more than 180°, rolling shutters         T22 T23 T24
-//! actors     colours that rotate with an actor                      T25
+//! actors     colours that rotate with an actor, places, motion       T25 T29 T30
 //! ```
 //!
 //! The reference backend is not compared with itself: its images must be finite, and have the values that a case
@@ -69,7 +69,7 @@ enum CaseBody {
 type Body = fn(&mut CaseRun<'_>) -> Result<(), RenderError>;
 
 /// All cases, in order of their numbers.
-pub static CASES: [Case; 28] = [
+pub static CASES: [Case; 30] = [
     shapes::T1,
     shapes::T2,
     shapes::T3,
@@ -98,6 +98,8 @@ pub static CASES: [Case; 28] = [
     shapes::T26,
     order::T27,
     opacities::T28,
+    actors::T29,
+    actors::T30,
 ];
 
 /// The result of a case on one backend.

@@ -31,6 +31,13 @@ pub const SCENE_PARTS: usize = 100_000;
 /// share add at most as many again. A lorry with a surface of 60 m² gets one every 17 mm.
 pub const MESH_GAUSSIANS: u32 = 200_000;
 
+/// Largest asset of an actor, in bytes: 2 million Gaussians of SH degree 3 in f32 are 472 MB, and the levels of
+/// detail as much again.
+pub const ACTOR_BYTES: u64 = 1 << 30;
+
+/// Largest header of an asset, in bytes. One has about 2 kB.
+pub const ACTOR_HEADER_BYTES: usize = 64 << 10;
+
 /// The most parts that the long triangles of a mesh are halved into. At 232 bytes each they take
 /// 100 MB.
 pub const MESH_PARTS: usize = 400_000;
@@ -38,6 +45,9 @@ pub const MESH_PARTS: usize = 400_000;
 /// The most values of a NuRec payload, not counting the content of arrays; each takes 32 bytes of
 /// memory. The tracks of a log are 100,000.
 pub const NUREC_VALUES: usize = 1 << 20;
+
+/// The most layers of static Gaussians of a NuRec payload. NVIDIA's scenes have fewer than ten.
+pub const NUREC_LAYERS: usize = 1024;
 
 /// The most Gaussians of one import, because their order within the twin is stored as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;

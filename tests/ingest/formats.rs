@@ -1,8 +1,10 @@
 //! Scenes written by small writers of every format are read back, within the precision of the
 //! format.
 
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest;
+use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,
@@ -239,6 +241,79 @@ fn nurec_comes_back_without_tracked_objects() {
 }
 
 #[test]
+fn tracked_objects_of_nurec_are_split_by_track() {
+    let g = gaussians(50, 1, 20.0, 8);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.usdz");
+    std::fs::write(&path, usdz(nurec_plain(&g, true))).unwrap();
+    let (objects, hash) = ingest::read_tracked(&path, &mut |_, _| {}).unwrap();
+    assert_eq!(hash.len(), 64);
+    let names: Vec<&str> = objects.iter().map(|object| object.track.as_str()).collect();
+    assert_eq!(names, ["car 7", "car 9"]);
+    let within = Within { mean_m: 0.01, quat: 5e-4, opacity: 6e-4, dc: 5e-4, sh: 5e-4, ..EXACT };
+    for (first, object) in objects.iter().enumerate() {
+        let own = g.select((first..50).step_by(2));
+        assert_alike(&object.gaussians, &own, within, "NuRec");
+    }
+    std::fs::write(&path, usdz(nurec_plain(&g, false))).unwrap();
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("there are none"), "{error}");
+}
+
+#[test]
+fn rigid_nodes_are_split_by_point_ids() {
+    let g = gaussians(30, 2, 20.0, 9);
+    let ids: Vec<u8> = (0..30_i64).flat_map(|i| (i % 3 * 10).to_le_bytes()).collect();
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("rigid.safetensors");
+    let write = |ids: Option<&[u8]>| {
+        let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let means: Vec<u8> =
+            g.means_m.as_flattened().iter().flat_map(|m| (*m as f32).to_le_bytes()).collect();
+        let sh = |from: usize, to: usize| -> Vec<u8> {
+            (0..30).flat_map(|i| floats_of(&g.sh_of(i)[from..to])).collect()
+        };
+        let tensors: Vec<(&str, Vec<usize>, Vec<u8>)> = vec![
+            ("means", vec![30, 3], means),
+            ("quats", vec![30, 4], floats(g.quats_wxyz.as_flattened())),
+            ("scales", vec![30, 3], floats(g.ln_scales.as_flattened())),
+            ("opacities", vec![30], floats(&g.logit_opacities)),
+            ("sh0", vec![30, 1, 3], sh(0, 3)),
+            ("shN", vec![30, 8, 3], sh(3, 27)),
+        ];
+        let mut views: Vec<(&str, TensorView<'_>)> = tensors
+            .iter()
+            .map(|(name, shape, data)| {
+                (*name, TensorView::new(Dtype::F32, shape.clone(), data).unwrap())
+            })
+            .collect();
+        if let Some(ids) = ids {
+            let shape = vec![ids.len() / 8, 1];
+            views.push(("point_ids", TensorView::new(Dtype::I64, shape, ids).unwrap()));
+        }
+        std::fs::write(&path, safetensors::serialize(views, None).unwrap()).unwrap();
+    };
+    write(Some(&ids));
+    let (objects, _) = ingest::read_tracked(&path, &mut |_, _| {}).unwrap();
+    let names: Vec<&str> = objects.iter().map(|object| object.track.as_str()).collect();
+    assert_eq!(names, ["0", "10", "20"]);
+    assert_eq!(objects[1].gaussians.logit_opacities, g.select((1..30).step_by(3)).logit_opacities);
+    assert_eq!(objects[2].gaussians.sh, g.select((2..30).step_by(3)).sh);
+    // As a scene, the file is read without the numbers.
+    assert_eq!(ingest::read(&path, &mut |_, _| {}).unwrap().len(), 30);
+    write(None);
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("point_ids"), "{error}");
+    write(Some(&ids[..80]));
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("10 numbers for 30"), "{error}");
+}
+
+fn floats_of(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+#[test]
 fn progress_of_every_format_ends_at_all_bytes() {
     for case in crate::corpus::corpus() {
         let dir = tempfile::tempdir().unwrap();
@@ -251,5 +326,74 @@ fn progress_of_every_format_ends_at_all_bytes() {
         let read = case.files.iter().filter(|(name, _)| !name.starts_with("coarse/"));
         let bytes = read.map(|(name, _)| dir.path().join(name).metadata().unwrap().len()).sum();
         assert_eq!(reports.last(), Some(&(bytes, bytes)), "{}", case.name);
+    }
+}
+
+/// Each naming counts for nothing: neither the time to read a file nor the memory for it.
+#[test]
+fn a_file_that_a_scene_names_often_is_read_once() {
+    let g = gaussians(20, 0, 20.0, 1);
+    let (json, buffer) = gltf(&g, "", r#""uri":"scene.bin","#);
+    let named = format!(r#"{{"uri":"scene.bin","byteLength":{}}}"#, buffer.len());
+    let often = format!(r#""buffers":[{}{}"#, format!("{named},").repeat(39), r#"{"uri""#);
+    let json = json.replacen(r#""buffers":[{"uri""#, &often, 1);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.gltf");
+    std::fs::write(&path, &json).unwrap();
+    std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
+    let mut read_bytes = 0;
+    let read = ingest::read(&path, &mut |done, _| read_bytes = done).unwrap();
+    assert_eq!(read.len(), 20);
+    assert_eq!(read_bytes, (json.len() + buffer.len()) as u64);
+}
+
+/// A file from an untrusted source names nothing that is not listed.
+#[test]
+fn a_listed_scene_reads_listed_files_only() {
+    let g = gaussians(20, 0, 20.0, 1);
+    let (json, buffer) = gltf(&g, "", r#""uri":"scene.bin","#);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.gltf");
+    let elsewhere = dir.path().join("elsewhere");
+    std::fs::write(&path, &json).unwrap();
+    std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
+    std::fs::write(&elsewhere, &buffer).unwrap();
+    let read = |listed: &ListedFiles| {
+        let limits = ReadLimits { listed: Some(listed), ..ReadLimits::of_own_file() };
+        ingest::read_limited(&path, &limits, &mut |_, _| {})
+    };
+    let error = read(&ListedFiles::new()).unwrap_err().to_string();
+    assert!(
+        error.starts_with("part \"scene.bin\": is not the name of exactly one file"),
+        "{error}"
+    );
+    let read = read(&ListedFiles::from([("scene.bin".to_owned(), elsewhere)])).unwrap();
+    assert_eq!((read.gaussians.len(), read.parts.len()), (20, 1));
+    assert_eq!(read.hash, ingest::read_hashed(&path, &mut |_, _| {}).unwrap().1);
+}
+
+/// What is unpacked counts against the memory of the reader, and reading stops when it is told to.
+#[test]
+fn a_reader_has_a_budget_and_can_be_stopped() {
+    let g = gaussians(2_000, 3, 20.0, 1);
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in [
+        ("gzip.spz", gzip(&spz_plain(&g, 3))),
+        ("zstd.spz", spz4(&g)),
+        ("scene.glb", glb(gltf(&g, "", ""))),
+        ("scene.sog", zip_of(&sog(&g, 2), false)),
+        ("scene.usdz", usdz(nurec_plain(&g, false))),
+    ] {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let read = |limits: ReadLimits<'_>| ingest::read_limited(&path, &limits, &mut |_, _| {});
+        assert_eq!(read(ReadLimits::of_own_file()).unwrap().gaussians.len(), 2_000);
+        let error = read(ReadLimits { memory_bytes: 10_000, ..ReadLimits::of_own_file() });
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("10000 may be used"), "{name}: {error}");
+        let stop = StopFlag::default();
+        stop.stop();
+        let error = read(ReadLimits { stop, ..ReadLimits::of_own_file() }).unwrap_err().to_string();
+        assert!(error.contains("reading was stopped"), "{name}: {error}");
     }
 }

@@ -20,7 +20,7 @@ async fn request(server: &TestServer, text: &str) -> (u16, String) {
     (status, answer)
 }
 
-async fn get(server: &TestServer, path: &str) -> (u16, String) {
+pub(crate) async fn get(server: &TestServer, path: &str) -> (u16, String) {
     request(server, &format!("GET {path} HTTP/1.1\nHost: localhost\n\n")).await
 }
 
@@ -133,7 +133,8 @@ async fn health_and_twins() {
     let (status, answer) = get(&server, "/v1/twins").await;
     assert_eq!(status, 200);
     assert!(answer.contains("application/json"), "{answer}");
-    let body = json_body(&answer);
+    let body: serde_json::Value =
+        serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
     assert_eq!(body["twins"][0]["name"], "test");
     assert_eq!(get(&server, "/nothing").await.0, 404);
     // A version never changes: its manifest is not read again.
@@ -146,45 +147,6 @@ async fn health_and_twins() {
     assert_eq!(get(&server, "/readyz").await.0, 200);
     assert_eq!(get(&server, "/v1/session").await.0, 426);
     assert_eq!(request(&server, "rubbish\n\n").await.0, 400);
-}
-
-/// The drive of the twin `test` has a keyframe every metre, 0.1 s apart.
-#[tokio::test]
-async fn recorded_drives() {
-    let server = TestServer::start().await;
-    let path = "/v1/twins/test/trajectories/log";
-    let whole = json_body(&get(&server, path).await.1);
-    assert_eq!((&whole["version"], &whole["length_m"]), (&1.into(), &9.0.into()));
-    assert_eq!(whole["keyframes"].as_array().unwrap().len(), 10);
-    let part = json_body(&get(&server, &format!("{path}?from_m=2&to_m=3&every_m=0.25")).await.1);
-    let keyframes = part["keyframes"].as_array().unwrap();
-    assert_eq!(keyframes.len(), 5);
-    let pose = serde_json::json!({ "xyz": [2.25, 0.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0] });
-    let expected = serde_json::json!({ "station_m": 2.25, "time_us": 225_000, "pose": pose });
-    assert_eq!(keyframes[1], expected);
-    for (query, status, code, field) in [
-        ("trajectories/other", 404, "unknown_trajectory", "trajectory"),
-        ("trajectories/log?version=9", 404, "unknown_version", "version"),
-        ("trajectories/log?from_m=10", 400, "out_of_range", "from_m"),
-        ("trajectories/log?from_m=nan", 400, "out_of_range", "from_m"),
-        ("trajectories/log?from_m=3&to_m=2", 400, "out_of_range", "to_m"),
-        ("trajectories/log?every_m=0", 400, "out_of_range", "every_m"),
-        ("trajectories/log?every_m=0.00001", 400, "out_of_range", "every_m"),
-        ("trajectories/log?step=1", 400, "invalid_request", "step"),
-    ] {
-        let (found, answer) = get(&server, &format!("/v1/twins/test/{query}")).await;
-        let body = json_body(&answer);
-        assert_eq!(
-            (found, body["code"].as_str(), body["field"].as_str()),
-            (status, Some(code), Some(field)),
-            "{query}"
-        );
-    }
-    assert_eq!(get(&server, "/v1/twins/nowhere/trajectories/log").await.0, 404);
-}
-
-fn json_body(answer: &str) -> serde_json::Value {
-    serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap()
 }
 
 /// All files below a directory.
@@ -239,6 +201,7 @@ async fn public_addresses_are_refused() {
         twins: server.twins.path().to_owned(),
         cache: None,
         episodes: server.episodes.path().to_owned(),
+        scenarios: server.twins.path().join(".scenarios"),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
         backend: server.painter.clone(),
@@ -250,4 +213,43 @@ async fn public_addresses_are_refused() {
     let taken =
         wildcity_server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
     assert!(matches!(taken, ServerError::Listen { .. }), "{taken}");
+}
+
+/// Sockets that are opened and not used do not keep health checks and agents away.
+#[tokio::test]
+async fn idle_sockets_take_no_slot_from_others() {
+    let limits = Limits { connections: 8, ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    let mut idle = Vec::new();
+    for round in 0..14 {
+        for _ in 0..90 {
+            idle.push(TcpStream::connect(server.address()).await.unwrap());
+        }
+        let health = tokio::time::timeout(Duration::from_secs(2), get(&server, "/healthz"));
+        let (status, _) = health.await.unwrap_or_else(|_| panic!("no answer in round {round}"));
+        assert_eq!(status, 200);
+    }
+    server.still_serves().await;
+}
+
+/// DNS rebinding: a page's own host name, made to stand for 127.0.0.1.
+#[tokio::test]
+async fn a_server_without_tokens_answers_for_its_own_host_only() {
+    let server = TestServer::start().await;
+    for (host, status) in [
+        ("localhost", 200),
+        ("LOCALHOST:8080", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:8080", 200),
+        ("evil.example", 403),
+        ("evil.example:8080", 403),
+        ("localhost.evil.example", 403),
+        ("127.0.0.1.evil.example", 403),
+        ("", 403),
+    ] {
+        let text = format!("GET /v1/twins HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, status, "{host}");
+        let text = format!("GET /healthz HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, 200, "{host}");
+    }
 }

@@ -17,12 +17,14 @@ from test_push import write_ply
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = [
     "README.md",
+    "docs/actors.md",
     "docs/agents.md",
     "docs/alpamayo.md",
     "docs/alpasim.md",
     "docs/gym.md",
     "docs/operators.md",
     "docs/pipelines.md",
+    "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
 ]

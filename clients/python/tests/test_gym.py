@@ -16,7 +16,7 @@ import wildcity
 import wildcity.gym
 from gymnasium.utils.env_checker import check_env
 from test_end_to_end import PAIR, Server, server, write_corridor, write_log
-from wildcity import Pose, RecordedDrive, Refused, ServeFailed, Station, serving
+from wildcity import Drive, DrivePose, Pose, Refused, ServeFailed, Station, serving
 from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Route
 
 SMALL: dict[str, Any] = {"twin": "corridor", "rig": PAIR, "size": (32, 20), "horizon": 30, "speed": 5.0}
@@ -156,18 +156,6 @@ def test_closing_ends_the_sessions(server: Server) -> None:
     assert server.get("/v1/sessions")[1].count('"session"') == 0
 
 
-def test_recorded_drives(server: Server) -> None:
-    drive = wildcity.recorded_drive("corridor", "log", server=server.url, from_m=2.0, to_m=4.0, every_m=0.25)
-    assert (drive.trajectory, drive.version, drive.length_m) == ("log", 1, pytest.approx(10.0))
-    assert drive.station_m == pytest.approx(np.arange(2.0, 4.1, 0.25))
-    assert drive.pose(1).xyz == pytest.approx((2.25, 0.0, 0.0))
-    assert drive.time_us[1] == 450_000
-    assert len(wildcity.recorded_drive("corridor", "log", server=server.url).station_m) == 21
-    with pytest.raises(Refused, match="unknown_trajectory") as refused:
-        wildcity.recorded_drive("corridor", "other", server=server.url)
-    assert refused.value.field == "trajectory"
-
-
 def test_a_route_that_crosses_itself_is_followed_by_its_stations() -> None:
     # A figure of eight: two circles of radius 10 m that touch at the origin.
     angle = np.linspace(0, 2 * np.pi, 200)
@@ -175,9 +163,11 @@ def test_a_route_that_crosses_itself_is_followed_by_its_stations() -> None:
     second = np.stack([10 * np.sin(angle), 10 * np.cos(angle) - 10], axis=-1)
     xy = np.concatenate([first, second[1:]])
     station_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    xyz = np.column_stack([xy, np.zeros(len(xy))])
-    q = np.tile([1.0, 0, 0, 0], (len(xy), 1))
-    route = Route(RecordedDrive("eight", 1, station_m[-1], station_m, np.arange(len(xy)), xyz, q))
+    poses = tuple(
+        DrivePose(station, time_us, Pose((x, y, 0.0)))
+        for time_us, (station, (x, y)) in enumerate(zip(station_m.tolist(), xy.tolist(), strict=True))
+    )
+    route = Route(Drive("eight", 1, "", float(station_m[-1]), poses))
     at_crossing = Pose((0.1, 0.0, 0.0))
     assert route.locate(at_crossing, 1.0)[0] == pytest.approx(0.1, abs=0.01)
     middle = route.length_m / 2

@@ -14,7 +14,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use wildcity_protocol::error::Code;
-use wildcity_protocol::http::{NewPush, Push, PushState, RecordedDrive, Refusal, Rollback};
+use wildcity_protocol::http::{NewPush, Push, PushState, Refusal, Rollback};
+use wildcity_protocol::message::{Drive, DriveSection};
 
 use crate::limits;
 use crate::options::ConnectOptions;
@@ -182,24 +183,6 @@ impl HttpClient {
         }
     }
 
-    /// The recorded keyframes of a drive, of the latest version if there is no `version`.
-    ///
-    /// # Errors
-    /// The server refuses, or does not answer.
-    pub async fn recorded_drive(
-        &self,
-        twin: &str,
-        trajectory: &str,
-        version: Option<u64>,
-    ) -> Result<RecordedDrive, HttpError> {
-        let path = ["v1", "twins", twin, "trajectories", trajectory];
-        let mut server = self.clone();
-        if let Some(version) = version {
-            server.server.set_query(Some(&format!("version={version}")));
-        }
-        server.request_json(Method::GET, &path, None::<&()>).await
-    }
-
     /// Makes an old version of a twin the latest again, as a new version, and returns the number of the new
     /// version.
     ///
@@ -214,6 +197,28 @@ impl HttpClient {
         let body = Rollback { version };
         let made: RolledBack = self.request_json(Method::POST, &path, Some(&body)).await?;
         Ok(made.version)
+    }
+
+    /// Poses of a recorded drive of a version of a twin; of the latest if `version` is `None`.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn trajectory(
+        &self,
+        twin: &str,
+        version: Option<u64>,
+        section: &DriveSection,
+    ) -> Result<Drive, HttpError> {
+        let DriveSection { name, from_m, to_m, every_m } = section;
+        let path = ["v1", "twins", twin, "trajectories", name];
+        let version = version.map(|number| ("version", number.to_string()));
+        let stations = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
+        let stations =
+            stations.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
+        let mut url = self.url(&path);
+        url.query_pairs_mut().extend_pairs(version.into_iter().chain(stations));
+        let answer = self.send(self.http.request(Method::GET, url), limits::HTTP_TIMEOUT).await?;
+        serde_json::from_slice(&answer).map_err(|error| self.unreadable(&error))
     }
 
     /// Sends a request with an optional JSON body, and reads the JSON of the answer.
@@ -234,11 +239,16 @@ impl HttpClient {
 
     /// A request to a path, given by its segments.
     pub(crate) fn request(&self, method: Method, path: &[&str]) -> RequestBuilder {
+        self.http.request(method, self.url(path))
+    }
+
+    /// The address of a path, given by its segments.
+    fn url(&self, path: &[&str]) -> Url {
         let mut url = self.server.clone();
         if let Ok(mut segments) = url.path_segments_mut() {
             segments.clear().extend(path);
         }
-        self.http.request(method, url)
+        url
     }
 
     /// Sends a request and returns the body of a successful answer.

@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use glam::{DMat3, DQuat, DVec3};
 
-use wildcity_client::protocol::http::RecordedPose;
-use wildcity_client::protocol::message::{ImagePart, Opened, Outputs, RigChoice, Start};
+use wildcity_client::protocol::message::{
+    Drive, DrivePose, DriveSection, ImagePart, Opened, Outputs, RigChoice, Start,
+};
 use wildcity_client::{
     Client, ClientError, ConnectOptions, Dynamics, DynamicsChoice, DynamicsModel, HttpClient,
     HttpError, ImageView, Movement, Observation, Open,
@@ -168,12 +169,6 @@ fn outcome_of(error: &DriverError) -> Outcome {
     }
 }
 
-/// A recorded drive: its name, and its poses with their stations and times.
-struct Drive {
-    name: String,
-    keyframes: Vec<RecordedPose>,
-}
-
 async fn recorded_drive(
     settings: &EpisodeSettings,
     client: &Client,
@@ -185,13 +180,14 @@ async fn recorded_drive(
         BridgeError::Setting(format!("twin {:?} has no recorded drive to follow", settings.twin))
     })?;
     let http = HttpClient::new(&http_address(&settings.server), options)?;
-    let recorded = http.recorded_drive(&settings.twin, &name, settings.version).await?;
-    let count = recorded.keyframes.len();
+    let section = DriveSection { name, from_m: None, to_m: None, every_m: None };
+    let drive = http.trajectory(&settings.twin, settings.version, &section).await?;
+    let count = drive.poses.len();
     if count < 2 {
-        let text = format!("trajectory {name:?} has {count} poses; a route needs two");
+        let text = format!("trajectory {:?} has {count} poses; a route needs two", drive.name);
         return Err(BridgeError::Setting(text));
     }
-    Ok(Drive { name, keyframes: recorded.keyframes })
+    Ok(drive)
 }
 
 /// `http://HOST:PORT` of `ws://HOST:PORT/v1/session`.
@@ -232,14 +228,14 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
 
 /// The recorded speed where the episode starts.
 fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
-    let first_us = drive.keyframes[0].time_us;
-    let is_after = |at: &RecordedPose| match settings.start_m {
+    let first_us = drive.poses[0].time_us;
+    let is_after = |at: &DrivePose| match settings.start_m {
         Some(start_m) => at.station_m >= start_m,
         None => at.time_us >= first_us + settings.warm_up_us,
     };
-    let after = drive.keyframes.iter().position(is_after).unwrap_or(0);
-    let after = after.clamp(1, drive.keyframes.len() - 1);
-    let [from, to] = [&drive.keyframes[after - 1], &drive.keyframes[after]];
+    let after = drive.poses.iter().position(is_after).unwrap_or(0);
+    let after = after.clamp(1, drive.poses.len() - 1);
+    let [from, to] = [&drive.poses[after - 1], &drive.poses[after]];
     (to.station_m - from.station_m) / (1e-6 * (to.time_us - from.time_us) as f64)
 }
 
@@ -292,7 +288,7 @@ impl<'a> Episode<'a> {
                 .map_err(|error| BridgeError::Setting(format!("camera {:?}: {error}", camera.name)))
         });
         let start = Pose::checked(opened.start.xyz, opened.start.q)?;
-        let points = drive.keyframes.iter().map(|at| (at.station_m, at.pose.xyz));
+        let points = drive.poses.iter().map(|at| (at.station_m, at.pose.xyz));
         Ok(Self {
             settings,
             cameras: cameras.collect::<Result<_, _>>()?,

@@ -1,6 +1,12 @@
 //! Actors: what moves in a twin beside the ego.
 
+mod asset;
+mod placed;
+
 use serde::{Deserialize, Serialize};
+
+pub use asset::{ActorAsset, ActorViewpoint, AssetDescription, AssetError, AssetLevel};
+pub use placed::{ContactShadow, PlacedChunk};
 
 /// The kind of an actor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

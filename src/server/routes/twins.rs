@@ -11,19 +11,20 @@ use wildcity_twin::store::StoreError;
 
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
-use crate::convert::{self, DriveQuery};
+use crate::convert;
 use crate::fault::Fault;
 use crate::state::ServerState;
 
 use super::refusal::HttpResult;
 
-/// `GET /v1/twins`: the latest version of every twin that the token may use.
+/// `GET /v1/twins`: the latest version of every twin that the token may use, and the damaged ones of them.
 pub(super) async fn list(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
 ) -> HttpResult {
     let mut twins = state.engine.twins().await?;
-    twins.retain(|twin| grant.allows_twin(&twin.name));
+    twins.twins.retain(|twin| grant.allows_twin(&twin.name));
+    twins.damaged.retain(|twin| grant.allows_twin(&twin.name));
     Ok(Json(convert::twins(&twins)).into_response())
 }
 
@@ -35,7 +36,7 @@ pub(super) async fn show(
 ) -> HttpResult {
     grant.require_twin(&name)?;
     let twins = state.engine.twins().await?;
-    match twins.iter().find(|twin| twin.name == name) {
+    match twins.twins.iter().find(|twin| twin.name == name) {
         Some(twin) => Ok(Json(convert::twin(twin)).into_response()),
         None => {
             // A twin that is not listed may be damaged: opening it gives the reason.
@@ -65,21 +66,22 @@ pub(super) async fn versions(
     Ok(Json(convert::versions(&versions, held)).into_response())
 }
 
-/// `GET /v1/twins/{twin}/trajectories/{trajectory}`: poses of a recorded drive.
+/// `GET /v1/twins/{twin}/trajectories/{name}`: poses of a recorded drive.
 pub(super) async fn trajectory(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
-    Path((name, trajectory)): Path<(String, String)>,
+    Path((twin, name)): Path<(String, String)>,
     RawQuery(query): RawQuery,
 ) -> HttpResult {
-    grant.require_twin(&name)?;
-    let query = DriveQuery::parse(query.as_deref().unwrap_or_default())?;
-    let engine = state.engine.clone();
-    let version = blocking(move || {
-        let number = query.version.or_else(|| engine.pinned_latest(&name));
-        engine.catalog().version(&name, number)
+    grant.require_twin(&twin)?;
+    let (version, section) = convert::drive_query(name, query.as_deref().unwrap_or_default())?;
+    let version = version.or_else(|| state.engine.pinned_latest(&twin));
+    let catalog = state.engine.catalog().clone();
+    let body = blocking(move || {
+        let version = catalog.version(&twin, version).map_err(Fault::from)?;
+        convert::drive_body(&version, &section)
     });
-    Ok(Json(query.answer(&version.await?, &trajectory)?).into_response())
+    Ok(Json(body.await?).into_response())
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.

@@ -7,11 +7,17 @@ use crate::limits;
 
 use super::StoreError;
 
+/// The folder of assets of actors, in place of a twin's name; no twin can have it.
+pub(super) const ACTORS: &str = ".actors";
+
 /// Path of a log record below the root. The number has ten digits, so that names sort as numbers
 /// do.
 pub(super) fn record_key(name: &str, number: u64) -> String {
     format!("{name}/log/{number:010}")
 }
+
+/// Ending of a side file that a process keeps locked while it uses the side file of the same name.
+pub(super) const LOCK_ENDING: &str = ".lock";
 
 /// Path of an object below the root.
 pub(super) fn object_key(name: &str, hash: &str) -> String {

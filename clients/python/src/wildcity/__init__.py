@@ -6,7 +6,6 @@ in SI units, or have their unit in their name. Frames and conventions are in `pr
 
 from importlib.metadata import version as _version
 
-from .drives import RecordedDrive, recorded_drive
 from .errors import (
     BadFrame,
     Code,
@@ -22,6 +21,9 @@ from .observation import Observation, View
 from .protocol import (
     Action,
     Camera,
+    Drive,
+    DrivePose,
+    DriveSection,
     Dynamics,
     Ego,
     Exposure,
@@ -32,9 +34,12 @@ from .protocol import (
     Opened,
     Outputs,
     Pose,
+    RandomStart,
+    RecordedPoint,
     Resumed,
     Rig,
     Shutter,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -47,7 +52,7 @@ from .protocol import (
     Windshield,
     png_data_uri,
 )
-from .pushing import Push, PushProgress, push, rollback
+from .pushing import Push, PushProgress, push, recorded_drive, rollback
 from .serving import LocalServer, ServeFailed, serve
 from .sync import Client, Session, connect
 
@@ -61,6 +66,9 @@ __all__ = [
     "Code",
     "ConnectFailed",
     "Disconnected",
+    "Drive",
+    "DrivePose",
+    "DriveSection",
     "Dynamics",
     "Ego",
     "Exposure",
@@ -77,13 +85,15 @@ __all__ = [
     "Push",
     "PushFailed",
     "PushProgress",
-    "RecordedDrive",
+    "RandomStart",
+    "RecordedPoint",
     "Refused",
     "Resumed",
     "Rig",
     "ServeFailed",
     "Session",
     "Shutter",
+    "SnapshotPoint",
     "Station",
     "Summary",
     "Switched",

@@ -194,6 +194,7 @@ impl ObservationBuilder {
                 opacity,
                 normals,
                 appearance: Some(&camera.appearance),
+                ..Target::default()
             });
         }
         targets

@@ -4,19 +4,24 @@
 //! `.gaussians_nodes.LAYER`, arrays of f16 or f32 with their shapes: positions, rotations (w, x, y,
 //! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the higher
 //! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
-//! layer of tracked objects is skipped, because it has no fixed place. Positions are in the
+//! layer of tracked objects is skipped, because it has no fixed place ([`read_tracked`] reads it:
+//! gaussian_cuboid_ids names the track of each Gaussian, and positions are relative to the middle
+//! of the track's cuboid). Positions are in the
 //! payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use half::f16;
 
+use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
-use super::unpack_budget::{self, UnpackBudget};
+use super::objects::{self, TrackedObject};
+use super::unpack_budget::UnpackBudget;
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
 use msgpack::Value;
@@ -24,42 +29,124 @@ use msgpack::Value;
 const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
-/// Reads a payload.
+/// Reads the static Gaussians of a payload.
 pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
-    let limit = unpack_budget::limit_bytes(payload.len() as u64);
-    let mut bytes = Vec::new();
-    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
-    read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
-    budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let missing = |name: &str| bad(name, "is missing".into());
-    let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
-    let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
-    let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
-    let names = state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
-    let is_static = |layer: &&str| match tracks.and_then(|tracks| tracks.get(layer)) {
-        Some(Value::Array(ids)) => ids.is_empty(),
-        _ => true,
-    };
-    let mut all = Gaussians::default();
-    let mut layers = names.filter(is_static).peekable();
-    if layers.peek().is_none() {
-        return Err(missing("a layer of static Gaussians"));
+    let payload = Payload::of(&root)?;
+    let is_static = |name: &&str| payload.tracks_of(name).is_empty();
+    let layers: Vec<&str> = payload.names.iter().copied().filter(is_static).collect();
+    if layers.is_empty() {
+        return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
+    let mut all = Gaussians::default();
     for name in layers {
-        check_activations(data, name)?;
-        let part = Layer { state, name }.read()?;
-        all.append(&part);
+        budget.check_stop()?;
+        all.append(&payload.layer(name)?.read()?);
         check_count(all.len() as u64)?;
     }
     validate::check(&all, &Field::plain_name)?;
     Ok(all)
 }
 
+/// Reads the tracked objects of a payload: layers with tracks, split by track.
+pub(super) fn read_tracked(
+    payload: &[u8],
+    budget: &mut UnpackBudget,
+) -> Result<Vec<TrackedObject>, IngestError> {
+    let bytes = unpack(payload, budget)?;
+    let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
+    let payload = Payload::of(&root)?;
+    let mut found = Vec::new();
+    for &name in &payload.names {
+        let tracks = payload.tracks_of(name);
+        if tracks.is_empty() {
+            continue;
+        }
+        budget.check_stop()?;
+        let layer = payload.layer(name)?;
+        let gaussians = layer.read()?;
+        check_count(gaussians.len() as u64)?;
+        validate::check(&gaussians, &Field::plain_name)?;
+        let ids = layer.cuboid_ids(gaussians.len(), tracks.len())?;
+        let track = |id: i64| match tracks.get(usize::try_from(id).ok()?)? {
+            Value::Text(track) => Some((*track).to_owned()),
+            Value::Count(number) => Some(number.to_string()),
+            _ => Some(id.to_string()),
+        };
+        found.extend(objects::split(&gaussians, &ids, track));
+    }
+    Ok(found)
+}
+
+/// The bytes of a gzip stream.
+fn unpack(payload: &[u8], budget: &mut UnpackBudget) -> Result<Vec<u8>, IngestError> {
+    let limit = budget.left_bytes();
+    let mut bytes = Vec::new();
+    let mut decoder = GzDecoder::new(payload);
+    let read = decoder.by_ref().take(limit + 1).read_to_end(&mut bytes);
+    read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
+    budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let rest = decoder.into_inner();
+    if !rest.is_empty() {
+        return Err(bad("the gzip stream", format!("is followed by {} bytes", rest.len())));
+    }
+    Ok(bytes)
+}
+
+/// The maps of a payload that are read. They are searched once per layer and field, so they are indexed.
+struct Payload<'a> {
+    /// The layers' names, in the order of the file.
+    names: Vec<&'a str>,
+    fields: BTreeMap<&'a str, &'a Value<'a>>,
+    tracks: BTreeMap<&'a str, &'a Value<'a>>,
+    settings: BTreeMap<&'a str, &'a Value<'a>>,
+}
+
+impl<'a> Payload<'a> {
+    fn of(root: &'a Value<'a>) -> Result<Self, IngestError> {
+        let missing = |name: &str| bad(name, "is missing".into());
+        let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
+        let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
+        let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
+        let settings = data.get("config").and_then(|config| config.get("layers"));
+        let names = state.keys();
+        let names = names.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
+        // A key may be repeated: the first one counts.
+        let mut seen = BTreeSet::new();
+        let names: Vec<&str> = names.filter(|&name| seen.insert(name)).collect();
+        if names.len() > limits::NUREC_LAYERS {
+            let reason =
+                format!("{} layers; at most {} are read", names.len(), limits::NUREC_LAYERS);
+            return Err(bad("nre_data.state_dict", reason));
+        }
+        Ok(Self {
+            names,
+            fields: state.index(),
+            tracks: tracks.map(Value::index).unwrap_or_default(),
+            settings: settings.map(Value::index).unwrap_or_default(),
+        })
+    }
+
+    /// The tracks of a layer; none for a static one.
+    fn tracks_of(&self, layer: &str) -> &'a [Value<'a>] {
+        match self.tracks.get(layer) {
+            Some(Value::Array(ids)) => ids,
+            _ => &[],
+        }
+    }
+
+    /// A layer of Gaussians.
+    fn layer(&self, name: &'a str) -> Result<Layer<'_>, IngestError> {
+        if let Some(settings) = self.settings.get(name) {
+            check_activations(settings, name)?;
+        }
+        Ok(Layer { fields: &self.fields, name })
+    }
+}
+
 /// Checks that parameters have the activations that this reader assumes.
-fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
-    let layers = data.get("config").and_then(|config| config.get("layers"));
-    let Some(settings) = layers.and_then(|layers| layers.get(layer)) else { return Ok(()) };
+fn check_activations(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     let wanted = [
         ("density_activation", "sigmoid"),
         ("scale_activation", "exp"),
@@ -79,7 +166,7 @@ fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
 
 /// The arrays of one layer.
 struct Layer<'a> {
-    state: &'a Value<'a>,
+    fields: &'a BTreeMap<&'a str, &'a Value<'a>>,
     name: &'a str,
 }
 
@@ -112,13 +199,35 @@ impl Layer<'_> {
         Ok(g)
     }
 
+    /// The index of each Gaussian's track, stored as i32 or i64.
+    fn cuboid_ids(&self, rows: usize, tracks: usize) -> Result<Vec<i64>, IngestError> {
+        let key = self.key("gaussian_cuboid_ids");
+        let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
+            return Err(bad(&key, "is not an array of bytes".into()));
+        };
+        let ids: Vec<i64> = if bytes.len() == 4 * rows {
+            bytes.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect()
+        } else if bytes.len() == 8 * rows {
+            bytes.as_chunks().0.iter().map(|id| i64::from_le_bytes(*id)).collect()
+        } else {
+            let reason =
+                format!("{} bytes, which is not the size of {rows} i32 or i64", bytes.len());
+            return Err(bad(&key, reason));
+        };
+        let beyond = ids.iter().find(|&&id| usize::try_from(id).is_ok_and(|id| id >= tracks));
+        match beyond {
+            Some(id) => Err(bad(&key, format!("{id} is a track; there are {tracks}"))),
+            None => Ok(ids),
+        }
+    }
+
     fn key(&self, field: &str) -> String {
         format!("{LAYERS}{}.{field}", self.name)
     }
 
     /// The SH degree that training had reached, stored as i64.
     fn active_degree(&self) -> Option<u8> {
-        match self.state.get(&self.key("n_active_features")) {
+        match self.fields.get(&*self.key("n_active_features")) {
             Some(Value::Bytes(bytes)) => {
                 let degree = i64::from_le_bytes(**bytes.first_chunk().as_ref()?);
                 u8::try_from(degree).ok()
@@ -134,7 +243,7 @@ impl Layer<'_> {
         rows: Option<usize>,
     ) -> Result<Array<'_>, IngestError> {
         let key = self.key(field);
-        let shape = match self.state.get(&format!("{key}.shape")) {
+        let shape = match self.fields.get(&*format!("{key}.shape")) {
             Some(Value::Array(shape)) => shape.iter().map(Value::as_usize).collect(),
             _ => None,
         };
@@ -148,7 +257,7 @@ impl Layer<'_> {
                 format!("[{found_rows}, {found_columns}], not [{}, {}]", any(rows), any(columns));
             return Err(bad(&format!("{key}.shape"), reason));
         }
-        let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
+        let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
         let values = found_rows as u128 * found_columns as u128;

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sync import Client, Session, connect
-from .task import DriveConfig, DriveTask, Seen
+from .task import DriveConfig, DriveTask, Seen, drive_of
 
 
 class DriveEnv(gymnasium.Env[Any, Any]):
@@ -75,7 +75,7 @@ class DriveEnv(gymnasium.Env[Any, Any]):
         if self._session is None or self._task is None:
             config = self.config
             self._client = connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
-            self._session = self._client.open(**config.open_options())
+            self._session = self._client.open(**config.open_options(self._client.welcome))
             self._version = self._session.opened.version
-            self._task = DriveTask(config, config.recorded(self._client.welcome, self._version))
+            self._task = DriveTask(config, drive_of(self._session.opened))
         return self._session, self._task

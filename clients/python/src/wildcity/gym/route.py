@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..drives import RecordedDrive
-from ..protocol import Pose
+from ..protocol import Drive, Pose
 
 BEHIND_M = 20.0
 AHEAD_M = 40.0
@@ -16,12 +15,12 @@ AHEAD_M = 40.0
 class Route:
     """The polyline through the poses of a recorded drive."""
 
-    def __init__(self, drive: RecordedDrive) -> None:
-        if len(drive.station_m) < 2:
-            raise ValueError(f"the drive {drive.trajectory!r} has {len(drive.station_m)} pose; a route needs two")
-        self.station_m = drive.station_m
-        self.xy = drive.xyz[:, :2]
-        self.length_m = float(drive.station_m[-1])
+    def __init__(self, drive: Drive) -> None:
+        if len(drive.poses) < 2:
+            raise ValueError(f"the drive {drive.name!r} has {len(drive.poses)} pose; a route needs two")
+        self.station_m = np.array([one.station_m for one in drive.poses])
+        self.xy = np.array([one.pose.xyz[:2] for one in drive.poses])
+        self.length_m = float(self.station_m[-1])
 
     def locate(self, pose: Pose, near_m: float | None = None) -> tuple[float, float]:
         """The station of the nearest point of the route, and the distance from it, both in metres.

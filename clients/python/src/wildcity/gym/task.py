@@ -10,9 +10,20 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..drives import RecordedDrive, recorded_drive
 from ..observation import Observation
-from ..protocol import Action, Dynamics, ImagePart, Model, Outputs, Rig, Station, Welcome
+from ..protocol import (
+    Action,
+    Drive,
+    DriveSection,
+    Dynamics,
+    ImagePart,
+    Model,
+    Opened,
+    Outputs,
+    Rig,
+    Station,
+    Welcome,
+)
 from .route import Route
 
 ACCELERATION_M_S2 = 9.8
@@ -88,8 +99,8 @@ class DriveConfig:
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}; an episode has at least one step")
 
-    def open_options(self) -> dict[str, Any]:
-        """Arguments of `Client.open`."""
+    def open_options(self, welcome: Welcome) -> dict[str, Any]:
+        """Arguments of `Client.open`. Raises `ValueError` if the twin has no drive to follow."""
         images = {camera: ImagePart(size=self.size) for camera in self.cameras}
         return {
             "twin": self.twin,
@@ -99,6 +110,7 @@ class DriveConfig:
             "outputs": Outputs(cameras=self.cameras, encoding="raw", images=images),
             "dynamics": Dynamics(self.dynamics, speed=self.speed),
             "dt_us": self.dt_us,
+            "trajectory": DriveSection(self._drive_name(welcome)),
         }
 
     def observation_space(self) -> spaces.Dict:
@@ -120,17 +132,13 @@ class DriveConfig:
         """Acceleration by 9.8 m/s² and curvature by 0.2 1/m (positive to the left)."""
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-    def recorded(self, welcome: Welcome, version: int) -> RecordedDrive:
-        """The drive to follow. Raises `ValueError` if the twin has none."""
-        name = self.trajectory
-        if name is None:
-            drives = [drive.name for twin in welcome.twins if twin.name == self.twin for drive in twin.trajectories]
-            if not drives:
-                raise ValueError(f"twin {self.twin!r} has no recorded drive to follow")
-            name = drives[0]
-        return recorded_drive(
-            self.twin, name, server=self.server, version=version, token=self.token, timeout=self.timeout
-        )
+    def _drive_name(self, welcome: Welcome) -> str:
+        if self.trajectory is not None:
+            return self.trajectory
+        drives = [drive.name for twin in welcome.twins if twin.name == self.twin for drive in twin.trajectories]
+        if not drives:
+            raise ValueError(f"twin {self.twin!r} has no recorded drive to follow")
+        return drives[0]
 
 
 def image_key(camera: str) -> str:
@@ -138,12 +146,18 @@ def image_key(camera: str) -> str:
     return f"image_{camera.replace('.', '_')}"
 
 
+def drive_of(opened: Opened) -> Drive:
+    """The drive that `open_options` asks for."""
+    assert opened.trajectory is not None, "the server left out the drive that was asked for"
+    return opened.trajectory
+
+
 class DriveTask:
     """Episodes along one recorded drive."""
 
-    def __init__(self, config: DriveConfig, drive: RecordedDrive) -> None:
+    def __init__(self, config: DriveConfig, drive: Drive) -> None:
         self.config = config
-        self.trajectory = drive.trajectory
+        self.trajectory = drive.name
         self.route = Route(drive)
         self._state: DriveState | None = None
         self._steps = 0

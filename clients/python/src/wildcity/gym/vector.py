@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ..aio import Client, Session, connect
-from .task import DriveConfig, DriveTask, Seen
+from .task import DriveConfig, DriveTask, Seen, drive_of
 
 T = TypeVar("T")
 
@@ -157,12 +157,11 @@ async def _open_all(config: DriveConfig, count: int) -> list[_Lane]:
     clients = await asyncio.gather(
         *(connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token) for _ in range(count))
     )
-    sessions = await asyncio.gather(*(client.open(**config.open_options()) for client in clients))
-    # Read once: all sessions show the same version.
-    version = sessions[0].opened.version
-    drive = await asyncio.to_thread(config.recorded, clients[0].welcome, version)
+    options = config.open_options(clients[0].welcome)
+    sessions = await asyncio.gather(*(client.open(**options) for client in clients))
     return [
-        _Lane(client, session, DriveTask(config, drive)) for client, session in zip(clients, sessions, strict=True)
+        _Lane(client, session, DriveTask(config, drive_of(session.opened)))
+        for client, session in zip(clients, sessions, strict=True)
     ]
 
 
