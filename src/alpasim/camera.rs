@@ -101,7 +101,8 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
             (first != end).then_some(RollingShutter { direction, world_from_camera_first: first })
         }
     };
-    Ok(View { camera, world_from_camera: end, rolling_shutter })
+    // Only moving actors need the readout of a camera at rest, and none are drawn.
+    Ok(View { camera, world_from_camera: end, rolling_shutter, readout: None })
 }
 
 /// A camera of a rig, as `get_available_cameras` lists it.

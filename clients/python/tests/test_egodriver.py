@@ -8,14 +8,16 @@ import os
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+import wildcity
 from carla_driver_interface.driver import BaseDriver, DriveContext, DriveResult
 from carla_driver_interface.geometry import Pose, Trajectory
 from carla_driver_interface.policies import load_policy
 from carla_driver_interface.server import serving
-from test_end_to_end import Server, server
+from test_end_to_end import PAIR, Server, server, write_corridor, write_log
 
 COMMON = ["--steps", "6", "--warm-up-us", "500000", "--cameras", "front", "--size", "96x64", "--rig", "vehicle6"]
 
@@ -159,3 +161,78 @@ def test_episodes_run_beside_each_other(server: Server) -> None:
     assert status == 0, errors
     assert sorted(report["seed"] for report in reports) == [0, 1, 2]
     assert len({report["frames_hash"] for report in reports}) == 1
+
+
+def run_suite(folder: Path, agent: str) -> tuple[int, dict[str, Any]]:
+    """Runs a scenario of 0.6 s along the corridor, and returns the exit code and result.json."""
+    binary = os.environ["WILDCITY_BIN"]
+    write_corridor(folder / "corridor.ply")
+    write_log(folder / "log.json")
+    (folder / "rig.json").write_text(json.dumps(wildcity.protocol.encode(PAIR)))
+    twins = ["--twins", str(folder / "twins")]
+    files = ["--trajectory", str(folder / "log.json"), "--rig", str(folder / "rig.json")]
+    subprocess.run([binary, "import", str(folder / "corridor.ply"), "--twin", "corridor", *files, *twins], check=True)
+    scenario = {
+        "format": "wildcity.scenario/1",
+        "name": "straight",
+        "twin": {"name": "corridor"},
+        "ego": {
+            "start": {"trajectory": "log", "station_m": 2.0},
+            "dynamics": {"model": "dynamic", "speed": 5.0},
+        },
+        "end": {"time_s": 0.6, "off_route_m": 10.0},
+    }
+    (folder / "straight.json").write_text(json.dumps(scenario))
+    command = [binary, "episode", "run", str(folder / "straight.json"), "--agent", agent, *twins]
+    done = subprocess.run([*command, "--out", str(folder / "out"), "--retries", "0"], timeout=120)
+    return done.returncode, json.loads((folder / "out" / "result.json").read_text())
+
+
+def test_a_suite_judges_a_driver(tmp_path: Path) -> None:
+    with driver(load_policy("route_follower")) as address:
+        status, result = run_suite(tmp_path, f"egodriver:{address}")
+    assert (status, result["agent"], result["counts"]["passed"]) == (0, f"egodriver:{address}", 1), result
+
+
+def test_a_suite_counts_a_broken_driver_as_not_driven(tmp_path: Path) -> None:
+    with driver(Broken("raises")) as address:
+        status, result = run_suite(tmp_path, f"egodriver:{address}")
+    (episode,) = result["episodes"]
+    assert (status, result["counts"]["technical"]) == (3, 1), result
+    assert [error["kind"] for error in episode["errors"]] == ["agent_error"]
+
+
+@pytest.mark.parametrize("agent", ["egodriver:", "egodriver:127.0.0.1:1; true"])
+def test_an_address_that_is_none_is_refused(tmp_path: Path, agent: str) -> None:
+    binary = os.environ["WILDCITY_BIN"]
+    suite = Path(__file__).parents[3] / "scenes" / "suites" / "street" / "suite.json"
+    command = [binary, "episode", "run", str(suite), "--agent", agent, "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "expected egodriver:HOST:PORT" in done.stderr, done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server with the demo street."""
+    folder = tmp_path_factory.mktemp("street")
+    environment = {**os.environ, "XDG_DATA_HOME": str(folder / "data"), "XDG_STATE_HOME": str(folder / "state")}
+    demo = [os.environ["WILDCITY_BIN"], "demo", "--steps", "1", "--out", str(folder / "demo")]
+    subprocess.run(demo, env=environment, check=True, stdout=subprocess.DEVNULL, timeout=300)
+    with wildcity.serve(folder / "data" / "wildcity" / "twins") as running:
+        yield Server(running.url)
+
+
+@pytest.mark.parametrize("policy", ["route_follower", "constant_speed"])
+def test_a_stock_policy_drives_60_steps_of_the_demo_street(street: Server, policy: str) -> None:
+    options = ["--steps", "60", "--cameras", "front", "--size", "96x62"]
+    command = [os.environ["WILDCITY_BIN"], "drive", "demo", "--server", street.url, *options]
+    with driver(load_policy(policy)) as address:
+        runs = [
+            subprocess.run([*command, "--egodriver", address], capture_output=True, text=True, timeout=240)
+            for _ in range(2)
+        ]
+    first, again = (json.loads(run.stdout) for run in runs)
+    assert (first["outcome"], first["steps"]) == ("completed", 60), runs[0].stderr
+    assert first["distance_m"] > 20.0
+    assert again == first

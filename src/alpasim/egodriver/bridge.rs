@@ -9,7 +9,7 @@ use std::time::Duration;
 use glam::{DMat3, DQuat, DVec3};
 
 use wildcity_client::protocol::message::{
-    Drive, DrivePose, DriveSection, ImagePart, Opened, Outputs, RigChoice, Start,
+    Drive, DrivePose, DriveSection, ImagePart, Opened, Outputs, Start,
 };
 use wildcity_client::{
     Client, ClientError, ConnectOptions, Dynamics, DynamicsChoice, DynamicsModel, HttpClient,
@@ -20,7 +20,7 @@ use wildcity_scene::rig::RigCamera;
 
 use super::driver::{Driver, DriverError};
 use super::plan::trajectory;
-use super::route::Route;
+use super::route::{Route, waypoints};
 use crate::camera::{available, logical_id};
 use crate::limits;
 use crate::scene::LocalFrame;
@@ -42,16 +42,13 @@ pub struct EpisodeSettings {
     pub token: Option<String>,
     /// `HOST:PORT` of the driver.
     pub driver: String,
-    /// Name of the twin.
-    pub twin: String,
-    /// Its version; the latest if absent.
-    pub version: Option<u64>,
-    /// Name of the drive to follow; the first of the twin if absent.
+    /// What is opened: twin, version, rig, scenario, times. Its outputs are not used. Without dynamics, the ego is
+    /// `model` at `speed_m_s`.
+    pub open: Open,
+    /// Name of the drive to follow; the one of the start, or the first of the twin, if absent.
     pub trajectory: Option<String>,
-    /// Where to start along it, in metres; after the warm-up if absent.
+    /// Where to start along it, in metres; as `open` says if absent.
     pub start_m: Option<f64>,
-    /// Name of a rig; the twin's own if absent.
-    pub rig: Option<String>,
     /// Cameras to send; all of the rig if absent.
     pub cameras: Option<Vec<String>>,
     /// Width and height of the images, in pixels; those of the rig if absent.
@@ -60,11 +57,9 @@ pub struct EpisodeSettings {
     pub model: DynamicsModel,
     /// Speed at the start, in m/s; as recorded if absent.
     pub speed_m_s: Option<f64>,
-    /// Length of the recorded drive before the start, in microseconds.
-    pub warm_up_us: i64,
     /// Frames of each camera before the first decision.
     pub frames: u32,
-    /// Steps of 0.1 s.
+    /// Steps.
     pub steps: u64,
     /// Seed of the episode.
     pub seed: u64,
@@ -174,14 +169,20 @@ async fn recorded_drive(
     client: &Client,
     options: &ConnectOptions,
 ) -> Result<Drive, BridgeError> {
-    let twin = client.welcome().twins.iter().find(|twin| twin.name == settings.twin);
+    let open = &settings.open;
+    let twin = client.welcome().twins.iter().find(|twin| twin.name == open.twin);
     let first = twin.and_then(|twin| twin.trajectories.first()).map(|drive| drive.name.clone());
-    let name = settings.trajectory.clone().or(first).ok_or_else(|| {
-        BridgeError::Setting(format!("twin {:?} has no recorded drive to follow", settings.twin))
+    let started = match &open.start {
+        Some(Start::Station { trajectory, .. }) => Some(trajectory.clone()),
+        Some(Start::Random { random }) => random.trajectory.clone(),
+        Some(Start::Pose { .. }) | None => None,
+    };
+    let name = settings.trajectory.clone().or(started).or(first).ok_or_else(|| {
+        BridgeError::Setting(format!("twin {:?} has no recorded drive to follow", open.twin))
     })?;
     let http = HttpClient::new(&http_address(&settings.server), options)?;
     let section = DriveSection { name, from_m: None, to_m: None, every_m: None };
-    let drive = http.trajectory(&settings.twin, settings.version, &section).await?;
+    let drive = http.trajectory(&open.twin, open.version, &section).await?;
     let count = drive.poses.len();
     if count < 2 {
         let text = format!("trajectory {:?} has {count} poses; a route needs two", drive.name);
@@ -200,8 +201,6 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
     let start_m = settings.start_m;
     let start =
         start_m.map(|station_m| Start::Station { trajectory: drive.name.clone(), station_m });
-    let speed = settings.speed_m_s.unwrap_or_else(|| recorded_speed_m_s(drive, settings));
-    let dynamics = Dynamics { model: settings.model, speed, reverse: false };
     let images = settings.size_px.iter().flat_map(|size| {
         let names = settings.cameras.iter().flatten();
         names.map(|name| {
@@ -209,20 +208,22 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
             (name.clone(), ImagePart { crop: None, size })
         })
     });
+    let dynamics = || {
+        let speed = settings.speed_m_s.unwrap_or_else(|| recorded_speed_m_s(drive, settings));
+        DynamicsChoice::Full(Dynamics { model: settings.model, speed, reverse: false })
+    };
+    let given = &settings.open;
     Open {
-        version: settings.version,
         seed: settings.seed,
-        start,
-        rig: settings.rig.clone().map(RigChoice::Preset),
+        start: start.or_else(|| given.start.clone()),
         outputs: Outputs {
             cameras: settings.cameras.clone(),
             images: images.collect(),
             frames: Some(u64::from(settings.frames)),
             ..Outputs::default()
         },
-        dynamics: Some(DynamicsChoice::Full(dynamics)),
-        warm_up_us: Some(settings.warm_up_us),
-        ..Open::twin(&settings.twin)
+        dynamics: Some(given.dynamics.unwrap_or_else(dynamics)),
+        ..given.clone()
     }
 }
 
@@ -231,7 +232,7 @@ fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
     let first_us = drive.poses[0].time_us;
     let is_after = |at: &DrivePose| match settings.start_m {
         Some(start_m) => at.station_m >= start_m,
-        None => at.time_us >= first_us + settings.warm_up_us,
+        None => at.time_us >= first_us + settings.open.warm_up_us.unwrap_or_default(),
     };
     let after = drive.poses.iter().position(is_after).unwrap_or(0);
     let after = after.clamp(1, drive.poses.len() - 1);
@@ -327,14 +328,18 @@ impl<'a> Episode<'a> {
             }
             let here = ego_pose(&seen)?;
             let now_us = driver_us(seen.metadata().time_us);
-            let waypoints = self.route.ahead(&here);
+            let waypoints = match &seen.metadata().route {
+                Some(route) => waypoints(&route.points),
+                None => self.route.ahead(&here),
+            };
             driver.submit_route(wire::Route { waypoints, timestamp_us: now_us }).await?;
             let plan = driver.drive(now_us, now_us + self.dt_us.unsigned_abs()).await?;
             let planned =
                 trajectory(plan.trajectory.as_ref(), &self.frame, &here, now_us, self.dt_us)?;
             let is_last = plan.terminate_session || step == self.settings.steps;
             seen = client.drive(Movement::Trajectory(planned), is_last).await?;
-            if is_last {
+            // A rule of the scenario may have ended it before.
+            if seen.metadata().terminated {
                 break;
             }
         }

@@ -76,9 +76,35 @@ impl Route {
     }
 }
 
+/// The 20 points of a scenario's route, which are in the rig frame and have the same distances, at height 0. A route that
+/// ends before goes straight on.
+pub(super) fn waypoints(points: &[[f64; 3]]) -> Vec<Vec3> {
+    let mut ahead: Vec<DVec2> = points.iter().map(|&[x, y, _]| DVec2::new(x, y)).collect();
+    let direction = match ahead.as_slice() {
+        [.., before, last] => (*last - *before).normalize_or(DVec2::X),
+        _ => DVec2::X,
+    };
+    let spacing_m = AHEAD_M / (WAYPOINTS - 1) as f64;
+    while ahead.len() < WAYPOINTS {
+        let next = ahead.last().map_or(DVec2::ZERO, |last| *last + spacing_m * direction);
+        ahead.push(next);
+    }
+    ahead.iter().map(|point| Vec3 { x: point.x as f32, y: point.y as f32, z: 0.0 }).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_route_that_ends_goes_straight_on() {
+        let spacing_m = 80.0 / 19.0;
+        let ahead = waypoints(&[[0.0, 1.0, 2.0], [0.0, 1.0 + spacing_m, 2.0]]);
+        assert_eq!(ahead.len(), 20);
+        assert!(ahead.iter().all(|point| point.x == 0.0 && point.z == 0.0));
+        assert!((ahead[19].y - 81.0).abs() < 1e-4, "{ahead:?}");
+        assert_eq!(waypoints(&[])[1].x, spacing_m as f32);
+    }
 
     #[test]
     fn the_route_is_ahead_of_the_ego_and_goes_straight_on() {

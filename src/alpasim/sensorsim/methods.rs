@@ -57,9 +57,9 @@ impl Sensorsim {
     pub(super) async fn get_available_scenes(
         &self,
     ) -> Result<common::AvailableScenesReturn, Status> {
-        let twins = self.engine.twins().await.map_err(SensorsimError::from)?;
+        let listed = self.engine.twins().await.map_err(SensorsimError::from)?;
         let mut scene_ids = Vec::new();
-        for twin in &twins {
+        for twin in &listed.twins {
             for drive in &twin.trajectories {
                 for start_m in listed_starts_m(drive.length_m) {
                     let id = SceneId {
@@ -116,9 +116,9 @@ impl Sensorsim {
     pub(super) async fn get_available_ego_masks(
         &self,
     ) -> Result<wire::AvailableEgoMasksReturn, Status> {
-        let twins = self.engine.twins().await.map_err(SensorsimError::from)?;
+        let listed = self.engine.twins().await.map_err(SensorsimError::from)?;
         let mut ego_mask_metadata = Vec::new();
-        for twin in &twins {
+        for twin in &listed.twins {
             let opened = self.engine.open_version(twin.name.clone(), Some(twin.number)).await;
             let resident = opened.map_err(SensorsimError::from)?;
             let Some(rig) = &resident.version.manifest.rig else { continue };
