@@ -16,10 +16,10 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from carla_driver_interface._proto import sensorsim_pb2, sensorsim_pb2_grpc
+from carla_driver_interface._proto import sensorsim_pb2
 from numpy.typing import NDArray
 from PIL import Image
-from test_alpasim import AT, FORWARD, listening, pose
+from test_alpasim import AT, FORWARD, Stub, listening, pose
 from test_end_to_end import write_log
 
 SCENE = "points@1+log+0"
@@ -80,7 +80,7 @@ def stub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:
         try:
             with grpc.insecure_channel(listening(process)["AlpaSim: listening on "]) as channel:
-                yield sensorsim_pb2_grpc.SensorsimServiceStub(channel)
+                yield Stub(channel)
         finally:
             process.terminate()
 

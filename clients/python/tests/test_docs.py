@@ -31,20 +31,6 @@ PAGES = [
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-@pytest.fixture(scope="module")
-def reader(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of a reader with `wildcity` on the path and the demo twin built."""
-    binary = os.environ.get("WILDCITY_BIN")
-    assert binary, "set WILDCITY_BIN to the built wildcity binary"
-    home = tmp_path_factory.mktemp("home")
-    environment = dict(os.environ)
-    environment["PATH"] = f"{Path(binary).parent}:{Path(sys.executable).parent}:{environment['PATH']}"
-    for name in ("DATA", "STATE", "CACHE"):
-        environment[f"XDG_{name}_HOME"] = str(home / name.lower())
-    run(["wildcity", "demo", "--steps", "1", "--out", str(home / "demo")], home, environment)
-    return environment
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_does_what_it_says(page: str, reader: dict[str, str], tmp_path: Path) -> None:
     write_ply(tmp_path / "capture.ply", 0.0, 1)
