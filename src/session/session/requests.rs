@@ -6,7 +6,7 @@
 use serde_json::Value;
 use tokio::time::Instant;
 
-use wildcity_render::{Backend, Frame};
+use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
 
@@ -26,10 +26,18 @@ use crate::options::{ResetOptions, Start, StepOptions};
 use crate::pin::pin;
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
-use crate::scenario::EpisodeTraffic;
+use crate::scenario::assets::FrameDetail;
+use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
+
+/// What a frame shows beside the twin: the ego and its past, and the actors.
+#[derive(Clone, Copy)]
+pub(super) struct Moment<'a> {
+    pub(super) episode: &'a Episode,
+    pub(super) traffic: Option<&'a EpisodeTraffic>,
+}
 
 impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
@@ -74,7 +82,8 @@ impl Session {
 
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
+        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = RecordedCommand::of(&command);
@@ -123,7 +132,8 @@ impl Session {
         }
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
-        let rendered = self.render(&self.version, &episode, captures, None).await?;
+        let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, None).await?;
         self.record(self.frame_record(FrameRequest::Observe, &episode, &rendered)).await?;
         Ok(rendered.observation)
     }
@@ -157,12 +167,14 @@ impl Session {
             Some(scenario) => {
                 let scenario = scenario.clone();
                 let version = self.resident().version.clone();
-                Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
+                let engine = self.engine.clone();
+                let find = move || scenario.of_episode(seed, &version, engine.cache());
+                Some(run_blocking(find).await??)
             }
         };
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
-            .or_else(|| settings.scenario.as_ref()?.start_of(loaded.as_ref()?));
+            .or_else(|| settings.scenario.as_ref()?.start_of(&loaded.as_ref()?.loaded));
         let start = match &start {
             // Dynamics decide whether a start is placed on the ground.
             None if dynamics.model == settings.dynamics.model => settings.start.clone(),
@@ -177,11 +189,15 @@ impl Session {
             .map_err(|error| error.of_reset(Some(start)))?,
         };
         let mut next = start.episode(seed, dynamics, settings.dt_us);
-        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
+        let exposure_us = View::longest_exposure_us(settings.layout.cameras());
+        let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
+            EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
+        });
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
+        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let scenario = scenario_hash(traffic.as_ref());
@@ -218,10 +234,11 @@ impl Session {
     pub(super) async fn render(
         &self,
         version: &PinnedVersion,
-        episode: &Episode,
+        moment: Moment<'_>,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
+        let Moment { episode, traffic } = moment;
         let layout = &self.settings.layout;
         let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(
@@ -237,11 +254,17 @@ impl Session {
                 continue;
             }
             let views = layout.views(episode, &capture);
+            let viewpoints = viewpoints(&views);
+            let profile = version.profile;
+            let placed = traffic.map(|traffic| {
+                let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };
+                traffic.placed(capture.time_us, detail)
+            });
             // Load before the job is queued, so that no render thread waits for a disk.
             let resident = version.resident.clone();
-            let pinned = pin(resident, version.profile, deadline, viewpoints(&views)).await?;
+            let mut pinned = pin(resident, profile, deadline, viewpoints).await?;
+            pinned.place(placed.unwrap_or_default());
             builder.add_load(pinned.waited_for, pinned.waited);
-            let profile = version.profile;
             let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
             let cost = FrameCost { session: self.number, pixels };
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
