@@ -15,7 +15,7 @@ use tokio::task::JoinHandle;
 
 use wildcity_session::Engine;
 
-use super::methods::Sensorsim;
+use super::methods::{Sensorsim, stopped};
 use crate::grpc::{unary, unimplemented};
 use crate::limits;
 use crate::wire::common::Empty;
@@ -103,12 +103,6 @@ impl Running {
             tracing::warn!("some AlpaSim clients did not leave within {:?}", limits::DRAIN);
         }
     }
-}
-
-/// Returns when the service stops.
-pub(super) async fn stopped(mut stopping: watch::Receiver<bool>) {
-    // An error means that the sender was dropped, which stops the service as well.
-    let _ = stopping.wait_for(|&stop| stop).await;
 }
 
 async fn accept(

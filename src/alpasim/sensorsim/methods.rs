@@ -12,7 +12,6 @@ use tonic::Status;
 use wildcity_scene::rig::RigCamera;
 use wildcity_session::Engine;
 
-use super::listen::stopped;
 use super::open::OpenVersions;
 use super::render::{OpenScene, images};
 use super::status::SensorsimError;
@@ -231,4 +230,10 @@ impl Sensorsim {
             }
         }
     }
+}
+
+/// Returns when the service stops.
+pub(super) async fn stopped(mut stopping: watch::Receiver<bool>) {
+    // An error means that the sender was dropped, which stops the service as well.
+    let _ = stopping.wait_for(|&stop| stop).await;
 }
