@@ -15,9 +15,8 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, RenderProfile};
 use wildcity_session::{
-    DType, Encoding, Engine, Observation, Outputs, RigChoice,
-    ScenarioError, ScenarioOptions, ScenarioSource, Session, SessionError, SessionOptions, Start,
-    StepOptions, TensorKind,
+    DType, Encoding, Engine, Observation, Outputs, RigChoice, ScenarioError, ScenarioOptions,
+    ScenarioSource, Session, SessionError, SessionOptions, Start, StepOptions, TensorKind,
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
