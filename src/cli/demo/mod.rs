@@ -58,7 +58,7 @@ pub(super) struct Demo {
     out: PathBuf,
 
     /// Open the street in the viewer of a browser, instead of driving through it as an agent.
-    #[arg(long, conflicts_with = "steps")]
+    #[arg(long, conflicts_with_all = ["steps", "scenario"])]
     view: bool,
 
     #[command(flatten)]
