@@ -109,7 +109,7 @@ impl Cut {
         let bytes = ingest::read_whole(path, MAP_BYTES as u64).with_context(context)?;
         let file = TracksFile::parse(&bytes).with_context(context)?;
         let places = swept(&file).with_context(context)?;
-        let option = format!("cut=tracks {}", blake3::hash(&bytes).to_hex());
+        let option = format!("cut={} tracks at {} places", file.tracks.len(), places.len());
         let cut = catalog.cut_all(base, &places, option)?;
         writeln!(
             io::stdout().lock(),
