@@ -23,7 +23,7 @@ def test_the_return_of_ppo_rises(server: Server) -> None:
         server=server.url,
         twin="corridor",
         rig=PAIR,
-        size=(32, 20),
+        size=(48, 36),
         horizon=30,
         speed=5.0,
         off_route_m=1.0,
