@@ -31,6 +31,7 @@ mod profile_options;
 mod progress;
 mod push;
 mod render;
+mod repair;
 mod replay;
 mod report;
 mod rig;
@@ -71,6 +72,7 @@ enum Command {
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    Repair(repair::Repair),
     Replay(replay::Replay),
     Episode(episode::Episode),
     Rig(rig::RigCommand),
@@ -99,6 +101,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Repair(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),

@@ -21,7 +21,7 @@ use crate::tiles::{Tiling, Window};
 /// Where and how a model runs.
 #[derive(Clone, Debug)]
 pub struct LoadOptions {
-    /// The runtime: a libonnxruntime.so from version 1.18 on.
+    /// The runtime: a libonnxruntime.so from version 1.18 on. An empty path is refused as `RuntimeUnnamed`.
     pub library: PathBuf,
     /// One of the manifest's; its first if none is given.
     pub provider: Option<Provider>,
@@ -127,6 +127,13 @@ impl Model {
     /// What computes.
     pub fn provider(&self) -> Provider {
         self.provider
+    }
+
+    /// Version of the runtime, as its build says.
+    pub fn runtime(&self) -> &'static str {
+        let build = onnx::build_info();
+        let branch = build.split("git-branch=").nth(1).and_then(|rest| rest.split(',').next());
+        branch.unwrap_or(build)
     }
 
     /// BLAKE3 of all that decides the bytes beside the images: manifest (which pins the files), build of the

@@ -39,6 +39,9 @@ pub fn is_loaded() -> bool {
 /// The environment; opens the library if no model did before.
 fn environment(path: &Path) -> Result<Environment, RepairError> {
     let refused = |message: String| RepairError::Runtime { path: path.to_owned(), message };
+    if path.as_os_str().is_empty() {
+        return Err(RepairError::RuntimeUnnamed);
+    }
     let library = files::check_library(path).map_err(refused)?;
     let mut runtime = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(runtime) = &*runtime {

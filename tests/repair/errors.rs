@@ -148,6 +148,15 @@ fn a_provider_that_is_not_there_is_an_error_and_not_the_cpu() {
 }
 
 #[test]
+fn without_a_library_the_error_says_how_to_name_one() {
+    let folder = Folder::new(&doubles::identity(), json!({}));
+    let error = Model::load(&folder.path(), &LoadOptions::new("")).unwrap_err();
+    assert_eq!(error, RepairError::RuntimeUnnamed);
+    let text = error.to_string();
+    assert!(text.contains("--onnxruntime") && text.contains("ORT_DYLIB_PATH"), "{text}");
+}
+
+#[test]
 fn images_of_wrong_sizes_are_refused_and_the_model_goes_on() {
     let model = Folder::new(&doubles::identity(), json!({})).load().unwrap();
     let image = picture(20, 10);

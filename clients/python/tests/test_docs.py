@@ -22,6 +22,7 @@ PAGES = [
     "docs/alpamayo.md",
     "docs/operators.md",
     "docs/pipelines.md",
+    "docs/repair.md",
     "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
