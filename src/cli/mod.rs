@@ -12,12 +12,14 @@
 use std::process::ExitCode;
 
 mod actor;
+mod alpasim;
 mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod drive;
 mod episode;
 mod exit;
 mod import;
@@ -43,6 +45,7 @@ mod sky_source;
 mod stress;
 mod time;
 mod twin;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -57,6 +60,7 @@ struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   wildcity demo                                   (build a street, drive through it, look at images)
+  wildcity demo --view                            (drive through it by hand, in the browser)
   wildcity import street.ply --twin street --axes y-down-z-forward
   wildcity serve                                  (then an agent can open the twin \"street\")
   wildcity help import                            (options and examples of one command)";
@@ -65,6 +69,7 @@ Examples:
 enum Command {
     Demo(demo::Demo),
     Serve(serve::Serve),
+    View(view::View),
     Import(import::Import),
     Inspect(inspect::Inspect),
     Push(push::Push),
@@ -73,6 +78,8 @@ enum Command {
     Actor(actor::Actor),
     Render(render::Render),
     Repair(repair::Repair),
+    Drive(drive::Drive),
+    Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
     Episode(episode::Episode),
     Rig(rig::RigCommand),
@@ -94,6 +101,7 @@ pub fn main() -> ExitCode {
     let result = match arguments.command {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
+        Command::View(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Push(command) => command.run(),
@@ -102,6 +110,8 @@ pub fn main() -> ExitCode {
         Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Repair(command) => command.run(),
+        Command::Drive(command) => command.run(),
+        Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),

@@ -28,5 +28,5 @@ pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list};
+pub use listing::{Listed, list, read_text};
 pub use outcome::result;
