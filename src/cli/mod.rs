@@ -33,6 +33,7 @@ mod profile_options;
 mod progress;
 mod push;
 mod render;
+mod repair;
 mod replay;
 mod report;
 mod rig;
@@ -76,6 +77,7 @@ enum Command {
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    Repair(repair::Repair),
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
@@ -107,6 +109,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Repair(command) => command.run(),
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),

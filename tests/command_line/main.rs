@@ -49,6 +49,7 @@ mod kills;
 mod load;
 mod push;
 mod remote;
+mod repair;
 mod replay;
 mod report;
 mod rig;

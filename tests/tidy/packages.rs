@@ -17,6 +17,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("bincode", &["src/twin/store/chunk_file.rs"]),
     ("fearless_simd", &["src/render/cpu", "src/scene/sky"]),
     ("wgpu", &["src/render/gpu"]),
+    ("ort", &["src/repair/onnx.rs"]),
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
     ("rustls", &["src/twin/store/remote", "src/server/tls.rs", "clients/rust"]),
     ("flate2", &["src/twin/ingest"]),
@@ -38,6 +39,7 @@ const FILES: &[&str] = &[
     "src/server/spool",
     "src/server/tls.rs",
     "clients/rust/src/upload.rs",
+    "src/repair/files.rs",
     "src/cli",
 ];
 

@@ -24,6 +24,7 @@ PAGES = [
     "docs/gym.md",
     "docs/operators.md",
     "docs/pipelines.md",
+    "docs/repair.md",
     "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",

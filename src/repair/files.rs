@@ -1,0 +1,80 @@
+//! Reads the files of a model. What is hashed is what runs: each file is read once, and the session is built
+//! from those bytes. A file that is replaced afterwards changes nothing until the model is loaded again.
+
+use std::fs;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::error::RepairError;
+use crate::limits::{MAX_MANIFEST_BYTES, MAX_MODEL_BYTES};
+use crate::manifest::Manifest;
+
+/// A manifest and the bytes that it names.
+pub(crate) struct ModelFiles {
+    pub(crate) manifest: Manifest,
+    pub(crate) manifest_bytes: Vec<u8>,
+    pub(crate) graph: GraphFiles,
+}
+
+/// What a session is built from.
+pub(crate) struct GraphFiles {
+    /// The .onnx file.
+    pub(crate) path: PathBuf,
+    pub(crate) bytes: Vec<u8>,
+    /// External weights, by the name that the graph uses.
+    pub(crate) weights: Vec<(String, Arc<[u8]>)>,
+}
+
+pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
+    let manifest_bytes = read_at_most(path, MAX_MANIFEST_BYTES)?;
+    let manifest = Manifest::parse(&manifest_bytes, path)?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut contents = Vec::new();
+    let mut left = MAX_MODEL_BYTES;
+    for (at, file) in manifest.files.iter().enumerate() {
+        let path = folder.join(&file.path);
+        let bytes = read_at_most(&path, left)?;
+        left -= bytes.len() as u64;
+        let found = blake3::hash(&bytes).to_hex().to_string();
+        if !found.eq_ignore_ascii_case(&file.blake3) {
+            let pinned = file.blake3.clone();
+            return Err(RepairError::Changed {
+                path,
+                field: format!("files[{at}]"),
+                pinned,
+                found,
+            });
+        }
+        contents.push((file.path.clone(), bytes));
+    }
+    let (name, bytes) = contents.remove(0);
+    let weights = contents.into_iter().map(|(name, bytes)| (name, bytes.into())).collect();
+    let graph = GraphFiles { path: folder.join(name), bytes, weights };
+    Ok(ModelFiles { manifest, manifest_bytes, graph })
+}
+
+fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
+    let error = |message: String| RepairError::File { path: path.to_owned(), message };
+    let file = fs::File::open(path).map_err(|e| error(e.to_string()))?;
+    let metadata = file.metadata().map_err(|e| error(e.to_string()))?;
+    if !metadata.is_file() {
+        return Err(error("not a regular file".to_owned()));
+    }
+    let mut bytes = Vec::new();
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(|e| error(e.to_string()))?;
+    if bytes.len() as u64 > limit {
+        return Err(error(format!("more than {limit} bytes are not read")));
+    }
+    Ok(bytes)
+}
+
+/// Whether a runtime library can be there at all: a clear message before the loader's.
+pub(crate) fn check_library(path: &Path) -> Result<PathBuf, String> {
+    let absolute =
+        fs::canonicalize(path).map_err(|error| format!("{error}; name a libonnxruntime.so"))?;
+    if !absolute.is_file() {
+        return Err("not a regular file; name a libonnxruntime.so".to_owned());
+    }
+    Ok(absolute)
+}

@@ -1,0 +1,114 @@
+//! How far a pixel of the output depends on the input, measured.
+//!
+//! A NaN goes into one pixel of every input that has pixels. Sums and products carry it on whatever the other
+//! values are, so the outputs that become NaN are all that depend on that pixel. (A small change of the value
+//! may vanish in an activation and then shows too little.) With strides the answer depends on the phase of
+//! the pixel, so each is tried. An operation that swallows NaN would hide something: the caller compares tiles
+//! with the whole once, before it relies on the halo.
+
+use crate::error::RepairError;
+use crate::limits::MAX_HALO_PROBE_PX;
+use crate::planes::Planes;
+
+/// How far the output depends on the input.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Halo {
+    /// In pixels of the input, in each direction.
+    Pixels(usize),
+    /// On the whole image, or on more than the probe could show.
+    Whole,
+}
+
+/// A model at work: planes of each input with pixels to planes of the output. NaN is no error here.
+pub(crate) type Run<'a> = dyn FnMut(&[Planes]) -> Result<Planes, RepairError> + 'a;
+
+/// What is probed.
+pub(crate) struct Probe {
+    /// Channels of each input with pixels, and its range.
+    pub(crate) inputs: Vec<(usize, [f32; 2])>,
+    pub(crate) multiple_of: usize,
+    /// Height and width, if the model takes no other.
+    pub(crate) fixed: Option<[usize; 2]>,
+    pub(crate) scale: usize,
+}
+
+impl Probe {
+    /// Measures the halo in images that grow until it fits.
+    pub(crate) fn halo(&self, run: &mut Run<'_>) -> Result<Halo, RepairError> {
+        let largest = MAX_HALO_PROBE_PX.max(4 * self.multiple_of);
+        let mut side = 64_usize.next_multiple_of(self.multiple_of).max(4 * self.multiple_of);
+        loop {
+            let size = self.fixed.unwrap_or([side; 2]);
+            if let Halo::Pixels(halo) = self.halo_at(size, run)? {
+                return Ok(Halo::Pixels(halo));
+            }
+            if self.fixed.is_some() || side >= largest {
+                return Ok(Halo::Whole);
+            }
+            side *= 2;
+        }
+    }
+
+    fn halo_at(&self, [height, width]: [usize; 2], run: &mut Run<'_>) -> Result<Halo, RepairError> {
+        let mut halo = 0;
+        for phase in 0..self.multiple_of {
+            let middle = |side: usize| {
+                (side / 2 / self.multiple_of * self.multiple_of + phase).min(side - 1)
+            };
+            let [y, x] = [middle(height), middle(width)];
+            let mut inputs = self.images(height, width);
+            for planes in &mut inputs {
+                for channel in 0..planes.channels {
+                    planes.row_mut(channel, y)[x] = f32::NAN;
+                }
+            }
+            let output = run(&inputs)?;
+            match reach(&output, [y, x], self.scale) {
+                Some(reach) => halo = halo.max(reach),
+                None => return Ok(Halo::Whole),
+            }
+        }
+        Ok(Halo::Pixels(halo))
+    }
+
+    /// The same images every time: a pattern with all frequencies, in the range of each input.
+    pub(crate) fn images(&self, height: usize, width: usize) -> Vec<Planes> {
+        let image = |(at, (channels, [black, white])): (usize, &(usize, [f32; 2]))| {
+            let mut planes = Planes::zeros(*channels, height, width);
+            let mut state = 0x9e37_79b9_u32 ^ at as u32;
+            for value in &mut planes.values {
+                // xorshift32 (Marsaglia 2003); 24 bits are a fraction of f32.
+                state ^= state << 13;
+                state ^= state >> 17;
+                state ^= state << 5;
+                *value = black + (white - black) * ((state >> 8) as f32 / 16_777_216.0);
+            }
+            planes
+        };
+        self.inputs.iter().enumerate().map(image).collect()
+    }
+}
+
+/// Largest distance of a NaN from the pixel, in pixels of the input. None if one is at the border: then more
+/// may lie beyond; or if there is none at all: then the model hides them.
+fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
+    let mut reach = None;
+    for channel in 0..output.channels {
+        for at_y in 0..output.height {
+            for (at_x, value) in output.row(channel, at_y).iter().enumerate() {
+                if !value.is_nan() {
+                    continue;
+                }
+                let is_border = [at_y, at_x].contains(&0)
+                    || at_y + 1 == output.height
+                    || at_x + 1 == output.width;
+                if is_border {
+                    return None;
+                }
+                let distance = (at_y / scale).abs_diff(y).max((at_x / scale).abs_diff(x));
+                reach = reach.max(Some(distance));
+            }
+        }
+    }
+    reach
+}

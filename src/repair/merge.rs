@@ -1,0 +1,78 @@
+//! Output of the model to an image of 8 bits.
+
+use crate::image::{Image, View};
+use crate::manifest::{Manifest, Merge, OutputRole};
+use crate::planes::Planes;
+use crate::resample::{Kernel, resample};
+use crate::roles;
+
+/// The image. `seen` is what the model got as its image, `output` what it returned for that; both are free of
+/// padding, and smaller or larger than the image if the fit is `resize`.
+pub(crate) fn merge(manifest: &Manifest, view: &View<'_>, seen: Planes, output: Planes) -> Image {
+    let role = manifest.output().role;
+    let scale = manifest.output().scale as usize;
+    let range = manifest.output().range;
+    let height = view.rendered.height * scale;
+    let width = view.rendered.width * scale;
+    let rendered = roles::rgb(view.rendered);
+    let merged = if manifest.merge == Merge::Residual {
+        let difference = match role {
+            OutputRole::Residual => output.map(|value| value / (range[1] - range[0]) * 255.0),
+            OutputRole::Rgb | OutputRole::Luma => {
+                let mut difference = roles::out_of_range(output, range);
+                let seen = roles::out_of_range(seen, manifest.image_input().range);
+                let values = difference.values.iter_mut().zip(&seen.values);
+                values.for_each(|(value, seen)| *value -= seen);
+                difference
+            }
+        };
+        added(&rendered, &resample(&difference, height, width, Kernel::Lanczos3))
+    } else {
+        let output = resample(&roles::out_of_range(output, range), height, width, Kernel::Lanczos3);
+        match role {
+            OutputRole::Luma => {
+                // Chroma as colour minus luma: that is linear, so it can be resampled without a matrix.
+                let mut chroma = rendered.clone();
+                let luma = roles::luma(&rendered);
+                for channel in 0..3 {
+                    for y in 0..chroma.height {
+                        let values = chroma.row_mut(channel, y).iter_mut().zip(luma.row(0, y));
+                        values.for_each(|(value, luma)| *value -= luma);
+                    }
+                }
+                added(&resample(&chroma, height, width, Kernel::Bicubic), &output)
+            }
+            OutputRole::Rgb | OutputRole::Residual => output,
+        }
+    };
+    image(&merged, view.mask, scale)
+}
+
+/// The sum; planes of one channel are added to each.
+fn added(planes: &Planes, more: &Planes) -> Planes {
+    let mut sum = planes.clone();
+    for channel in 0..sum.channels {
+        for y in 0..sum.height {
+            let more = more.row(channel.min(more.channels - 1), y);
+            sum.row_mut(channel, y).iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
+        }
+    }
+    sum
+}
+
+/// 0 to 255, clamped and rounded; black outside the mask.
+fn image(planes: &Planes, mask: Option<&[f32]>, scale: usize) -> Image {
+    let mut rgb8 = Vec::with_capacity(3 * planes.height * planes.width);
+    let source_width = planes.width / scale;
+    for y in 0..planes.height {
+        for x in 0..planes.width {
+            let is_inside =
+                mask.is_none_or(|mask| mask[y / scale * source_width + x / scale] > 0.0);
+            for channel in 0..3 {
+                let value = if is_inside { planes.at(channel, y, x) } else { 0.0 };
+                rgb8.push(value.round() as u8);
+            }
+        }
+    }
+    Image { width: planes.width, height: planes.height, rgb8 }
+}

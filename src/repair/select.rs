@@ -1,0 +1,83 @@
+//! Which views of a step are repaired: by trust, with hysteresis, and at most so many a step.
+//!
+//! Trust is 1 on the recorded drive, so nothing is repaired there. Two thresholds keep a camera near one of
+//! them from going on and off, which would be seen as flicker. No clock has a part in it: budgets count
+//! images, so that a replay decides alike.
+
+use serde::{Deserialize, Serialize};
+
+/// The thresholds of an episode.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Selection {
+    /// A camera is repaired from trust below this on (about 1.4 m beside the drive).
+    pub below: f64,
+    /// A camera is no longer repaired from trust above this on (about 0.8 m).
+    pub above: f64,
+    /// Under this trust nothing is repaired: a model would invent the image.
+    pub at_least: f64,
+    /// Most images of a step. Those with the least trust come first, then the first cameras.
+    pub per_step: usize,
+}
+
+impl Default for Selection {
+    fn default() -> Self {
+        Selection { below: 0.75, above: 0.85, at_least: 0.1, per_step: 16 }
+    }
+}
+
+/// What is repaired in a step.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Decision {
+    /// Per camera: whether it is in repair after this step. The `before` of the next step.
+    pub is_on: Vec<bool>,
+    /// The cameras to repair now, by index, in ascending order.
+    pub cameras: Vec<usize>,
+}
+
+impl Selection {
+    /// Checks the thresholds.
+    ///
+    /// # Errors
+    /// The field that is wrong and what is accepted.
+    pub fn check(&self) -> Result<(), String> {
+        let fields = [("below", self.below), ("above", self.above), ("at_least", self.at_least)];
+        for (field, value) in fields {
+            if !(0.0..=1.0).contains(&value) {
+                return Err(format!("{field}: {value:?}; trust is 0 to 1"));
+            }
+        }
+        if self.above < self.below {
+            let (above, below) = (self.above, self.below);
+            return Err(format!(
+                "above: {above:?} is less than below ({below:?}); give at least {below:?}"
+            ));
+        }
+        if self.at_least > self.below {
+            let (least, below) = (self.at_least, self.below);
+            return Err(format!(
+                "at_least: {least:?} is more than below ({below:?}); nothing would be repaired"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Decides a step. `trust` has a value per camera; `before` says which cameras were in repair after the
+    /// previous step, and is empty after a reset and for single observations, which have no history. A trust
+    /// that is not a number counts as 0.
+    pub fn decide(&self, before: &[bool], trust: &[f64]) -> Decision {
+        let trust: Vec<f64> = trust.iter().map(|t| if t.is_nan() { 0.0 } else { *t }).collect();
+        let was_on = |camera: usize| before.get(camera).copied().unwrap_or(false);
+        let is_on = |camera: usize| match was_on(camera) {
+            true => trust[camera] <= self.above,
+            false => trust[camera] < self.below,
+        };
+        let is_on: Vec<bool> = (0..trust.len()).map(is_on).collect();
+        let is_chosen = |camera: &usize| is_on[*camera] && trust[*camera] >= self.at_least;
+        let mut cameras: Vec<usize> = (0..trust.len()).filter(is_chosen).collect();
+        cameras.sort_by(|a, b| trust[*a].total_cmp(&trust[*b]).then(a.cmp(b)));
+        cameras.truncate(self.per_step);
+        cameras.sort_unstable();
+        Decision { is_on, cameras }
+    }
+}

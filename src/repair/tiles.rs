@@ -1,0 +1,138 @@
+//! Windows of an image that equal the whole.
+//!
+//! Every window has the size of a tile and begins at a multiple of `multiple_of`, so that strides fall on the
+//! same pixels as in the whole image. Of a window only the part counts that is at least a halo away from its
+//! borders, except where its border is that of the image: there the model pads as it does in the whole.
+
+use crate::error::RepairError;
+use crate::planes::Rect;
+
+/// A tile: what the model sees, and which part of its output is used.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Window {
+    /// In the image.
+    pub(crate) seen: Rect,
+    /// In the image, within `seen`. The parts of all windows cover the image, each pixel once.
+    pub(crate) used: Rect,
+}
+
+/// How images are cut.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Tiling {
+    /// Height and width of a window.
+    pub(crate) tile: [usize; 2],
+    pub(crate) multiple_of: usize,
+    pub(crate) halo: usize,
+}
+
+impl Tiling {
+    /// The windows of an image whose sides are multiples of `multiple_of`.
+    pub(crate) fn windows(&self, height: usize, width: usize) -> Result<Vec<Window>, RepairError> {
+        let rows = self.spans(height, self.tile[0])?;
+        let columns = self.spans(width, self.tile[1])?;
+        let mut windows = Vec::with_capacity(rows.len() * columns.len());
+        for row in &rows {
+            for column in &columns {
+                windows.push(Window {
+                    seen: Rect {
+                        top: row.start,
+                        left: column.start,
+                        height: row.len,
+                        width: column.len,
+                    },
+                    used: Rect {
+                        top: row.used.0,
+                        left: column.used.0,
+                        height: row.used.1 - row.used.0,
+                        width: column.used.1 - column.used.0,
+                    },
+                });
+            }
+        }
+        Ok(windows)
+    }
+
+    /// The windows along one axis.
+    fn spans(&self, side: usize, tile: usize) -> Result<Vec<Span>, RepairError> {
+        if side <= tile {
+            return Ok(vec![Span { start: 0, len: side, used: (0, side) }]);
+        }
+        // From one window to the next: without both halos, rounded down so that phases stay.
+        let stride = tile.saturating_sub(2 * self.halo) / self.multiple_of * self.multiple_of;
+        if stride == 0 {
+            let message = format!(
+                "a tile of {tile} px has nothing within its halo of {} px on each side; use larger tiles",
+                self.halo
+            );
+            return Err(RepairError::Tiles { message });
+        }
+        let mut spans = Vec::new();
+        let mut start = 0;
+        let mut covered = 0;
+        loop {
+            let is_last = start + tile >= side;
+            let start_here = if is_last { side - tile } else { start };
+            let end = if is_last { side } else { start_here + tile - self.halo };
+            spans.push(Span { start: start_here, len: tile, used: (covered, end) });
+            if is_last {
+                return Ok(spans);
+            }
+            covered = end;
+            start += stride;
+        }
+    }
+}
+
+/// A window along one axis.
+struct Span {
+    start: usize,
+    len: usize,
+    /// First pixel and the one after the last.
+    used: (usize, usize),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_cover_each_pixel_once_with_a_halo_to_spare() {
+        for (height, width, tile, multiple_of, halo) in [
+            (231, 359, [64, 80], 1, 7),
+            (256, 512, [64, 64], 4, 20),
+            (40, 300, [64, 64], 1, 31),
+            (192, 192, [128, 128], 64, 30),
+        ] {
+            let tiling = Tiling { tile, multiple_of, halo };
+            let windows = tiling.windows(height, width).unwrap();
+            let mut count = vec![0; height * width];
+            for Window { seen, used } in &windows {
+                assert!(seen.top % multiple_of == 0 && seen.left % multiple_of == 0);
+                assert!(seen.height <= tile[0] && seen.width <= tile[1]);
+                let spare = |start: usize, from: usize| start == 0 || from >= start + halo;
+                assert!(
+                    spare(seen.top, used.top) && spare(seen.left, used.left),
+                    "{seen:?} {used:?}"
+                );
+                let end = |start: usize, len: usize, to: usize, side: usize| {
+                    start + len == side || to + halo <= start + len
+                };
+                assert!(end(seen.top, seen.height, used.top + used.height, height));
+                assert!(end(seen.left, seen.width, used.left + used.width, width));
+                for y in used.top..used.top + used.height {
+                    for x in used.left..used.left + used.width {
+                        count[y * width + x] += 1;
+                    }
+                }
+            }
+            assert!(count.iter().all(|n| *n == 1), "{tiling:?}");
+        }
+    }
+
+    #[test]
+    fn a_halo_that_fills_the_tile_is_refused() {
+        let tiling = Tiling { tile: [64, 64], multiple_of: 1, halo: 32 };
+        let error = tiling.windows(100, 100).unwrap_err();
+        assert!(error.to_string().contains("use larger tiles"), "{error}");
+    }
+}

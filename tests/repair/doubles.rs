@@ -1,0 +1,123 @@
+//! Graphs that stand in for models: each does one thing.
+
+use crate::protobuf::{
+    BOOL, Dim, F16, F32, Graph, I64, floats, graph_attribute, int, ints, node, port, tensor,
+};
+
+const IMAGE: [Dim; 4] = [Some(1), Some(3), None, None];
+
+/// One input, one output, both RGB in f32.
+fn rgb(nodes: Vec<crate::protobuf::Message>, constants: Vec<crate::protobuf::Message>) -> Vec<u8> {
+    let inputs = vec![port("image", F32, &IMAGE)];
+    let outputs = vec![port("repaired", F32, &[Some(1), None, None, None])];
+    Graph { nodes, constants, inputs, outputs }.onnx()
+}
+
+/// The image itself.
+pub(crate) fn identity() -> Vec<u8> {
+    rgb(vec![node("Identity", &["image"], &["repaired"], &[])], Vec::new())
+}
+
+/// The image, times or plus a number.
+pub(crate) fn arithmetic(operator: &str, value: f32) -> Vec<u8> {
+    rgb(
+        vec![node(operator, &["image", "value"], &["repaired"], &[])],
+        vec![floats("value", &[], &[value])],
+    )
+}
+
+/// A value of 0.5 or more becomes NaN: the square root of 0.49 - value.
+pub(crate) fn nan_where_bright() -> Vec<u8> {
+    let nodes = vec![
+        node("Sub", &["limit", "image"], &["left"], &[]),
+        node("Sqrt", &["left"], &["repaired"], &[]),
+    ];
+    rgb(nodes, vec![floats("limit", &[], &[0.49])])
+}
+
+/// Six channels.
+pub(crate) fn six_channels() -> Vec<u8> {
+    rgb(vec![node("Concat", &["image", "image"], &["repaired"], &[int("axis", 1)])], Vec::new())
+}
+
+/// A convolution of `side` x `side`, with a stride of `stride` there and back. Its halo is known.
+pub(crate) fn convolution(side: usize, stride: usize) -> Vec<u8> {
+    let pad = (side / 2) as u64;
+    // Depthwise: each channel by itself, weights that are all different.
+    let count = 3 * side * side;
+    let weights: Vec<f32> = (0..count).map(|at| ((at * 37 % 101) as f32 - 50.0) / 500.0).collect();
+    let constants = vec![floats("w", &[3, 1, side as u64, side as u64], &weights)];
+    let attributes = [
+        ints("pads", &[pad, pad, pad, pad]),
+        ints("strides", &[stride as u64, stride as u64]),
+        int("group", 3),
+    ];
+    let mut nodes = vec![node("Conv", &["image", "w"], &["small"], &attributes)];
+    let mut constants = constants;
+    if stride == 1 {
+        nodes.push(node("Identity", &["small"], &["repaired"], &[]));
+    } else {
+        // Each value becomes a block: a transposed convolution with ones.
+        constants.push(floats(
+            "ones",
+            &[3, 1, stride as u64, stride as u64],
+            &vec![1.0; 3 * stride * stride],
+        ));
+        let attributes = [ints("strides", &[stride as u64, stride as u64]), int("group", 3)];
+        nodes.push(node("ConvTranspose", &["small", "ones"], &["repaired"], &attributes));
+    }
+    rgb(nodes, constants)
+}
+
+/// Every output pixel depends on every input pixel.
+pub(crate) fn global() -> Vec<u8> {
+    let nodes = vec![
+        node("GlobalAveragePool", &["image"], &["mean"], &[]),
+        node("Sub", &["image", "mean"], &["repaired"], &[]),
+    ];
+    rgb(nodes, Vec::new())
+}
+
+/// Adds 1e-9 a trillion times, in a loop that looks at the image: it never ends.
+pub(crate) fn endless() -> Vec<u8> {
+    let body = Graph {
+        nodes: vec![
+            node("Identity", &["go_on"], &["go_on_out"], &[]),
+            node("Add", &["sum", "step"], &["sum_out"], &[]),
+        ],
+        constants: vec![floats("step", &[], &[1e-9])],
+        inputs: vec![
+            port("iteration", I64, &[]),
+            port("go_on", BOOL, &[]),
+            port("sum", F32, &IMAGE),
+        ],
+        outputs: vec![port("go_on_out", BOOL, &[]), port("sum_out", F32, &IMAGE)],
+    };
+    let body = graph_attribute("body", &body.message());
+    let trips = tensor("trips", I64, &[], &1_000_000_000_000_u64.to_le_bytes());
+    let go = tensor("go", BOOL, &[], &[1]);
+    rgb(vec![node("Loop", &["trips", "go", "image"], &["repaired"], &[body])], vec![trips, go])
+}
+
+/// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all pixels, as
+/// attention does: its mean is added, weighted by a constant `strength`.
+pub(crate) fn difix() -> Vec<u8> {
+    let half = |value: f32| half::f16::from_f32(value).to_le_bytes();
+    Graph {
+        nodes: vec![
+            node("GlobalAveragePool", &["reference"], &["mean"], &[]),
+            node("Sub", &["mean", "image"], &["to_mean"], &[]),
+            node("Mul", &["to_mean", "strength"], &["change"], &[]),
+            node("Add", &["image", "change"], &["sum"], &[]),
+            node("Clip", &["sum", "low", "high"], &["repaired"], &[]),
+        ],
+        constants: vec![tensor("low", F16, &[], &half(-1.0)), tensor("high", F16, &[], &half(1.0))],
+        inputs: vec![
+            port("image", F16, &IMAGE),
+            port("reference", F16, &IMAGE),
+            port("strength", F16, &[]),
+        ],
+        outputs: vec![port("repaired", F16, &IMAGE)],
+    }
+    .onnx()
+}
