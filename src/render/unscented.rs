@@ -25,6 +25,7 @@
 
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
+use super::layout::PixelFilter;
 use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::camera::{FieldCone, WIDEST_RAD};
@@ -115,7 +116,7 @@ impl<'a> UnscentedView<'a> {
             image_rad,
             least_px_per_rad,
             reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
-            blur_px: sigmas * profile.blur.sqrt() + 2.0,
+            blur_px: sigmas * PixelFilter::new(profile, &view.camera).max_sigma_px() + 2.0,
             windshield_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
             translation_m,
             rotation_rad,

@@ -20,6 +20,9 @@ pub struct Setting {
     pub profile: Vec<String>,
     /// Width and height of the images, as a share of the cameras'.
     pub scale: f64,
+    /// Whether images of another size are drawn with the blur of their own pixels, and not as the native
+    /// images shrunk.
+    pub own_blur: bool,
     /// Encoding of the images. None compares values before they are rounded to 8 bits, and times no
     /// encoding.
     #[serde(rename = "sent")]

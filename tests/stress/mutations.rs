@@ -115,6 +115,8 @@ enum Mutation {
     NoLens,
     /// One (Gaussian, tile) pair more is counted.
     DuplicateInstance,
+    /// An image below its native size is drawn with the blur of its own pixels.
+    OwnBlur,
 }
 
 impl Backend for MutatedBackend<'_> {
@@ -157,6 +159,9 @@ impl Backend for MutatedBackend<'_> {
                 *position_m = position_m.as_vec3().as_dvec3();
             }),
             Mutation::NoLens => views.iter_mut().for_each(|view| view.camera.lens = Lens::Pinhole),
+            Mutation::OwnBlur => {
+                views.iter_mut().for_each(|view| view.camera.native_size_px = None)
+            }
             Mutation::GlobalShutter => {
                 views.iter_mut().for_each(|view| view.rolling_shutter = None)
             }
@@ -252,7 +257,7 @@ fn folded(scene: &Scene, view: &mut View) -> Scene {
 use Mutation::{
     Background, CapAndStop, CentredPrincipalPoint, CoarseCentres, Culled, DuplicateInstance,
     Flicker, Folded, GlobalShutter, HalfNear, Mirror, MoreBlur, NoLens, Nondeterministic, OneByte,
-    OtherClamp, Paler, PoseF32, Reversed, Unmasked, Unwritten,
+    OtherClamp, OwnBlur, Paler, PoseF32, Reversed, Unmasked, Unwritten,
 };
 
 /// Mutations for each case, and the checks that must fail with each, by a part of their text.
@@ -315,6 +320,7 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T27", CoarseCentres, &["as f64"]),
     ("T27", Culled, &["it is covered"]),
     ("T28", Paler, &["the fog lets through", "as f64"]),
+    ("T29", OwnBlur, &["the native image shrunk", "mean opacity off by", "as f64"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit tests of

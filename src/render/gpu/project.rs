@@ -97,7 +97,7 @@ impl ProjectWork {
             }
             let chunk_view = work.chunk_views.len() as u32;
             let View { camera, world_from_camera, .. } = &frame.views[view];
-            let relative = CpuChunkView::new(&frame.views[view], chunk);
+            let relative = CpuChunkView::new(&frame.views[view], chunk, frame.profile);
             let relative = ChunkView::new(view as u32, &relative);
             work.chunk_views.push(match camera.depth_is_distance() {
                 false => relative,

@@ -11,6 +11,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::blend::Pixel;
 use super::project::{Splat, mean_and_axes};
 use crate::View;
+use crate::layout::{Filtered, PixelFilter};
 use wildcity_scene::{RenderProfile, Scene};
 
 /// A Gaussian in the world.
@@ -51,7 +52,8 @@ pub(super) fn row(
     let y_px = f64::from(row) + 0.5;
     let pixel = |column: u32| {
         let mut pixel = Pixel::EMPTY;
-        let Some(ray) = Ray::of(view, DVec2::new(f64::from(column) + 0.5, y_px)) else {
+        let at_px = DVec2::new(f64::from(column) + 0.5, y_px);
+        let Some(ray) = Ray::of(view, at_px, profile) else {
             return pixel;
         };
         for (splat, gaussian) in splats.iter().zip(gaussians) {
@@ -74,11 +76,13 @@ struct Ray {
     px_per_rad: [DVec3; 2],
     /// A lower bound of the Jacobian's smaller singular value.
     least_px_per_rad: f64,
+    /// What is added to screen covariances.
+    filter: PixelFilter,
 }
 
 impl Ray {
     /// `None` outside of the lens' field.
-    fn of(view: &View, at_px: DVec2) -> Option<Self> {
+    fn of(view: &View, at_px: DVec2, profile: &RenderProfile) -> Option<Self> {
         let direction = view.ray_world(at_px)?;
         let pose = view.world_from_camera_at(at_px);
         // How the ray changes per pixel, by differences to both sides, or to the one that is within the field.
@@ -105,7 +109,8 @@ impl Ray {
         // norm.
         let least_px_per_rad = x.cross(y).length() / x.length().hypot(y.length());
         let origin_m = pose.position_m;
-        Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad })
+        let filter = PixelFilter::new(profile, &view.camera);
+        Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad, filter })
     }
 
     /// Alpha before the cap; 0 where it surely is below the cut, or the closest point lies behind the camera.
@@ -116,7 +121,8 @@ impl Ray {
         // far end.
         let across_m2 = to_mean_m.length_squared() - along_m * along_m;
         let farthest_m = along_m.max(0.0) + 4.0 * gaussian.sigma_m;
-        let blur_m2 = profile.blur * (farthest_m / self.least_px_per_rad).powi(2);
+        let blur_px2 = self.filter.total_px2.max_element();
+        let blur_m2 = blur_px2 * (farthest_m / self.least_px_per_rad).powi(2);
         let sigmas2 = 2.0 * (gaussian.opacity / profile.alpha_cut).ln() + 1e-6;
         let near = across_m2 <= sigmas2 * (gaussian.sigma_m * gaussian.sigma_m + blur_m2);
         if !near {
@@ -144,14 +150,13 @@ impl Ray {
         let xx = row_x.dot(row_x);
         let xy = row_x.dot(row_y);
         let yy = row_y.dot(row_y);
-        let det = det_before + profile.blur * (xx + yy + profile.blur);
-        let xx = xx + profile.blur;
-        let yy = yy + profile.blur;
+        let Filtered { xx, yy, det, blur_share, shrink_share } =
+            self.filter.filtered(xx, yy, det_before);
         let DVec2 { x: dx, y: dy } = offset_px;
         let power = -0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det;
-        let mut opacity = gaussian.opacity;
+        let mut opacity = gaussian.opacity * shrink_share.sqrt();
         if profile.antialiased {
-            opacity *= (det_before / det).max(0.005 * 0.005).sqrt();
+            opacity *= blur_share.max(0.005 * 0.005).sqrt();
         }
         opacity * power.exp()
     }

@@ -197,10 +197,10 @@ fn jobs<'a>(frame: &Frame<'a>, non_pinhole: &'a [Option<NonPinholeView<'a>>]) ->
         for chunk in &frame.scene.chunks {
             let projection = match non_pinhole {
                 Some(NonPinholeView { unscented, lens }) => ChunkProjection::Unscented(
-                    UnscentedChunkView::new(view, chunk, unscented, lens.as_ref()),
+                    UnscentedChunkView::new(view, chunk, frame.profile, unscented, lens.as_ref()),
                 ),
                 None => ChunkProjection::Pinhole {
-                    chunk_view: ChunkView::new(view, chunk),
+                    chunk_view: ChunkView::new(view, chunk, frame.profile),
                     frustum: Frustum::new(view, chunk, frame.profile),
                 },
             };

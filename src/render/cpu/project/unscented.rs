@@ -15,9 +15,9 @@ use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::lens::{ExposedPixels, LensPixels, LensProjection};
-use crate::layout::Cutoffs;
+use crate::layout::{Cutoffs, Filtered, PixelFilter};
 use crate::unscented::{CullBound, Footprint, UnscentedView};
-use wildcity_scene::Chunk;
+use wildcity_scene::{Chunk, RenderProfile};
 use wildcity_scene::chunk::{LANES, Lanes, column};
 use wildcity_scene::geometry::camera::WIDEST_RAD;
 
@@ -35,6 +35,8 @@ pub(super) struct UnscentedChunkView<'a> {
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
+    /// What is added to screen covariances.
+    filter: PixelFilter,
     /// Whether depth is the distance from the camera, and not z.
     depth_is_distance: bool,
 }
@@ -44,6 +46,7 @@ impl<'a> UnscentedChunkView<'a> {
     pub(super) fn new(
         view: &View,
         chunk: &Chunk,
+        profile: &RenderProfile,
         unscented: &'a UnscentedView<'a>,
         lens: Option<&'a LensProjection>,
     ) -> Self {
@@ -60,6 +63,7 @@ impl<'a> UnscentedChunkView<'a> {
             camera_from_chunk: [0, 1, 2].map(row),
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
+            filter: PixelFilter::new(profile, &view.camera),
             depth_is_distance: view.camera.depth_is_distance(),
         }
     }
@@ -209,7 +213,7 @@ fn project_lanes<S: Simd>(
         }
     }
     let moments = Moments { xx, yy, xy, det };
-    let ellipse = Ellipse::from_moments(moments, splat(cutoffs.blur_px2), splat(LOG2_UNIT));
+    let ellipse = Ellipse::from_moments(simd, moments, &view.filter, splat(1.0));
 
     let inside = in_range & margin.simd_ge(splat(0.0));
     let projected =
@@ -326,7 +330,6 @@ fn project_one(
         view.unscented.project(mean_m, axes_m)?;
 
     // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
-    let blur = f64::from(cutoffs.blur_px2);
     let mut xx = 0.0;
     let mut yy = 0.0;
     let mut xy = 0.0;
@@ -340,16 +343,20 @@ fn project_one(
             det_before += minor * minor;
         }
     }
-    let det = det_before + blur * (xx + yy + blur);
+    let Filtered { xx, yy, det, blur_share, shrink_share } =
+        view.filter.rounded().filtered(xx, yy, det_before);
     if cutoffs.antialiased {
-        log2_opacity += 0.5 * (det_before / det).max(0.005 * 0.005).log2();
+        log2_opacity += 0.5 * blur_share.max(0.005 * 0.005).log2();
+    }
+    if view.filter.is_shrunk() {
+        log2_opacity += 0.5 * shrink_share.log2();
     }
 
     // The box where alpha reaches the cut, against the image's pixel centres.
     let power = log2_opacity - log2_cut;
     let unit = f64::from(LOG2_UNIT);
-    let sigma_x = (xx + blur).sqrt();
-    let sigma_y = (yy + blur).sqrt();
+    let sigma_x = xx.sqrt();
+    let sigma_y = yy.sqrt();
     let extent_px =
         power.max(0.0).sqrt() / unit * DVec2::new(sigma_x, sigma_y) + f64::from(EXTENT_SLACK_PX);
     let on_image = power >= 0.0
