@@ -1,5 +1,6 @@
 // Stage project for lenses and rolling shutters by the unscented transform: the mean and covariance of
-// six projected sigma points. Twin of `src/render/unscented.rs`, which explains the choice of points.
+// six projected sigma points. Twin of `src/render/unscented.rs`, which explains the choice of points. Where the
+// camera's expansion around the centre gives the same within a bound, it stands for the points.
 //
 // f32 suffices because no large numbers cancel: the six points are taken relative to where the centre
 // lands, polynomials take fractions of the lens' field, a windshield's polynomials give the change of the
@@ -7,6 +8,7 @@
 // motion back from there.
 
 #import lens
+#import expansion
 
 // Most iterations of the search for the row that sees a point, and the change (a fraction of the
 // exposure) at which it ends.
@@ -32,14 +34,36 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
         return Projected();
     }
 
+    let chunk_from_gaussian = rotation_from_quat(gaussian.quat_wxyz);
+    var axes_m: array<vec3f, 3>;
+    for (var axis = 0u; axis < 3u; axis++) {
+        let axis_m = chunk_from_gaussian[axis] * gaussian.scale_m[axis];
+        axes_m[axis] = vec3f(dot(rows[0].xyz, axis_m), dot(rows[1].xyz, axis_m), dot(rows[2].xyz, axis_m));
+    }
+    let from_camera_m =
+        gaussian.mean_m - view.camera_m + center.fraction * lenses[view_index].moved_world_m;
+
+    // Small Gaussians: the expansion around the centre.
+    let expanded = expand_axes(view_index, center, axes_m);
+    if expanded.close {
+        let u = expanded.root_px;
+        let xs = vec3f(u[0].x, u[1].x, u[2].x);
+        let ys = vec3f(u[0].y, u[1].y, u[2].y);
+        let minors = cross(xs, ys);
+        let covariance = vec3f(dot(xs, xs), dot(xs, ys), dot(ys, ys));
+        let foot = Footprint(center.at_px + expanded.shift_px, covariance, dot(minors, minors), 1.0);
+        var projected = shape_of(foot, gaussian.log2_opacity, view_index);
+        projected.depth_m = depth_m;
+        projected.from_camera_m = from_camera_m;
+        return projected;
+    }
+
     // The sigma points at +-sqrt(3) standard deviations along each axis, relative to where the centre
     // lands, so that the shape of small Gaussians is not lost to rounding.
-    let chunk_from_gaussian = rotation_from_quat(gaussian.quat_wxyz);
     var pairs: array<vec4f, 3>;
     var sum_px = vec2f(0.0);
     for (var axis = 0u; axis < 3u; axis++) {
-        let axis_m = chunk_from_gaussian[axis] * (ROOT_3 * gaussian.scale_m[axis]);
-        let offset_m = vec3f(dot(rows[0].xyz, axis_m), dot(rows[1].xyz, axis_m), dot(rows[2].xyz, axis_m));
+        let offset_m = ROOT_3 * axes_m[axis];
         let one_px = project_point(view_index, center_m + offset_m, center.fraction).at_px - center.at_px;
         let other_px = project_point(view_index, center_m - offset_m, center.fraction).at_px - center.at_px;
         pairs[axis] = vec4f(one_px, other_px);
@@ -75,7 +99,7 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     let foot = Footprint(center.at_px + mean_px, covariance, det_unblurred, units_per_px);
     var projected = shape_of(foot, gaussian.log2_opacity, view_index);
     projected.depth_m = depth_m;
-    projected.from_camera_m = gaussian.mean_m - view.camera_m + center.fraction * lenses[view_index].moved_world_m;
+    projected.from_camera_m = from_camera_m;
     return projected;
 }
 

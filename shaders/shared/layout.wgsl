@@ -80,6 +80,7 @@ struct Lens {
     moved_world_m: vec3f,
     pad2: u32,
     axis_angle: vec4f,
+    expansion: vec4f,
 }
 
 struct ClusterView {

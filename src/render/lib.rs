@@ -17,6 +17,7 @@ pub mod automatic;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
+pub mod expansion;
 pub mod gpu;
 pub mod hybrid;
 pub mod layout;

@@ -25,6 +25,7 @@
 
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
+use super::expansion::ExpansionBound;
 use super::layout::PixelFilter;
 use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
@@ -43,6 +44,7 @@ pub struct UnscentedView<'a> {
     /// Nearest and farthest depth of a centre, in metres.
     range_m: [f64; 2],
     cull_bound: CullBound,
+    expansion_bound: Option<ExpansionBound>,
 }
 
 /// A Gaussian on the image.
@@ -83,7 +85,7 @@ pub struct CullBound {
     pub reach_px_per_rad: f64,
     /// What the blur adds to the reach, in pixels.
     pub blur_px: f64,
-    /// Most that a windshield changes angles, in radians; 0 without one.
+    /// Most that a windshield changes the angle between two rays, in radians; 0 without one.
     pub windshield_rad: f64,
     /// How far the camera moves during the exposure, in metres.
     pub translation_m: f64,
@@ -117,7 +119,8 @@ impl<'a> UnscentedView<'a> {
             least_px_per_rad,
             reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
             blur_px: sigmas * PixelFilter::new(profile, &view.camera).max_sigma_px() + 2.0,
-            windshield_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
+            // Both rays of an angle are refracted.
+            windshield_rad: view.camera.windshield.map_or(0.0, |glass| 2.0 * glass.most_rad()),
             translation_m,
             rotation_rad,
         };
@@ -126,6 +129,7 @@ impl<'a> UnscentedView<'a> {
             camera_from_world: view.world_from_camera.inverse(),
             range_m: [profile.near, profile.far],
             cull_bound,
+            expansion_bound: ExpansionBound::of(view, profile),
         })
     }
 
@@ -180,6 +184,11 @@ impl<'a> UnscentedView<'a> {
     /// The bound that culls, for tests of many Gaussians at once.
     pub fn cull_bound(&self) -> &CullBound {
         &self.cull_bound
+    }
+
+    /// When an expansion stands for the six points; `None` if never.
+    pub fn expansion_bound(&self) -> Option<&ExpansionBound> {
+        self.expansion_bound.as_ref()
     }
 
     /// Size of the image, in pixels.

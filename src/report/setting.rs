@@ -85,6 +85,8 @@ pub enum Family {
     Stop,
     /// How exactly the sky is looked up.
     Sky,
+    /// How exactly Gaussians are projected by lenses and rolling shutters.
+    Lens,
     /// Splats of non-pinhole cameras, compared with a ray for every pixel.
     Rays,
     /// Size of the images.
@@ -109,6 +111,7 @@ impl Family {
             Self::AlphaCut => "alpha cut",
             Self::Stop => "stop",
             Self::Sky => "sky",
+            Self::Lens => "lens",
             Self::Rays => "rays",
             Self::Scale => "image scale",
             Self::Encoding => "as sent",
@@ -125,6 +128,7 @@ impl Family {
             Self::AlphaCut => "smallest alpha",
             Self::Stop => "stop transmittance",
             Self::Sky => "sky map",
+            Self::Lens => "six points or expansion",
             Self::Rays => "reference: exact rays",
             Self::Encoding => "encoding",
             Self::Combined => "several",

@@ -81,6 +81,8 @@ const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
 const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
 /// Scales of the image's sides. An agent that reads 576 x 320 px of a camera of 1920 x 1080 px has 0.3.
 const SCALES: [f64; 3] = [0.5, 1.0 / 3.0, 0.25];
+/// Values of `lens_error_px`; 0 projects six points of every Gaussian.
+const LENS_ERRORS_PX: [f64; 4] = [0.0, 1.0 / 256.0, 1.0 / 16.0, 0.25];
 /// JPEG qualities; 90 is the server's default.
 const JPEG_QUALITIES: [u8; 4] = [50, 75, 90, 98];
 /// `tau_px` and `alpha_cut` of the combined settings, from cautious to coarse.
@@ -114,6 +116,7 @@ pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingLis
     list.add_records();
     list.add_blending();
     list.add_sky();
+    list.add_lens_errors();
     list.add_exact_rays();
     list.add_scales();
     list.add_encodings();
@@ -234,6 +237,17 @@ impl<'a> ListBuilder<'a> {
                     self.add_profile_change(Family::Sky, format!("sky_error={error}"));
                 }
             }
+        }
+    }
+
+    fn add_lens_errors(&mut self) {
+        if !self.twin.has_non_pinhole {
+            self.skip("lens_error_px", "every camera is a pinhole at rest, which has no six points");
+            return;
+        }
+        let own = self.twin.profile.lens_error_px;
+        for error_px in LENS_ERRORS_PX.into_iter().filter(|error_px| *error_px != own) {
+            self.add_profile_change(Family::Lens, format!("lens_error_px={error_px}"));
         }
     }
 

@@ -91,7 +91,7 @@ fn layouts_are_the_same() {
         Lens {
             center_px, model, windshield, linear, end, end_value, end_slope, end_rad, widest_rad, by_distance,
             non_pinhole, pad0, coefficients, windshield_shift, remaining_exposure, moved_m, pad1,
-            moved_world_m, pad2, axis_angle,
+            moved_world_m, pad2, axis_angle, expansion,
         }
         ClusterView { line, chunk_view }
         Span { first, count }

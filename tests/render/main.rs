@@ -25,3 +25,4 @@ mod normals;
 mod others;
 mod parity;
 mod sky;
+mod small_images;

@@ -243,7 +243,7 @@ fn low(exact: f64) -> f32 {
     (exact - f64::from(exact as f32)) as f32
 }
 
-/// Lens, windshield, and rolling shutter of a view that is no static pinhole (352 bytes). Read by
+/// Lens, windshield, and rolling shutter of a view that is no static pinhole (368 bytes). Read by
 /// `shaders/lens.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -293,6 +293,8 @@ pub struct Lens {
     pub pad2: u32,
     /// The camera's rotation during the exposure: unit axis, and angle in radians.
     pub axis_angle: [f32; 4],
+    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order; 0 for always six points.
+    pub expansion: [f32; 4],
 }
 
 /// One cluster in one view (8 bytes): the unit of work of stage project.

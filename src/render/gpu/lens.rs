@@ -17,9 +17,11 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::layout::Lens;
+use crate::expansion::ExpansionBound;
 use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
+use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::camera::{
     self, FTheta, FThetaReference, Fisheye, MonotonePolynomial, OpenCv, Windshield,
     WindshieldReference,
@@ -40,7 +42,7 @@ impl Lenses {
         let mut lenses = [Lens::zeroed(); MAX_VIEWS];
         for (lens, view) in lenses.iter_mut().zip(frame.views) {
             if !view.is_static_pinhole() {
-                *lens = Lens::of(view);
+                *lens = Lens::of(view, frame.profile);
             }
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
@@ -57,7 +59,7 @@ impl Lenses {
 
 impl Lens {
     /// The parameters of a view that is no static pinhole.
-    fn of(view: &View) -> Self {
+    fn of(view: &View, profile: &RenderProfile) -> Self {
         let camera = &view.camera;
         let pinhole = &camera.pinhole;
         let mut lens = Self {
@@ -82,6 +84,11 @@ impl Lens {
         }
         if let Some(motion) = view.shutter_motion() {
             lens.set_shutter_motion(&motion);
+        }
+        if let Some(bound) = ExpansionBound::of(view, profile) {
+            let ExpansionBound { max_error_px, second_px, third_px, per_bend } = bound;
+            let bound = [max_error_px, second_px, third_px, per_bend];
+            lens.expansion = bound.map(|value| value as f32);
         }
         lens
     }

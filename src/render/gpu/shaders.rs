@@ -78,6 +78,7 @@ const FILES: &[(&str, &str)] = &[
     ("background", include_str!("../../../shaders/background.wgsl")),
     ("bin", include_str!("../../../shaders/bin.wgsl")),
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
+    ("expansion", include_str!("../../../shaders/expansion.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),

@@ -12,6 +12,7 @@
 //! those for which the search finds no row, and those of cameras that this module does not describe.
 
 mod chebyshev;
+mod expansion;
 mod rays;
 mod shutter;
 mod windshield;
@@ -24,6 +25,7 @@ use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::Lens;
 
 use chebyshev::ChebyshevSeries;
+pub(super) use expansion::{ExpandedAxes, Remainder};
 pub(super) use rays::LensRays;
 use shutter::SimdShutter;
 use windshield::{Refracted, SimdWindshield};
@@ -43,9 +45,23 @@ pub(super) struct LensProjection {
 #[derive(Clone, Debug)]
 enum Model {
     /// Fisheye and f-theta: `center + px_from_round (x, y)/(|p| + z) r(t)/t`, up to a largest t.
-    Round { px_from_round: [[f32; 2]; 2], series: ChebyshevSeries, max_t: f32 },
+    Round {
+        px_from_round: [[f32; 2]; 2],
+        series: ChebyshevSeries,
+        derivatives: Option<RoundDerivatives>,
+        max_t: f32,
+    },
     /// Pinhole, and OpenCV's polynomials of the slopes x/z and y/z, up to a largest squared slope.
     Slopes { focal_px: [f32; 2], k: [f32; 6], p: [f32; 2], s: [f32; 4], max_slope2: f32 },
+}
+
+/// Derivatives of the radius r(θ) of a round lens, as series in t.
+#[derive(Clone, Debug)]
+struct RoundDerivatives {
+    /// r′(θ).
+    slope: ChebyshevSeries,
+    /// r″(θ).
+    curvature: ChebyshevSeries,
 }
 
 /// Image points.
@@ -174,7 +190,7 @@ impl LensProjection {
         let Vec3x16 { x, y, z } = point_m;
         let [cx, cy] = self.center_px.map(splat);
         match &self.model {
-            Model::Round { px_from_round, series, max_t } => {
+            Model::Round { px_from_round, series, max_t, .. } => {
                 let off_axis2 = x.mul_add(x, y * y);
                 let inverse = splat(1.0) / (z.mul_add(z, off_axis2).sqrt() + z);
                 let t = off_axis2.sqrt() * inverse;
@@ -232,8 +248,49 @@ impl Model {
     ) -> Option<Self> {
         let max_t = (0.5 * max_rad).tan();
         let series = ChebyshevSeries::fit(max_t, max_error, &|t| radius(2.0 * t.atan()))?;
-        Some(Self::Round { px_from_round, series, max_t: max_t as f32 * INSIDE })
+        let derivatives = RoundDerivatives::new(max_rad, radius);
+        let max_t = max_t as f32 * INSIDE;
+        Some(Self::Round { px_from_round, series, derivatives, max_t })
     }
+}
+
+impl RoundDerivatives {
+    /// Largest error of the slope, as a share of the slope at the axis: of the size of a splat.
+    const SLOPE_ERROR: f64 = 1e-6;
+
+    /// The same of the curvature, which only moves the mean of a splat by a pixel or so.
+    const CURVATURE_ERROR: f64 = 1e-3;
+
+    /// `None` if no short series describes them.
+    fn new(max_rad: f64, radius: &dyn Fn(f64) -> f64) -> Option<Self> {
+        let slope = |rad: f64| round_slope(radius, max_rad, rad);
+        let curvature = |rad: f64| round_curvature(radius, max_rad, rad);
+        // A series is fitted to f(t)/t.
+        let fit = |error: f64, of_rad: &dyn Fn(f64) -> f64| {
+            let max_t = (0.5 * max_rad).tan();
+            let max_error = error * slope(0.0) * max_t;
+            ChebyshevSeries::fit(max_t, max_error, &|t| t * of_rad(2.0 * t.atan()))
+        };
+        Some(Self {
+            slope: fit(Self::SLOPE_ERROR, &slope)?,
+            curvature: fit(Self::CURVATURE_ERROR, &curvature)?,
+        })
+    }
+}
+
+/// `r′` of a radius at an angle, by a central difference within the field. Series are sampled at angles that are
+/// farther than the difference from the field's ends.
+fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
+    let h = 1e-4;
+    let rad = rad.clamp(h, max_rad - h);
+    (radius(rad + h) - radius(rad - h)) / (2.0 * h)
+}
+
+/// `r″`, likewise.
+fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
+    let h = 5e-4;
+    let rad = rad.clamp(h, max_rad - h);
+    (radius(rad + h) - 2.0 * radius(rad) + radius(rad - h)) / (h * h)
 }
 
 /// The largest angle off the axis that the image shows, behind the windshield, in radians. The field may be

@@ -225,6 +225,22 @@ impl SplatBlock {
         rgb.z.store_array(&mut self.blue);
     }
 
+    /// Takes the visible splats of another block of the same Gaussians into their lanes.
+    pub(super) fn merge(&mut self, other: &Self) {
+        for i in (0..LANES).filter(|i| other.visible >> i & 1 == 1) {
+            self.mean_x[i] = other.mean_x[i];
+            self.mean_y[i] = other.mean_y[i];
+            self.l0[i] = other.l0[i];
+            self.l1[i] = other.l1[i];
+            self.l2[i] = other.l2[i];
+            self.log2_opacity[i] = other.log2_opacity[i];
+            self.depth_m[i] = other.depth_m[i];
+            self.extent_x[i] = other.extent_x[i];
+            self.extent_y[i] = other.extent_y[i];
+        }
+        self.visible |= other.visible;
+    }
+
     /// Appends the visible splats, in order of lanes and so of global ids.
     #[inline(always)]
     pub(super) fn append_visible(&self, splats: &mut Vec<Splat>) {

@@ -1,5 +1,6 @@
 //! Projection by every camera that is not a static pinhole: six points of each Gaussian
-//! ([`crate::unscented`] explains the method).
+//! ([`crate::unscented`] explains the method), or the camera's expansion around its centre where the two differ by
+//! less than a bound ([`crate::expansion`]).
 //!
 //! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32. Those with a
 //! point beyond the lens' field, or with a point for which the search found no row, are projected one by one
@@ -14,7 +15,8 @@ use super::splat_block::{Ellipse, LOG2_UNIT, Moments, ProjectedBlock, SplatBlock
 use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
 use crate::cpu::lanes::Vec3x16;
-use crate::cpu::lens::{ExposedPixels, LensPixels, LensProjection};
+use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensPixels, LensProjection, Remainder};
+use crate::expansion::ExpansionBound;
 use crate::layout::{Cutoffs, Filtered, PixelFilter};
 use crate::unscented::{CullBound, Footprint, UnscentedView};
 use wildcity_scene::{Chunk, RenderProfile};
@@ -107,9 +109,9 @@ pub(super) fn project_block<S: Simd>(
     Some(splats)
 }
 
-/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
-/// and a bit for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera to the
-/// centres, in world axes.
+/// Projects those Gaussians of a block whose points are within the lens' field: by the expansion around their
+/// centres where that suffices, and by six points elsewhere. Returns their splats, and a bit for each other
+/// Gaussian that may be seen. `toward_m` receives the vectors from the camera to the centres, in world axes.
 #[inline(always)]
 fn project_lanes<S: Simd>(
     simd: S,
@@ -132,15 +134,18 @@ fn project_lanes<S: Simd>(
 
     // Cull what is too faint, and what surely misses the image.
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
-    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
+    let scale = Vec3x16::load(simd, columns, column::SCALE);
+    let bound = view.unscented.cull_bound();
+    let sigma_m = scale.x.max(scale.y).max(scale.z);
     let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
-        & !surely_unseen(simd, center, x.max(y).max(z), view.unscented.cull_bound());
+        & !surely_unseen(simd, center, sigma_m, bound);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
     // When each centre is exposed, and where the camera is then.
-    let ExposedPixels { pixels: center_px, remaining } = lens.project(simd, center, splat(0.0));
+    let exposed = lens.project(simd, center, splat(0.0));
+    let ExposedPixels { pixels: center_px, remaining } = exposed;
     let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     if let Some(shutter) = lens.shutter() {
         toward = toward.plus(shutter.translation_world(simd, remaining));
@@ -151,39 +156,172 @@ fn project_lanes<S: Simd>(
     // decides for the others.
     let depth_m = depth(simd, at_end_m, view, lens, center, remaining);
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
+    let found = center_px.margin.simd_ge(splat(0.0));
     let is_depth = match lens.shutter() {
         None => splat(0.0).simd_ge(splat(0.0)),
-        Some(_) => center_px.margin.simd_ge(splat(0.0)),
+        Some(_) => found,
     };
-    let in_range = in_range & (in_depth | !is_depth);
+    let mut in_range = in_range & (in_depth | !is_depth);
+    if lens.shutter().is_none() {
+        in_range = in_range & !(found & beside(simd, center_px, center, sigma_m, view));
+    }
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
-    // The six points: ±√3 standard deviations along each own axis.
+    // The own axes times their standard deviations.
     let axes = rotation_columns(simd, columns);
-    let [right, down, forward] =
-        view.camera_from_chunk.map(|[x, y, z, _]| [x as f32, y as f32, z as f32]);
-    let right = Vec3x16::splat(simd, right);
-    let down = Vec3x16::splat(simd, down);
-    let forward = Vec3x16::splat(simd, forward);
-    let mut margin = center_px.margin;
+    let gaussians = CenteredBlock {
+        center,
+        axes_m: [axes[0].scale(scale.x), axes[1].scale(scale.y), axes[2].scale(scale.z)],
+        exposed,
+        depth_m,
+        log2_opacity,
+        in_range,
+    };
+    let (mut splats, left) = expand(simd, &gaussians, view, lens, cutoffs);
+    if left.all_false() {
+        return (splats, 0);
+    }
+    let gaussians = CenteredBlock { in_range: left, ..gaussians };
+    let (of_points, remaining) = project_six_points(simd, &gaussians, view, lens, cutoffs);
+    splats.merge(&of_points);
+    (splats, remaining)
+}
+
+/// Sixteen Gaussians whose centres have been projected.
+struct CenteredBlock<S: Simd> {
+    /// Centres in the camera's frame at the end of the exposure, in metres.
+    center: Vec3x16<S>,
+    /// Own axes times their standard deviations, in the chunk's axes, in metres.
+    axes_m: [Vec3x16<S>; 3],
+    /// The centres' images.
+    exposed: ExposedPixels<S>,
+    depth_m: f32x16<S>,
+    log2_opacity: f32x16<S>,
+    /// Which may be seen.
+    in_range: mask32x16<S>,
+}
+
+/// The rows of camera_from_chunk's rotation.
+#[inline(always)]
+fn rotation_rows<S: Simd>(simd: S, view: &UnscentedChunkView<'_>) -> [Vec3x16<S>; 3] {
+    view.camera_from_chunk
+        .map(|[x, y, z, _]| Vec3x16::splat(simd, [x as f32, y as f32, z as f32]))
+}
+
+/// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
+/// be seen.
+#[inline(always)]
+fn expand<S: Simd>(
+    simd: S,
+    gaussians: &CenteredBlock<S>,
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    cutoffs: &Cutoffs,
+) -> (SplatBlock, mask32x16<S>) {
+    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
+    let none = (SplatBlock::default(), in_range);
+    let Some(bound) = view.unscented.expansion_bound() else { return none };
+    let Some(mut expansion) = lens.expand(simd, center, exposed) else { return none };
+    expansion.in_frame(rotation_rows(simd, view));
+    let ExpandedAxes { columns: [u, v, w], mean_shift, remainder } = expansion.axes(simd, axes_m);
+    let pixels = exposed.pixels;
+    let close = in_range
+        & pixels.margin.simd_ge(f32x16::splat(simd, 0.0))
+        & is_close(simd, &remainder, bound);
+    if close.all_false() {
+        return none;
+    }
+    let row_x = Vec3x16 { x: u.x, y: v.x, z: w.x };
+    let row_y = Vec3x16 { x: u.y, y: v.y, z: w.y };
+    let projected = ProjectedBlock {
+        mean_x: pixels.x_px + mean_shift.x,
+        mean_y: pixels.y_px + mean_shift.y,
+        depth_m,
+        log2_opacity,
+        ellipse: Ellipse::from_root(simd, row_x, row_y, &view.filter),
+        in_range: close,
+    };
+    (projected.clip(simd, view.size_px, cutoffs), in_range & !close)
+}
+
+/// Where the expansion differs from six points by less than the bound.
+#[inline(always)]
+fn is_close<S: Simd>(
+    simd: S,
+    remainder: &Remainder<S>,
+    bound: &ExpansionBound,
+) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let Remainder { square, longest, bend_px2, shutter_px, room } = *remainder;
+    let cube = longest * longest * longest;
+    let error_px = splat(bound.second_px).mul_add(
+        square,
+        splat(bound.third_px).mul_add(cube, splat(bound.per_bend).mul_add(bend_px2, shutter_px)),
+    );
+    // The points lie √3 standard deviations from the centre; the rest is a margin.
+    let within = room.simd_ge(splat(2.5) * longest);
+    within & error_px.simd_le(splat(bound.max_error_px))
+}
+
+/// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from
+/// there than the most pixels per radian allow ([`CullBound`]).
+#[inline(always)]
+fn beside<S: Simd>(
+    simd: S,
+    center_px: LensPixels<S>,
+    center_m: Vec3x16<S>,
+    sigma_m: f32x16<S>,
+    view: &UnscentedChunkView<'_>,
+) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let bound = view.unscented.cull_bound();
+    let share = splat(3.0_f64.sqrt()) * sigma_m / center_m.dot(center_m).sqrt();
+    // Below s = 1/2, asin s is at most s π/3. A windshield changes the angle between two rays by less than half
+    // of it.
+    let widened = if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 };
+    let spread_rad = share * splat(widened * std::f64::consts::FRAC_PI_3);
+    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
+    let [width, height] = view.size_px.map(|side| f32x16::splat(simd, side));
+    let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
+    let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
+    // Where the points may lie near the axis' other end, the lens is not continued, and no bound holds.
+    let forward = center_m.z.simd_gt(splat(0.0));
+    share.simd_lt(splat(0.5)) & forward & off_px.simd_gt(reach_px)
+}
+
+/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
+/// and a bit for each other Gaussian that may be seen.
+#[inline(always)]
+fn project_six_points<S: Simd>(
+    simd: S,
+    gaussians: &CenteredBlock<S>,
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    cutoffs: &Cutoffs,
+) -> (SplatBlock, u64) {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
+
+    // The six points: ±√3 standard deviations along each own axis.
+    let [right, down, forward] = rotation_rows(simd, view);
+    let mut margin = exposed.pixels.margin;
     let mut pairs = [[splat(0.0); 4]; 3];
     let mut mean_x = splat(0.0);
     let mut mean_y = splat(0.0);
-    for axis in 0..3 {
-        let distance = [x, y, z][axis] * splat(3.0_f32.sqrt());
-        let offset = axes[axis].scale(distance);
+    for (axis_m, pair) in axes_m.into_iter().zip(&mut pairs) {
+        let offset = axis_m.scale(splat(3.0_f32.sqrt()));
         let offset = Vec3x16 { x: right.dot(offset), y: down.dot(offset), z: forward.dot(offset) };
         let plus = center.plus(offset);
         let minus = center.minus(offset);
         // Each search begins with the moment at which the centre is exposed.
         let LensPixels { x_px: ax, y_px: ay, margin: a } =
-            lens.project(simd, plus, remaining).pixels;
+            lens.project(simd, plus, exposed.remaining).pixels;
         let LensPixels { x_px: bx, y_px: by, margin: b } =
-            lens.project(simd, minus, remaining).pixels;
+            lens.project(simd, minus, exposed.remaining).pixels;
         margin = margin.min(a).min(b);
-        pairs[axis] = [ax, ay, bx, by];
+        *pair = [ax, ay, bx, by];
         mean_x += ax + bx;
         mean_y += ay + by;
     }
