@@ -251,7 +251,7 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 
 /// Gaussians with standard deviations of 0.05 to 6 native px in the view of T29, thin ones among them.
 fn of_any_size(i: usize) -> GaussianSpec {
-    let [x, y, z, size, flat] = low_discrepancy(i);
+    let [x, y, z, size, flat, ..] = low_discrepancy(i);
     let away_m = 4.0 + 8.0 * z;
     let sigma_m = away_m / 150.0 * 0.05 * 120.0_f64.powf(size.powi(2));
     GaussianSpec {

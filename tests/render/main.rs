@@ -20,6 +20,7 @@ mod truths;
 mod appearance;
 mod cameras;
 mod determinism;
+mod expansion;
 mod models;
 mod normals;
 mod others;

@@ -16,7 +16,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::{ExposedPixels, LensPixels, LensProjection, Model, RoundDerivatives, SimdShutter};
+use super::{ExposedPixels, LensPixels, LensProjection, Model, RoundDerivatives};
 use crate::cpu::lanes::Vec3x16;
 
 /// Places and displacements on the image, in pixels.
