@@ -13,8 +13,8 @@
 //! ```
 //!
 //! - `third`: a column of the covariance's root has `t₁(v) + 3 t₃(v)`, where `t₁` and `t₃` are the terms of first and
-//!   third order. A lens of r pixels at θ has `|t₃| <= 0.6 L + |r″|/2 + |r‴|/6` with the most pixels per radian L:
-//!   perspective alone has `a c²`, at most 0.385, and the arc tangent `a³/3`.
+//!   third order. With the most pixels per radian L, a lens of r pixels at θ has `|t₃|` of at most about half of
+//!   `0.6 L + |r″|/2 + |r‴|/6`: perspective alone has `a c²`, at most 0.385, and the arc tangent `a³/3`.
 //! - `per_bend`: the six points' pairs lie beside their straight lines by the terms of second order, `bend`, which
 //!   widens the covariance by at most `3 Σ bend²`. The standard deviation, at least σ after the blur, grows by that
 //!   divided by 2 σ.
@@ -65,13 +65,13 @@ impl ExpansionBound {
             Lens::FTheta(lens) => round(camera, &|rad| lens.radius_px(rad)),
         };
         if let Some(windshield) = &camera.windshield {
-            second_px += 0.5 * px_per_rad * windshield_bend(windshield, max_seen_rad(camera));
+            second_px += 0.5 * px_per_rad * windshield_bend(camera, windshield);
         }
         let least_sigma_px = PixelFilter::new(profile, camera).total_px2.min_element().sqrt();
         Some(Self {
             max_error_px: profile.lens_error_px,
             second_px,
-            third_px: 3.0 * third_px,
+            third_px: 1.5 * third_px,
             per_bend: 1.5 / least_sigma_px,
         })
     }
@@ -138,11 +138,11 @@ fn slopes(camera: &Camera) -> FieldBounds {
     bounds
 }
 
-/// A bound of a windshield's second derivatives within an angle off the axis, per rad².
+/// A bound of a windshield's second derivatives within the image, per rad².
 ///
 /// Where its change of the angles φ, θ is ε per radian, it also has `ε tan φ` of the derivatives that these
 /// coordinates have on a sphere.
-fn windshield_bend(windshield: &Windshield, max_rad: f64) -> f64 {
+fn windshield_bend(camera: &Camera, windshield: &Windshield) -> f64 {
     let bend = |polynomial: &Bivariate, identity: [f64; 2], at: DVec2| {
         let mut first = -DVec2::from_array(identity);
         let mut second = [0.0; 3];
@@ -152,7 +152,11 @@ fn windshield_bend(windshield: &Windshield, max_rad: f64) -> f64 {
                 let c = polynomial.coefficient(i, j);
                 let power = |x: f64, n: usize, times: u32| {
                     let factor: f64 = (0..times as usize).map(|k| n as f64 - k as f64).product();
-                    if n < times as usize { 0.0 } else { factor * x.powi((n - times as usize) as i32) }
+                    if n < times as usize {
+                        0.0
+                    } else {
+                        factor * x.powi((n - times as usize) as i32)
+                    }
                 };
                 first += c * DVec2::new(
                     power(at.x, i, 1) * power(at.y, j, 0),
@@ -166,10 +170,10 @@ fn windshield_bend(windshield: &Windshield, max_rad: f64) -> f64 {
         let curved = at.abs().max_element().tan() * first.length();
         second[0].abs() + 2.0 * second[1].abs() + second[2].abs() + 2.0 * curved
     };
-    // Where the refraction begins to fade out there is no expansion.
-    let max_rad = max_rad.min(Windshield::FADES_Z[1].acos());
-    let within = grid(max_rad).filter(|at| at.length() <= max_rad);
-    within.fold(0.0, |most, at| {
+    // The rays of a grid of pixels.
+    let rays = grid(0.5).filter_map(|at| camera.unproject((at + 0.5) * camera.size_px()));
+    let angles_rad = rays.map(|ray| DVec2::new(ray.x.asin(), ray.y.asin()));
+    angles_rad.fold(0.0, |most, at| {
         let horizontal = bend(windshield.horizontal(), [1.0, 0.0], at);
         let vertical = bend(windshield.vertical(), [0.0, 1.0], at);
         most.max(horizontal.hypot(vertical))

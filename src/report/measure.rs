@@ -308,11 +308,7 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
 }
 
 /// The image that an agent receives.
-fn received(
-    setting: &Setting,
-    view: &View,
-    drawing: &RenderedImage,
-) -> Result<Image, ReportError> {
+fn received(setting: &Setting, view: &View, drawing: &RenderedImage) -> Result<Image, ReportError> {
     let mut image = displayed(view, drawing);
     if setting.encoding.is_some() {
         let encoded = encode(setting.encoding, view, &drawing.rgb8);

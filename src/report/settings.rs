@@ -242,7 +242,10 @@ impl<'a> ListBuilder<'a> {
 
     fn add_lens_errors(&mut self) {
         if !self.twin.has_non_pinhole {
-            self.skip("lens_error_px", "every camera is a pinhole at rest, which has no six points");
+            self.skip(
+                "lens_error_px",
+                "every camera is a pinhole at rest, which has no six points",
+            );
             return;
         }
         let own = self.twin.profile.lens_error_px;

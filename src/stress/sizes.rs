@@ -239,7 +239,11 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let shrunk = mean_of(&rgb, 3, of_pixel);
         let drawn = image.rgba.chunks_exact(4).flat_map(|rgba| [rgba[0], rgba[1], rgba[2]]);
         let differences = drawn.zip(&shrunk).map(|(a, b)| f64::from(a - b));
-        run.check_at_least_db(format!("{what}: the native image shrunk, dB"), psnr_db(differences), 40.0);
+        run.check_at_least_db(
+            format!("{what}: the native image shrunk, dB"),
+            psnr_db(differences),
+            40.0,
+        );
         let mean = |values: &[f32]| {
             values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len() as f64
         };

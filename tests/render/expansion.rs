@@ -25,7 +25,8 @@ fn six_points() -> RenderProfile {
 /// The cameras of the real rig as a model reads them, and one of each model; at rest, and rolling.
 fn views() -> Vec<(String, View)> {
     let real = Rig::preset("alpamayo2").unwrap().cameras;
-    let real = real.into_iter().map(|mounted| (mounted.name, mounted.camera.scaled(576, 320).unwrap()));
+    let real =
+        real.into_iter().map(|mounted| (mounted.name, mounted.camera.scaled(576, 320).unwrap()));
     let models = lenses().into_iter().map(|(name, camera)| (name.to_owned(), camera));
     let pinhole = Pinhole { fx: 500.0, fy: 500.0, cx: 310.0, cy: 250.0 };
     let pinhole = ("pinhole".to_owned(), Camera::from_pinhole(640, 480, pinhole));
@@ -93,7 +94,11 @@ fn apart_px(a: &wildcity_render::layout::Splat, b: &wildcity_render::layout::Spl
 }
 
 /// The splats of a view by a profile.
-fn splats(scene: &Scene, profile: &RenderProfile, view: View) -> Vec<wildcity_render::layout::Splat> {
+fn splats(
+    scene: &Scene,
+    profile: &RenderProfile,
+    view: View,
+) -> Vec<wildcity_render::layout::Splat> {
     let frame = Frame { scene, profile, views: &[view] };
     cpu().run_through(&frame, Stage::Project).unwrap().0.splats
 }
@@ -202,8 +207,9 @@ fn median(mut values: Vec<f64>) -> f64 {
 fn paired(name: &str, a: &dyn Fn() -> StepMs, b: &dyn Fn() -> StepMs) -> f64 {
     a();
     b();
-    let pairs: Vec<[StepMs; 2]> = (0..11).map(|_| [a(), b()]).collect();
-    let of = |i: usize, part: fn(&StepMs) -> f64| median(pairs.iter().map(|p| part(&p[i])).collect());
+    let pairs: Vec<[StepMs; 2]> = (0..7).map(|_| [a(), b()]).collect();
+    let of =
+        |i: usize, part: fn(&StepMs) -> f64| median(pairs.iter().map(|p| part(&p[i])).collect());
     let ratio = median(pairs.iter().map(|[a, b]| a.step / b.step).collect());
     eprintln!(
         "{name}: step {:.1} against {:.1} ms, project {:.1} against {:.1} ms, ratio {ratio:.2}",
@@ -240,8 +246,9 @@ fn lenses_and_shutters_cost_little_more_than_pinholes() {
     }
     let (_, global) = rig_and_pinholes("vehicle6", None);
     let rolled = rolling(&global);
-    let ratio =
-        paired("vehicle6, rolling and global", &|| step(&default, &rolled), &|| step(&default, &global));
+    let ratio = paired("vehicle6, rolling and global", &|| step(&default, &rolled), &|| {
+        step(&default, &global)
+    });
     paired("vehicle6, rolling and by six points", &|| step(&default, &rolled), &|| {
         step(&six_points(), &rolled)
     });
@@ -257,7 +264,8 @@ fn every_instruction_set_expands_the_same_splats() {
     let (street, pose) = street_scene();
     let view = View::new(lenses()[2].1, pose);
     let frame = Frame { scene: &street, profile: &RenderProfile::default(), views: &[view] };
-    let of = |simd: Simd| Some(Cpu::new(1, simd).ok()?.run_through(&frame, Stage::Project).unwrap().0);
+    let of =
+        |simd: Simd| Some(Cpu::new(1, simd).ok()?.run_through(&frame, Stage::Project).unwrap().0);
     let best = of(Simd::Best).unwrap();
     let others = [of(Simd::Avx512), of(Simd::Avx2), of(Simd::Sse42)];
     for other in others.into_iter().flatten() {

@@ -69,8 +69,12 @@ impl Image {
     /// weighted by opacity, as depths of Gaussians are within a pixel.
     pub fn averaged(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px;
-        let mut new =
-            Self { size_px: [width, height], rgb: Vec::new(), depth_m: Vec::new(), opacity: Vec::new() };
+        let mut new = Self {
+            size_px: [width, height],
+            rgb: Vec::new(),
+            depth_m: Vec::new(),
+            opacity: Vec::new(),
+        };
         let columns = Coverage::of_all(width, own_width);
         for row in Coverage::of_all(height, own_height) {
             for column in &columns {

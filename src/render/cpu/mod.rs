@@ -2,7 +2,8 @@
 //!
 //! Each file is a stage: `project`, `sort`, `bin`, `rasterize`, `resolve`. The images are
 //! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
-//! splats in one order. Scratch buffers are kept from frame to frame.
+//! splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that would
+//! exceed it together are rendered one half after the other.
 
 mod appearance;
 mod background;
@@ -25,6 +26,7 @@ use rayon::ThreadPool;
 use crate::limits;
 
 use self::background::Background;
+use self::project::{Jobs, NonPinholeView};
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -121,7 +123,10 @@ impl Cpu {
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
-            scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
+            let timer = StageTimer::start();
+            let non_pinhole = NonPinholeView::all_of(frame);
+            let jobs = Jobs::new(frame, &non_pinhole);
+            scratch.run(self.level, frame, &jobs, last, timer, &mut stats)?;
             let mut timer = StageTimer::start();
             let outputs = export::stage_outputs(scratch, last, &cutoffs);
             timer.finish("hand over", &mut stats);
@@ -132,20 +137,22 @@ impl Cpu {
 
 impl Scratch {
     /// Runs the stages up to and including `last`. Each stage overwrites its part, so what an earlier frame
-    /// left there, even one that panicked, does not matter.
+    /// left there, even one that panicked, does not matter. Its jobs are those of the frame; `timer` has run
+    /// since before they were listed.
     fn run(
         &mut self,
         level: Level,
         frame: &Frame<'_>,
-        cutoffs: &Cutoffs,
+        jobs: &Jobs<'_>,
         last: Stage,
+        mut timer: StageTimer,
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
         let Self { projected, sorted, bins } = self;
-        let mut timer = StageTimer::start();
-        projected.project(level, frame, cutoffs);
+        let cutoffs = &Cutoffs::new(frame.profile);
+        projected.project(level, jobs, cutoffs);
         timer.finish("project", stats);
-        stats.visible_pairs = projected.len() as u64;
+        stats.visible_pairs += projected.len() as u64;
         if last >= Stage::Sort {
             sorted.sort(projected, cutoffs);
             timer.finish("sort", stats);
@@ -153,7 +160,7 @@ impl Scratch {
         if last >= Stage::Bin {
             bins.bin(level, projected, sorted, frame.views, cutoffs)?;
             timer.finish("bin", stats);
-            stats.instances = bins.instances() as u64;
+            stats.instances += bins.instances() as u64;
         }
         Ok(())
     }
@@ -187,23 +194,77 @@ impl Backend for Cpu {
         let backgrounds = Background::of(frame)?;
         let mut scratch = self.scratch.lock();
         let scratch = &mut *scratch;
-        let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
-            scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
-            let mut timer = StageTimer::start();
-            let Scratch { projected, bins, .. } = scratch;
-            let input = rasterize::Input {
-                projected,
-                bins,
-                views: frame.views,
-                backgrounds: &backgrounds,
-                cutoffs: &cutoffs,
-            };
-            stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
-            timer.finish("rasterize", &mut stats);
+            let part = FramePart { frame: *frame, backgrounds: &backgrounds, first_view: 0 };
+            self.render_part(scratch, part, targets, finished, &mut stats)?;
             Ok(stats)
         })
+    }
+}
+
+/// Some of a frame's views, which are rendered together.
+#[derive(Clone, Copy)]
+struct FramePart<'a> {
+    /// The frame with these views only.
+    frame: Frame<'a>,
+    /// One per view of the part, or none.
+    backgrounds: &'a [Background],
+    /// Index of the part's first view in the whole frame.
+    first_view: usize,
+}
+
+impl<'a> FramePart<'a> {
+    /// The same in two parts.
+    fn halves(&self) -> [Self; 2] {
+        let middle = self.frame.views.len() / 2;
+        let (first, second) = self.frame.views.split_at(middle);
+        let (behind_first, behind_second) = match self.backgrounds.is_empty() {
+            true => (self.backgrounds, self.backgrounds),
+            false => self.backgrounds.split_at(middle),
+        };
+        let part = |views, backgrounds, first_view| Self {
+            frame: Frame { views, ..self.frame },
+            backgrounds,
+            first_view,
+        };
+        [
+            part(first, behind_first, self.first_view),
+            part(second, behind_second, self.first_view + middle),
+        ]
+    }
+}
+
+impl Cpu {
+    /// Renders a part of a frame; views that together have more splats than fit into
+    /// [`limits::FRAME_SPLATS`] one half after the other. The images do not depend on it.
+    fn render_part(
+        &self,
+        scratch: &mut Scratch,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+        finished: OnViewDone<'_>,
+        stats: &mut FrameStats,
+    ) -> Result<(), RenderError> {
+        let FramePart { frame, backgrounds, first_view } = part;
+        let timer = StageTimer::start();
+        let non_pinhole = NonPinholeView::all_of(&frame);
+        let jobs = Jobs::new(&frame, &non_pinhole);
+        if frame.views.len() > 1 && jobs.max_splats() > limits::FRAME_SPLATS {
+            let [first, second] = part.halves();
+            let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
+            self.render_part(scratch, first, of_first, finished, stats)?;
+            return self.render_part(scratch, second, of_second, finished, stats);
+        }
+        scratch.run(self.level, &frame, &jobs, Stage::Bin, timer, stats)?;
+        let mut timer = StageTimer::start();
+        let Scratch { projected, bins, .. } = scratch;
+        let cutoffs = &Cutoffs::new(frame.profile);
+        let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
+        let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
+        stats.evaluations += rasterize::rasterize(self.level, input, targets, &finished);
+        timer.finish("rasterize", stats);
+        Ok(())
     }
 }
 
@@ -217,10 +278,14 @@ impl StageTimer {
         Self { start: Instant::now() }
     }
 
-    /// Records the time since the end of the previous stage.
+    /// Adds the time since the end of the previous stage.
     fn finish(&mut self, name: &'static str, stats: &mut FrameStats) {
         let now = Instant::now();
-        stats.stages_ms.push((name, (now - self.start).as_secs_f64() * 1e3));
+        let ms = (now - self.start).as_secs_f64() * 1e3;
+        match stats.stages_ms.iter_mut().find(|(stage, _)| *stage == name) {
+            Some((_, sum_ms)) => *sum_ms += ms,
+            None => stats.stages_ms.push((name, ms)),
+        }
         self.start = now;
     }
 }

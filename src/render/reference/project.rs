@@ -69,7 +69,7 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
         // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
         opacity *= blur_share.max(0.005 * 0.005).sqrt();
     }
-    opacity *= shrink_share.sqrt();
+    opacity *= shrink_share.powf(PixelFilter::SHRINK_POWER);
     let visible = opacity >= profile.alpha_cut;
     visible.then(|| Splat {
         gaussian: [0, index],

@@ -154,7 +154,7 @@ impl Ray {
             self.filter.filtered(xx, yy, det_before);
         let DVec2 { x: dx, y: dy } = offset_px;
         let power = -0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det;
-        let mut opacity = gaussian.opacity * shrink_share.sqrt();
+        let mut opacity = gaussian.opacity * shrink_share.powf(PixelFilter::SHRINK_POWER);
         if profile.antialiased {
             opacity *= blur_share.max(0.005 * 0.005).sqrt();
         }

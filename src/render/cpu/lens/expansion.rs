@@ -126,8 +126,7 @@ impl LensProjection {
         let gain = splat(1.0) / (splat(1.0) - per_px.dot(motion_px));
         let to_limit = unclamped.abs().min((splat(1.0) - unclamped).abs());
         let rotation_rad = splat(shutter.rotation_rad());
-        let terms =
-            ShutterTerms { motion, motion_px, per_px, gain, rolls, to_limit, rotation_rad };
+        let terms = ShutterTerms { motion, motion_px, per_px, gain, rolls, to_limit, rotation_rad };
         expansion.shutter = Some(terms);
 
         // From the frame at the moment of exposure to the one at the end: (row · R v) is (Rᵀ row · v).
@@ -248,14 +247,8 @@ impl LensProjection {
                 let along_y = radial + twice(yy * rise + p2 * x) + splat(6.0) * p1 * y;
                 let [fx, fy] = focal_px.map(splat);
                 let plane = [
-                    [
-                        fx * (along_x + twice(prism_x * x)),
-                        fx * (across + twice(prism_x * y)),
-                    ],
-                    [
-                        fy * (across + twice(prism_y * x)),
-                        fy * (along_y + twice(prism_y * y)),
-                    ],
+                    [fx * (along_x + twice(prism_x * x)), fx * (across + twice(prism_x * y))],
+                    [fy * (across + twice(prism_y * x)), fy * (along_y + twice(prism_y * y))],
                 ];
                 let rows = [
                     Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
@@ -284,9 +277,9 @@ impl<S: Simd> Expansion<S> {
     #[inline(always)]
     pub(in crate::cpu) fn in_frame(&mut self, camera_from_other: [Vec3x16<S>; 3]) {
         let [right, down, forward] = camera_from_other;
-        self.rows = self.rows.map(|row| {
-            right.scale(row.x).plus(down.scale(row.y)).plus(forward.scale(row.z))
-        });
+        self.rows = self
+            .rows
+            .map(|row| right.scale(row.x).plus(down.scale(row.y)).plus(forward.scale(row.z)));
     }
 
     /// The image of a Gaussian's axes, times their standard deviations, in metres.
@@ -360,10 +353,7 @@ impl<S: Simd> Expansion<S> {
     #[inline(always)]
     fn to_px(&self, away: f32x16<S>, around: f32x16<S>) -> Px<S> {
         let [x, y] = self.plane;
-        Px {
-            x: x[0].mul_add(away, x[1] * around),
-            y: y[0].mul_add(away, y[1] * around),
-        }
+        Px { x: x[0].mul_add(away, x[1] * around), y: y[0].mul_add(away, y[1] * around) }
     }
 
     /// The largest entry of the matrix to pixels.

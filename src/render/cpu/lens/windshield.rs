@@ -84,11 +84,7 @@ impl SimdWindshield {
     /// With `x = sin φ` outside and `x′ = sin h(φ, θ)` inside, `∂x′/∂x = cos h ∂h/∂φ / cos φ`, and likewise for the
     /// other three; z′ follows from the unit length.
     #[inline(always)]
-    pub(super) fn expand<S: Simd>(
-        &self,
-        simd: S,
-        unit: Vec3x16<S>,
-    ) -> RefractionDerivatives<S> {
+    pub(super) fn expand<S: Simd>(&self, simd: S, unit: Vec3x16<S>) -> RefractionDerivatives<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let one = splat(1.0);
         let cosine = |sine: f32x16<S>| (one - sine * sine).max(splat(1e-12)).sqrt();
@@ -194,12 +190,7 @@ impl Polynomial2 {
 
     /// By Horner's scheme in both angles, of the polynomial and of its derivatives.
     #[inline(always)]
-    fn with_slopes<S: Simd>(
-        &self,
-        simd: S,
-        phi: f32x16<S>,
-        theta: f32x16<S>,
-    ) -> ValueAndSlopes<S> {
+    fn with_slopes<S: Simd>(&self, simd: S, phi: f32x16<S>, theta: f32x16<S>) -> ValueAndSlopes<S> {
         let zero = f32x16::splat(simd, 0.0);
         let mut sum = ValueAndSlopes { value: zero, by_phi: zero, by_theta: zero };
         for row in self.0.iter().rev() {

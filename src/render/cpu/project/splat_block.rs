@@ -43,12 +43,7 @@ impl<S: Simd> Ellipse<S> {
     /// needles, for which `ac - b²` cancels to nothing. The determinant is of fourth order in the size, so
     /// that a splat wider than [`MAX_SIGMA_PX`] is computed in a unit larger than the pixel.
     #[inline(always)]
-    pub(super) fn from_root(
-        simd: S,
-        v0: Vec3x16<S>,
-        v1: Vec3x16<S>,
-        filter: &PixelFilter,
-    ) -> Self {
+    pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, filter: &PixelFilter) -> Self {
         let splat = |value: f32| f32x16::splat(simd, value);
         let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
         let units_per_px = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
@@ -93,9 +88,8 @@ impl<S: Simd> Ellipse<S> {
         let shrink_share;
         if filter.is_shrunk() {
             // det(C + diag(u, v)) = det C + u C_yy + v C_xx + u v, a sum of positives, too.
-            let det_with = |x: f32x16<S>, y: f32x16<S>| {
-                x.mul_add(yy + y, y.mul_add(xx, det_before))
-            };
+            let det_with =
+                |x: f32x16<S>, y: f32x16<S>| x.mul_add(yy + y, y.mul_add(xx, det_before));
             let blur_y = area(filter.total_px2.y);
             let det_native = det_with(area(filter.native_px2.x), area(filter.native_px2.y));
             det = det_with(blur_x, blur_y);
@@ -161,8 +155,8 @@ impl<S: Simd> ProjectedBlock<S> {
             log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
         }
         if let Some(ratio) = ellipse.shrink_share {
-            // The splat keeps its sum over all pixels.
-            log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
+            let power = splat(PixelFilter::SHRINK_POWER as f32);
+            log2_opacity = power.mul_add(log2(simd, ratio), log2_opacity);
         }
 
         // The box where alpha reaches the cut: u² + v² = log2(opacity) - log2(alpha_cut), and along x and y

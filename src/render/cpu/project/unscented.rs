@@ -19,9 +19,9 @@ use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensPixels, LensProjection, 
 use crate::expansion::ExpansionBound;
 use crate::layout::{Cutoffs, Filtered, PixelFilter};
 use crate::unscented::{CullBound, Footprint, UnscentedView};
-use wildcity_scene::{Chunk, RenderProfile};
 use wildcity_scene::chunk::{LANES, Lanes, column};
 use wildcity_scene::geometry::camera::WIDEST_RAD;
+use wildcity_scene::{Chunk, RenderProfile};
 
 /// One chunk in a view that is not a static pinhole.
 #[derive(Clone, Copy)]
@@ -206,8 +206,7 @@ struct CenteredBlock<S: Simd> {
 /// The rows of camera_from_chunk's rotation.
 #[inline(always)]
 fn rotation_rows<S: Simd>(simd: S, view: &UnscentedChunkView<'_>) -> [Vec3x16<S>; 3] {
-    view.camera_from_chunk
-        .map(|[x, y, z, _]| Vec3x16::splat(simd, [x as f32, y as f32, z as f32]))
+    view.camera_from_chunk.map(|[x, y, z, _]| Vec3x16::splat(simd, [x as f32, y as f32, z as f32]))
 }
 
 /// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
@@ -248,11 +247,7 @@ fn expand<S: Simd>(
 
 /// Where the expansion differs from six points by less than the bound.
 #[inline(always)]
-fn is_close<S: Simd>(
-    simd: S,
-    remainder: &Remainder<S>,
-    bound: &ExpansionBound,
-) -> mask32x16<S> {
+fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) -> mask32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
     let Remainder { square, longest, bend_px2, shutter_px, room } = *remainder;
     let cube = longest * longest * longest;
@@ -487,7 +482,7 @@ fn project_one(
         log2_opacity += 0.5 * blur_share.max(0.005 * 0.005).log2();
     }
     if view.filter.is_shrunk() {
-        log2_opacity += 0.5 * shrink_share.log2();
+        log2_opacity += PixelFilter::SHRINK_POWER * shrink_share.log2();
     }
 
     // The box where alpha reaches the cut, against the image's pixel centres.
