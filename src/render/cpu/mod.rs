@@ -12,6 +12,7 @@ mod export;
 mod lanes;
 mod lens;
 mod math;
+mod part;
 mod project;
 mod rasterize;
 mod resolve;
@@ -26,7 +27,7 @@ use rayon::ThreadPool;
 use crate::limits;
 
 use self::background::Background;
-use self::project::{Jobs, NonPinholeView};
+use self::part::FramePart;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -123,10 +124,7 @@ impl Cpu {
         let cutoffs = Cutoffs::new(frame.profile);
         self.pool.install(|| {
             let mut stats = FrameStats::default();
-            let timer = StageTimer::start();
-            let non_pinhole = NonPinholeView::all_of(frame);
-            let jobs = Jobs::new(frame, &non_pinhole);
-            scratch.run(self.level, frame, &jobs, last, timer, &mut stats)?;
+            scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
             let mut timer = StageTimer::start();
             let outputs = export::stage_outputs(scratch, last, &cutoffs);
             timer.finish("hand over", &mut stats);
@@ -137,20 +135,18 @@ impl Cpu {
 
 impl Scratch {
     /// Runs the stages up to and including `last`. Each stage overwrites its part, so what an earlier frame
-    /// left there, even one that panicked, does not matter. Its jobs are those of the frame; `timer` has run
-    /// since before they were listed.
+    /// left there, even one that panicked, does not matter.
     fn run(
         &mut self,
         level: Level,
         frame: &Frame<'_>,
-        jobs: &Jobs<'_>,
+        cutoffs: &Cutoffs,
         last: Stage,
-        mut timer: StageTimer,
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
         let Self { projected, sorted, bins } = self;
-        let cutoffs = &Cutoffs::new(frame.profile);
-        projected.project(level, jobs, cutoffs);
+        let mut timer = StageTimer::start();
+        projected.project(level, frame, cutoffs);
         timer.finish("project", stats);
         stats.visible_pairs += projected.len() as u64;
         if last >= Stage::Sort {
@@ -203,38 +199,6 @@ impl Backend for Cpu {
     }
 }
 
-/// Some of a frame's views, which are rendered together.
-#[derive(Clone, Copy)]
-struct FramePart<'a> {
-    /// The frame with these views only.
-    frame: Frame<'a>,
-    /// One per view of the part, or none.
-    backgrounds: &'a [Background],
-    /// Index of the part's first view in the whole frame.
-    first_view: usize,
-}
-
-impl<'a> FramePart<'a> {
-    /// The same in two parts.
-    fn halves(&self) -> [Self; 2] {
-        let middle = self.frame.views.len() / 2;
-        let (first, second) = self.frame.views.split_at(middle);
-        let (behind_first, behind_second) = match self.backgrounds.is_empty() {
-            true => (self.backgrounds, self.backgrounds),
-            false => self.backgrounds.split_at(middle),
-        };
-        let part = |views, backgrounds, first_view| Self {
-            frame: Frame { views, ..self.frame },
-            backgrounds,
-            first_view,
-        };
-        [
-            part(first, behind_first, self.first_view),
-            part(second, behind_second, self.first_view + middle),
-        ]
-    }
-}
-
 impl Cpu {
     /// Renders a part of a frame; views that together have more splats than fit into
     /// [`limits::FRAME_SPLATS`] one half after the other. The images do not depend on it.
@@ -247,19 +211,16 @@ impl Cpu {
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
         let FramePart { frame, backgrounds, first_view } = part;
-        let timer = StageTimer::start();
-        let non_pinhole = NonPinholeView::all_of(&frame);
-        let jobs = Jobs::new(&frame, &non_pinhole);
-        if frame.views.len() > 1 && jobs.max_splats() > limits::FRAME_SPLATS {
+        if frame.views.len() > 1 && part.max_splats() > limits::FRAME_SPLATS {
             let [first, second] = part.halves();
             let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
             self.render_part(scratch, first, of_first, finished, stats)?;
             return self.render_part(scratch, second, of_second, finished, stats);
         }
-        scratch.run(self.level, &frame, &jobs, Stage::Bin, timer, stats)?;
+        let cutoffs = &Cutoffs::new(frame.profile);
+        scratch.run(self.level, &frame, cutoffs, Stage::Bin, stats)?;
         let mut timer = StageTimer::start();
         let Scratch { projected, bins, .. } = scratch;
-        let cutoffs = &Cutoffs::new(frame.profile);
         let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
         let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
         stats.evaluations += rasterize::rasterize(self.level, input, targets, &finished);

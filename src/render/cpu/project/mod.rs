@@ -72,14 +72,11 @@ pub(super) struct Unit {
 }
 
 /// A view that is not a static pinhole.
-pub(super) struct NonPinholeView<'a> {
+struct NonPinholeView<'a> {
     unscented: UnscentedView<'a>,
     /// The lens for 16 points at a time; `None` where only the f64 path describes it.
     lens: Option<LensProjection>,
 }
-
-/// The work of a frame.
-pub(super) struct Jobs<'a>(Vec<Job<'a>>);
 
 /// What one thread computes at a time: becomes one [`Unit`].
 struct Job<'a> {
@@ -101,10 +98,14 @@ enum ChunkProjection<'a> {
 
 impl Projected {
     /// Projects every Gaussian of the scene into every view.
-    pub(super) fn project(&mut self, level: Level, jobs: &Jobs<'_>, cutoffs: &Cutoffs) {
+    pub(super) fn project(&mut self, level: Level, frame: &Frame<'_>, cutoffs: &Cutoffs) {
         let Self { pages, units, free } = self;
         free.get_mut().append(pages);
-        let jobs = &jobs.0;
+
+        // Prepare what is the same for all chunks of a view, then one job per visible unit.
+        let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
+            frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
+        let jobs = jobs(frame, &non_pinhole);
 
         // In parallel: each job fills pages of its own.
         let filled: Vec<(usize, Vec<Page>)> = jobs
@@ -154,27 +155,10 @@ impl Projected {
 }
 
 impl<'a> NonPinholeView<'a> {
-    /// What is the same for all chunks of a view; `None` for a static pinhole.
-    pub(super) fn all_of(frame: &Frame<'a>) -> Vec<Option<Self>> {
-        frame.views.iter().map(|view| Self::new(view, frame)).collect()
-    }
-
+    /// `None` for a static pinhole.
     fn new(view: &'a crate::View, frame: &Frame<'_>) -> Option<Self> {
         let unscented = UnscentedView::new(view, frame.profile)?;
         Some(Self { unscented, lens: LensProjection::new(view) })
-    }
-}
-
-impl<'a> Jobs<'a> {
-    /// All jobs of a frame, in order of (view, global id). A unit that a view cannot see has no job; it costs
-    /// one visibility test per cluster.
-    pub(super) fn new(frame: &Frame<'a>, non_pinhole: &'a [Option<NonPinholeView<'a>>]) -> Self {
-        Self(jobs(frame, non_pinhole))
-    }
-
-    /// At most so many splats come of them.
-    pub(super) fn max_splats(&self) -> usize {
-        self.0.iter().map(|job| job.clusters.len() * CLUSTER).sum()
     }
 }
 
@@ -205,6 +189,8 @@ fn copy_to_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
     pages
 }
 
+/// All jobs of a frame, in order of (view, global id). A unit that a view cannot see has no job; it costs one
+/// visibility test per cluster.
 fn jobs<'a>(frame: &Frame<'a>, non_pinhole: &'a [Option<NonPinholeView<'a>>]) -> Vec<Job<'a>> {
     let mut jobs = Vec::new();
     for (index, (view, non_pinhole)) in frame.views.iter().zip(non_pinhole).enumerate() {
