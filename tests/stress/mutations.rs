@@ -320,7 +320,7 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T27", CoarseCentres, &["as f64"]),
     ("T27", Culled, &["it is covered"]),
     ("T28", Paler, &["the fog lets through", "as f64"]),
-    ("T29", OwnBlur, &["the native image shrunk", "mean opacity off by", "as f64"]),
+    ("T29", OwnBlur, &["nearer to native by dB", "as f64"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit tests of

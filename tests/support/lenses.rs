@@ -105,7 +105,9 @@ pub(crate) fn check_projections(
         let image = render_one(backend, &scene_of(&[ball]), &fine, view);
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
-        assert!(off_px < 0.1, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());
+        // Samples at pixel centres move the centroid of a splat that is as thin as in a shrunk image: 0.1 px.
+        let most_px = if camera.native_size_px.is_some() { 0.15 } else { 0.1 };
+        assert!(off_px < most_px, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());
         seen += 1;
     }
     seen
